@@ -1,0 +1,52 @@
+"""magtwin: magnetic digital twins of robots, authored in USD.
+
+A Scene goes in (lab, robot, map, sensors), a Run comes out (what every sensor would have read).
+Names are loaded when first used, so that `import magtwin` costs nothing.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from magtwin.field.map import AnomalyMap
+    from magtwin.names import RefusedError
+    from magtwin.path import Path
+    from magtwin.run import COLUMNS, Run
+    from magtwin.spec import Scene
+    from magtwin.twin import Twin, open_twin, simulate
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "AnomalyMap": "magtwin.field.map",
+    "COLUMNS": "magtwin.run",
+    "Path": "magtwin.path",
+    "RefusedError": "magtwin.names",
+    "Run": "magtwin.run",
+    "Scene": "magtwin.spec",
+    "Twin": "magtwin.twin",
+    "open_twin": "magtwin.twin",
+    "simulate": "magtwin.twin",
+}
+
+__all__ = [
+    "COLUMNS",
+    "AnomalyMap",
+    "Path",
+    "RefusedError",
+    "Run",
+    "Scene",
+    "Twin",
+    "open_twin",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'magtwin' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME})

@@ -1,0 +1,218 @@
+"""Files: where magtwin's own lie, how outputs are written, checksums, settings in TOML."""
+
+import dataclasses
+import hashlib
+import os
+import shutil
+import tempfile
+import tomllib
+import types
+import typing
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from magtwin.names import RefusedError, hint
+
+T = TypeVar("T")
+
+
+def shipped(*parts: str) -> Path:
+    """A file or folder that ships with magtwin: `shipped("maps", "lab")`.
+
+    `robots/`, `maps/`, `scenes/` and `weights/` stand at the top of a checkout, and inside the
+    package, under `_shipped/`, where magtwin was installed from a wheel.
+    """
+    package = Path(__file__).resolve().parent
+    root = package / "_shipped"
+    path = (root if root.is_dir() else package.parent).joinpath(*parts)
+    if not path.exists():
+        raise RefusedError(f"{path}: not there; magtwin's own files are missing, install it again")
+    return path
+
+
+def existing(path: str | os.PathLike[str], what: str) -> Path:
+    """`path` if it is there.
+
+    Raises:
+        RefusedError: It is not; the text says what was expected of it.
+    """
+    path = Path(path)
+    if not path.exists():
+        siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+        near = f"; {hint(path.name, siblings)}" if siblings and len(siblings) < 50 else ""
+        raise RefusedError(f"{path}: no such {what}{near}")
+    return path
+
+
+def check_free(path: str | os.PathLike[str], *, force: bool = False) -> Path:
+    """`path` if it may be written: nothing is there yet, or `force` was given.
+
+    Raises:
+        RefusedError: It exists and `force` was not given.
+    """
+    path = Path(path)
+    if path.exists() and not force:
+        raise RefusedError(f"{path}: exists already; give --force to replace it, or another name")
+    return path
+
+
+@contextmanager
+def output(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Path]:
+    """A path beside `path` to write a file or a folder to; it takes the place of `path` at the end.
+
+    Nothing is left behind when the block raises, so no half-written output is ever seen. Give the
+    yielded name the suffix of the target (it has it) and create the file or folder yourself.
+
+    Args:
+        path: The file or folder to make. Its parents are created.
+        force: Whether one that exists is replaced.
+
+    Raises:
+        RefusedError: It exists and `force` was not given, or its folder cannot be written.
+    """
+    path = check_free(path, force=force)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    except OSError as error:
+        raise RefusedError(f"{path}: cannot be written ({error.strerror})") from error
+    try:
+        yield aside / path.name
+        if path.is_dir():
+            os.replace(path, aside / ".old")
+        os.replace(aside / path.name, path)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def sha256(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of a file, lower-case hex."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The tables of a TOML file.
+
+    Raises:
+        RefusedError: The file is missing, or is not TOML; the text gives the line.
+    """
+    path = existing(path, "TOML file")
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RefusedError(f"{path}: not TOML: {error}") from error
+
+
+def from_table(cls: type[T], table: dict[str, Any], path: str | os.PathLike[str], section: str = "") -> T:
+    """A dataclass made from a table of a TOML file, every key and type checked.
+
+    Args:
+        cls: The dataclass; nested dataclasses are nested tables, tuples of them are arrays of tables.
+        table: What `read_toml` gave, or a part of it.
+        path: The file, for refusals; relative `Path` fields are taken from its folder.
+        section: Name of the table in the file, for refusals.
+
+    Raises:
+        RefusedError: A key that the class does not have (the nearest one is named), a missing key, or
+            a value of the wrong type or range, each with file and line.
+    """
+    where = _Where(Path(path), section)
+    hints = typing.get_type_hints(cls)
+    known = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    for key in table:
+        if key not in known:
+            raise where.refused(key, f"unknown key {key!r}; {hint(key, known)}")
+    for name, spec in known.items():
+        if (
+            name not in table
+            and spec.default is dataclasses.MISSING
+            and spec.default_factory is dataclasses.MISSING
+        ):
+            raise where.refused("", f"key {name!r} is missing")
+    values = {key: _value(hints[key], value, where, key) for key, value in table.items()}
+    try:
+        return cls(**values)
+    except RefusedError as error:
+        raise where.refused(next((k for k in values if k in str(error)), ""), str(error)) from error
+
+
+@dataclasses.dataclass(frozen=True)
+class _Where:
+    """A table of a TOML file, for refusals that name the line."""
+
+    path: Path
+    section: str
+
+    def refused(self, key: str, text: str) -> RefusedError:
+        table = f"[{self.section}] " if self.section else ""
+        return RefusedError(f"{self.path}{self._line(key)}: {table}{text}")
+
+    def _line(self, key: str) -> str:
+        inside = not self.section
+        try:
+            lines = self.path.read_text(encoding="utf-8").splitlines()
+        except OSError:
+            return ""
+        for number, line in enumerate(lines, 1):
+            text = line.strip()
+            if text.startswith("["):
+                inside = text.strip("[] ") == self.section
+                if inside and not key:
+                    return f":{number}"
+                if self.section and text.strip("[] ") == f"{self.section}.{key}":
+                    return f":{number}"
+            elif inside and key and text.split("=")[0].strip().strip('"') == key:
+                return f":{number}"
+        return ""
+
+
+def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
+    """`value` as the annotation `kind` says."""
+    wrong = where.refused(key, f"{key} must be {_say(kind)}, got {value!r}")
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return _value(next(a for a in args if a is not type(None)), value, where, key)
+    section = f"{where.section}.{key}" if where.section else key
+    if dataclasses.is_dataclass(kind):
+        if not isinstance(value, dict):
+            raise wrong
+        return from_table(kind, value, where.path, section)  # type: ignore[arg-type]
+    if origin is tuple:
+        if not isinstance(value, list):
+            raise wrong
+        if len(args) == 2 and args[1] is Ellipsis:
+            args = (args[0],) * len(value)
+        if len(args) != len(value):
+            raise wrong
+        if any(dataclasses.is_dataclass(a) for a in args):
+            return tuple(from_table(a, v, where.path, section) for a, v in zip(args, value, strict=True))
+        return tuple(_value(a, v, where, key) for a, v in zip(args, value, strict=True))
+    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    if kind is Path and isinstance(value, str):
+        return (where.path.parent / value).resolve()
+    if kind in (str, int, bool) and type(value) is kind:
+        return value
+    raise wrong
+
+
+def _say(kind: Any) -> str:
+    """An annotation in words."""
+    words = {
+        float: "a number",
+        int: "a whole number",
+        str: "a text",
+        bool: "true or false",
+        Path: "a file name",
+    }
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if origin is tuple:
+        if args[-1] is Ellipsis:
+            return f"a list, each {_say(args[0])}"
+        return f"a list of {len(args)}, each {_say(args[0])}"
+    if origin in (typing.Union, types.UnionType):
+        return _say(next(a for a in args if a is not type(None)))
+    return words.get(kind, "a table")
