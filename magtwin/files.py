@@ -81,8 +81,8 @@ def output(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Pat
     try:
         yield aside / path.name
         if path.is_dir():
-            os.replace(path, aside / ".old")
-        os.replace(aside / path.name, path)
+            path.rename(aside / ".old")
+        (aside / path.name).replace(path)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
 

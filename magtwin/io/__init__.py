@@ -1,1 +1,1 @@
-
+"""Where runs go: tables, Rerun recordings, pictures."""

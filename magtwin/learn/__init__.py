@@ -1,1 +1,1 @@
-
+"""The neural magnetometer: features, networks, training, prediction."""

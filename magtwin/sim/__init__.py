@@ -1,1 +1,1 @@
-
+"""The simulator: kinematics, controllers, sensors, the platform's own field."""

@@ -1,1 +1,1 @@
-
+"""Authoring and reading USD."""

@@ -1,1 +1,1 @@
-
+"""URDF to a USD articulation."""
