@@ -1,0 +1,111 @@
+"""The originals, from where their owners publish them, each file checked against its SHA-256.
+
+magtwin ships nothing of them. Each source is a table beside this file: name, checksum, and path in a
+repository at a pinned commit.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from magtwin.files import output
+from magtwin.names import RefusedError, find
+
+_GITHUB = "https://raw.githubusercontent.com"
+
+
+@dataclass(frozen=True)
+class Source:
+    """A table of files, and where they are published."""
+
+    table: str
+    """File beside this module: name, SHA-256, path below `base_url`, a line each."""
+
+    base_url: str
+    """Address that the paths of the table are appended to."""
+
+    licence: str
+    """SPDX identifier of its licence."""
+
+    def files(self) -> list[tuple[str, str, str]]:
+        """Name, SHA-256 and path of each file."""
+        text = (Path(__file__).parent / self.table).read_text(encoding="utf-8")
+        lines = (line.split() for line in text.splitlines() if line and not line.startswith("#"))
+        return [(name, checksum, path) for name, checksum, path in lines]
+
+
+SOURCES = {
+    "aprilab": (
+        Source(
+            "aprilab.txt",
+            f"{_GITHUB}/aprilab-uf/nn_magnetometer/f81ff6c533745b62d97cf9f4775848d86f9e73b5",
+            "MIT",
+        ),
+    ),
+    "turtlebot4": (
+        Source(
+            "turtlebot4.txt",
+            f"{_GITHUB}/turtlebot/turtlebot4/d6881758863264ca32cf2a965c2a0ddfb2cc3094",
+            "Apache-2.0",
+        ),
+        Source(
+            "create3.txt",
+            f"{_GITHUB}/iRobotEducation/create3_sim/6a8bc44f9be2c260bc17e753c31455d6759af238",
+            "BSD-3-Clause",
+        ),
+    ),
+}
+"""What can be fetched, by name: the APRILab survey, network and paths; the TurtleBot 4's description."""
+
+
+def fetch(
+    name: str,
+    dest: Path,
+    *,
+    base_url: str | None = None,
+    force: bool = False,
+    progress: Callable[[int, int, str], None] = lambda done, total, file: None,
+) -> list[Path]:
+    """Fetch a source into a folder of its own.
+
+    Args:
+        name: An entry of SOURCES.
+        dest: Folder to make; nothing is left of it when a file is missing or wrong.
+        base_url: Address to take the files from instead, a mirror with the same paths.
+        force: Whether a folder that exists is replaced.
+        progress: Called with files done, files in all, and the name of the next file.
+
+    Returns:
+        The files written.
+
+    Raises:
+        RefusedError: No such source, no connection, a file that is not there, or a wrong checksum.
+    """
+    import pooch
+
+    sources = find("source", name, SOURCES)
+    if base_url is not None and urlsplit(base_url).scheme not in ("http", "https"):
+        raise RefusedError(f"--base-url {base_url!r}: must begin with http:// or https://")
+    jobs = [
+        (file, checksum, f"{(base_url or source.base_url).rstrip('/')}/{path}")
+        for source in sources
+        for file, checksum, path in source.files()
+    ]
+    downloader = pooch.HTTPDownloader(timeout=30)
+    pooch.get_logger().setLevel("ERROR")
+    with output(dest, force=force) as folder:
+        for done, (file, checksum, url) in enumerate(jobs):
+            progress(done, len(jobs), file)
+            target = folder / file
+            try:
+                pooch.retrieve(
+                    url, f"sha256:{checksum}", fname=target.name, path=target.parent, downloader=downloader
+                )
+            except ValueError as error:  # pooch: the checksum differs
+                raise RefusedError(f"{url}: its SHA-256 is not {checksum}; nothing was kept") from error
+            except OSError as error:  # requests' exceptions are OSErrors
+                reason = str(error).split("\n")[0]
+                raise RefusedError(f"{url}: could not be fetched ({reason}); nothing was kept") from error
+        progress(len(jobs), len(jobs), "")
+    return [dest / file for file, _, _ in jobs]
