@@ -1,0 +1,425 @@
+"""Shape and Link: what a stage shows, as triangles, and the bodies that carry it."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pxr import Gf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+
+from magtwin.files import existing
+from magtwin.frames import IDENTITY_XYZW, canonical
+from magtwin.names import RefusedError
+from magtwin.spec import ZERO3, Quat, Vec3
+
+SEGMENTS = 32
+"""Sides of the polygon that stands for a circle."""
+
+GREY = (0.5, 0.5, 0.5, 1.0)
+"""Colour of what has none."""
+
+BASE_LINK = "base_link"
+"""Name of the link whose frame is the robot's, as in REP-105."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Triangles of one colour (or coloured by vertex), in the frame of the body that carries them."""
+
+    prim: str
+    """Path of the gprim, or of the GeomSubset of a mesh with several materials."""
+
+    link: str
+    """Name of the rigid body that carries it; "" for what stands still."""
+
+    vertices: NDArray[np.float32]
+    """Vertices in the link's frame, in world where nothing carries it [m], shape (V, 3)."""
+
+    faces: NDArray[np.int32]
+    """Corners of the triangles, counter-clockwise seen from outside, shape (F, 3)."""
+
+    colour: tuple[float, float, float, float]
+    """Red, green, blue, opacity, 0 to 1, linear, as USD has them."""
+
+    vertex_colours: NDArray[np.float32] | None = None
+    """Red, green, blue of each vertex, 0 to 1, linear, shape (V, 3); none where one colour does."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """A rigid body: where it rests, and the joint that moves it."""
+
+    name: str
+    """Name of its prim; its path where another body has the name already."""
+
+    p_base_link: Vec3
+    """Origin in the base link of its robot, at rest [m]."""
+
+    q_base_link_xyzw: Quat
+    """Axes in the base link of its robot, at rest."""
+
+    axis_link: Vec3 | None = None
+    """Axis that the link turns about, in the link's own frame, unit length; none if it does not turn."""
+
+    joint: str = ""
+    """Name of the joint that holds it to its parent; "" for a base."""
+
+    p_world_link: Vec3 = ZERO3
+    """Origin in world, as the stage stands [m]."""
+
+    q_world_link_xyzw: Quat = IDENTITY_XYZW
+    """Axes in world, as the stage stands."""
+
+
+def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
+    """The stage of a USD file.
+
+    Raises:
+        RefusedError: No such file, or not USD; the text says what USD said of it.
+    """
+    path = existing(path, "USD file")
+    try:
+        return Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        reason = str(error).strip().splitlines()[-1].strip()
+        raise RefusedError(f"{path}: cannot be opened as USD: {reason}") from error
+
+
+def read_shapes(stage: Usd.Stage | str | os.PathLike[str]) -> list[Shape]:
+    """Everything that a viewer shows of a stage, as triangles, in order of the prims.
+
+    Meshes, cubes, spheres, cylinders, cones, capsules and planes, those in instances included, that
+    are visible and of purpose default or render: colliders (guide) and proxies stay out. Subdivision
+    surfaces come as their control mesh.
+
+    Args:
+        stage: A stage, or the path of a USD file.
+
+    Raises:
+        RefusedError: The file is missing or is not USD, or a mesh contradicts itself; the text names
+            the prim.
+    """
+    stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
+    cache, bodies = UsdGeom.XformCache(), _bodies(stage)
+    shapes: list[Shape] = []
+    for prim in _prims(stage):
+        gprim = UsdGeom.Gprim(prim)
+        if not gprim or not _is_shown(gprim):
+            continue
+        solid = _solid(gprim)
+        if solid is None:
+            continue
+        body = _carrier(prim, bodies)
+        to_frame = cache.GetLocalToWorldTransform(prim)
+        if body is not None:
+            to_frame = to_frame * _rigid(cache.GetLocalToWorldTransform(body)).GetInverse()
+        name = "" if body is None else bodies[body.GetPath()]
+        shapes += _shapes(gprim, solid, np.array(to_frame), name)
+    return shapes
+
+
+def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
+    """The rigid bodies of a stage by name, with their rest poses in their robot's base.
+
+    A robot's base is its body called `base_link`, or else the body that its tree of joints starts
+    from. Bodies that no joint holds are their own base.
+
+    Args:
+        stage: A stage, or the path of a USD file.
+
+    Raises:
+        RefusedError: The file is missing or is not USD, or joints go round in a circle.
+    """
+    stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
+    cache, bodies = UsdGeom.XformCache(), _bodies(stage)
+    world = {path: _rigid(cache.GetLocalToWorldTransform(stage.GetPrimAtPath(path))) for path in bodies}
+    above = {child: (joint, parent) for joint, parent, child in _joints(stage, bodies)}
+    roots = {path: _root(path, above) for path in bodies}
+    named = {roots[path]: path for path in bodies if path.name == BASE_LINK}
+    links = {}
+    for path, name in bodies.items():
+        joint = above[path][0] if path in above else None
+        base = named.get(roots[path], roots[path])
+        p, q = _pose(world[path] * world[base].GetInverse())
+        p_world, q_world = _pose(world[path])
+        links[name] = Link(
+            name=name,
+            p_base_link=p,
+            q_base_link_xyzw=q,
+            axis_link=None if joint is None else _axis(joint),
+            joint="" if joint is None else joint.GetPrim().GetName(),
+            p_world_link=p_world,
+            q_world_link_xyzw=q_world,
+        )
+    return links
+
+
+def _prims(stage: Usd.Stage) -> Iterator[Usd.Prim]:
+    """Every prim, those inside instances included."""
+    return iter(stage.Traverse(Usd.TraverseInstanceProxies()))
+
+
+def _bodies(stage: Usd.Stage) -> dict:
+    """Names of the rigid bodies by path, each name once."""
+    names: dict = {}
+    for prim in _prims(stage):
+        if prim.HasAPI(UsdPhysics.RigidBodyAPI):
+            taken = prim.GetName() in names.values()
+            names[prim.GetPath()] = str(prim.GetPath()) if taken else prim.GetName()
+    return names
+
+
+def _carrier(prim: Usd.Prim, bodies: dict) -> Usd.Prim | None:
+    """The nearest rigid body at or above a prim."""
+    while prim and prim.GetPath() not in bodies:
+        prim = prim.GetParent()
+    return prim if prim else None
+
+
+def _joints(stage: Usd.Stage, bodies: dict) -> Iterator[tuple]:
+    """Joint, parent body and child body of every joint between two bodies."""
+    for prim in _prims(stage):
+        joint = UsdPhysics.Joint(prim)
+        if not joint:
+            continue
+        ends = [rel.GetTargets() for rel in (joint.GetBody0Rel(), joint.GetBody1Rel())]
+        if all(len(end) == 1 and end[0] in bodies for end in ends):
+            yield joint, ends[0][0], ends[1][0]
+
+
+def _root(path, above: dict):  # type: ignore[no-untyped-def]
+    """The body that the tree of joints over a body starts from."""
+    seen = [path]
+    while path in above:
+        path = above[path][1]
+        if path in seen:
+            raise RefusedError(f"{path}: its joints go round in a circle: {' -> '.join(map(str, seen))}")
+        seen.append(path)
+    return path
+
+
+def _axis(joint: UsdPhysics.Joint) -> Vec3 | None:
+    """The axis of a revolute joint in the frame of its second body."""
+    revolute = UsdPhysics.RevoluteJoint(joint.GetPrim())
+    if not revolute:
+        return None
+    axis = Gf.Vec3d(*("XYZ".index(revolute.GetAxisAttr().Get()) == i for i in range(3)))
+    turned = Gf.Rotation(joint.GetLocalRot1Attr().Get()).TransformDir(axis)
+    x, y, z = (round(float(c), 9) + 0.0 for c in turned)
+    return (x, y, z)
+
+
+def _rigid(matrix: Gf.Matrix4d) -> Gf.Matrix4d:
+    """A transform without its scale and shear: a frame."""
+    return matrix.RemoveScaleShear()
+
+
+def _pose(matrix: Gf.Matrix4d) -> tuple[Vec3, Quat]:
+    """Position and quaternion xyzw (w >= 0) of a rigid transform."""
+    q, (px, py, pz) = matrix.ExtractRotationQuat(), matrix.ExtractTranslation()
+    x, y, z, w = (float(v) for v in canonical([*q.GetImaginary(), q.GetReal()]))
+    return (float(px), float(py), float(pz)), (x, y, z, w)
+
+
+def _is_shown(gprim: UsdGeom.Gprim) -> bool:
+    return gprim.ComputeVisibility() != UsdGeom.Tokens.invisible and gprim.ComputePurpose() in (
+        UsdGeom.Tokens.default_,
+        UsdGeom.Tokens.render,
+    )
+
+
+@dataclass(frozen=True)
+class _Solid:
+    """Points of a gprim, and the triangles between them, each with the face that it was cut from."""
+
+    points: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    """Corners of the triangles as indices into the face-vertex list, shape (F, 3)."""
+    corners: NDArray[np.int64]
+    """Index of the point at each entry of the face-vertex list."""
+    origin: NDArray[np.int64]
+    """Index of the face that each triangle is a part of, shape (F,)."""
+
+
+def _solid(gprim: UsdGeom.Gprim) -> _Solid | None:
+    """A gprim in its own space, or none for kinds that have no surface (points, curves)."""
+    prim = gprim.GetPrim()
+    if prim.IsA(UsdGeom.Mesh):
+        return _mesh(UsdGeom.Mesh(prim))
+    get = {name: prim.GetAttribute(name).Get() for name in ("radius", "height", "size", "width", "length")}
+    axis = prim.GetAttribute("axis").Get()
+    kind = prim.GetTypeName()
+    if kind == "Cube":
+        return _faces(*_box(get["size"]))
+    if kind == "Plane":
+        return _faces(*_plane(get["width"], get["length"], axis))
+    if kind == "Sphere":
+        return _faces(*_revolved(_arc(get["radius"], -90, 90), "Z"))
+    if kind == "Cylinder":
+        r, h = get["radius"], get["height"] / 2
+        return _faces(*_revolved(np.array([[0, -h], [r, -h], [r, h], [0, h]]), axis))
+    if kind == "Cone":
+        r, h = get["radius"], get["height"] / 2
+        return _faces(*_revolved(np.array([[0, -h], [r, -h], [0, h]]), axis))
+    if kind == "Capsule":
+        lift = np.array([0, get["height"] / 2])
+        halves = [_arc(get["radius"], -90, 0) - lift, _arc(get["radius"], 0, 90) + lift]
+        return _faces(*_revolved(np.vstack(halves), axis))
+    return None
+
+
+def _mesh(mesh: UsdGeom.Mesh) -> _Solid:
+    """A mesh's polygons cut into fans of triangles, holes left out."""
+    points = np.array(mesh.GetPointsAttr().Get() or np.empty((0, 3)), float)
+    counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [], int)
+    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], int)
+    if counts.sum() != len(corners) or (
+        len(corners) and not 0 <= corners.min() <= corners.max() < len(points)
+    ):
+        raise RefusedError(
+            f"{mesh.GetPath()}: its {counts.sum()} corners, {len(corners)} indices and {len(points)} points "
+            "contradict each other; export the mesh again"
+        )
+    cuts = np.maximum(counts - 2, 0)
+    origin = np.repeat(np.arange(len(counts)), cuts)
+    first = np.repeat(np.cumsum(counts) - counts, cuts)
+    step = np.arange(len(origin)) - np.repeat(np.cumsum(cuts) - cuts, cuts)
+    triangles = np.column_stack([first, first + step + 1, first + step + 2])
+    if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
+        triangles = triangles[:, ::-1]
+    kept = ~np.isin(origin, np.array(mesh.GetHoleIndicesAttr().Get() or [], int))
+    return _Solid(points, triangles[kept], corners, origin[kept])
+
+
+def _faces(points: NDArray, triangles: NDArray) -> _Solid:
+    """A solid made of triangles."""
+    count = len(triangles)
+    return _Solid(
+        points, np.arange(3 * count).reshape(count, 3), np.asarray(triangles, int).ravel(), np.arange(count)
+    )
+
+
+def _box(size: float) -> tuple[NDArray, NDArray]:
+    corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3, indexing="ij"), -1).reshape(8, 3) * size
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    return corners, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+
+
+def _plane(width: float, length: float, axis: str) -> tuple[NDArray, NDArray]:
+    """A rectangle whose normal is `axis`; width and length lie as UsdGeomPlane has them."""
+    w, h = width / 2, length / 2
+    across = {"X": ([0, 0, w], [0, h, 0]), "Y": ([w, 0, 0], [0, 0, h]), "Z": ([w, 0, 0], [0, h, 0])}[axis]
+    u, v = np.array(across, float)
+    points = np.array([-u - v, u - v, u + v, v - u])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    return points, triangles if np.cross(u, v)["XYZ".index(axis)] > 0 else triangles[:, ::-1]
+
+
+def _arc(radius: float, start_deg: float, end_deg: float) -> NDArray:
+    """Distance from the axis and height along it, of points on a circle, from below upwards."""
+    steps = round((end_deg - start_deg) / 180 * SEGMENTS / 2)
+    angle = np.radians(np.linspace(start_deg, end_deg, steps + 1))
+    return radius * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _revolved(profile: NDArray, axis: str) -> tuple[NDArray, NDArray]:
+    """The surface that a profile of (distance, height) sweeps about an axis; its ends lie on the axis."""
+    angle = 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(SEGMENTS)])
+    rings = [r * ring + [0, 0, z] for r, z in profile[1:-1]]
+    points = np.vstack([[[0, 0, profile[0][1]]], *rings, [[0, 0, profile[-1][1]]]])
+    here = np.arange(SEGMENTS)
+    there = (here + 1) % SEGMENTS
+    last = len(points) - 1
+    triangles = [np.column_stack([np.zeros_like(here), 1 + there, 1 + here])]
+    for k in range(len(rings) - 1):
+        a, b = 1 + k * SEGMENTS, 1 + (k + 1) * SEGMENTS
+        triangles += [np.column_stack([a + here, a + there, b + there])]
+        triangles += [np.column_stack([a + here, b + there, b + here])]
+    top = 1 + (len(rings) - 1) * SEGMENTS
+    triangles += [np.column_stack([top + here, top + there, np.full_like(here, last)])]
+    order = {"X": [2, 0, 1], "Y": [1, 2, 0], "Z": [0, 1, 2]}[axis]  # even permutations keep the winding
+    return points[:, order], np.vstack(triangles)
+
+
+def _shapes(gprim: UsdGeom.Gprim, solid: _Solid, to_frame: NDArray, link: str) -> list[Shape]:
+    """The shapes of one gprim: one, or one a subset with a material of its own."""
+    prim = gprim.GetPrim()
+    points = np.column_stack([solid.points, np.ones(len(solid.points))]) @ to_frame[:, :3]
+    mirrored = np.linalg.det(to_frame[:3, :3]) < 0
+    parts = [(prim, np.ones(len(solid.origin), bool))]
+    for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
+        own = np.isin(solid.origin, np.array(subset.GetIndicesAttr().Get() or [], int))
+        parts[0] = (prim, parts[0][1] & ~own)
+        parts.append((subset.GetPrim(), own))
+    shapes = []
+    for part, mask in parts:
+        if not mask.any():
+            continue
+        material = _material_colour(part)
+        vertices, corners = points, solid.corners[solid.triangles[mask]]
+        colours = None if material is not None else _display_colours(gprim, solid, mask)
+        if colours is not None and len(colours) != len(points):  # each corner has its own
+            vertices, corners = points[corners.ravel()], np.arange(corners.size).reshape(-1, 3)
+        used, faces = np.unique(corners[:, ::-1] if mirrored else corners, return_inverse=True)
+        shapes.append(
+            Shape(
+                prim=str(part.GetPath()),
+                link=link,
+                vertices=vertices[used].astype(np.float32),
+                faces=faces.reshape(-1, 3).astype(np.int32),
+                colour=_display_colour(gprim) if material is None else material,
+                vertex_colours=None if colours is None else colours[used].astype(np.float32),
+            )
+        )
+    return shapes
+
+
+def _material_colour(prim: Usd.Prim) -> tuple[float, float, float, float] | None:
+    """Colour and opacity of the bound UsdPreviewSurface; none where it takes its colour from a primvar."""
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    surface = material.ComputeSurfaceSource()[0] if material else None
+    if not surface or surface.GetIdAttr().Get() != "UsdPreviewSurface":
+        return None
+    diffuse, opacity = surface.GetInput("diffuseColor"), surface.GetInput("opacity")
+    if diffuse and diffuse.HasConnectedSource():
+        return None
+    r, g, b = (diffuse.Get() if diffuse else None) or (0.18, 0.18, 0.18)  # the schema's own fallback
+    a = opacity.Get() if opacity else None
+    return (float(r), float(g), float(b), 1.0 if a is None else float(a))
+
+
+def _display_colour(gprim: UsdGeom.Gprim) -> tuple[float, float, float, float]:
+    """The constant displayColor and displayOpacity, or the mean of varying ones."""
+    colours, opacities = gprim.GetDisplayColorAttr().Get(), gprim.GetDisplayOpacityAttr().Get()
+    if not colours:
+        return GREY
+    r, g, b = np.mean(np.array(colours, float), axis=0)
+    return (float(r), float(g), float(b), float(np.mean(opacities)) if opacities else 1.0)
+
+
+def _display_colours(gprim: UsdGeom.Gprim, solid: _Solid, mask: NDArray) -> NDArray | None:
+    """Values of displayColor by point (P, 3), or by corner of the chosen triangles (3 F, 3); none if constant."""
+    primvar = gprim.GetDisplayColorPrimvar()
+    colours = primvar.ComputeFlattened()
+    if not colours or len(colours) == 1:
+        return None
+    values: NDArray = np.array(colours, float)
+    kind = primvar.GetInterpolation()
+    if kind in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying) and len(values) == len(solid.points):
+        return values
+    if kind == UsdGeom.Tokens.faceVarying and len(values) == len(solid.corners):
+        return values[solid.triangles[mask]].reshape(-1, 3)
+    if kind == UsdGeom.Tokens.uniform and len(values) > solid.origin.max():
+        return np.repeat(values[solid.origin[mask]], 3, axis=0)
+    raise RefusedError(
+        f"{gprim.GetPath()}: {len(values)} displayColor values of interpolation {kind!r} do not fit its "
+        f"{len(solid.points)} points; author one for each"
+    )
+
+
+def srgb_from_linear(colour: ArrayLike) -> NDArray[np.float64]:
+    """Colours as screens want them (IEC 61966-2-1) from linear ones as USD has them, any shape, 0 to 1."""
+    c = np.clip(np.asarray(colour, float), 0, 1)
+    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
