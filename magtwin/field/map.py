@@ -1,0 +1,269 @@
+"""AnomalyMap: the magnitude of the magnetic field over a floor, by position and heading."""
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.names import RefusedError
+
+Array = NDArray[np.float64]
+
+TURN = 2 * np.pi
+EDGE = 1e-9
+"""Rounding that a lookup forgives, in cells at the border and as weight of a masked node."""
+
+BLOCK = 8192
+"""Points worked on at a time: their temporaries stay in the second-level cache."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AnomalyMap:
+    """Total field on a grid over x, y and heading, as a robot reads it that stands at each node.
+
+    Node (h, j, i) lies at x = origin_m[0] + i cell_m[0], y = origin_m[1] + j cell_m[1] in world, with
+    the robot's heading at headings_rad[h]. Arrays are copied at birth and cannot be written to; two
+    maps are equal when every field is.
+    """
+
+    values_nt: Array
+    """Field magnitude at the nodes [nT], shape (H, Y, X); anything, even nan, where not `valid`."""
+
+    origin_m: tuple[float, float]
+    """World x and y of node [0, 0] [m]."""
+
+    cell_m: tuple[float, float]
+    """Distance between nodes along x and y [m]."""
+
+    headings_rad: Array
+    """Headings of the layers [rad], ascending in [0, 2 pi), shape (H,)."""
+
+    valid: NDArray[np.bool_] = None  # type: ignore[assignment]
+    """Nodes whose value is field, shape (H, Y, X); all of them unless given."""
+
+    variance_nt2: Array | None = None
+    """Variance of each value [nT^2], shape (H, Y, X); none where unknown."""
+
+    name: str = ""
+    """What the map is called, and its layer."""
+
+    method: str = ""
+    """How the values came about."""
+
+    source: str = ""
+    """What they were made from: files with checksums, or a script with its seed."""
+
+    licence: str = ""
+    """SPDX name of the licence that they are under."""
+
+    created: str = ""
+    """Day on which they were made, YYYY-MM-DD; "" where unknown."""
+
+    def __post_init__(self) -> None:
+        values = _frozen(self.values_nt, float)
+        if values.ndim != 3 or not (values.shape[0] >= 1 and min(values.shape[1:]) >= 2):
+            raise RefusedError(
+                f"values_nt of AnomalyMap must have shape (H, Y, X) with at least one heading and "
+                f"2 x 2 nodes, got {values.shape}"
+            )
+        valid = np.ones(values.shape, bool) if self.valid is None else self.valid
+        arrays: dict[str, Any] = {"values_nt": values, "valid": _frozen(valid, bool)}
+        arrays["headings_rad"] = headings = _frozen(self.headings_rad, float)
+        if self.variance_nt2 is not None:
+            arrays["variance_nt2"] = _frozen(self.variance_nt2, float)
+        for name, array in arrays.items():
+            shape = values.shape[:1] if name == "headings_rad" else values.shape
+            if array.shape != shape:
+                raise RefusedError(f"{name} of AnomalyMap must have shape {shape}, got {array.shape}")
+            object.__setattr__(self, name, array)
+        if not (np.all(np.diff(headings) > 0) and headings[0] >= 0 and headings[-1] < TURN):
+            raise RefusedError(
+                f"headings_rad of AnomalyMap must ascend in [0, 2 pi), got {headings.tolist()}"
+            )
+        for name in ("origin_m", "cell_m"):
+            pair = tuple(float(v) for v in getattr(self, name))
+            if len(pair) != 2 or not np.all(np.isfinite(pair)) or (name == "cell_m" and min(pair) <= 0):
+                above = " above 0" if name == "cell_m" else ""
+                raise RefusedError(f"{name} of AnomalyMap must be two lengths{above} [m], got {pair}")
+            object.__setattr__(self, name, pair)
+        self._check_values()
+
+    def _check_values(self) -> None:
+        bad = self.valid & ~np.isfinite(self.values_nt)
+        if bad.any():
+            h, j, i = np.argwhere(bad)[0]
+            raise RefusedError(
+                f"values_nt of AnomalyMap must be finite at valid nodes, got {self.values_nt[h, j, i]} at "
+                f"heading {h}, row {j}, column {i}; mask the node in `valid`"
+            )
+        if self.variance_nt2 is not None and not np.all(self.variance_nt2[self.valid] >= 0):
+            raise RefusedError("variance_nt2 of AnomalyMap must not be below 0, nor nan, at valid nodes")
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, AnomalyMap):
+            return NotImplemented
+        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+
+    @property
+    def x_m(self) -> Array:
+        """World x of the columns [m], shape (X,)."""
+        return np.asarray(self.origin_m[0] + self.cell_m[0] * np.arange(self.values_nt.shape[2]))
+
+    @property
+    def y_m(self) -> Array:
+        """World y of the rows [m], shape (Y,)."""
+        return np.asarray(self.origin_m[1] + self.cell_m[1] * np.arange(self.values_nt.shape[1]))
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Least x, greatest x, least y, greatest y of the nodes, in world [m]."""
+        _, rows, columns = self.values_nt.shape
+        (x, y), (dx, dy) = self.origin_m, self.cell_m
+        return x, x + dx * (columns - 1), y, y + dy * (rows - 1)
+
+    def contains(self, p_xy: ArrayLike) -> NDArray[np.bool_]:
+        """Whether points lie on the grid, its border included, masked nodes or not.
+
+        Args:
+            p_xy: Points in world [m], shape (..., 2).
+
+        Returns:
+            Flags, shape (...); false for nan.
+        """
+        u = (np.asarray(p_xy, float) - self.origin_m) / self.cell_m
+        _, rows, columns = self.values_nt.shape
+        return np.all((u >= -EDGE) & (u <= np.array([columns - 1, rows - 1]) + EDGE), axis=-1)
+
+    def lookup(
+        self,
+        p_xy: ArrayLike,
+        yaw: ArrayLike,
+        *,
+        outside: Literal["nan", "clamp", "raise"] = "nan",
+    ) -> Array:
+        """Field at poses, linear in heading, y and x between the nodes around each.
+
+        B = sum over the 8 nodes of w_h w_y w_x B_hyx. Heading lies on a circle: between the last
+        layer and 2 pi above the first one it is interpolated as between any two. With one layer only
+        the heading does not matter.
+
+        Args:
+            p_xy: Points in world [m], shape (..., 2).
+            yaw: Headings [rad], any real number, shape (...); the two shapes are broadcast.
+            outside: What a point off the grid gives: nan, the nearest point's field, or a refusal.
+
+        Returns:
+            Field magnitude [nT], shape (...); nan where an input is nan, and where a masked node has
+            weight.
+
+        Raises:
+            RefusedError: A point lies off the grid and `outside` is "raise".
+        """
+        if outside not in ("nan", "clamp", "raise"):
+            raise RefusedError(f'outside must be "nan", "clamp" or "raise", got {outside!r}')
+        p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
+        if p.ndim == 0 or p.shape[-1] != 2:
+            raise RefusedError(f"p_xy must have shape (..., 2), got {p.shape}")
+        shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
+        p = np.broadcast_to(p, (*shape, 2)).reshape(-1, 2)
+        angle = np.broadcast_to(yaw, shape).reshape(-1)
+        if outside == "raise":
+            self._refuse_outside(p)
+        out = np.empty(len(p))
+        values, holes = self.values_nt.ravel(), None
+        if not self.valid.all():
+            values = np.where(self.valid.ravel(), values, 0.0)
+            holes = (~self.valid).ravel().astype(float)
+        row = self.values_nt.shape[2]
+        for start in range(0, len(p), BLOCK):
+            part = slice(start, start + BLOCK)
+            nodes, weights, unknown = self._corners(p[part], angle[part], clamp=outside == "clamp")
+            out[part] = _blend(values, nodes, weights, row)
+            if holes is not None:
+                unknown |= _blend(holes, nodes, weights, row) > EDGE
+            out[part][unknown] = np.nan
+        return out.reshape(shape)
+
+    def _refuse_outside(self, p: Array) -> None:
+        off = ~(self.contains(p) | np.isnan(p).any(axis=-1))
+        if off.any():
+            x0, x1, y0, y1 = self.extent
+            where = ", ".join(f"{c:.3f}" for c in p[off][0])
+            raise RefusedError(
+                f"{np.count_nonzero(off)} of {len(p)} points lie off the map {self.name!r} "
+                f"(x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m), the first at ({where}); "
+                'keep inside, or ask for outside="clamp" or "nan"'
+            )
+
+    def _corners(
+        self, p: Array, yaw: Array, *, clamp: bool
+    ) -> tuple[tuple[NDArray[np.intp], ...], tuple[Array, ...], NDArray[np.bool_]]:
+        """Flat index of the low corner in both layers, the weights of the high ones, and what is unknown."""
+        _, rows, columns = self.values_nt.shape
+        low, part, unknown = [], [], ~np.isfinite(yaw)
+        for axis, count in ((0, columns), (1, rows)):
+            u = (p[:, axis] - self.origin_m[axis]) / self.cell_m[axis]
+            inside = (u >= -EDGE) & (u <= count - 1 + EDGE)
+            unknown |= np.isnan(u) if clamp else ~inside
+            u = np.clip(np.where(np.isnan(u), 0.0, u), 0, count - 1)
+            cell = np.minimum(u.astype(np.intp), count - 2)
+            low.append(cell)
+            part.append(u - cell)
+        node = low[1] * columns + low[0]
+        h0, h1, turned = self._layers(np.where(unknown, 0.0, yaw))
+        size = rows * columns
+        return (h0 * size + node, h1 * size + node), (part[0], part[1], turned), unknown
+
+    def _layers(self, yaw: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+        """Index of the layers below and above each heading, and how far it lies between them, 0 to 1."""
+        knots = np.append(self.headings_rad, self.headings_rad[0] + TURN)
+        count = len(knots) - 1
+        if count == 1:
+            zero = np.zeros(yaw.shape, np.intp)
+            return zero, zero, np.zeros(yaw.shape)
+        angle = yaw - knots[0]
+        angle -= TURN * np.floor(angle / TURN)
+        angle = np.clip(angle, 0, TURN)
+        if np.abs(np.diff(knots) - TURN / count).max() < 1e-12:  # evenly spaced: no search
+            u = angle * (count / TURN)
+            low = np.minimum(u.astype(np.intp), count - 1)
+            part = u - low
+        else:
+            low = np.searchsorted(knots[1:-1] - knots[0], angle, side="right")
+            part = (angle - (knots[low] - knots[0])) / np.diff(knots)[low]
+        high = low + 1
+        high[high == count] = 0
+        return low, high, part
+
+
+def _blend(values: Array, nodes: tuple[NDArray[np.intp], ...], weights: tuple[Array, ...], row: int) -> Array:
+    """Trilinear sums over flat `values`: low corners in both layers, weights of the high x, y, heading."""
+    wx, wy, wh = weights
+    layers = []
+    for node in nodes:
+        low = _between(values.take(node), values.take(node + 1), wx)
+        high = _between(values.take(node + row), values.take(node + (row + 1)), wx)
+        layers.append(_between(low, high, wy))
+    return _between(layers[0], layers[1], wh)
+
+
+def _between(low: Array, high: Array, weight: Array) -> Array:
+    """Sum low (1 - w) + high w: exact at w = 0 and at w = 1; overwrites both."""
+    high *= weight
+    low *= 1 - weight
+    low += high
+    return low
+
+
+def _frozen(values: ArrayLike, kind: type) -> NDArray[Any]:
+    """A copy that cannot be written to."""
+    array: NDArray[Any] = np.array(values, kind)
+    array.flags.writeable = False
+    return array
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return np.array_equal(a, b, equal_nan=a.dtype != bool)
+    return bool(a is b or (not isinstance(a, np.ndarray) and not isinstance(b, np.ndarray) and a == b))
