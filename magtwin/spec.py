@@ -4,7 +4,7 @@ Plain data between `usd/`, which authors and reads it, and `sim/`, which runs it
 for one attribute of a prim. Lengths are metres, angles radians, fields nT. A spec is checked at birth.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -197,7 +197,18 @@ class DriveSpec:
     """Relative standard deviation of the wheels' scale, drawn once a run: what makes odometry drift."""
 
     def __post_init__(self) -> None:
-        _above_zero(self, *(f.name for f in fields(self) if f.type is float or f.type == "float"))
+        _above_zero(
+            self,
+            "wheel_separation_m",
+            "wheel_radius_m",
+            "v_max",
+            "w_max",
+            "a_max",
+            "alpha_max",
+            "command_timeout_s",
+            "odometry_rate_hz",
+        )
+        _not_negative(self, "odometry_noise_std")
 
 
 @dataclass(frozen=True, kw_only=True)
