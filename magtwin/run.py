@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.names import RefusedError, find
+from magtwin.report import Figure, Report
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,27 @@ class Run(Mapping[str, NDArray[Any]]):
     def with_facts(self, **facts: str | int | float | bool) -> "Run":
         """This run with facts added or replaced."""
         return Run(self.columns, {**self.facts, **facts})
+
+    def report(self, title: str = "Run") -> Report:
+        """What happened, in a few figures; columns that the run does not have are passed over."""
+        figures = [Figure("duration", self.duration_s, "s"), Figure("readings", self.rows)]
+        if "p_world_base" in self:
+            steps = np.diff(self["p_world_base"][:, :2], axis=0)
+            figures.append(Figure("distance driven", float(np.hypot(*steps.T).sum()), "m"))
+        for name in ("b_total_nt", "b_map_nt", "b_disturbance_nt"):
+            values = self.columns.get(name, np.array([]))
+            values = values[np.isfinite(values)]
+            if len(values):
+                note = f"{values.min():.0f} to {values.max():.0f}"
+                figures.append(Figure(name, float(values.mean()), "nT", float(values.std()), note))
+        error = self.columns.get("b_total_nt", np.array([])) - self.columns.get("b_truth_nt", np.array([]))
+        if np.isfinite(error).any():
+            note = "mean absolute difference of b_total_nt from b_truth_nt"
+            figures.append(Figure("error", float(np.nanmean(np.abs(error))), "nT", None, note))
+        for name in self:
+            if name.startswith("flag_") and self[name].any():
+                figures.append(Figure(name, int(self[name].sum()), "readings", None, COLUMNS[name].doc))
+        return Report(title, tuple(figures), dict(self.facts))
 
 
 def _column(name: str, values: NDArray[Any]) -> NDArray[Any]:

@@ -1,0 +1,578 @@
+"""The command line: one typed function a subcommand, nothing else."""
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import App, Parameter
+from cyclopts.config import Env, Toml
+from cyclopts.exceptions import CycloptsError
+
+import magtwin
+from magtwin.names import RefusedError
+
+app = App(
+    name="magtwin",
+    help="Magnetic digital twins of robots: author labs and robots as USD, drive them, log what a "
+    "neural-network magnetometer reads.",
+    version=magtwin.__version__,
+    config=[Env("MAGTWIN_", show=False), Toml("magtwin.toml", search_parents=False)],
+    help_epilogue="Options also come from the environment (MAGTWIN_RUN_SEED=1) and from magtwin.toml. "
+    "Exit status: 0 done, 1 an input was refused, 2 wrong usage. --debug shows the traceback of a refusal.",
+)
+map_app = App(name="map", help="Make and look at anomaly maps.")
+net_app = App(name="net", help="Work with networks.")
+app.command(map_app)
+app.command(net_app)
+
+Force = Annotated[bool, Parameter(name="--force", negative="")]
+Json = Annotated[bool, Parameter(name="--json", negative="")]
+
+
+@app.command
+def demo(*, out: Path = Path("demo"), seed: int = 0, force: Force = False, json: Json = False) -> None:
+    """Author a lab and a TurtleBot 4, drive a figure of eight, log what the magnetometer reads.
+
+    Writes the stages, run.rrd (opens in Rerun), run.parquet and pictures. Takes under a minute.
+
+    Parameters
+    ----------
+    out
+        Folder to make.
+    seed
+        Seed of all noise.
+    force
+        Replace the folder if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.files import output, shipped
+    from magtwin.usd.robot import build_robot
+    from magtwin.usd.scene import author_scene, scene_from_toml
+
+    steps = _steps(quiet=json)
+    with output(out, force=force) as folder:
+        steps("Authoring the TurtleBot 4 from its URDF")
+        robot_folder = shipped("robots", "turtlebot4")
+        build_robot(
+            robot_folder / "turtlebot4.urdf",
+            robot_folder / "robot.toml",
+            folder / "robot" / "turtlebot4.usda",
+        )
+        steps("Authoring the lab around it, with its magnetic map")
+        scene = scene_from_toml(shipped("scenes", "lab.toml"))
+        scene_file = author_scene(scene, folder / "scene")
+        report = _run(
+            scene_file, "figure8", folder, steps=steps, seed=seed, speed=0.2, title=f"Demo in {out}"
+        )
+        steps("Taking pictures")
+        _pictures(scene_file, folder)
+    _print_report(report, json)
+    if not json:
+        _say(
+            f"\nLook at it:  magtwin view {out / 'run.rrd'}"
+            f"\nPictures:    {out / 'run.png'}, {out / 'lab.png'}"
+        )
+
+
+@app.command
+def robot(
+    urdf: Path, *, out: Path, settings: Path | None = None, force: Force = False, json: Json = False
+) -> None:
+    """Convert a URDF to a USD articulation that drives.
+
+    Parameters
+    ----------
+    urdf
+        The robot's URDF.
+    out
+        Folder to make; it will hold <name>.usda and the layers it refers to.
+    settings
+        TOML with drive, battery, platform field and sensor mounts, such as robots/turtlebot4/robot.toml.
+    force
+        Replace the folder if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.files import existing, output
+    from magtwin.usd.robot import build_robot
+    from magtwin.usd.urdf import convert_urdf
+
+    existing(urdf, "URDF")
+    with output(out, force=force) as folder:
+        file = folder / f"{urdf.stem}.usda"
+        if settings is None:
+            convert_urdf(urdf, file)
+        else:
+            build_robot(urdf, settings, file)
+        from magtwin.usd.info import info_of_stage
+
+        report = info_of_stage(file)
+    _print_report(report, json)
+    if not json:
+        _say(f"Wrote {out / file.name}")
+
+
+@map_app.command(name="import")
+def map_import(
+    folder: Path,
+    *,
+    out: Path,
+    name: str | None = None,
+    licence: str = "",
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Read a survey, one CSV file a heading, into a map layer.
+
+    Parameters
+    ----------
+    folder
+        Folder of 0_map.csv, 90_map.csv, ...: rows of x [m], y [m], heading [rad], field [nT].
+    out
+        Map layer to write, a .usdc file.
+    name
+        Name of the map; the folder's unless given.
+    licence
+        Licence of the survey, an SPDX identifier such as MIT.
+    force
+        Replace the file if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.field.survey import import_survey
+    from magtwin.files import check_free
+    from magtwin.usd.maps import save_map
+
+    _check_suffix(out, (".usdc", ".usd"), "a map layer")
+    check_free(out, force=force)
+    field = import_survey(folder, name=name or folder.resolve().name, licence=licence)
+    save_map(field, out, force=force)
+    _print_report(field.report(), json)
+    if not json:
+        _say(f"Wrote {out}")
+
+
+@map_app.command(name="plot")
+def map_plot(file: Path, *, out: Path, force: Force = False) -> None:
+    """Draw a map, a panel a heading.
+
+    Parameters
+    ----------
+    file
+        Map layer (.usdc), or a folder of survey CSVs.
+    out
+        Picture to write, a .png file.
+    force
+        Replace the picture if it exists.
+    """
+    from magtwin.files import output
+    from magtwin.io.plots import plot_map
+
+    _check_suffix(out, (".png",), "a picture")
+    field = _open_map(file)
+    with output(out, force=force) as aside:
+        plot_map(field, aside)
+    _say(f"Wrote {out}")
+
+
+@map_app.command(name="info")
+def map_info(file: Path, *, json: Json = False) -> None:
+    """Say what a map holds and where it comes from.
+
+    Parameters
+    ----------
+    file
+        Map layer (.usdc), or a folder of survey CSVs.
+    json
+        Print it as JSON.
+    """
+    _print_report(_open_map(file).report(), json)
+
+
+@app.command
+def scene(
+    spec: str,
+    *,
+    out: Path,
+    map: Path | None = None,  # noqa: A002 - the option is called --map
+    net: Path | None = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Author a scene from its TOML: the lab, its map, a robot with sensors.
+
+    Parameters
+    ----------
+    spec
+        TOML file, or the name of one that ships with magtwin: lab, aprilab.
+    out
+        Folder to make; it holds all that the stage needs and can be moved.
+    map
+        Map layer to use in place of the one that the TOML names.
+    net
+        Weights to use in place of those that the TOML names (.safetensors or .pth).
+    force
+        Replace the folder if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.files import shipped
+    from magtwin.usd.info import info_of_stage
+    from magtwin.usd.scene import author_scene, scene_from_toml
+
+    file = Path(spec)
+    if not file.suffix and not file.exists():
+        from magtwin.names import find
+
+        file = find("scene", spec, {f.stem: f for f in sorted(shipped("scenes").glob("*.toml"))})
+    root = author_scene(scene_from_toml(file, map_layer=map, network=net), out, force=force)
+    _print_report(info_of_stage(root), json)
+    if not json:
+        _say(f"Wrote {root}")
+
+
+@app.command
+def run(
+    scene: Path,
+    *,
+    path: str = "figure8",
+    net: Path | None = None,
+    seed: int = 0,
+    speed: float = 0.2,
+    duration: float | None = None,
+    rate_hz: float | None = None,
+    lidar: Literal["schedule", "on", "off"] = "schedule",
+    outside: Literal["nan", "clamp", "raise"] = "nan",
+    out: Path | None = None,
+    rrd: Path | None = None,
+    parquet: Path | None = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Drive a scene's robot along a path and write what happened.
+
+    With none of --out, --rrd and --parquet, writes the folder "run".
+
+    Parameters
+    ----------
+    scene
+        USD stage to drive in.
+    path
+        sine, lawnmower, figure8, narrow_figure8, curvilinear, or a CSV file of x,y [m].
+    net
+        Weights to use in place of the scene's (.safetensors or .pth); "none" for the disturbance by physics.
+    seed
+        Seed of all noise; one seed, one Run.
+    speed
+        Forward speed where the path is straight [m/s].
+    duration
+        How long to drive [s]; once along the path unless given, longer gives further laps.
+    rate_hz
+        Magnetometer readings a second [Hz]; the scene's unless given.
+    lidar
+        Whether the LiDAR follows its schedule, or stays on or off.
+    outside
+        What the map reads outside its extent: nan, the nearest value inside, or a refusal.
+    out
+        Folder to make, for run.rrd, run.parquet and run.png.
+    rrd
+        Rerun recording to write.
+    parquet
+        Parquet table to write.
+    force
+        Replace what exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.files import check_free, existing, output
+
+    existing(scene, "scene")
+    if out is rrd is parquet is None:
+        out = Path("run")
+    for target in (out, rrd, parquet):
+        if target is not None:
+            check_free(target, force=force)
+    options: dict[str, Any] = {
+        "steps": _steps(quiet=json),
+        "net": net,
+        "seed": seed,
+        "speed": speed,
+        "duration_s": duration,
+        "rate_hz": rate_hz,
+        "lidar": lidar,
+        "outside": outside,
+        "rrd": rrd,
+        "parquet": parquet,
+        "force": force,
+        "title": f"{path} in {scene}",
+    }
+    if out is None:
+        report = _run(scene, path, None, **options)
+    else:
+        with output(out, force=force) as folder:
+            folder.mkdir()
+            report = _run(scene, path, folder, **options)
+    _print_report(report, json)
+    if not json:
+        _say("Wrote " + ", ".join(str(target) for target in (out, rrd, parquet) if target is not None))
+
+
+@net_app.command(name="convert")
+def net_convert(pth: Path, *, out: Path, force: Force = False) -> None:
+    """Convert a released checkpoint (.pth) to safetensors, executing nothing of what it holds.
+
+    Parameters
+    ----------
+    pth
+        Checkpoint with the weights and the two scalers.
+    out
+        File to write, .safetensors.
+    force
+        Replace the file if it exists.
+    """
+    from magtwin.learn.model import convert
+
+    _check_suffix(out, (".safetensors",), "a network")
+    net = convert(pth, out, force=force)
+    _print_report(net.report(), as_json=False)
+    _say(f"Wrote {out}")
+
+
+@app.command
+def info(file: Path, *, json: Json = False) -> None:
+    """Say what a stage, a map, a run or a network holds.
+
+    Parameters
+    ----------
+    file
+        A .usd, .usda, .usdc, .usdz, .parquet, .safetensors or .pth file.
+    json
+        Print it as JSON.
+    """
+    from magtwin.files import existing
+    from magtwin.names import find
+
+    existing(file, "file")
+    suffixes: dict[str, Any] = {
+        ".usd": _info_of_usd,
+        ".usda": _info_of_usd,
+        ".usdc": _info_of_usd,
+        ".usdz": _info_of_usd,
+        ".parquet": _info_of_run,
+        ".safetensors": _info_of_net,
+        ".pth": _info_of_net,
+    }
+    _print_report(find("kind of file", file.suffix, suffixes)(file), json)
+
+
+@app.command
+def view(file: Path) -> None:
+    """Open a recording, or the recording of a run, in the Rerun viewer.
+
+    Parameters
+    ----------
+    file
+        A .rrd file.
+    """
+    from magtwin.io.rerun import view as view_rrd
+
+    view_rrd(file)
+
+
+@app.command
+def fetch(
+    what: Literal["aprilab", "turtlebot4"],
+    *,
+    dest: Path | None = None,
+    base_url: str | None = None,
+    force: Force = False,
+) -> None:
+    """Fetch the originals, at a pinned commit, each file checked against its SHA-256.
+
+    Parameters
+    ----------
+    what
+        aprilab: the survey, the released network and paths (MIT). turtlebot4: the description packages
+        (Apache-2.0, BSD-3-Clause).
+    dest
+        Folder to make; named after the source unless given.
+    base_url
+        Address of a mirror with the same paths.
+    force
+        Replace the folder if it exists.
+    """
+    from magtwin.fetch import fetch as fetch_files
+
+    dest = dest or Path(what)
+    with _progress(f"Fetching {what}") as advance:
+        files = fetch_files(what, dest, base_url=base_url, force=force, progress=advance)
+    _say(f"Wrote {len(files)} files to {dest}")
+
+
+def main() -> None:
+    """Entry point of the `magtwin` command."""
+    arguments = sys.argv[1:]
+    debug = "--debug" in arguments
+    try:
+        app([a for a in arguments if a != "--debug"], exit_on_error=False, print_error=True)
+    except CycloptsError:
+        sys.exit(2)
+    except RefusedError as error:
+        if debug:
+            raise
+        _fail(str(error))
+    except (OSError, MemoryError) as error:
+        if debug:
+            raise
+        _fail(f"{error} ({type(error).__name__})")
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _fail(text: str) -> None:
+    print("magtwin: " + " ".join(text.split()), file=sys.stderr)  # noqa: T201
+    sys.exit(1)
+
+
+def _say(text: str) -> None:
+    print(text)  # noqa: T201
+
+
+def _steps(*, quiet: bool) -> Any:
+    """A function that says what is being done, on stderr."""
+    return (lambda text: None) if quiet else (lambda text: print(f"  {text} ...", file=sys.stderr))  # noqa: T201
+
+
+@contextmanager
+def _progress(title: str) -> Iterator[Any]:
+    """A progress bar with rate and time left; gives `advance(done, total, what)`."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn(title),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[what]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task(title, total=None, what="")
+        yield lambda done, total, what: progress.update(task, completed=done, total=total, what=what)
+
+
+def _check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:
+    if path.suffix not in suffixes:
+        raise RefusedError(f"{path}: {what} ends in {' or '.join(suffixes)}")
+
+
+def _print_report(report: Any, as_json: bool) -> None:
+    """A report as a table for people, or as JSON for scripts."""
+    if as_json:
+        _say(report.to_json())
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=report.title, title_justify="left", show_header=False, box=None, pad_edge=False)
+    for column in ("name", "value", "unit", "note"):
+        table.add_column(
+            column,
+            style="dim" if column == "note" else None,
+            justify="right" if column == "value" else "left",
+        )
+    for figure in report.figures:
+        value = f"{figure.value:.6g}" if isinstance(figure.value, float) else str(figure.value)
+        spread = f" ± {figure.spread:.3g}" if figure.spread is not None else ""
+        table.add_row(figure.name, value + spread, figure.unit, figure.note)
+    for name, fact in report.facts.items():
+        table.add_row(name, "", "", json.dumps(fact) if isinstance(fact, dict | list) else str(fact))
+    Console().print(table)
+
+
+def _open_map(file: Path) -> Any:
+    """The map of a layer, or of a folder of survey CSVs."""
+    if file.is_dir():
+        from magtwin.field.survey import import_survey
+
+        return import_survey(file)
+    from magtwin.usd.maps import load_map
+
+    return load_map(file)
+
+
+def _run(
+    scene_file: Path,
+    path: str,
+    folder: Path | None,
+    *,
+    steps: Any,
+    title: str,
+    rrd: Path | None = None,
+    parquet: Path | None = None,
+    force: bool = False,
+    net: Path | None = None,
+    **options: Any,
+) -> Any:
+    """Run a scene and write the outputs asked for; returns the run's report."""
+    from magtwin.io.rerun import write_rrd
+    from magtwin.io.tables import write_parquet
+    from magtwin.path import resolve_path
+    from magtwin.twin import open_twin, simulate
+
+    planned = resolve_path(path)
+    twin = open_twin(scene_file, net=net)
+    steps(f"Driving {planned.name}")
+    result = simulate(twin, planned, **options)
+    steps("Writing the run")
+    for target in (folder / "run.parquet" if folder else None, parquet):
+        if target is not None:
+            write_parquet(result, target, force=force)
+    for target in (folder / "run.rrd" if folder else None, rrd):
+        if target is not None:
+            write_rrd(
+                result,
+                target,
+                scene=twin.scene,
+                scene_file=twin.scene_file,
+                field=twin.field,
+                planned=planned,
+                force=force,
+            )
+    if folder:
+        from magtwin.io.plots import plot_run
+
+        plot_run(result, twin.field, folder / "run.png", planned=planned.p_xy)
+    return result.report(title)
+
+
+def _pictures(scene_file: Path, folder: Path) -> None:
+    """A picture of the lab; where no OpenGL is to be had, says so and goes on."""
+    from magtwin.io.pictures import picture_of_stage
+
+    try:
+        picture_of_stage(scene_file, folder / "lab.png")
+    except RefusedError as error:
+        print(f"  no picture of the lab: {error}", file=sys.stderr)  # noqa: T201
+
+
+def _info_of_usd(file: Path) -> Any:
+    from magtwin.usd.info import info_of_stage
+
+    return info_of_stage(file)
+
+
+def _info_of_run(file: Path) -> Any:
+    from magtwin.io.tables import read_parquet
+
+    return read_parquet(file).report(str(file))
+
+
+def _info_of_net(file: Path) -> Any:
+    from magtwin.learn.model import load_net
+
+    return load_net(file).report()

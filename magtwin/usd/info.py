@@ -1,0 +1,60 @@
+"""What a stage holds, told without knowing what wrote it."""
+
+from collections import Counter
+from pathlib import Path
+
+from pxr import Usd, UsdGeom, UsdPhysics
+
+from magtwin.files import existing
+from magtwin.names import RefusedError
+from magtwin.report import Figure, Report
+
+_PREFIX = "Magtwin"
+
+
+def open_stage(path: Path) -> Usd.Stage:
+    """The stage of a file.
+
+    Raises:
+        RefusedError: The file is missing or is not USD.
+    """
+    from pxr import Tf
+
+    existing(path, "USD file")
+    try:
+        return Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise RefusedError(f"{path}: cannot be read as USD: {str(error).splitlines()[-1].strip()}") from error
+
+
+def info_of_stage(path: Path) -> Report:
+    """Units, extent, bodies, joints, mass and magnetic prims of a stage."""
+    stage = open_stage(path)
+    prims = list(stage.TraverseAll())
+    bodies = [p for p in prims if p.HasAPI(UsdPhysics.RigidBodyAPI)]
+    joints = Counter(p.GetTypeName().removeprefix("Physics") for p in prims if p.IsA(UsdPhysics.Joint))
+    mass = sum(
+        UsdPhysics.MassAPI(p).GetMassAttr().Get() or 0.0 for p in bodies if p.HasAPI(UsdPhysics.MassAPI)
+    )
+    purposes = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render]
+    box = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes).ComputeWorldBound(stage.GetPseudoRoot())
+    size = box.ComputeAlignedRange().GetSize()
+    figures = [
+        Figure("default prim", str(stage.GetDefaultPrim().GetPath()) if stage.GetDefaultPrim() else "none"),
+        Figure("metres per unit", UsdGeom.GetStageMetersPerUnit(stage)),
+        Figure("up axis", str(UsdGeom.GetStageUpAxis(stage))),
+        Figure("layers", len(stage.GetUsedLayers())),
+        Figure("prims", len(prims)),
+        Figure("size", " x ".join(f"{s:.3f}" for s in size), "m"),
+        Figure("rigid bodies", len(bodies)),
+        Figure("joints", sum(joints.values()), note=", ".join(f"{n} {t}" for t, n in sorted(joints.items()))),
+        Figure("mass", float(mass), "kg"),
+    ]
+    for prim in prims:
+        for schema in prim.GetAppliedSchemas():
+            if schema.startswith(_PREFIX) and schema != "MagtwinMagneticSourceAPI":
+                figures.append(Figure(schema, str(prim.GetPath())))
+    sources = sum(p.HasAPI("MagtwinMagneticSourceAPI") for p in prims)
+    if sources:
+        figures.append(Figure("MagtwinMagneticSourceAPI", sources, "prims"))
+    return Report(str(path), tuple(figures))
