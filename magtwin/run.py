@@ -138,9 +138,8 @@ class Run(Mapping[str, NDArray[Any]]):
         if np.isfinite(error).any():
             note = "mean absolute difference of b_total_nt from b_truth_nt"
             figures.append(Figure("error", float(np.nanmean(np.abs(error))), "nT", None, note))
-        for name in self:
-            if name.startswith("flag_") and self[name].any():
-                figures.append(Figure(name, int(self[name].sum()), "readings", None, COLUMNS[name].doc))
+        raised = [name for name in self if name.startswith("flag_") and self[name].any()]
+        figures += [Figure(n, int(self[n].sum()), "readings", None, COLUMNS[n].doc) for n in raised]
         return Report(title, tuple(figures), dict(self.facts))
 
 

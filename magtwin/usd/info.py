@@ -9,7 +9,7 @@ from magtwin.files import existing
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
 
-_PREFIX = "Magtwin"
+_PREFIX, _SOURCE = "Magtwin", "MagtwinMagneticSourceAPI"
 
 
 def open_stage(path: Path) -> Usd.Stage:
@@ -50,11 +50,10 @@ def info_of_stage(path: Path) -> Report:
         Figure("joints", sum(joints.values()), note=", ".join(f"{n} {t}" for t, n in sorted(joints.items()))),
         Figure("mass", float(mass), "kg"),
     ]
-    for prim in prims:
-        for schema in prim.GetAppliedSchemas():
-            if schema.startswith(_PREFIX) and schema != "MagtwinMagneticSourceAPI":
-                figures.append(Figure(schema, str(prim.GetPath())))
-    sources = sum(p.HasAPI("MagtwinMagneticSourceAPI") for p in prims)
-    if sources:
-        figures.append(Figure("MagtwinMagneticSourceAPI", sources, "prims"))
+    applied = [
+        (schema, prim) for prim in prims for schema in prim.GetAppliedSchemas() if schema.startswith(_PREFIX)
+    ]
+    figures += [Figure(schema, str(prim.GetPath())) for schema, prim in applied if schema != _SOURCE]
+    if sources := sum(schema == _SOURCE for schema, _ in applied):
+        figures.append(Figure(_SOURCE, sources, "prims"))
     return Report(str(path), tuple(figures))
