@@ -1,0 +1,85 @@
+"""Fields at the magnetometer: the lab's, and what the robot adds to it."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.field.sources import dipole_field_nt
+from magtwin.names import RefusedError
+from magtwin.spec import BatterySpec, PlatformFieldSpec, Scene
+
+Array = NDArray[np.float64]
+
+
+def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
+    """The lab's field without the robot: the Earth's, uniform, and that of every source.
+
+    Args:
+        scene: A scene whose Earth's field is known.
+        p_world: Points [m], shape (..., 3).
+
+    Returns:
+        Field in world axes [nT], shape (..., 3).
+
+    Raises:
+        RefusedError: The scene has no Earth's field, so only its map is known.
+    """
+    if scene.earth is None:
+        raise RefusedError(
+            f"scene {scene.name!r} has no Earth's field, so its exact field is not known; "
+            "give it an [earth] table, or read the field from its map"
+        )
+    place = np.array([s.p_world for s in scene.sources], float).reshape(-1, 3)
+    moment = np.array([s.m_world for s in scene.sources], float).reshape(-1, 3)
+    return dipole_field_nt(p_world, place, moment) + scene.earth.b_world_nt
+
+
+def platform_field_nt(
+    platform: PlatformFieldSpec,
+    b_body: ArrayLike,
+    *,
+    b_rate: ArrayLike,
+    wheel_rate: ArrayLike,
+    lidar_on: ArrayLike,
+    battery_a: ArrayLike,
+) -> Array:
+    """The whole field at the magnetometer, the robot's own part included.
+
+    B = (1 + S) b + h + E db/dt + m_l w_l + m_r w_r + l on + c i: induced, permanent and eddy parts
+    after Tolles and Lawson (1950), then the motors, the LiDAR's supply and the battery's current.
+
+    Args:
+        platform: S, h, E, m_l, m_r, l and c.
+        b_body: Ambient field b in base_link axes [nT], shape (N, 3).
+        b_rate: Its rate of change in base_link axes, turning of the robot included [nT/s], shape (N, 3).
+        wheel_rate: Rates w of the left and right wheel [rad/s], shape (N, 2).
+        lidar_on: Whether the LiDAR spins, shape (N,).
+        battery_a: Supply current above that at full charge i [A], shape (N,); see `excess_current_a`.
+
+    Returns:
+        Field in base_link axes [nT], shape (N, 3).
+    """
+    b, rate = np.asarray(b_body, float), np.asarray(b_rate, float)
+    wheels, on = np.asarray(wheel_rate, float), np.asarray(lidar_on, float)
+    motors = np.array([platform.left_motor_nt_s, platform.right_motor_nt_s])
+    supply = on[..., None] * platform.lidar_nt + np.asarray(battery_a, float)[..., None] * platform.battery_nt
+    return (
+        b
+        + b @ np.reshape(platform.soft_iron, (3, 3)).T
+        + platform.hard_iron_nt
+        + rate @ np.reshape(platform.eddy_s, (3, 3)).T
+        + wheels @ motors
+        + supply
+    )
+
+
+def excess_current_a(battery: BatterySpec, voltage_v: ArrayLike) -> Array:
+    """Supply current above that at full charge, for a load of constant power: P / U - P / U_full.
+
+    Args:
+        battery: The pack and its load.
+        voltage_v: Voltage U [V], any shape.
+
+    Returns:
+        Current [A], the same shape.
+    """
+    return battery.load_w / np.asarray(voltage_v, float) - battery.load_w / battery.voltage_full_v
