@@ -1,0 +1,59 @@
+# What a stranger types. `make demo` and `make test` do all the set-up on a machine with Python 3.11+.
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check -q install -c constraints.txt
+
+.PHONY: demo test lint bench wheel-test schema assets clean help
+
+help:  ## Say what there is to make
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+demo: $(VENV)/.installed  ## Author a lab and a robot, drive it, log the run to demo/
+	$(BIN)/magtwin demo --out demo --force
+
+test: $(VENV)/.dev  ## Run all tests
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/deptry .
+
+bench: $(VENV)/.dev  ## Compare with peers; prints ratios
+	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
+
+wheel-test: $(VENV)/.dev  ## Build the wheel, install it in an empty environment, run the demo from there
+	rm -rf build/wheel && mkdir -p build/wheel
+	$(BIN)/python -m build -q --wheel --outdir build/wheel .
+	$(PYTHON) -m venv build/wheel/venv
+	build/wheel/venv/bin/python -m pip --disable-pip-version-check -q install -c constraints.txt build/wheel/*.whl
+	cd build/wheel && venv/bin/magtwin demo --out demo && venv/bin/magtwin info demo/run.parquet
+
+schema: $(VENV)/.dev  ## Generate the schema library anew from schema.usda
+	$(BIN)/python -m magtwin.usd.schema
+
+assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
+	$(BIN)/python robots/turtlebot4/build.py
+	$(BIN)/python maps/lab/build.py
+	$(BIN)/python weights/train_lab.py
+	$(BIN)/python scenes/build.py
+
+clean:  ## Remove the environment and what was built
+	rm -rf $(VENV) build demo
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(0 if v >= (3, 11) else f"magtwin needs Python 3.11 or newer, {sys.executable} is {v[0]}.{v[1]}; name another with make PYTHON=...")'
+	$(PYTHON) -m venv $(VENV) || { echo "no venv module: apt-get install python3-venv"; exit 1; }
+
+$(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "Installing magtwin and what it needs into $(VENV) (a few minutes, once) ..."
+	$(PIP) -e .
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/.installed
+	$(PIP) -e '.[dev]'
+	@touch $@
