@@ -1,0 +1,137 @@
+"""Outputs are whole or absent; settings are checked key by key."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from magtwin.files import check_free, existing, from_table, output, read_toml, sha256, shipped
+from magtwin.names import RefusedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wheel:
+    radius_m: float
+    """Radius [m]."""
+
+    def __post_init__(self):
+        if self.radius_m <= 0:
+            raise RefusedError(f"radius_m must be above 0, got {self.radius_m}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cart:
+    name: str
+    wheels: tuple[Wheel, ...] = ()
+    spare: Wheel = field(default_factory=lambda: Wheel(radius_m=1.0))
+    place: tuple[float, float] = (0.0, 0.0)
+    asset: Path | None = None
+    laps: int = 1
+
+
+def read_cart(tmp_path, text):
+    file = tmp_path / "cart.toml"
+    file.write_text(text)
+    return from_table(Cart, read_toml(file), file)
+
+
+def test_a_table_becomes_the_dataclass_with_nested_tables_and_paths_from_its_folder(tmp_path):
+    cart = read_cart(
+        tmp_path,
+        'name = "a"\nplace = [1, 2.5]\nasset = "x/y.usda"\n'
+        "[spare]\nradius_m = 2\n[[wheels]]\nradius_m = 3.0\n",
+    )
+    assert cart == Cart(
+        name="a",
+        wheels=(Wheel(radius_m=3.0),),
+        spare=Wheel(radius_m=2.0),
+        place=(1.0, 2.5),
+        asset=tmp_path / "x" / "y.usda",
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('name = "a"\nplase = [1, 2]', r"cart.toml:2: unknown key 'plase'; did you mean 'place'"),
+        (
+            'name = "a"\n[spare]\nradius = 2',
+            r"cart.toml:3: \[spare\] unknown key 'radius'; did you mean 'radius_m'",
+        ),
+        ("laps = 2", r"cart.toml: key 'name' is missing"),
+        ('name = "a"\nlaps = 2.5', r"cart.toml:2: laps must be a whole number, got 2.5"),
+        ('name = "a"\nlaps = true', r"cart.toml:2: laps must be a whole number, got True"),
+        ('name = "a"\nplace = [1]', r"cart.toml:2: place must be a list of 2, each a number, got \[1\]"),
+        ('name = "a"\nspare = 3', r"cart.toml:2: spare must be a table, got 3"),
+        ('name = "a"\n[spare]\nradius_m = -1', r"cart.toml:3: \[spare\] radius_m must be above 0, got -1"),
+        ('name = "a"\nlaps = = 2', r"cart.toml: not TOML: .*line 2"),
+    ],
+)
+def test_a_wrong_table_is_refused_with_file_line_and_what_was_seen(tmp_path, text, message):
+    with pytest.raises(RefusedError, match=message):
+        read_cart(tmp_path, text)
+
+
+def test_a_missing_file_is_refused_by_the_near_name(tmp_path):
+    (tmp_path / "lab.toml").touch()
+    with pytest.raises(RefusedError, match=r"lav.toml: no such TOML file; did you mean 'lab.toml'"):
+        read_toml(tmp_path / "lav.toml")
+
+
+def test_an_output_appears_only_when_it_is_whole(tmp_path):
+    with output(tmp_path / "new" / "a.txt") as aside:
+        aside.write_text("whole")
+        assert not (tmp_path / "new" / "a.txt").exists()
+    assert (tmp_path / "new" / "a.txt").read_text() == "whole"
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["a.txt"]
+
+
+def write_and_fail(path, **options):
+    with output(path, **options) as aside:
+        aside.write_text("half")
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_output_leaves_the_old_one_untouched(tmp_path):
+    (tmp_path / "a.txt").write_text("old")
+    with pytest.raises(KeyboardInterrupt):
+        write_and_fail(tmp_path / "a.txt", force=True)
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.txt", "old")]
+
+
+def test_a_folder_is_replaced_whole(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "old").touch()
+    with output(tmp_path / "run", force=True) as aside:
+        aside.mkdir()
+        (aside / "new").touch()
+    assert [p.name for p in (tmp_path / "run").iterdir()] == ["new"]
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+
+
+def test_nothing_is_overwritten_unasked(tmp_path):
+    (tmp_path / "a.txt").touch()
+    with pytest.raises(RefusedError, match=r"a.txt: exists already; give --force"):
+        check_free(tmp_path / "a.txt")
+    assert check_free(tmp_path / "a.txt", force=True) == tmp_path / "a.txt"
+
+
+def test_an_output_below_a_file_is_refused(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(RefusedError, match="cannot be written"):
+        write_and_fail(tmp_path / "file" / "a.txt")
+
+
+def test_sha256_is_that_of_fips_180_abc(tmp_path):
+    (tmp_path / "abc").write_bytes(b"abc")
+    assert sha256(tmp_path / "abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_shipped_files_are_found_and_missing_ones_refused():
+    assert shipped("robots", "turtlebot4", "robot.toml").is_file()
+    with pytest.raises(RefusedError, match="install it again"):
+        shipped("robots", "nobody")
+
+
+def test_existing_gives_the_path_back(tmp_path):
+    assert existing(tmp_path, "folder") == tmp_path
