@@ -1,0 +1,346 @@
+"""Path: where to drive, a line on the floor that knows its arc length."""
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.files import existing
+from magtwin.names import RefusedError, find, hint
+
+Array = NDArray[np.float64]
+
+_SAME_M = 1e-6
+"""Neighbours nearer than this are one point; a line whose ends are nearer than this is closed [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """A polyline in the plane of the floor, parametrised by its arc length.
+
+    Neighbours that coincide are merged at birth. A closed path ends where it began: its first point
+    is repeated at the end, and is added there if it is not.
+    """
+
+    name: str
+    """What it is called: a name of `PATHS`, or the file that it came from."""
+
+    p_xy: Array
+    """Points in world [m], shape (N, 2), N >= 2."""
+
+    closed: bool = False
+    """Whether it can be driven round and round."""
+
+    def __post_init__(self) -> None:
+        p = np.array(self.p_xy, float)
+        if p.ndim != 2 or p.shape[1] != 2:
+            raise RefusedError(f"path {self.name!r}: points must have shape (N, 2), got {p.shape}")
+        if not np.isfinite(p).all():
+            row = int(np.flatnonzero(~np.isfinite(p).all(axis=1))[0])
+            raise RefusedError(f"path {self.name!r}: point {row} is not finite: {tuple(p[row].tolist())}")
+        if self.closed and len(p) > 1 and math.dist(p[0], p[-1]) >= _SAME_M:
+            p = np.vstack([p, p[:1]])
+        p = _without_repeats(p)
+        if len(p) < 2:
+            raise RefusedError(f"path {self.name!r}: two different points are needed, got {len(p)}")
+        if self.closed:
+            p[-1] = p[0]
+        s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p, axis=0).T))])
+        for name, array in (("p_xy", p), ("_s", s)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @property
+    def s(self) -> Array:
+        """Arc length at each point, from 0 [m], shape (N,)."""
+        return self._s  # type: ignore[attr-defined, no-any-return]
+
+    @property
+    def length(self) -> float:
+        """Arc length of the whole path [m]."""
+        return float(self.s[-1])
+
+    def at(self, s: ArrayLike) -> Array:
+        """Points at arc lengths `s` [m], shape (...) -> (..., 2).
+
+        A closed path repeats with its length; an open one goes on straight beyond its ends.
+        """
+        s, i = self._segment(s)
+        along = ((s - self.s[i]) / (self.s[i + 1] - self.s[i]))[..., None]
+        return self.p_xy[i] + along * (self.p_xy[i + 1] - self.p_xy[i])
+
+    def heading(self, s: ArrayLike) -> Array:
+        """Direction of travel at arc lengths `s` [rad], in [-pi, pi], shape (...).
+
+        At a corner it is the direction after it.
+        """
+        _, i = self._segment(s)
+        step = self.p_xy[i + 1] - self.p_xy[i]
+        return np.arctan2(step[..., 1], step[..., 0])
+
+    def turn(self, s: ArrayLike, reach_m: float) -> Array:
+        """Angle between the chords that come to and go from `s`, left positive [rad], shape (...).
+
+        Args:
+            s: Arc lengths [m], shape (...).
+            reach_m: Length of path that each chord spans [m].
+        """
+        s = np.asarray(s, float)
+        here = self.at(s)
+        x0, y0 = np.moveaxis(here - self.at(s - reach_m), -1, 0)
+        x1, y1 = np.moveaxis(self.at(s + reach_m) - here, -1, 0)
+        return np.arctan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1)
+
+    def curvature(self, s: ArrayLike, reach_m: float = 0.02) -> Array:
+        """Mean curvature over `reach_m` each way of `s`, left positive [1/m], shape (...).
+
+        The angle between two chords over the arc between their middles, which for an arc of a circle
+        of radius R is 1/R. A polyline has none of its own, so choose `reach_m` above its spacing.
+        """
+        return self.turn(s, reach_m) / reach_m
+
+    def nearest(self, p_xy: ArrayLike) -> tuple[Array, Array]:
+        """The nearest point of the path, exactly, to each of many points.
+
+        Every segment is tried, in blocks of points, so time is points x segments (about 10 ns each).
+
+        Args:
+            p_xy: Points in world [m], shape (..., 2).
+
+        Returns:
+            Arc length of the nearest point [m], and signed distance from the path, left positive [m],
+            each of shape (...).
+        """
+        q = np.asarray(p_xy, float)
+        flat = q.reshape(-1, 2)
+        step, ds = np.diff(self.p_xy, axis=0), np.diff(self.s)
+        unit = step / ds[:, None]
+        s, d = np.empty(len(flat)), np.empty(len(flat))
+        block = max(1, 200_000 // len(ds))
+        for first in range(0, len(flat), block):
+            rows = slice(first, first + block)
+            x = flat[rows, None, 0] - self.p_xy[:-1, 0]
+            y = flat[rows, None, 1] - self.p_xy[:-1, 1]
+            along = np.clip(x * unit[:, 0] + y * unit[:, 1], 0.0, ds)
+            x -= along * unit[:, 0]
+            y -= along * unit[:, 1]
+            best = np.argmin(x * x + y * y, axis=1)
+            pick = np.arange(len(best)), best
+            s[rows] = self.s[best] + along[pick]
+            left = unit[best, 0] * y[pick] - unit[best, 1] * x[pick]
+            d[rows] = np.copysign(np.hypot(x[pick], y[pick]), left)
+        return s.reshape(q.shape[:-1]), d.reshape(q.shape[:-1])
+
+    def prolonged(self, length_m: float) -> "Path":
+        """This path driven on until it is at least `length_m` long.
+
+        A closed path gets further laps, an open one is driven back and forth. The result is open.
+        """
+        times = max(1, math.ceil(length_m / self.length))
+        there, back = self.p_xy[1:], (self.p_xy if self.closed else self.p_xy[::-1])[1:]
+        parts = [self.p_xy[:1], *((there, back)[n % 2] for n in range(times))]
+        return Path(self.name, np.vstack(parts))
+
+    def _segment(self, s: ArrayLike) -> tuple[Array, NDArray[np.intp]]:
+        s = np.asarray(s, float)
+        if self.closed:
+            s = s % self.length
+        return s, np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, len(self.s) - 2)
+
+
+def sine(
+    *,
+    amplitude_m: float = 1.2,
+    wavenumber_rad_m: float = 2 * math.pi / 2.5,
+    phase_rad: float = 0.0,
+    y_mid_m: float = 0.0,
+    x_first_m: float = -2.5,
+    x_last_m: float = 2.5,
+) -> Path:
+    """A sine wave along x: y = A sin(w x - x0) + y0 (eq. 7 of the neural magnetometer paper).
+
+    Args:
+        amplitude_m: A [m].
+        wavenumber_rad_m: w [rad/m].
+        phase_rad: x0 [rad].
+        y_mid_m: y0 [m].
+        x_first_m: First x [m].
+        x_last_m: Last x [m].
+    """
+    x = np.linspace(x_first_m, x_last_m, 2001)
+    y = amplitude_m * np.sin(wavenumber_rad_m * x - phase_rad) + y_mid_m
+    return Path("sine", np.column_stack([x, y]))
+
+
+def lawnmower(
+    *,
+    x_first_m: float = -2.5,
+    x_last_m: float = 2.5,
+    height_m: float = 3.0,
+    step_m: float = 0.5,
+    y_first_m: float = -1.5,
+) -> Path:
+    """Sweeps along y, side by side: r = f(a0, ae, h, step) (eq. 8 of the neural magnetometer paper).
+
+    Sweep k stands at x_k = a0 + k step up to ae, and goes from y0 to y0 + h where k is even and back
+    where k is odd.
+
+    Args:
+        x_first_m: a0, x of the first sweep [m].
+        x_last_m: ae, no sweep lies beyond it [m].
+        height_m: h, length of a sweep [m].
+        step_m: Distance between sweeps [m], away from a0 or back, as a0 and ae say.
+        y_first_m: y0, y of the first point [m].
+    """
+    if not step_m > 0:
+        raise RefusedError(f"step_m of a lawnmower must be above 0 m, got {step_m}")
+    count = int(abs(x_last_m - x_first_m) / step_m + 1e-9) + 1
+    x = np.repeat(x_first_m + math.copysign(step_m, x_last_m - x_first_m) * np.arange(count), 2)
+    y = y_first_m + height_m * np.tile([0.0, 1.0, 1.0, 0.0], count)[: 2 * count]
+    return Path("lawnmower", np.column_stack([x, y]))
+
+
+def figure8(*, half_length_m: float = 2.4, half_width_m: float = 1.2) -> Path:
+    """A figure of eight along x, from its crossing: x = a sin u, y = b sin 2u (Lissajous 1:2).
+
+    Args:
+        half_length_m: a [m].
+        half_width_m: b [m].
+    """
+    u = np.linspace(0.0, 2 * np.pi, 2001)
+    points = np.column_stack([half_length_m * np.sin(u), half_width_m * np.sin(2 * u)])
+    return Path("figure8", points, closed=True)
+
+
+def narrow_figure8(*, half_length_m: float = 2.4, half_width_m: float = 0.3) -> Path:
+    """The figure of eight of `figure8`, so narrow that its ends are tight: their radius is 4 b^2 / a.
+
+    Args:
+        half_length_m: a [m].
+        half_width_m: b [m].
+    """
+    return Path("narrow_figure8", figure8(half_length_m=half_length_m, half_width_m=half_width_m).p_xy, True)
+
+
+def curvilinear(*, half_length_m: float = 2.4, half_width_m: float = 1.3, waviness: float = 0.4) -> Path:
+    """A closed curve that bends left and right: x = a cos u, y = b (sin u + c cos 3u) / (1 + c).
+
+    The paper calls two of its drives curvilinear and gives no equation; this one is ours.
+
+    Args:
+        half_length_m: a [m].
+        half_width_m: b, which |y| does not exceed [m].
+        waviness: c >= 0; 0 gives an ellipse.
+    """
+    u = np.linspace(0.0, 2 * np.pi, 2001)
+    y = half_width_m * (np.sin(u) + waviness * np.cos(3 * u)) / (1 + waviness)
+    return Path("curvilinear", np.column_stack([half_length_m * np.cos(u), y]), closed=True)
+
+
+PATHS: Mapping[str, Callable[..., Path]] = MappingProxyType(
+    {
+        "sine": sine,
+        "lawnmower": lawnmower,
+        "figure8": figure8,
+        "narrow_figure8": narrow_figure8,
+        "curvilinear": curvilinear,
+    }
+)
+"""Functions that make paths, by name; each with defaults that fit a floor of 6 x 3.5 m."""
+
+
+def path_named(name: str) -> Path:
+    """The path that `PATHS` calls `name`, with its default size.
+
+    Raises:
+        UnknownNameError: No such path; the text names the nearest one.
+    """
+    return find("path", name, PATHS)()
+
+
+def resolve_path(name_or_file: str | os.PathLike[str]) -> Path:
+    """A path from a name of `PATHS`, or else from a CSV file.
+
+    Raises:
+        RefusedError: It is neither, or the file is not a path.
+    """
+    text = os.fspath(name_or_file)
+    if text in PATHS:
+        return path_named(text)
+    file = FilePath(text)
+    if file.exists() or file.suffix or file.name != text:
+        return read_path_csv(file)
+    raise RefusedError(f"no path {text!r}; {hint(text, PATHS)}; or give a CSV file with x,y in metres")
+
+
+def read_path_csv(file: str | os.PathLike[str]) -> Path:
+    """A polyline from a CSV file of `x,y` in metres, one point a line, with or without a header.
+
+    Neighbours that coincide are merged. A line that ends where it began is closed.
+
+    Raises:
+        RefusedError: The file is missing, empty, or has a line that is not two numbers.
+    """
+    file = existing(file, "path file")
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise RefusedError(f"{file}: not a text file of x,y in metres ({error})") from error
+    points: list[tuple[float, float]] = []
+    header_seen = False
+    for number, line in enumerate(lines, 1):
+        cells = [cell.strip() for cell in line.split(",")]
+        if cells == [""]:
+            continue
+        if len(cells) != 2:
+            raise RefusedError(f"{file}:{number}: a point is two numbers, x,y in metres; got {line!r}")
+        try:
+            point = float(cells[0]), float(cells[1])
+        except ValueError:
+            if points or header_seen:
+                raise RefusedError(f"{file}:{number}: not a number in {line!r}; x,y in metres are wanted") from None
+            header_seen = True
+            continue
+        if not (math.isfinite(point[0]) and math.isfinite(point[1])):
+            raise RefusedError(f"{file}:{number}: a point must be finite, got {line!r}")
+        points.append(point)
+    if not points:
+        raise RefusedError(f"{file}: no points in it; one x,y in metres a line is wanted")
+    p = _without_repeats(np.array(points))
+    if len(p) < 2:
+        raise RefusedError(f"{file}: only one point in it; a path needs two that differ")
+    return Path(str(file), p, closed=len(p) > 2 and math.dist(p[0], p[-1]) < _SAME_M)
+
+
+def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> None:
+    """Whether a round robot on the path stays on a floor that is centred on the world's origin.
+
+    Args:
+        path: Where its centre goes.
+        floor_m: Extent of the floor in x and y [m].
+        footprint_radius_m: Radius of the robot [m].
+
+    Raises:
+        RefusedError: It does not; the text gives the first such point and how far it is outside.
+    """
+    beyond = np.max(np.abs(path.p_xy) + footprint_radius_m - np.array(floor_m) / 2, axis=1)
+    outside = np.flatnonzero(beyond > 1e-9)
+    if len(outside):
+        i = int(outside[0])
+        x, y = path.p_xy[i]
+        raise RefusedError(
+            f"path {path.name} leaves the floor at point {i + 1} of {len(beyond)}, ({x:.3f}, {y:.3f}) m: "
+            f"a robot of radius {footprint_radius_m:g} m is {beyond[i]:.3f} m outside the floor of "
+            f"{floor_m[0]:g} x {floor_m[1]:g} m; move or shrink the path, or enlarge the floor"
+        )
+
+
+def _without_repeats(p: Array) -> Array:
+    """Points of (N, 2) whose neighbours differ; the first of equals stays."""
+    apart = np.hypot(*np.diff(p, axis=0).T) >= _SAME_M
+    return p[np.concatenate([[True], apart])]
