@@ -338,7 +338,7 @@ def net_convert(pth: Path, *, out: Path, force: Force = False) -> None:
 
     _check_suffix(out, (".safetensors",), "a network")
     net = convert(pth, out, force=force)
-    _print_report(net.report(), as_json=False)
+    _print_report(net.report(str(out)), as_json=False)
     _say(f"Wrote {out}")
 
 
@@ -413,24 +413,26 @@ def fetch(
     _say(f"Wrote {len(files)} files to {dest}")
 
 
-def main() -> None:
-    """Entry point of the `magtwin` command."""
-    arguments = sys.argv[1:]
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the `magtwin` command; `arguments` are those of the command line unless given."""
+    arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
     try:
-        app([a for a in arguments if a != "--debug"], exit_on_error=False, print_error=True)
+        app([a for a in arguments if a != "--debug"], exit_on_error=False, result_action="return_value")
     except CycloptsError:
         sys.exit(2)
-    except RefusedError as error:
-        if debug:
-            raise
-        _fail(str(error))
-    except (OSError, MemoryError) as error:
-        if debug:
-            raise
-        _fail(f"{error} ({type(error).__name__})")
     except KeyboardInterrupt:
         sys.exit(130)
+    except Exception as error:
+        if debug:
+            raise
+        if isinstance(error, RefusedError):
+            _fail(str(error))
+        if isinstance(error, OSError | MemoryError):
+            _fail(f"{error} ({type(error).__name__})")
+        _fail(
+            f"a fault of magtwin's own, {type(error).__name__}: {error}; --debug shows where, please report it"
+        )
 
 
 def _fail(text: str) -> None:
@@ -575,4 +577,4 @@ def _info_of_run(file: Path) -> Any:
 def _info_of_net(file: Path) -> Any:
     from magtwin.learn.model import load_net
 
-    return load_net(file).report()
+    return load_net(file).report(str(file))

@@ -1,6 +1,7 @@
 """Files: where magtwin's own lie, how outputs are written, checksums, settings in TOML."""
 
 import dataclasses
+import difflib
 import hashlib
 import os
 import shutil
@@ -41,8 +42,8 @@ def existing(path: str | os.PathLike[str], what: str) -> Path:
     path = Path(path)
     if not path.exists():
         siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-        near = f"; {hint(path.name, siblings)}" if siblings and len(siblings) < 50 else ""
-        raise RefusedError(f"{path}: no such {what}{near}")
+        near = difflib.get_close_matches(path.name, siblings, n=1)
+        raise RefusedError(f"{path}: no such {what}" + (f"; did you mean {near[0]!r}?" if near else ""))
     return path
 
 

@@ -71,9 +71,9 @@ def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
     from magtwin.learn.magnetometer import NeuralMagnetometer
 
     magnetometer = NeuralMagnetometer.load(spec.network, sha256=spec.network_sha256)
-    if spec.inputs and spec.inputs != magnetometer.inputs:
+    if spec.inputs and spec.inputs != magnetometer.features:
         raise RefusedError(
-            f"{spec.network}: takes {', '.join(magnetometer.inputs)}, but the scene's magnetometer names "
+            f"{spec.network}: takes {', '.join(magnetometer.features)}, but the scene's magnetometer names "
             f"{', '.join(spec.inputs)}; author the scene anew with this network"
         )
     return magnetometer
