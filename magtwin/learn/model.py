@@ -1,5 +1,6 @@
 """FieldNet: a network that predicts the disturbance, with all it needs to be used, in one file."""
 
+import itertools
 import json
 import math
 import os
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
@@ -78,12 +79,11 @@ class FieldNet(torch.nn.Module):
         self.facts: dict[str, Fact] = dict(facts or {})
         if not hidden or not all(width > 0 for width in hidden) or not 0 <= dropout < 1:
             raise RefusedError(
-                f"a network needs hidden layers above 0 wide and dropout in 0..1, got {tuple(hidden)}, {dropout}"
+                f"a network needs hidden layers above 0 wide and dropout in 0..1, "
+                f"got {tuple(hidden)} and {dropout}"
             )
         widths = [len(self.features), *hidden, 1]
-        self.layers = torch.nn.ModuleList(
-            torch.nn.Linear(a, b) for a, b in zip(widths, widths[1:], strict=False)
-        )
+        self.layers = torch.nn.ModuleList(torch.nn.Linear(a, b) for a, b in itertools.pairwise(widths))
         ones = torch.ones(len(self.features), dtype=torch.float64)
         for name, value in (
             ("x_mean", 0 * ones),
@@ -310,8 +310,3 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 def _say(tensor: torch.Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
-
-
-def parameters_of(net: FieldNet) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Weight (out, in) and bias (out,) of each layer as numpy, first to last."""
-    return [(n.weight.detach().numpy(), n.bias.detach().numpy()) for n in net.linears]

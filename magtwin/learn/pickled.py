@@ -7,7 +7,7 @@ have been called with what, and the reader decides what it means.
 """
 
 import pickletools
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,13 +50,6 @@ class _Mark:
 
 
 _MARK = _Mark()
-_LITERALS = frozenset(
-    "BININT BININT1 BININT2 LONG1 LONG4 BINFLOAT BINUNICODE SHORT_BINUNICODE BINUNICODE8 "
-    "BINBYTES SHORT_BINBYTES BINBYTES8".split()
-)
-_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
-_EMPTY: dict[str, Callable[[], Any]] = {"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple}
-_TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
 def read_pickle(data: bytes, admitted: Collection[str], where: str) -> Any:
@@ -101,24 +94,83 @@ class _Machine:
 
     def step(self, op: str, arg: Any) -> bool:
         """Do one instruction; True at the end of the pickle."""
-        if op == "STOP":
-            return True
-        if op in _LITERALS:
-            self.stack.append(arg)
-        elif op in _CONSTANTS:
-            self.stack.append(_CONSTANTS[op])
-        elif op in _EMPTY:
-            self.stack.append(_EMPTY[op]())
-        elif op in _TUPLES:
-            self.stack.append(tuple(self.pop(_TUPLES[op])))
-        elif (do := getattr(self, f"do_{op}", None)) is not None:
-            do(arg)
-        elif op in ("INST", "GLOBAL"):
-            self.do_GLOBAL(arg)
-        else:
-            raise RefusedError(
-                f"{self.where}: its pickle uses {op}, which no checkpoint needs; nothing of it was executed"
-            )
+        push = self.stack.append
+        match op:
+            case "STOP":
+                return True
+            case "PROTO":
+                if not 2 <= arg <= 5:
+                    raise ValueError(f"protocol {arg}")
+            case "FRAME":
+                pass  # frames only help readers of streams
+            case (
+                ("BININT" | "BININT1" | "BININT2" | "LONG1" | "LONG4" | "BINFLOAT")
+                | ("BINUNICODE" | "SHORT_BINUNICODE" | "BINUNICODE8")
+                | ("BINBYTES" | "SHORT_BINBYTES" | "BINBYTES8")
+            ):
+                push(arg)
+            case "NONE":
+                push(None)
+            case "NEWTRUE" | "NEWFALSE":
+                push(op == "NEWTRUE")
+            case "EMPTY_DICT":
+                push({})
+            case "EMPTY_LIST":
+                push([])
+            case "EMPTY_TUPLE":
+                push(())
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                push(tuple(self.pop(int(op[-1]))))
+            case "TUPLE":
+                push(tuple(self.pop_to_mark()))
+            case "MARK":
+                push(_MARK)
+            case "POP":
+                self.pop(1)
+            case "POP_MARK":
+                self.pop_to_mark()
+            case "APPEND":
+                self.extend(self.pop(1))
+            case "APPENDS":
+                self.extend(self.pop_to_mark())
+            case "SETITEM":
+                self.update(self.pop(2))
+            case "SETITEMS":
+                self.update(self.pop_to_mark())
+            case "BINPUT" | "LONG_BINPUT":
+                self.memo[arg] = self.top()
+            case "MEMOIZE":
+                self.memo[len(self.memo)] = self.top()
+            case "BINGET" | "LONG_BINGET":
+                if arg not in self.memo:
+                    raise LookupError(f"nothing was kept as {arg}")
+                push(self.memo[arg])
+            case "GLOBAL":
+                push(self.named(arg.replace(" ", ".", 1)))
+            case "STACK_GLOBAL":
+                module, name = self.pop(2)
+                if not (isinstance(module, str) and isinstance(name, str)):
+                    raise TypeError("a global whose name is no text")
+                push(self.named(f"{module}.{name}"))
+            case "REDUCE" | "NEWOBJ":
+                called, args = self.pop(2)
+                if not (isinstance(called, Global) and isinstance(args, tuple)):
+                    raise TypeError(f"a call of a {type(called).__name__}")
+                push(Made(called.name, args))
+            case "BUILD":
+                (state,) = self.pop(1)
+                made = self.top()
+                if not isinstance(made, Made):
+                    raise TypeError(f"a state for a {type(made).__name__}")
+                made.state = state
+            case "BINPERSID":
+                push(Outside(*self.pop(1)))
+            case _:
+                if op == "INST":  # protocol 0's call, which names what it calls
+                    self.named(arg.replace(" ", ".", 1))
+                raise RefusedError(
+                    f"{self.where}: its pickle uses {op}, which no network needs; nothing of it was executed"
+                )
         return False
 
     def result(self) -> Any:
@@ -152,77 +204,6 @@ class _Machine:
             raise LookupError("too few values on its stack")
         return self.stack[-1]
 
-    def do_PROTO(self, version: int) -> None:
-        if not 2 <= version <= 5:
-            raise ValueError(f"protocol {version}")
-
-    def do_FRAME(self, length: int) -> None:
-        """Frames only help readers of streams."""
-
-    def do_MARK(self, _: None) -> None:
-        self.stack.append(_MARK)
-
-    def do_POP(self, _: None) -> None:
-        self.pop(1)
-
-    def do_POP_MARK(self, _: None) -> None:
-        self.pop_to_mark()
-
-    def do_TUPLE(self, _: None) -> None:
-        self.stack.append(tuple(self.pop_to_mark()))
-
-    def do_APPEND(self, _: None) -> None:
-        self.extend(self.pop(1))
-
-    def do_APPENDS(self, _: None) -> None:
-        self.extend(self.pop_to_mark())
-
-    def do_SETITEM(self, _: None) -> None:
-        self.update(self.pop(2))
-
-    def do_SETITEMS(self, _: None) -> None:
-        self.update(self.pop_to_mark())
-
-    def do_BINPUT(self, key: int) -> None:
-        self.memo[key] = self.top()
-
-    do_LONG_BINPUT = do_BINPUT
-
-    def do_MEMOIZE(self, _: None) -> None:
-        self.memo[len(self.memo)] = self.top()
-
-    def do_BINGET(self, key: int) -> None:
-        if key not in self.memo:
-            raise LookupError(f"nothing was kept as {key}")
-        self.stack.append(self.memo[key])
-
-    do_LONG_BINGET = do_BINGET
-
-    def do_GLOBAL(self, name: str) -> None:
-        self.stack.append(self.named(name.replace(" ", ".", 1)))
-
-    def do_STACK_GLOBAL(self, _: None) -> None:
-        module, name = self.pop(2)
-        if not (isinstance(module, str) and isinstance(name, str)):
-            raise TypeError("a global whose name is no text")
-        self.stack.append(self.named(f"{module}.{name}"))
-
-    def do_REDUCE(self, _: None) -> None:
-        self.make()
-
-    def do_NEWOBJ(self, _: None) -> None:
-        self.make()
-
-    def do_BUILD(self, _: None) -> None:
-        (state,) = self.pop(1)
-        made = self.top()
-        if not isinstance(made, Made):
-            raise TypeError(f"a state for a {type(made).__name__}")
-        made.state = state
-
-    def do_BINPERSID(self, _: None) -> None:
-        self.stack.append(Outside(*self.pop(1)))
-
     def named(self, name: str) -> Global:
         """The global called `name`, if it is admitted."""
         if name not in self.admitted:
@@ -233,12 +214,6 @@ class _Machine:
                 "nothing of it was executed, do not load this file with other programs"
             )
         return Global(name)
-
-    def make(self) -> None:
-        called, args = self.pop(2)
-        if not (isinstance(called, Global) and isinstance(args, tuple)):
-            raise TypeError(f"a call of a {type(called).__name__}")
-        self.stack.append(Made(called.name, args))
 
     def extend(self, values: list[Any]) -> None:
         target = self.top()
