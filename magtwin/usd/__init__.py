@@ -1,1 +1,5 @@
-"""Authoring and reading USD."""
+"""Authoring and reading USD. Importing this room registers magtwin's schemas with USD."""
+
+from magtwin.usd.schema import register
+
+register()

@@ -1,0 +1,126 @@
+"""The `magtwin` schema library: registered with USD, checked, and applied to prims.
+
+The library is codeless: `schema.usda` is its source, `generate.py` makes `generatedSchema.usda` and
+`plugInfo.json` from it. USD reads schema plugins once, when its schema registry is first used, and is
+silent about those that come later; `register` therefore asks the registry whether it knows each one.
+"""
+
+import json
+import os
+from pathlib import Path
+
+from pxr import Plug, Sdf, Usd
+
+from magtwin.names import RefusedError, find
+
+FOLDER = Path(__file__).resolve().parent
+
+NOUNS = {
+    "anomalyMap": "MagtwinAnomalyMapAPI",
+    "magnetometer": "MagtwinMagnetometerAPI",
+    "imu": "MagtwinImuAPI",
+    "lidar": "MagtwinLidarAPI",
+    "source": "MagtwinMagneticSourceAPI",
+    "earth": "MagtwinEarthFieldAPI",
+    "battery": "MagtwinBatteryAPI",
+    "robot": "MagtwinRobotAPI",
+    "drive": "MagtwinDifferentialDriveAPI",
+    "platform": "MagtwinPlatformFieldAPI",
+    "lab": "MagtwinLabAPI",
+}
+"""Applied API schema of each noun; its attributes are named `magtwin:<noun>:<attribute>`."""
+
+
+def register() -> None:
+    """Make the schemas known to USD; once more does nothing.
+
+    Raises:
+        RefusedError: USD's schema registry was in use before, and will not take them any more.
+    """
+    Plug.Registry().RegisterPlugins(str(FOLDER))
+    registry = Usd.SchemaRegistry()
+    unknown = [api for api in NOUNS.values() if not registry.FindAppliedAPIPrimDefinition(api)]
+    if unknown:
+        raise RefusedError(
+            f"the USD schemas {', '.join(unknown)} came too late: USD reads schemas once, at the first use "
+            "of a stage; import magtwin.usd before opening one, or add "
+            f"{FOLDER} to PXR_PLUGINPATH_NAME"
+        )
+
+
+def schema_types() -> list[str]:
+    """Names of the schemas that the generated library declares, sorted."""
+    plugin = json.loads((FOLDER / "plugInfo.json").read_text(encoding="utf-8"))["Plugins"][0]
+    return sorted(plugin["Info"]["Types"])
+
+
+def attribute_name(noun: str, field: str) -> str:
+    """The attribute that stands for a field of a spec: ("drive", "wheel_radius_m") gives
+    `magtwin:drive:wheelRadiusM`.
+    """
+    first, *rest = field.split("_")
+    return f"magtwin:{noun}:{first}{''.join(word.capitalize() for word in rest)}"
+
+
+def place(prim: Usd.Prim) -> str:
+    """Where a prim is, for refusals: file and path."""
+    layer = prim.GetStage().GetRootLayer()
+    return f"{layer.realPath or layer.identifier} <{prim.GetPath()}>"
+
+
+def apply_api(prim: Usd.Prim, noun: str) -> Usd.Prim:
+    """Apply the schema of `noun` to `prim`, in the stage's edit target, unless it has it already.
+
+    Raises:
+        RefusedError: It may not be applied to a prim of that type.
+    """
+    api = find("schema", noun, NOUNS)
+    if prim.HasAPI(api):
+        return prim
+    allowed = prim.CanApplyAPI(api)
+    if not allowed:
+        raise RefusedError(
+            f"{place(prim)}: {api} goes on an Xform only, not on a {prim.GetTypeName() or 'def'}"
+        )
+    prim.ApplyAPI(api)
+    return prim
+
+
+def require_api(prim: Usd.Prim, noun: str) -> Usd.Prim:
+    """`prim`, if it has the schema of `noun`.
+
+    Raises:
+        RefusedError: It has not.
+    """
+    api = find("schema", noun, NOUNS)
+    if not prim.HasAPI(api):
+        raise RefusedError(f"{place(prim)}: has no {api}; it is not a {noun} that magtwin authored")
+    return prim
+
+
+def prims_with(root: Usd.Prim, noun: str) -> list[Usd.Prim]:
+    """The prims at and below `root` that have the schema of `noun`, in order of the stage."""
+    api = find("schema", noun, NOUNS)
+    return [prim for prim in Usd.PrimRange(root) if prim.HasAPI(api)]
+
+
+def only_prim_with(root: Usd.Prim, noun: str) -> Usd.Prim:
+    """The one prim at or below `root` that has the schema of `noun`.
+
+    Raises:
+        RefusedError: There is none, or there are several.
+    """
+    prims = prims_with(root, noun)
+    if len(prims) != 1:
+        seen = ", ".join(str(prim.GetPath()) for prim in prims) or "none"
+        raise RefusedError(f"{place(root)}: needs one prim with {NOUNS[noun]} below it, found {seen}")
+    return prims[0]
+
+
+def relative_asset(layer: Sdf.Layer, path: Path) -> str:
+    """`path` as an asset path relative to `layer`'s file; absolute where the layer has none."""
+    path = path.resolve()
+    if layer.anonymous or not layer.realPath:
+        return path.as_posix()
+    relative = Path(os.path.relpath(path, Path(layer.realPath).resolve().parent)).as_posix()
+    return relative if relative.startswith("../") else f"./{relative}"

@@ -1,0 +1,372 @@
+"""Sensors, drive, battery and magnetic sources as prims: `define_` authors one, `read_` gives its spec back.
+
+Every prim is an Xform with an applied schema of magtwin's, so that a runtime which has never heard of
+magtwin still places it. An attribute is authored where its composed value differs from the spec's, in
+the stage's edit target: layers over a robot hold only what they change.
+"""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
+
+from magtwin.frames import wxyz_from_xyzw, xyzw_from_wxyz
+from magtwin.names import RefusedError, hint
+from magtwin.spec import (
+    BatterySpec,
+    DriveSpec,
+    EarthFieldSpec,
+    ImuSpec,
+    LidarSpec,
+    MagnetometerSpec,
+    MountSpec,
+    PlatformFieldSpec,
+    Quat,
+    SourceSpec,
+    Vec3,
+)
+from magtwin.usd.schema import apply_api, attribute_name, place, relative_asset, require_api
+
+S = TypeVar("S")
+
+POSE_FIELDS = frozenset(("link", "p_link_sensor", "q_link_sensor_xyzw"))
+"""Fields of a MountSpec: the prim's place among the links and its transform hold them."""
+
+JOINT_FIELDS = ("left_wheel_joint", "right_wheel_joint")
+"""Fields of a DriveSpec that are relationships to joints."""
+
+MAP_RELATIONSHIP = "magtwin:magnetometer:map"
+
+IMU_TYPE = "IsaacImuSensor"
+LIDAR_TYPE = "OmniLidar"
+LIDAR_API = "OmniSensorGenericLidarCoreAPI"
+"""NVIDIA's types, by name: their plugins live in Omniverse, not here."""
+
+SINGLE_MAX = float(np.finfo(np.float32).max)
+
+FOOTPRINT = attribute_name("robot", "footprint_radius_m")
+
+
+def define_magnetometer(stage: Usd.Stage, path: str | Sdf.Path, spec: MagnetometerSpec) -> Usd.Prim:
+    """Author a magnetometer below the prim of its link.
+
+    Args:
+        stage: Written to in its edit target.
+        path: Path of the sensor's prim, a child of the prim called `spec.link`.
+        spec: What to author; `network` becomes a path relative to the edited layer.
+
+    Raises:
+        RefusedError: The parent prim is not the link, or a prim of another type is there.
+    """
+    prim = _define_mounted(stage, path, spec)
+    write_figures(apply_api(prim, "magnetometer"), "magnetometer", spec, skip=POSE_FIELDS)
+    return prim
+
+
+def read_magnetometer(prim: Usd.Prim) -> MagnetometerSpec:
+    """The spec of an authored magnetometer.
+
+    Raises:
+        RefusedError: It is none, a figure is out of range, or its network is missing.
+    """
+    return _read_mounted(MagnetometerSpec, prim, "magnetometer")
+
+
+def define_imu(stage: Usd.Stage, path: str | Sdf.Path, spec: ImuSpec) -> Usd.Prim:
+    """Author an inertial unit below the prim of its link, with NVIDIA's sensor as a child.
+
+    Args and refusals as for `define_magnetometer`.
+    """
+    prim = _define_mounted(stage, path, spec)
+    write_figures(apply_api(prim, "imu"), "imu", spec, skip=POSE_FIELDS)
+    sensor = stage.DefinePrim(prim.GetPath().AppendChild("imu_sensor"), IMU_TYPE)
+    _write_foreign(sensor, "enabled", Sdf.ValueTypeNames.Bool, True)
+    _write_foreign(sensor, "sensorPeriod", Sdf.ValueTypeNames.Float, 1 / spec.rate_hz)
+    return prim
+
+
+def read_imu(prim: Usd.Prim) -> ImuSpec:
+    """The spec of an authored inertial unit; refusals as for `read_magnetometer`."""
+    return _read_mounted(ImuSpec, prim, "imu")
+
+
+def define_lidar(stage: Usd.Stage, path: str | Sdf.Path, spec: LidarSpec) -> Usd.Prim:
+    """Author a planar LiDAR below the prim of its link, with NVIDIA's sensor as a child.
+
+    Args and refusals as for `define_magnetometer`.
+    """
+    prim = _define_mounted(stage, path, spec)
+    write_figures(apply_api(prim, "lidar"), "lidar", spec, skip=POSE_FIELDS)
+    sensor = stage.DefinePrim(prim.GetPath().AppendChild("omni_lidar"), LIDAR_TYPE)
+    if LIDAR_API not in sensor.GetPrimTypeInfo().GetAppliedAPISchemas():
+        sensor.AddAppliedSchema(LIDAR_API)
+    names, core = Sdf.ValueTypeNames, "omni:sensor:Core:"
+    turns = round(np.clip(spec.scan_rate_hz, 1, 1e6))  # NVIDIA's is a whole number
+    _write_foreign(sensor, core + "scanType", names.Token, "ROTARY")
+    _write_foreign(sensor, core + "scanRateBaseHz", names.UInt, turns)
+    _write_foreign(sensor, core + "nearRangeM", names.Float, spec.range_min_m)
+    _write_foreign(sensor, core + "farRangeM", names.Float, spec.range_max_m)
+    return prim
+
+
+def read_lidar(prim: Usd.Prim) -> LidarSpec:
+    """The spec of an authored LiDAR; refusals as for `read_magnetometer`."""
+    return _read_mounted(LidarSpec, prim, "lidar")
+
+
+def define_battery(stage: Usd.Stage, path: str | Sdf.Path, spec: BatterySpec) -> Usd.Prim:
+    """Author a battery as an Xform of its own; returns its prim."""
+    return write_figures(apply_api(_define_xform(stage, path), "battery"), "battery", spec)
+
+
+def read_battery(prim: Usd.Prim) -> BatterySpec:
+    """The spec of an authored battery; refusals as for `read_magnetometer`."""
+    return read_figures(BatterySpec, prim, "battery")
+
+
+def define_footprint(prim: Usd.Prim, footprint_radius_m: float) -> Usd.Prim:
+    """Mark `prim`, an Xform, as the root of a robot that needs a clear circle of this radius [m]."""
+    apply_api(prim, "robot").GetAttribute(FOOTPRINT).Set(footprint_radius_m)
+    return prim
+
+
+def read_footprint(prim: Usd.Prim) -> float:
+    """Radius of the circle that the robot rooted at `prim` needs clear [m]."""
+    return float(require_api(prim, "robot").GetAttribute(FOOTPRINT).Get())
+
+
+def define_drive(prim: Usd.Prim, spec: DriveSpec) -> Usd.Prim:
+    """Apply a differential drive to a robot's root prim; its wheel joints must be authored below.
+
+    Raises:
+        RefusedError: No joint has the name that the spec gives.
+    """
+    write_figures(apply_api(prim, "drive"), "drive", spec, skip=JOINT_FIELDS)
+    joints = {p.GetName(): p for p in Usd.PrimRange(prim) if p.IsA(UsdPhysics.Joint)}
+    for field in JOINT_FIELDS:
+        name = getattr(spec, field)
+        if name not in joints:
+            raise RefusedError(f"{place(prim)}: no joint {name!r} for {field}; {hint(name, joints)}")
+        relationship = prim.GetRelationship(attribute_name("drive", field))
+        if relationship.GetTargets() != [joints[name].GetPath()]:
+            relationship.SetTargets([joints[name].GetPath()])
+    return prim
+
+
+def read_drive(prim: Usd.Prim) -> DriveSpec:
+    """The spec of an authored drive.
+
+    Raises:
+        RefusedError: It is none, a figure is out of range, or a wheel's joint is missing.
+    """
+    require_api(prim, "drive")
+    joints = {f: target(prim, attribute_name("drive", f)).GetName() for f in JOINT_FIELDS}
+    return read_figures(DriveSpec, prim, "drive", **joints)
+
+
+def define_platform(prim: Usd.Prim, spec: PlatformFieldSpec) -> Usd.Prim:
+    """Apply the robot's own magnetic field to its root prim."""
+    return write_figures(apply_api(prim, "platform"), "platform", spec)
+
+
+def read_platform(prim: Usd.Prim) -> PlatformFieldSpec:
+    """The spec of an authored platform field; refusals as for `read_magnetometer`."""
+    return read_figures(PlatformFieldSpec, prim, "platform")
+
+
+def define_source(stage: Usd.Stage, parent: str | Sdf.Path, spec: SourceSpec) -> Usd.Prim:
+    """Author a magnetised thing as the child `spec.name` of the prim at `parent`, which is at the origin.
+
+    Raises:
+        RefusedError: Its name cannot name a prim.
+    """
+    check_prim_name(spec.name, "source")
+    prim = _define_xform(stage, Sdf.Path(str(parent)).AppendChild(spec.name))
+    write_pose(prim, spec.p_world)
+    return write_figures(apply_api(prim, "source"), "source", spec, skip=("name", "p_world"))
+
+
+def read_source(prim: Usd.Prim) -> SourceSpec:
+    """The spec of an authored source; refusals as for `read_magnetometer`."""
+    return read_figures(SourceSpec, prim, "source", name=prim.GetName(), p_world=read_pose(prim)[0])
+
+
+def define_earth(stage: Usd.Stage, path: str | Sdf.Path, spec: EarthFieldSpec) -> Usd.Prim:
+    """Author the Earth's field as an Xform of its own; returns its prim."""
+    return write_figures(apply_api(_define_xform(stage, path), "earth"), "earth", spec)
+
+
+def read_earth(prim: Usd.Prim) -> EarthFieldSpec:
+    """The spec of an authored Earth's field; refusals as for `read_magnetometer`."""
+    return read_figures(EarthFieldSpec, prim, "earth")
+
+
+def check_prim_name(name: str, what: str) -> str:
+    """`name` if a prim can have it.
+
+    Raises:
+        RefusedError: It has signs other than letters, digits and _, or begins with a digit.
+    """
+    if not Sdf.Path.IsValidIdentifier(name):
+        raise RefusedError(f"{what} {name!r} cannot name a prim; use letters, digits and _, no digit first")
+    return name
+
+
+def target(prim: Usd.Prim, relationship: str) -> Usd.Prim:
+    """The one prim that a relationship of `prim` points to.
+
+    Raises:
+        RefusedError: It points to no prim of the stage, or to several.
+    """
+    found = prim.GetRelationship(relationship)
+    paths = found.GetForwardedTargets() if found else []
+    there = prim.GetStage().GetPrimAtPath(paths[0]) if len(paths) == 1 else None
+    if not there:
+        seen = ", ".join(map(str, paths)) or "none"
+        raise RefusedError(f"{place(prim)}: {relationship} must point to one prim of the stage, found {seen}")
+    return there
+
+
+def write_pose(prim: Usd.Prim, p: Vec3, q_xyzw: Quat | None = None) -> None:
+    """Place an Xform in its parent: a position [m] and, unless none, a turn, both in double precision.
+
+    Other transform ops are dropped from the order.
+    """
+    want = [("xformOp:translate", Sdf.ValueTypeNames.Double3, Gf.Vec3d(p))]
+    if q_xyzw is not None:
+        want.append(
+            ("xformOp:orient", Sdf.ValueTypeNames.Quatd, Gf.Quatd(*map(float, wxyz_from_xyzw(q_xyzw))))
+        )
+    for name, kind, value in want:
+        attribute = prim.GetAttribute(name) or prim.CreateAttribute(name, kind, custom=False)
+        if attribute.GetTypeName() != kind:
+            raise RefusedError(f"{place(prim)}: {name} is a {attribute.GetTypeName()}, magtwin writes {kind}")
+        if attribute.Get() != value:
+            attribute.Set(value)
+    order = Vt.TokenArray([name for name, _, _ in want])
+    if UsdGeom.Xformable(prim).GetXformOpOrderAttr().Get() != order:
+        UsdGeom.Xformable(prim).GetXformOpOrderAttr().Set(order)
+
+
+def read_pose(prim: Usd.Prim) -> tuple[Vec3, Quat]:
+    """Position [m] and turn (xyzw) of an Xform in its parent.
+
+    What `write_pose` wrote comes back to the bit; any other rigid transform comes back as it composes.
+    """
+    xformable = UsdGeom.Xformable(prim)
+    ops = {op.GetOpName(): op.Get() for op in xformable.GetOrderedXformOps()}
+    if list(ops) in (["xformOp:translate"], ["xformOp:translate", "xformOp:orient"]):
+        translate, orient = ops["xformOp:translate"], ops.get("xformOp:orient", Gf.Quatd(1))
+    else:
+        local = xformable.GetLocalTransformation()
+        translate, orient = local.ExtractTranslation(), local.RemoveScaleShear().ExtractRotationQuat()
+    q = xyzw_from_wxyz((orient.GetReal(), *orient.GetImaginary()))
+    return tuple(map(float, translate)), tuple(map(float, q))  # type: ignore[return-value]
+
+
+def write_figures(prim: Usd.Prim, noun: str, spec: Any, *, skip: Any = ()) -> Usd.Prim:
+    """Write each field of a spec, but those in `skip`, to the attribute that stands for it."""
+    for field in fields(spec):
+        if field.name in skip:
+            continue
+        attribute = prim.GetAttribute(attribute_name(noun, field.name))
+        value = getattr(spec, field.name)
+        if plain_value(attribute) != (value.resolve() if isinstance(value, Path) else value):
+            attribute.Set(_usd_value(attribute, value))
+    return prim
+
+
+def read_figures(cls: type[S], prim: Usd.Prim, noun: str, **known: Any) -> S:
+    """A spec from the attributes of `prim`, for those fields that are not in `known`.
+
+    Raises:
+        RefusedError: The prim has not the schema, or a value is missing, of another type or out of range.
+    """
+    require_api(prim, noun)
+    values = dict(known)
+    for field in fields(cls):  # type: ignore[arg-type]
+        if field.name not in known:
+            values[field.name] = _read_value(prim.GetAttribute(attribute_name(noun, field.name)))
+    try:
+        return cls(**values)
+    except RefusedError as error:
+        raise RefusedError(f"{place(prim)}: {error}") from error
+
+
+def _define_xform(stage: Usd.Stage, path: str | Sdf.Path) -> Usd.Prim:
+    """An Xform at `path`; one that is there already is left as it is."""
+    prim = stage.GetPrimAtPath(path)
+    if not prim or not prim.IsDefined():
+        return UsdGeom.Xform.Define(stage, path).GetPrim()
+    return prim
+
+
+def _define_mounted(stage: Usd.Stage, path: str | Sdf.Path, spec: MountSpec) -> Usd.Prim:
+    path = Sdf.Path(str(path))
+    if path.GetParentPath().name != spec.link:
+        raise RefusedError(f"<{path}>: this sensor sits on {spec.link!r}, so its prim must be a child of it")
+    prim = _define_xform(stage, path)
+    write_pose(prim, spec.p_link_sensor, spec.q_link_sensor_xyzw)
+    return prim
+
+
+def _read_mounted(cls: type[S], prim: Usd.Prim, noun: str) -> S:
+    require_api(prim, noun)
+    p, q = read_pose(prim)
+    link = prim.GetParent().GetName()
+    return read_figures(cls, prim, noun, link=link, p_link_sensor=p, q_link_sensor_xyzw=q)
+
+
+def _write_foreign(prim: Usd.Prim, name: str, kind: Sdf.ValueTypeName, value: Any) -> None:
+    """Set an attribute of a type whose schema is not here."""
+    if kind == Sdf.ValueTypeNames.Float:
+        value = float(np.float32(np.clip(value, -SINGLE_MAX, SINGLE_MAX)))
+    attribute = prim.GetAttribute(name) or prim.CreateAttribute(name, kind, custom=False)
+    if attribute.Get() != value:
+        attribute.Set(value)
+
+
+def _usd_value(attribute: Usd.Attribute, value: Any) -> Any:
+    """A field's value as the attribute's type."""
+    kind = attribute.GetTypeName()
+    if kind == Sdf.ValueTypeNames.Asset:
+        layer = attribute.GetStage().GetEditTarget().GetLayer()
+        return Sdf.AssetPath(relative_asset(layer, value) if value is not None else "")
+    if kind == Sdf.ValueTypeNames.Matrix3d:
+        return Gf.Matrix3d(*value)
+    if kind == Sdf.ValueTypeNames.StringArray:
+        return Vt.StringArray(value)
+    return tuple(value) if isinstance(value, tuple) else value
+
+
+def plain_value(attribute: Usd.Attribute) -> Any:
+    """An attribute's value as plain Python: numbers, text, tuples, a Path or None.
+
+    Raises:
+        RefusedError: The layers give a value of another type than the schema does.
+    """
+    value, kind = attribute.Get(), attribute.GetTypeName()
+    if not isinstance(value, kind.type.pythonClass or type(kind.defaultValue)):
+        raise RefusedError(
+            f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}, got {value!r}"
+        )
+    if isinstance(value, Sdf.AssetPath):
+        return Path(value.resolvedPath or value.path).resolve() if value.path else None
+    if isinstance(value, Gf.Matrix3d):
+        return tuple(float(x) for row in value for x in row)
+    if isinstance(value, Gf.Vec3d | Gf.Vec2d):
+        return tuple(map(float, value))
+    return tuple(value) if isinstance(value, Vt.StringArray) else value
+
+
+def _read_value(attribute: Usd.Attribute) -> Any:
+    """What `plain_value` gives; a file that is named must be there."""
+    value = plain_value(attribute)
+    if isinstance(value, Path) and not attribute.Get().resolvedPath:
+        raise RefusedError(
+            f"{place(attribute.GetPrim())}: {attribute.GetName()} names {attribute.Get().path}, "
+            "which is not there"
+        )
+    return value

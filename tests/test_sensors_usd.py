@@ -1,0 +1,307 @@
+"""What is authored is what is read: each spec through its prim and back, to the bit."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+
+from magtwin.names import RefusedError
+from magtwin.spec import (
+    BatterySpec,
+    DriveSpec,
+    EarthFieldSpec,
+    ImuSpec,
+    LidarSpec,
+    MagnetometerSpec,
+    PlatformFieldSpec,
+    SourceSpec,
+)
+from magtwin.usd import sensors
+
+LINK = "/robot/some_link"
+
+unhurried = settings(deadline=None)  # USD loads plugins at the first example
+
+number = st.floats(allow_nan=False, allow_infinity=False)
+not_negative = st.floats(0, 1e300)
+above_zero = st.floats(1e-300, 1e300)
+vec3 = st.tuples(number, number, number)
+mount = {"link": st.just("some_link"), "p_link_sensor": vec3, "q_link_sensor_xyzw": st.tuples(*[number] * 4)}
+text = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=12)
+name = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,12}", fullmatch=True)
+
+
+def stage_with_link() -> Usd.Stage:
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.Xform.Define(stage, "/robot")
+    UsdGeom.Xform.Define(stage, LINK)
+    return stage
+
+
+def stage_with_wheels(spec: DriveSpec) -> Usd.Stage:
+    stage = stage_with_link()
+    for joint in (spec.left_wheel_joint, spec.right_wheel_joint):
+        UsdPhysics.RevoluteJoint.Define(stage, f"/robot/joints/{joint}")
+    return stage
+
+
+@unhurried
+@given(
+    st.builds(
+        MagnetometerSpec,
+        **mount,
+        rate_hz=above_zero,
+        noise_std_nt=not_negative,
+        resolution_nt=not_negative,
+        network=st.sampled_from([None, Path(__file__)]),
+        network_sha256=text,
+        inputs=st.lists(text, max_size=4).map(tuple),
+    )
+)
+def test_a_magnetometer_survives_the_stage(spec):
+    stage = stage_with_link()
+    assert sensors.read_magnetometer(sensors.define_magnetometer(stage, f"{LINK}/mag", spec)) == spec
+
+
+@unhurried
+@given(
+    st.builds(
+        ImuSpec,
+        **mount,
+        rate_hz=above_zero,
+        orientation_noise_std=not_negative,
+        gyro_noise_std=not_negative,
+        accel_noise_std=not_negative,
+    )
+)
+def test_an_imu_survives_the_stage(spec):
+    stage = stage_with_link()
+    assert sensors.read_imu(sensors.define_imu(stage, f"{LINK}/imu", spec)) == spec
+
+
+@unhurried
+@given(
+    st.builds(
+        LidarSpec,
+        **mount,
+        scan_rate_hz=above_zero,
+        range_min_m=not_negative,
+        range_max_m=above_zero,
+        on_s=not_negative,
+        off_s=not_negative,
+    )
+)
+def test_a_lidar_survives_the_stage(spec):
+    stage = stage_with_link()
+    assert sensors.read_lidar(sensors.define_lidar(stage, f"{LINK}/lidar", spec)) == spec
+
+
+@unhurried
+@given(
+    st.builds(
+        BatterySpec,
+        capacity_wh=above_zero,
+        load_w=not_negative,
+        initial_fraction=st.floats(0, 1),
+        voltage_empty_v=above_zero,
+        voltage_full_v=above_zero,
+        voltage_noise_std_v=not_negative,
+        rate_hz=above_zero,
+    )
+)
+def test_a_battery_survives_the_stage(spec):
+    stage = stage_with_link()
+    assert sensors.read_battery(sensors.define_battery(stage, "/robot/battery", spec)) == spec
+
+
+@unhurried
+@given(st.data())
+def test_a_drive_survives_the_stage(data):
+    joints = {f: data.draw(name) for f in sensors.JOINT_FIELDS}
+    figures = {f.name: data.draw(above_zero) for f in fields(DriveSpec) if f.name not in joints}
+    spec = DriveSpec(**joints, **figures)
+    stage = stage_with_wheels(spec)
+    assert sensors.read_drive(sensors.define_drive(stage.GetPrimAtPath("/robot"), spec)) == spec
+
+
+@unhurried
+@given(st.data())
+def test_a_platform_field_survives_the_stage(data):
+    spec = PlatformFieldSpec(
+        **{f.name: tuple(data.draw(number) for _ in f.default) for f in fields(PlatformFieldSpec)}
+    )
+    stage = stage_with_link()
+    assert sensors.read_platform(sensors.define_platform(stage.GetPrimAtPath("/robot"), spec)) == spec
+
+
+@unhurried
+@given(st.builds(SourceSpec, name=name, p_world=vec3, m_world=vec3))
+def test_a_source_survives_the_stage(spec):
+    stage = stage_with_link()
+    assert sensors.read_source(sensors.define_source(stage, "/robot", spec)) == spec
+
+
+@unhurried
+@given(
+    st.builds(
+        EarthFieldSpec,
+        b_world_nt=vec3,
+        latitude_deg=number,
+        longitude_deg=number,
+        height_m=number,
+        date=text,
+    )
+)
+def test_the_earths_field_survives_the_stage(spec):
+    stage = stage_with_link()
+    assert sensors.read_earth(sensors.define_earth(stage, "/robot/earth", spec)) == spec
+
+
+@unhurried
+@given(above_zero)
+def test_a_footprint_survives_the_stage(radius):
+    stage = stage_with_link()
+    assert sensors.read_footprint(sensors.define_footprint(stage.GetPrimAtPath("/robot"), radius)) == radius
+
+
+def test_a_sensor_is_placed_where_the_spec_says():
+    stage = stage_with_link()
+    UsdGeom.XformCommonAPI(stage.GetPrimAtPath(LINK)).SetTranslate((0, 0, 1))
+    quarter = (0.0, 0.0, 0.5**0.5, 0.5**0.5)  # a quarter turn about z
+    spec = ImuSpec(link="some_link", p_link_sensor=(1.0, 2.0, 3.0), q_link_sensor_xyzw=quarter)
+    prim = sensors.define_imu(stage, f"{LINK}/imu", spec)
+    world = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())
+    assert Gf.IsClose(world.Transform(Gf.Vec3d(1, 0, 0)), Gf.Vec3d(1, 3, 4), 1e-12)
+
+
+def test_a_pose_that_others_wrote_as_a_matrix_is_read():
+    stage = stage_with_link()
+    matrix = Gf.Matrix4d(Gf.Rotation(Gf.Vec3d(0, 0, 1), 90), Gf.Vec3d(1, 2, 3))
+    UsdGeom.Xformable(stage.GetPrimAtPath(LINK)).MakeMatrixXform().Set(matrix)
+    p, q = sensors.read_pose(stage.GetPrimAtPath(LINK))
+    assert p == (1, 2, 3)
+    assert q == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
+
+
+def test_defaults_author_nothing_and_a_change_authors_only_itself():
+    stage = stage_with_link()
+    prim = sensors.define_battery(stage, "/robot/battery", BatterySpec())
+    assert [a.GetName() for a in prim.GetAuthoredAttributes()] == []
+    sensors.define_battery(stage, "/robot/battery", BatterySpec(load_w=20.0))
+    assert [a.GetName() for a in prim.GetAuthoredAttributes()] == ["magtwin:battery:loadW"]
+
+
+def test_a_layer_over_a_sensor_holds_only_what_it_changes():
+    stage = stage_with_link()
+    spec = MagnetometerSpec(link="some_link", rate_hz=100.0, noise_std_nt=1.0, p_link_sensor=(0.1, 0.0, 0.0))
+    sensors.define_magnetometer(stage, f"{LINK}/mag", spec)
+    imu, lidar = ImuSpec(link="some_link", rate_hz=61.0), LidarSpec(link="some_link", range_min_m=0.2)
+    sensors.define_imu(stage, f"{LINK}/imu", imu)
+    sensors.define_lidar(stage, f"{LINK}/lidar", lidar)
+    session = Sdf.Layer.CreateAnonymous(".usda")
+    stage.GetSessionLayer().subLayerPaths.append(session.identifier)
+    stage.SetEditTarget(session)
+    sensors.define_imu(stage, f"{LINK}/imu", imu)
+    sensors.define_lidar(stage, f"{LINK}/lidar", lidar)
+    assert session.empty
+    sensors.define_magnetometer(stage, f"{LINK}/mag", replace(spec, noise_std_nt=2.0))
+    attributes = session.GetPrimAtPath(f"{LINK}/mag").attributes
+    assert [a.name for a in attributes] == ["magtwin:magnetometer:noiseStdNt"]
+
+
+def test_a_network_is_named_relative_to_the_edited_layer_and_moves_with_it(tmp_path):
+    (tmp_path / "a" / "weights").mkdir(parents=True)
+    (tmp_path / "a" / "weights" / "net.safetensors").write_bytes(b"net")
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a" / "s.usda"))
+    UsdGeom.Xform.Define(stage, LINK)
+    spec = MagnetometerSpec(link="some_link", network=tmp_path / "a" / "weights" / "net.safetensors")
+    prim = sensors.define_magnetometer(stage, f"{LINK}/mag", spec)
+    assert prim.GetAttribute("magtwin:magnetometer:network").Get().path == "./weights/net.safetensors"
+    stage.Save()
+    (tmp_path / "a").rename(tmp_path / "b")
+    moved = Usd.Stage.Open(str(tmp_path / "b" / "s.usda"))
+    read = sensors.read_magnetometer(moved.GetPrimAtPath(f"{LINK}/mag"))
+    assert read.network == tmp_path / "b" / "weights" / "net.safetensors"
+
+
+def test_nvidias_imu_and_lidar_carry_what_they_can():
+    stage = stage_with_link()
+    imu = sensors.define_imu(stage, f"{LINK}/imu", ImuSpec(link="some_link", rate_hz=50.0))
+    lidar = sensors.define_lidar(stage, f"{LINK}/lidar", LidarSpec(link="some_link", range_max_m=8.0))
+    imu_sensor, omni = imu.GetChild("imu_sensor"), lidar.GetChild("omni_lidar")
+    assert imu_sensor.GetTypeName() == "IsaacImuSensor"
+    assert imu_sensor.GetAttribute("sensorPeriod").Get() == pytest.approx(0.02)
+    assert omni.GetTypeName() == "OmniLidar"
+    assert omni.GetMetadata("apiSchemas").GetAppliedItems() == ["OmniSensorGenericLidarCoreAPI"]
+    assert omni.GetAttribute("omni:sensor:Core:scanRateBaseHz").Get() == 8
+    assert omni.GetAttribute("omni:sensor:Core:farRangeM").Get() == 8.0
+
+
+def test_a_missing_network_is_refused_by_file_and_prim(tmp_path):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "s.usda"))
+    UsdGeom.Xform.Define(stage, LINK)
+    spec = MagnetometerSpec(link="some_link", network=tmp_path / "gone.safetensors")
+    prim = sensors.define_magnetometer(stage, f"{LINK}/mag", spec)
+    with pytest.raises(
+        RefusedError, match=r"s\.usda </robot/some_link/mag>: .*network names \./gone\.safetensors"
+    ):
+        sensors.read_magnetometer(prim)
+
+
+def test_a_figure_out_of_range_is_refused_by_prim():
+    stage = stage_with_link()
+    prim = sensors.define_battery(stage, "/robot/battery", BatterySpec())
+    prim.GetAttribute("magtwin:battery:capacityWh").Set(-1.0)
+    with pytest.raises(RefusedError, match=r"</robot/battery>: capacity_wh of BatterySpec must be above 0"):
+        sensors.read_battery(prim)
+
+
+def test_a_figure_of_another_type_is_refused_by_prim():
+    stage = stage_with_link()
+    sensors.define_battery(stage, "/robot/battery", BatterySpec())
+    spec = Sdf.AttributeSpec(
+        stage.GetRootLayer().GetPrimAtPath("/robot/battery"),
+        "magtwin:battery:loadW",
+        Sdf.ValueTypeNames.String,
+    )
+    spec.default = "much"
+    with pytest.raises(RefusedError, match=r"</robot/battery>: magtwin:battery:loadW must be a double, got"):
+        sensors.read_battery(stage.GetPrimAtPath("/robot/battery"))
+
+
+def test_a_prim_that_is_no_sensor_is_refused():
+    stage = stage_with_link()
+    with pytest.raises(RefusedError, match=r"</robot>: has no MagtwinBatteryAPI"):
+        sensors.read_battery(stage.GetPrimAtPath("/robot"))
+
+
+def test_a_sensor_away_from_its_link_is_refused():
+    with pytest.raises(RefusedError, match=r"</robot/mag>: this sensor sits on 'some_link'"):
+        sensors.define_magnetometer(stage_with_link(), "/robot/mag", MagnetometerSpec(link="some_link"))
+
+
+def test_a_drive_without_its_joint_is_refused_with_the_near_name():
+    spec = DriveSpec()
+    stage = stage_with_wheels(spec)
+    with pytest.raises(RefusedError, match=r"no joint 'left_whel_joint'.*did you mean 'left_wheel_joint'"):
+        sensors.define_drive(stage.GetPrimAtPath("/robot"), replace(spec, left_wheel_joint="left_whel_joint"))
+
+
+def test_a_drive_whose_joint_was_removed_is_refused():
+    stage = stage_with_wheels(DriveSpec())
+    prim = sensors.define_drive(stage.GetPrimAtPath("/robot"), DriveSpec())
+    stage.RemovePrim("/robot/joints/left_wheel_joint")
+    with pytest.raises(
+        RefusedError, match="magtwin:drive:leftWheelJoint must point to one prim of the stage"
+    ):
+        sensors.read_drive(prim)
+
+
+def test_a_source_whose_name_cannot_name_a_prim_is_refused():
+    with pytest.raises(RefusedError, match="source 'steel beam' cannot name a prim"):
+        sensors.define_source(
+            stage_with_link(), "/robot", SourceSpec(name="steel beam", p_world=(0, 0, 0), m_world=(0, 0, 1))
+        )
