@@ -430,9 +430,7 @@ def main(arguments: list[str] | None = None) -> None:
             _fail(str(error))
         if isinstance(error, OSError | MemoryError):
             _fail(f"{error} ({type(error).__name__})")
-        _fail(
-            f"a fault of magtwin's own, {type(error).__name__}: {error}; --debug shows where, please report it"
-        )
+        _fail(f"a fault of magtwin's own, {type(error).__name__}: {error}; --debug shows where, do report it")
 
 
 def _fail(text: str) -> None:
