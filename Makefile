@@ -34,7 +34,7 @@ wheel-test: $(VENV)/.dev  ## Build the wheel, install it in an empty environment
 	cd build/wheel && venv/bin/magtwin demo --out demo && venv/bin/magtwin info demo/run.parquet
 
 schema: $(VENV)/.dev  ## Generate the schema library anew from schema.usda
-	$(BIN)/python -m magtwin.usd.schema
+	$(BIN)/python magtwin/usd/schema/generate.py
 
 assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
 	$(BIN)/python robots/turtlebot4/build.py
