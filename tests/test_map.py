@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.interpolate import RegularGridInterpolator
 
-from magtwin.field.map import AnomalyMap
+from magtwin.field.map import AnomalyMap, describe
 from magtwin.names import RefusedError
 
 FOUR = np.radians([0.0, 90.0, 180.0, 270.0])
@@ -257,3 +257,21 @@ def test_a_map_is_checked_at_birth(change, message):
 def test_headings_that_do_not_ascend_are_refused():
     with pytest.raises(RefusedError, match="ascend"):
         field_map(headings=np.radians([90, 0, 180, 270]))
+
+
+def test_the_figures_of_a_known_field_are_its_slope_and_its_heading_wave():
+    x, y = np.meshgrid(np.arange(6) * 0.25, np.arange(5) * 0.25)
+    wave = 300 * np.cos(FOUR) - 400 * np.sin(FOUR) + 70 * np.cos(2 * FOUR)
+    values = 41_000 + 3_000 * x + 4_000 * y + wave[:, None, None]
+    valid = np.ones(values.shape, bool)
+    valid[2, 4, 5] = False
+    values[2, 4, 5] = np.nan
+    field = AnomalyMap(
+        values_nt=values, origin_m=(0.0, 0.0), cell_m=(0.25, 0.25), headings_rad=FOUR, valid=valid
+    )
+    got = {f.name: f.value for f in describe(field).figures}
+    assert got["masked nodes"] == 1
+    for name in ("median gradient", "mean gradient", "greatest gradient"):
+        assert got[name] == pytest.approx(5, abs=1e-3)
+    assert got["heading amplitude"] == pytest.approx(500, abs=0.1)
+    assert got["greatest"] == pytest.approx(np.nanmax(values), abs=0.1)

@@ -1,0 +1,301 @@
+"""A survey on disk: one CSV a heading, as the APRILab's, read into an AnomalyMap."""
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.field.map import AnomalyMap, describe
+from magtwin.files import existing, sha256
+from magtwin.frames import wrap_angle
+from magtwin.names import RefusedError
+from magtwin.report import Figure, Report
+
+Array = NDArray[np.float64]
+
+COLUMNS = ("x", "y", "theta", "scalar_mag")
+SUFFIX = "_map.csv"
+
+LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
+"""Bounds of a survey's mean [nT]; the Earth's field lies in 22,000..67,000 nT, a building bends it."""
+
+NT_PER = {"tesla": 1e9, "gauss": 1e5, "uT": 1e3, "mG": 1e2}
+"""Units that a survey may be in by mistake."""
+
+WIDEST_DEG = 90.0
+"""Headings farther apart than this are taken for an incomplete survey unless the caller names them."""
+
+GRAIN_M = 1e-6
+"""Coordinates closer than this are one."""
+
+
+def import_survey(
+    folder: str | os.PathLike[str],
+    *,
+    name: str | None = None,
+    licence: str = "",
+    headings_deg: tuple[float, ...] | None = None,
+) -> AnomalyMap:
+    """The map of a survey folder: `0_map.csv`, `90_map.csv`, `180_map.csv`, `270_map.csv`.
+
+    Each file begins with the line `# x,y,theta,scalar_mag` and has one row a node, in any order:
+    x and y in world [m], the recorded heading [rad], the total field [nT]. The layer's heading is the
+    nominal one of the file's name; `survey_report` says how far the recorded ones are from it.
+
+    Args:
+        folder: Folder that holds the files. Other files in it are left alone.
+        name: Name of the map; that of the folder unless given.
+        licence: SPDX name of the survey's licence.
+        headings_deg: Headings that the survey has [deg]. Unless given, the files must be evenly
+            spaced on the circle and at most 90 deg apart, so that a lost file is noticed.
+
+    Returns:
+        The map; every node is valid, and nothing is known of its variance.
+
+    Raises:
+        RefusedError: A file or a heading is missing, a row or a value is none, the grid has a hole or
+            a node two values, the headings' grids differ, or the unit is not nT; with file and line.
+    """
+    return _assemble(_read(folder, headings_deg), Path(folder), name, licence)
+
+
+def survey_report(folder: str | os.PathLike[str], *, headings_deg: tuple[float, ...] | None = None) -> Report:
+    """What a survey holds, and how well its headings were kept.
+
+    Args:
+        folder: As in `import_survey`, with the same refusals.
+        headings_deg: As in `import_survey`.
+
+    Returns:
+        The map's figures; the median and the largest deviation of a recorded heading from the nominal
+        one, with the worst row; how many readings repeat the one before in their row to the last
+        digit, which a sensor that lost lock does and a field does not.
+    """
+    layers = _read(folder, headings_deg)
+    field = _assemble(layers, Path(folder), None, "")
+    deviation = [np.degrees(np.abs(wrap_angle(s.theta - np.radians(s.heading_deg)))) for s in layers]
+    worst = max(range(len(layers)), key=lambda k: deviation[k].max())
+    row = int(deviation[worst].argmax())
+    layer = layers[worst]
+    repeated = int(np.count_nonzero(np.diff(field.values_nt, axis=2) == 0))
+    every = np.concatenate(deviation)
+    return Report(
+        f"survey {folder}",
+        (
+            *describe(field).figures,
+            Figure("median heading deviation", round(float(np.median(every)), 3), "deg"),
+            Figure(
+                "largest heading deviation",
+                round(float(every.max()), 3),
+                "deg",
+                note=f"{layer.path.name}:{layer.lines[row]}, at ({layer.x[row]:g}, {layer.y[row]:g}) m",
+            ),
+            Figure(
+                "repeated readings", repeated, note="equal to the one before in the row to the last digit"
+            ),
+        ),
+        {"files": {s.path.name: s.sha256 for s in layers}},
+    )
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """The rows of one file."""
+
+    path: Path
+    heading_deg: float
+    lines: NDArray[np.intp]
+    x: Array
+    y: Array
+    theta: Array
+    field: Array
+    sha256: str
+
+
+def _read(folder: str | os.PathLike[str], headings_deg: tuple[float, ...] | None) -> list[_Layer]:
+    folder = existing(folder, "survey folder")
+    if not folder.is_dir():
+        raise RefusedError(f"{folder}: not a folder; give the one that holds 0{SUFFIX}, 90{SUFFIX}, ...")
+    files: dict[float, Path] = {}
+    for path in sorted(folder.glob(f"*{SUFFIX}")):
+        heading = _heading(path)
+        if heading in files:
+            raise RefusedError(
+                f"{path}: heading {heading:g} has two files, the other is {files[heading].name}"
+            )
+        files[heading] = path
+    _check_headings(folder, sorted(files), headings_deg)
+    return [_read_layer(files[heading], heading) for heading in sorted(files)]
+
+
+def _heading(path: Path) -> float:
+    text = path.name.removesuffix(SUFFIX)
+    try:
+        heading = float(text)
+    except ValueError:
+        heading = math.nan
+    if not 0 <= heading < 360:
+        raise RefusedError(
+            f"{path}: a survey file is named after its heading, 0 to 359 deg, as 90{SUFFIX}; got {text!r}"
+        )
+    return heading
+
+
+def _check_headings(folder: Path, found: list[float], expected: tuple[float, ...] | None) -> None:
+    if not found:
+        others = sorted(p.name for p in folder.iterdir())[:3]
+        seen = f"it holds {', '.join(others)}" if others else "it is empty"
+        raise RefusedError(f"{folder}: no survey file in it, such as 0{SUFFIX}; {seen}")
+    if expected is None:
+        least = min(np.diff([*found, found[0] + 360.0]))
+        count = round(360 / min(least, WIDEST_DEG))
+        expected = tuple(sorted((found[0] + 360 * k / count) % 360 for k in range(count)))
+        if not all(any(math.isclose(h, e, abs_tol=1e-9) for e in expected) for h in found):
+            raise RefusedError(
+                f"{folder}: headings {_say(found)} deg are not evenly spaced; "
+                "survey the missing ones, or name those that there are with headings_deg"
+            )
+    missing = [e for e in expected if not any(math.isclose(h, e, abs_tol=1e-9) for h in found)]
+    if missing:
+        raise RefusedError(
+            f"{folder}: heading {_say(missing)} deg missing, found {_say(found)}; "
+            f"expected {', '.join(f'{h:g}{SUFFIX}' for h in missing)}"
+        )
+    beyond = [h for h in found if not any(math.isclose(h, e, abs_tol=1e-9) for e in expected)]
+    if beyond:
+        raise RefusedError(f"{folder}: heading {_say(beyond)} deg is not among the expected {_say(expected)}")
+
+
+def _say(headings: list[float] | tuple[float, ...]) -> str:
+    return ", ".join(f"{h:g}" for h in headings)
+
+
+def _read_layer(path: Path, heading_deg: float) -> _Layer:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (UnicodeDecodeError, OSError) as error:
+        raise RefusedError(f"{path}: not a text file ({error}); a survey is CSV in UTF-8") from error
+    if not text.strip():
+        raise RefusedError(f"{path}: empty; expected the line '# {','.join(COLUMNS)}' and a row a node")
+    first, *rest = text.splitlines()
+    if tuple(word.strip() for word in first.lstrip("#").split(",")) != COLUMNS:
+        raise RefusedError(f"{path}:1: must be the header '# {','.join(COLUMNS)}', got {first[:60]!r}")
+    lines = [(number, line) for number, line in enumerate(rest, 2) if line.strip()]
+    if not lines:
+        raise RefusedError(f"{path}: no rows below the header; expected one a node")
+    table = np.array([_row(path, number, line) for number, line in lines])
+    x, y, theta, field = table.T
+    layer = _Layer(path, heading_deg, np.array([n for n, _ in lines]), x, y, theta, field, sha256(path))
+    _check_unit(layer)
+    return layer
+
+
+def _row(path: Path, number: int, line: str) -> list[float]:
+    words = line.split(",")
+    if len(words) != len(COLUMNS):
+        raise RefusedError(
+            f"{path}:{number}: {len(COLUMNS)} values expected ({', '.join(COLUMNS)}), got {len(words)}"
+        )
+    values = []
+    for column, word in zip(COLUMNS, words, strict=True):
+        try:
+            value = float(word)
+        except ValueError:
+            raise RefusedError(f"{path}:{number}: {column} must be a number, got {word.strip()!r}") from None
+        if not math.isfinite(value):
+            raise RefusedError(
+                f"{path}:{number}: {column} is {value}; every node needs a finite value, measure it again"
+            )
+        values.append(value)
+    if values[3] <= 0:
+        raise RefusedError(f"{path}:{number}: scalar_mag is a magnitude, above 0 nT, got {values[3]:g}")
+    return values
+
+
+def _check_unit(layer: _Layer) -> None:
+    mean = float(layer.field.mean())
+    if LEAST_MEAN_NT <= mean <= GREATEST_MEAN_NT:
+        return
+    fits = [
+        f"were it {unit}, it would be {mean * factor:,.0f} nT, so multiply by {factor:g}"
+        for unit, factor in NT_PER.items()
+        if LEAST_MEAN_NT <= mean * factor <= GREATEST_MEAN_NT
+    ]
+    raise RefusedError(
+        f"{layer.path}: the mean of scalar_mag is {mean:.6g}, outside {LEAST_MEAN_NT:,.0f}.."
+        f"{GREATEST_MEAN_NT:,.0f} nT; " + (" or ".join(fits) or "no usual unit makes it the Earth's field")
+    )
+
+
+def _assemble(layers: list[_Layer], folder: Path, name: str | None, licence: str) -> AnomalyMap:
+    axes = [(_axis(s, "x", s.x), _axis(s, "y", s.y)) for s in layers]
+    for layer, own in zip(layers, axes, strict=True):
+        for label, first, axis in zip("xy", axes[0], own, strict=True):
+            if len(first) != len(axis) or np.abs(first - axis).max() > GRAIN_M:
+                raise RefusedError(
+                    f"{layer.path}: its grid differs from {layers[0].path.name}'s: {label} has "
+                    f"{_span(axis)}, there {_span(first)}; survey every heading on one grid"
+                )
+    x, y = axes[0]
+    return AnomalyMap(
+        values_nt=np.stack([_grid(s, x, y) for s in layers]),
+        origin_m=(float(x[0]), float(y[0])),
+        cell_m=(float((x[-1] - x[0]) / (len(x) - 1)), float((y[-1] - y[0]) / (len(y) - 1))),
+        headings_rad=np.radians([s.heading_deg for s in layers]),
+        name=folder.resolve().name if name is None else name,
+        method="survey, one reading a node and heading, the robot at rest",
+        source="; ".join(f"{s.path.name} sha256:{s.sha256}" for s in layers),
+        licence=licence,
+    )
+
+
+def _axis(layer: _Layer, label: str, values: Array) -> Array:
+    """The grid's coordinates along x or y, ascending and evenly spaced."""
+    axis = np.sort(values)
+    axis = axis[np.append(True, np.diff(axis) > GRAIN_M)]
+    if len(axis) < 2:
+        raise RefusedError(
+            f"{layer.path}: all rows have {label} = {axis[0]:g}; a map needs two rows at least"
+        )
+    steps = np.diff(axis)
+    usual = float(np.median(steps))
+    odd = np.flatnonzero(np.abs(steps - usual) > 2 * GRAIN_M)
+    if len(odd):
+        k = odd[0]
+        raise RefusedError(
+            f"{layer.path}: {label} steps by {usual:g} m, but from {axis[k]:g} to {axis[k + 1]:g}; "
+            "a line of nodes is missing, or one lies off the grid"
+        )
+    return axis
+
+
+def _span(axis: Array) -> str:
+    return f"{axis[0]:g}..{axis[-1]:g} m in {len(axis)} nodes"
+
+
+def _grid(layer: _Layer, x: Array, y: Array) -> Array:
+    """The layer's field [nT] on the grid, shape (Y, X)."""
+    i = np.rint((layer.x - x[0]) / (x[1] - x[0])).astype(int)
+    j = np.rint((layer.y - y[0]) / (y[1] - y[0])).astype(int)
+    node = j * len(x) + i
+    order = np.argsort(node, kind="stable")
+    twice = np.flatnonzero(np.diff(node[order]) == 0)
+    if len(twice):
+        former, latter = order[twice[0]], order[twice[0] + 1]
+        raise RefusedError(
+            f"{layer.path}:{layer.lines[latter]}: node ({layer.x[latter]:g}, {layer.y[latter]:g}) has a "
+            f"value already, on line {layer.lines[former]}; keep one of the two"
+        )
+    if len(node) < len(x) * len(y):
+        hole = np.setdiff1d(np.arange(len(x) * len(y)), node)
+        first_j, first_i = divmod(int(hole[0]), len(x))
+        raise RefusedError(
+            f"{layer.path}: {len(hole)} of {len(x) * len(y)} nodes have no row, the first at "
+            f"({x[first_i]:g}, {y[first_j]:g}); the grid must be whole"
+        )
+    grid = np.empty(len(node))
+    grid[node] = layer.field
+    return grid.reshape(len(y), len(x))
