@@ -1,0 +1,502 @@
+"""Recording: a Run as a Rerun file with a ready layout, the lab and the robot in 3D beside its series."""
+
+import hashlib
+import json
+import os
+import re
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from magtwin.field.map import AnomalyMap
+from magtwin.files import existing, output
+from magtwin.frames import quat_multiply, rotate, wrap_angle
+from magtwin.io.tables import read_parquet
+from magtwin.io.viewer import show
+from magtwin.names import RefusedError, find
+from magtwin.path import Path
+from magtwin.run import Run
+from magtwin.spec import MountSpec, Scene
+from magtwin.usd.geometry import BASE_LINK, Link, Shape, open_stage, read_links, read_shapes, srgb_from_linear
+
+Array = NDArray[np.float64]
+
+APPLICATION = "magtwin"
+TIMELINE = "sim_time"
+BLOCK = 8192
+"""Rows sent in one chunk: few enough for the viewer to skip what it does not show."""
+
+POSE_HZ = 50.0
+"""Poses a second, at most: above this no eye sees a difference."""
+
+DOT_HZ = 10.0
+"""Readings a second that are drawn along the path."""
+
+ARROW_M_PER_NT = 8e-6
+"""Length of the field's arrow: 40 cm for 50 uT."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """A line of a plot: one part of a column."""
+
+    column: str
+    name: str
+    colour: tuple[int, int, int]
+    part: int = 0
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A plot: series of one unit, in one entity of the recording."""
+
+    entity: str
+    title: str
+    series: tuple[Series, ...]
+
+
+_BLUE, _ORANGE, _GREEN, _GREY = (86, 156, 255), (255, 158, 64), (92, 200, 120), (165, 165, 165)
+
+PANELS = (
+    Panel(
+        "series/field",
+        "Total field [nT]",
+        (
+            Series("b_measured_nt", "measured", _GREEN),
+            Series("b_total_nt", "total = map + disturbance", _ORANGE),
+            Series("b_map_nt", "map", _BLUE),
+            Series("b_truth_nt", "truth", _GREY),
+        ),
+    ),
+    Panel("series/disturbance", "Disturbance [nT]", (Series("b_disturbance_nt", "disturbance", _ORANGE),)),
+    Panel(
+        "series/speed",
+        "Speed [m/s]",
+        (
+            Series("odom_v", "odometry", _GREY, 0),
+            Series("v_base", "true", _BLUE, 0),
+            Series("v_cmd", "commanded", _ORANGE),
+        ),
+    ),
+    Panel(
+        "series/yaw_rate",
+        "Yaw rate [rad/s]",
+        (
+            Series("imu_w", "gyroscope", _GREY, 2),
+            Series("w_base", "true", _BLUE, 2),
+            Series("w_cmd", "commanded", _ORANGE),
+        ),
+    ),
+    Panel("series/battery_voltage", "Battery voltage [V]", (Series("battery_v", "voltage", _GREEN),)),
+    Panel("series/battery_charge", "Battery charge [0..1]", (Series("battery_fraction", "charge", _GREEN),)),
+)
+"""Every plot of the recording; series that a run has not got, or that are nan throughout, are left out."""
+
+FLAGS = {
+    "lidar_on": "LiDAR on",
+    "flag_bump": "bump",
+    "flag_outside_map": "outside map",
+    "flag_out_of_distribution": "out of distribution",
+    "flag_lost_lock": "lost lock",
+}
+"""Lanes of states: column and label."""
+
+
+def write_rrd(
+    run: Run,
+    path: str | os.PathLike[str],
+    *,
+    scene: Scene,
+    scene_file: FilePath,
+    field: AnomalyMap,
+    planned: Path,
+    force: bool = False,
+) -> None:
+    """Write a run as a Rerun recording that opens in a ready layout.
+
+    Series are at full rate, poses at `POSE_HZ` or less, on the timeline `sim_time`. The recording's id
+    comes from the run's content, so two files of one run hold the same recording; only what Rerun stamps
+    itself varies between them (ids of chunks, rows and views), which `rerun rrd compare --unordered`
+    does not look at.
+
+    Args:
+        run: What happened.
+        path: The .rrd file to make.
+        scene: What it happened in.
+        scene_file: The composed stage of the scene, whose shapes are shown.
+        field: The map that was driven over, drawn on the floor.
+        planned: The path that was to be driven.
+        force: Whether a file that exists is replaced.
+
+    Raises:
+        RefusedError: The file exists and `force` was not given, the stage cannot be read, or the run
+            has no rows.
+    """
+    with _recording(run, path, layout=_layout(run, scene), force=force) as rec:
+        stage = open_stage(scene_file)
+        scale = _Scale.over(field, run)
+        _log_map(rec, field, scale, yaw=float(run["yaw"][0]))
+        _log_scale(rec, field, scale)
+        _log_bodies(rec, run, scene, read_shapes(stage), read_links(stage))
+        _log_paths(rec, run, scene, scale, planned)
+        _log_series(rec, run)
+
+
+def view(path: str | os.PathLike[str]) -> None:
+    """Show a recording in the Rerun viewer, and return when it is closed.
+
+    Args:
+        path: A .rrd file, or the Parquet file of a run, whose series are then shown.
+
+    Raises:
+        RefusedError: The file is missing, is of another kind, or the viewer cannot run here.
+    """
+    path = existing(path, "recording")
+    if path.suffix == ".rrd":
+        show(path)
+        return
+    find("kind of recording", path.suffix, {".rrd": None, ".parquet": None})
+    run = read_parquet(path)
+    with tempfile.TemporaryDirectory() as folder:
+        rrd = FilePath(folder) / f"{path.stem}.rrd"
+        with _recording(run, rrd, layout=_layout(run, None)) as rec:
+            _log_series(rec, run)
+        show(rrd)
+
+
+@contextmanager
+def _recording(
+    run: Run, path: str | os.PathLike[str], *, layout: rrb.Blueprint, force: bool = False
+) -> Iterator[rr.RecordingStream]:
+    """A stream into a file beside `path`, with the facts of the run in it; whole at the end, or not there."""
+    if not run.rows:
+        raise RefusedError(f"{path}: the run has no rows, there is nothing to record")
+    strict = rr.strict_mode()
+    with output(path, force=force) as aside:
+        rec = rr.RecordingStream(APPLICATION, recording_id=_content_id(run), send_properties=False)
+        if not rr.is_enabled(rec):
+            raise RefusedError(f"{path}: Rerun is switched off by the environment variable RERUN; unset it")
+        rr.set_strict_mode(True)
+        try:
+            rec.save(aside, default_blueprint=layout)
+            rec.send_recording_name(str(run.facts.get("path", FilePath(path).stem)))
+            if run.facts:
+                rec.send_property("run", rr.AnyValues(**{key: [value] for key, value in run.facts.items()}))
+            rec.log("facts", rr.TextDocument(_facts(run), media_type=rr.MediaType.MARKDOWN), static=True)
+            yield rec
+        finally:
+            rr.set_strict_mode(strict)
+            rec.flush()
+            rec.disconnect()
+
+
+def _content_id(run: Run) -> str:
+    """An id that the same run always gets, and no other."""
+    digest = hashlib.sha256(json.dumps(dict(run.facts), sort_keys=True).encode())
+    for name, values in run.items():
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(values))
+    return digest.hexdigest()[:32]
+
+
+def _facts(run: Run) -> str:
+    """The facts of a run as a Markdown table."""
+    rate = (run.rows - 1) / run.duration_s if run.duration_s else 0.0
+    said = {
+        "readings": f"{run.rows:,}",
+        "duration": f"{run.duration_s:.1f} s",
+        "rate": f"{rate:.1f} Hz",
+        **run.facts,
+    }
+    rows = [f"| {key.replace('_', ' ')} | {value} |" for key, value in said.items()]
+    return "\n".join(["| run | |", "|---|---|", *rows])
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """The colours of field magnitudes: viridis between two values."""
+
+    low_nt: float
+    high_nt: float
+    table: NDArray[np.uint8]
+    """Red, green, blue, opacity in sRGB, shape (256, 4)."""
+
+    @classmethod
+    def over(cls, field: AnomalyMap, run: Run) -> "_Scale":
+        """The scale that map and readings share: whole uT, the outermost 1 % of either left to saturate."""
+        from matplotlib import colormaps
+
+        table = (colormaps["viridis"](np.arange(256)) * 255).round().astype(np.uint8)
+        readings = run["b_total_nt"][np.isfinite(run["b_total_nt"])]
+        ends = [np.percentile(v, [1, 99]) for v in (field.values_nt[field.valid], readings) if v.size]
+        low, high = np.min(ends), np.max(ends)
+        low, high = np.floor(low / 1000) * 1000, np.ceil(high / 1000) * 1000
+        return cls(float(low), float(max(high, low + 1000)), table)
+
+    def colours(self, b_nt: Array) -> NDArray[np.uint8]:
+        """Colours of field magnitudes [nT], shape (...) -> (..., 4); see-through where nan."""
+        share = (np.clip(b_nt, self.low_nt, self.high_nt) - self.low_nt) / (self.high_nt - self.low_nt)
+        known = np.isfinite(share)
+        out = self.table[np.where(known, share * 255, 0).round().astype(np.uint8)]
+        out[~known] = 0
+        return out
+
+
+def _log_map(rec: rr.RecordingStream, field: AnomalyMap, scale: _Scale, *, yaw: float) -> None:
+    """The floor in the colours of the map's layer nearest to a heading, linear between nodes."""
+    x0, x1, y0, y1 = field.extent
+    cell = max(0.02, (x1 - x0) / 1024, (y1 - y0) / 1024)
+    width, height = (max(1, round((b - a) / cell)) for a, b in ((x0, x1), (y0, y1)))
+    x = x0 + (np.arange(width) + 0.5) * (x1 - x0) / width
+    y = y1 - (np.arange(height) + 0.5) * (y1 - y0) / height  # images begin at the top
+    grid = np.stack(np.meshgrid(x, y), axis=-1)
+    pixels = scale.colours(field.lookup(grid, _nearest_heading(field, yaw)))
+    _log_image(rec, "world/map", pixels, cell, (x0, y0, 0.004))
+
+
+def _nearest_heading(field: AnomalyMap, yaw: float) -> float:
+    away = np.abs(wrap_angle(field.headings_rad - yaw))
+    return float(field.headings_rad[np.argmin(away)])
+
+
+def _log_scale(rec: rr.RecordingStream, field: AnomalyMap, scale: _Scale) -> None:
+    """A colour bar with its values, lying on the ground in front of the map."""
+    x0, x1, y0, _ = field.extent
+    length, breadth = 0.6 * (x1 - x0), 0.03 * (x1 - x0)
+    cell = length / 256
+    corner = ((x0 + x1 - length) / 2, y0 - 0.55 - breadth, 0.004)
+    bar = np.broadcast_to(scale.table, (max(1, round(breadth / cell)), 256, 4))
+    _log_image(rec, "world/scale", bar, cell, corner)
+    share = np.linspace(0, 1, 5)
+    at = np.column_stack([corner[0] + share * length, np.full(5, corner[1] - 0.08), np.zeros(5)])
+    value_ut = (scale.low_nt + share * (scale.high_nt - scale.low_nt)) / 1000
+    rec.log(
+        "world/scale/values",
+        rr.Points3D(
+            at,
+            labels=[f"{v:g} µT" for v in value_ut],
+            radii=0.0,
+            colors=(255, 255, 255),
+            show_labels=True,
+        ),
+        static=True,
+    )
+
+
+def _log_image(
+    rec: rr.RecordingStream,
+    entity: str,
+    rgba: NDArray[np.uint8],
+    cell: float,
+    corner: tuple[float, float, float],
+) -> None:
+    """An image lying level, its lower left corner at `corner` in world [m], `cell` [m] a pixel."""
+    height, width = rgba.shape[:2]
+    rec.log(
+        entity,
+        rr.GridMap(
+            data=np.ascontiguousarray(rgba).tobytes(),
+            format=rr.components.ImageFormat(
+                width=width, height=height, color_model="RGBA", channel_datatype="U8"
+            ),
+            cell_size=cell,
+            translation=corner,
+        ),
+        static=True,
+    )
+
+
+def _log_bodies(
+    rec: rr.RecordingStream, run: Run, scene: Scene, shapes: Sequence[Shape], links: dict[str, Link]
+) -> None:
+    """What stands still, and the robot: one entity a link, the base posed by the run, its wheels turning."""
+    rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for shape in shapes:
+        if not shape.link:
+            rec.log(f"world/lab{_entity(shape.prim)}", _mesh([shape]), static=True)
+    rows = _thinned(run, POSE_HZ)
+    _send(
+        rec,
+        "world/robot",
+        run["t"][rows],
+        rr.Transform3D,
+        translation=run["p_world_base"][rows].astype(np.float32),
+        quaternion=run["q_world_base_xyzw"][rows].astype(np.float32),
+    )
+    drive = scene.robot.drive
+    wheels = {drive.left_wheel_joint: 0, drive.right_wheel_joint: 1}
+    base = BASE_LINK if BASE_LINK in links else next((n for n, link in links.items() if not link.joint), "")
+    for name, link in links.items():
+        carried = [shape for shape in shapes if shape.link == name]
+        if not (carried or link.joint in wheels):
+            continue
+        if not link.joint and name != base:  # a body of its own that nothing moves
+            entity, p, q = f"world/lab/{_entity(name)}", link.p_world_link, link.q_world_link_xyzw
+        else:
+            entity, p, q = f"world/robot/{_entity(name)}", link.p_base_link, link.q_base_link_xyzw
+        if carried:
+            rec.log(entity, _mesh(carried), static=True)
+        if link.joint in wheels and link.axis_link is not None:
+            half = run["wheel_angle"][rows, wheels[link.joint]][:, None] / 2
+            turn = np.hstack([np.sin(half) * link.axis_link, np.cos(half)])
+            turned = quat_multiply(q, turn).astype(np.float32)
+            at = np.broadcast_to(np.asarray(p, np.float32), (len(turned), 3))
+            _send(rec, entity, run["t"][rows], rr.Transform3D, translation=at, quaternion=turned)
+        else:
+            rec.log(entity, rr.Transform3D(translation=p, quaternion=q), static=True)
+    if np.isfinite(run["b_vector_nt"]).any():
+        _log_vector(rec, run, scene.robot.magnetometer, rows)
+
+
+def _log_vector(rec: rr.RecordingStream, run: Run, mount: MountSpec, rows: NDArray[np.intp]) -> None:
+    """The field vector at the magnetometer, in its axes, where it is known."""
+    entity = f"world/robot/{_entity(mount.link)}/magnetometer"
+    rec.log(
+        entity,
+        rr.Transform3D(translation=mount.p_link_sensor, quaternion=mount.q_link_sensor_xyzw),
+        static=True,
+    )
+    rows = rows[np.isfinite(run["b_vector_nt"][rows]).all(axis=1)]
+    arrows = (run["b_vector_nt"][rows] * ARROW_M_PER_NT).astype(np.float32)
+    rec.log(f"{entity}/field", rr.Arrows3D.from_fields(colors=[(255, 255, 255)], radii=[0.006]), static=True)
+    _send(rec, f"{entity}/field", run["t"][rows], rr.Arrows3D, vectors=arrows)
+
+
+def _log_paths(rec: rr.RecordingStream, run: Run, scene: Scene, scale: _Scale, planned: Path) -> None:
+    """The path planned and the path driven on the floor, the readings above it where they were taken."""
+    plan = np.column_stack([planned.p_xy, np.full(len(planned.p_xy), 0.012)])
+    rec.log("world/planned", rr.LineStrips3D([plan], colors=(255, 255, 255), radii=0.008), static=True)
+    rows = _thinned(run, DOT_HZ)
+    base, q = run["p_world_base"][rows], run["q_world_base_xyzw"][rows]
+    driven = base + np.array([0, 0, 0.016])
+    rec.log("world/driven", rr.LineStrips3D([driven], colors=(230, 60, 60), radii=0.006), static=True)
+    sensor = (base + rotate(q, scene.robot.p_base_magnetometer)).astype(np.float32)
+    rec.log("world/readings", rr.Points3D.from_fields(radii=[0.014]), static=True)
+    colours = scale.colours(run["b_total_nt"][rows])
+    packed = colours.astype(np.uint32) @ np.array([1 << 24, 1 << 16, 1 << 8, 1], np.uint32)
+    _send(rec, "world/readings", run["t"][rows], rr.Points3D, positions=sensor, colors=packed)
+
+
+def _log_series(rec: rr.RecordingStream, run: Run) -> None:
+    """Every plot's series at full rate, and the flags where they change."""
+    for panel in PANELS:
+        series = _known(run, panel)
+        if not series:
+            continue
+        names, colours = [s.name for s in series], [s.colour for s in series]
+        rec.log(
+            panel.entity, rr.SeriesLines(names=names, colors=colours, widths=[1.5] * len(series)), static=True
+        )
+        values = np.column_stack([run[s.column].reshape(run.rows, -1)[:, s.part] for s in series])
+        _send(rec, panel.entity, run["t"], rr.Scalars, scalars=values)
+    for column, label in FLAGS.items():
+        if column not in run.columns:
+            continue
+        flag = run[column]
+        rows = np.flatnonzero(np.append(True, flag[1:] != flag[:-1]))
+        states = rr.StateConfiguration(
+            values=["yes", "no"], labels=[label, f"not {label}"], colors=[(255, 158, 64), (70, 70, 76)]
+        )
+        rec.log(f"flags/{column}", states, static=True)
+        words = np.where(flag[rows], "yes", "no").tolist()
+        _send(rec, f"flags/{column}", run["t"][rows], rr.StateChange, state=words)
+
+
+def _known(run: Run, panel: Panel) -> list[Series]:
+    """The series of a panel that the run has."""
+    return [s for s in panel.series if s.column in run.columns and np.isfinite(run[s.column]).any()]
+
+
+def _send(rec: rr.RecordingStream, entity: str, t: Array, archetype: Any, **values: Any) -> None:
+    """Columns of an archetype at times t [s], in blocks."""
+    times = np.rint(t * 1e9).astype("timedelta64[ns]")
+    for start in range(0, len(t), BLOCK):
+        part = slice(start, start + BLOCK)
+        columns = archetype.columns(**{key: array[part] for key, array in values.items()})
+        rec.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=times[part])], columns)
+
+
+def _thinned(run: Run, rate_hz: float) -> NDArray[np.intp]:
+    """Rows at about `rate_hz`, evenly spaced, the last one always among them."""
+    stride = max(1, round((run.rows - 1) / (run.duration_s * rate_hz))) if run.duration_s else 1
+    return np.unique(np.append(np.arange(0, run.rows, stride), run.rows - 1))
+
+
+def _mesh(shapes: Sequence[Shape]) -> rr.Mesh3D:
+    """Shapes as one mesh, flat triangles in the colours of their materials."""
+    corners = np.concatenate([shape.vertices[shape.faces] for shape in shapes])
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    colours = np.concatenate([_colours(shape) for shape in shapes])
+    return rr.Mesh3D(
+        vertex_positions=corners.reshape(-1, 3),
+        vertex_normals=np.repeat(normals, 3, axis=0),
+        vertex_colors=colours,
+    )
+
+
+def _colours(shape: Shape) -> NDArray[np.uint8]:
+    """Colour (sRGB) and opacity of each corner of a shape's triangles, shape (3 F, 4)."""
+    rgba = np.empty((3 * len(shape.faces), 4))
+    own = shape.colour[:3] if shape.vertex_colours is None else shape.vertex_colours[shape.faces.ravel()]
+    rgba[:, :3], rgba[:, 3] = srgb_from_linear(own), shape.colour[3]
+    return (rgba * 255).round().astype(np.uint8)
+
+
+def _entity(name: str) -> str:
+    """A prim's name or path as an entity path: only letters, digits, _ and - need no escape there."""
+    return re.sub(r"[^\w/-]", "_", name)
+
+
+def _layout(run: Run, scene: Scene | None) -> rrb.Blueprint:
+    """The views, the 3D one of a scene first, on the timeline of the run."""
+    plots: list[Any] = [
+        rrb.TimeSeriesView(origin=panel.entity, name=panel.title, plot_legend=rrb.Corner2D.RightTop)
+        for panel in PANELS
+        if _known(run, panel)
+    ]
+    shares = [3.0, 2.0] + [1.4] * (len(plots) - 2)
+    states = rrb.StateTimelineView(origin="flags", name="States")
+    facts = rrb.TextDocumentView(origin="facts", name="Run")
+    side: Any = rrb.Vertical(*plots, row_shares=shares[: len(plots)])
+    below: Any = rrb.Horizontal(states, facts, column_shares=[1.0, 1.0])
+    root: Any = rrb.Horizontal(side, rrb.Vertical(states, facts), column_shares=[3, 1])
+    if scene is not None:
+        left = rrb.Vertical(_lab_view(scene), below, row_shares=[3.0, 1.0])
+        root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
+    time = rrb.TimePanel(state="collapsed", timeline=TIMELINE)
+    return rrb.Blueprint(
+        root, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"), time
+    )
+
+
+def _lab_view(scene: Scene) -> rrb.Spatial3DView:
+    """The lab seen whole, from the south and above; readings appear as time goes on."""
+    x, y = scene.lab.floor_m
+    away = max(x, 1.6 * y)
+    so_far = rrb.VisibleTimeRange(
+        TIMELINE,
+        start=rrb.TimeRangeBoundary.infinite(),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+    return rrb.Spatial3DView(
+        origin="world",
+        name="Lab",
+        background=(24, 26, 31),
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(
+            position=(-0.12 * away, -0.72 * away, 0.72 * away),
+            look_target=(0, -0.05 * away, 0),
+            eye_up=(0, 0, 1),
+        ),
+        overrides={"world/readings": rrb.VisibleTimeRanges(so_far)},
+    )

@@ -1,0 +1,150 @@
+"""Viewer: the Rerun viewer that comes with its wheel, on a window or, for pictures, on none.
+
+It is started here rather than through `rerun.spawn`, which listens on every network interface.
+"""
+
+import os
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import rerun_cli
+from rerun.experimental import ViewerClient
+
+from magtwin.files import existing, output
+from magtwin.names import RefusedError
+
+LOCALHOST = "127.0.0.1"
+TIMELINE = "sim_time"
+START_S = 60.0
+"""How long the viewer may take to start on a busy machine without a graphics card [s]."""
+
+
+def show(rrd: str | os.PathLike[str]) -> None:
+    """Show a recording in a window; returns when it is closed.
+
+    Raises:
+        RefusedError: The file is missing, or the viewer cannot run here.
+    """
+    rrd = existing(rrd, "recording")
+    command = [_binary(), "--bind", LOCALHOST, "--port", "auto", str(rrd)]
+    result = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
+    if result.returncode:
+        raise RefusedError(
+            f"{rrd}: the Rerun viewer ended at once: {_reason(result.stderr)}; it needs a display"
+        )
+
+
+def screenshot(
+    rrd: str | os.PathLike[str],
+    png: str | os.PathLike[str],
+    *,
+    time_s: float | None = None,
+    size: tuple[int, int] = (1600, 1000),
+    force: bool = False,
+) -> list[str]:
+    """Draw a recording as the viewer shows it, on a machine with or without a display.
+
+    Args:
+        rrd: The recording.
+        png: The picture to make.
+        time_s: Where on the timeline `sim_time` [s]; none for where the viewer starts.
+        size: Width and height of the picture [pixels].
+        force: Whether a picture that exists is replaced.
+
+    Returns:
+        What views report to be amiss, a line each; empty when all is well.
+
+    Raises:
+        RefusedError: The recording is missing or the picture exists, or the machine has no Vulkan.
+    """
+    rrd = existing(rrd, "recording").resolve()
+    with output(png, force=force) as aside, headless_viewer(size) as client:
+        client.open(str(rrd))
+        _wait_until(lambda: _loaded(client), f"{rrd}: the viewer did not load it")
+        if time_s is not None:
+            client.set_time(TIMELINE, duration=time_s, play_state="paused")
+        client.save_screenshot(str(aside))  # the first one lays the views out
+        aside.unlink()
+        time.sleep(0.5)
+        client.save_screenshot(str(aside))
+        views = client.get_state().views
+    return [f"{v.name}: {r.severity}: {r.summary} {r.details or ''}" for v in views for r in v.reports]
+
+
+@contextmanager
+def headless_viewer(size: tuple[int, int] = (1600, 1000)) -> Iterator[ViewerClient]:
+    """A viewer without a window that listens on this machine only; ended with the block.
+
+    Raises:
+        RefusedError: It cannot run here; the text says what it said.
+    """
+    port = _free_port()
+    command = [_binary(), "--headless", "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen"]
+    command += ["--window-size", f"{size[0]}x{size[1]}"]
+    with tempfile.TemporaryFile("w+") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+        try:
+
+            def listening() -> bool:
+                if process.poll() is not None:
+                    log.seek(0)
+                    raise RefusedError(
+                        f"the Rerun viewer cannot draw here: {_reason(log.read())}; without a graphics card "
+                        "it needs Vulkan in software: apt install mesa-vulkan-drivers libvulkan1"
+                    )
+                with socket.socket() as probe:
+                    return probe.connect_ex((LOCALHOST, port)) == 0
+
+            _wait_until(listening, "the Rerun viewer did not start")
+            yield ViewerClient.connect(f"rerun+http://{LOCALHOST}:{port}/proxy")
+        finally:
+            _end(process)
+
+
+def _binary() -> str:
+    """The viewer's program, as its own launcher finds it."""
+    name = "rerun.exe" if os.name == "nt" else "rerun"
+    return str(existing(Path(rerun_cli.__file__).with_name(name), "Rerun viewer; install rerun-sdk again"))
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOCALHOST, 0))
+        return int(probe.getsockname()[1])
+
+
+def _loaded(client: ViewerClient) -> bool:
+    state = client.get_state()
+    return not state.loading and any(recording.timelines for recording in state.recordings)
+
+
+def _wait_until(done, refusal: str) -> None:  # type: ignore[no-untyped-def]
+    """Ask again and again; refuse after `START_S`."""
+    end = time.monotonic() + START_S
+    while not done():
+        if time.monotonic() > end:
+            raise RefusedError(f"{refusal} within {START_S:g} s")
+        time.sleep(0.1)
+
+
+def _reason(log: str) -> str:
+    """The line of a log that says most: the last that is not empty."""
+    lines = [line.strip() for line in log.splitlines() if line.strip()]
+    return lines[-1] if lines else "it gave no reason"
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    """End a process and what it started."""
+    for sign in (signal.SIGTERM, signal.SIGKILL):
+        if process.poll() is None:
+            os.killpg(process.pid, sign)
+            try:
+                process.wait(5)
+            except subprocess.TimeoutExpired:
+                continue
