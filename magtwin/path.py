@@ -303,7 +303,9 @@ def read_path_csv(file: str | os.PathLike[str]) -> Path:
             point = float(cells[0]), float(cells[1])
         except ValueError:
             if points or header_seen:
-                raise RefusedError(f"{file}:{number}: not a number in {line!r}; x,y in metres are wanted") from None
+                raise RefusedError(
+                    f"{file}:{number}: not a number in {line!r}; x,y in metres are wanted"
+                ) from None
             header_seen = True
             continue
         if not (math.isfinite(point[0]) and math.isfinite(point[1])):

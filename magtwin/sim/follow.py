@@ -6,6 +6,7 @@ scalars: a control step looks at the pose, and is a few microseconds of plain Py
 """
 
 import bisect
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -24,6 +25,9 @@ CONTROL_RATE_HZ = 50.0
 
 _NODE_M = 0.005
 """Spacing of a piece's nodes [m]."""
+
+_COINCIDENT_M = 1e-5
+"""Smoothed nodes of a zigzag that come nearer than this are one [m]."""
 
 _SMOOTH_M = 0.06
 """Half the base of the triangular window that smooths a piece [m]; a corner of 45 deg loses 8 mm."""
@@ -115,7 +119,7 @@ def plan(path: Path, drive: DriveSpec, *, speed: float) -> list[Piece]:
             f"speed must be above 0 and at most {drive.v_max:g} m/s, the drive's v_max; got {speed!r}"
         )
     stops = np.concatenate([[0.0], corners(path), [path.length]])
-    return [_piece(path, a, b, drive, speed) for a, b in zip(stops[:-1], stops[1:], strict=True)]
+    return [_piece(path, a, b, drive, speed) for a, b in itertools.pairwise(stops)]
 
 
 def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: float) -> Piece:
@@ -128,6 +132,9 @@ def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: f
     window = 1.0 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1)
     longer = np.vstack([before, p, after])
     x, y = (np.convolve(axis, window / window.sum(), mode="valid") for axis in longer.T)
+    apart = np.hypot(np.diff(x, prepend=np.inf), np.diff(y, prepend=np.inf)) > _COINCIDENT_M
+    apart[-1] = True
+    x, y = x[apart], y[apart]
 
     dx, dy = np.gradient(x), np.gradient(y)
     ds = np.maximum(np.hypot(dx, dy), 1e-9)
@@ -140,7 +147,9 @@ def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: f
         )
     v2 = np.clip(v, min(_SLOWEST, speed), speed) ** 2
     v2[[0, -1]] = 0.0
-    gain = 2 * _LIMIT_SHARE * drive.a_max * np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    gain = (
+        2 * _LIMIT_SHARE * drive.a_max * np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    )
     v2 = np.minimum.accumulate(v2 - gain) + gain
     v2 = (np.minimum.accumulate((v2 + gain)[::-1]))[::-1] - gain
     v2 = np.maximum(v2, 0.0)
@@ -210,24 +219,25 @@ class Follower:
             return self._limit(0.0, 0.0, v, w)
         offset = (dx * ey - dy * ex) / math.sqrt(length2)
         # The plan is read where this step will end.
-        ahead = i + max(along, 0.0) + v * self._dt / spacing
+        ahead = i + (along if along > 0.0 else 0.0) + v * self._dt / spacing
         j = int(ahead)
+        part = ahead - j
         if j > last:
-            j, part = last, min(ahead - last, 1.0)
-        else:
-            part = ahead - j
+            j, part = last, 1.0
         speed2 = piece.speed2
         planned = math.sqrt(speed2[j] + part * (speed2[j + 1] - speed2[j]))
         heading = headings[j] + part * (headings[j + 1] - headings[j])
         curvature = piece.curvature[j] + part * (piece.curvature[j + 1] - piece.curvature[j])
         error = heading - math.atan(offset / _SETTLE_M) - (yaw + w * self._dt)
-        error = (error + math.pi) % (2 * math.pi) - math.pi
+        if not -math.pi <= error < math.pi:
+            error = (error + math.pi) % (2 * math.pi) - math.pi
         if planned < self._creep:
             planned = self._creep
         off = abs(error)
         if off > _ALIGN[0]:
-            planned *= max(0.0, (_ALIGN[1] - off) / (_ALIGN[1] - _ALIGN[0]))
-        planned = min(planned, left_m / self._dt)
+            planned *= (_ALIGN[1] - off) / (_ALIGN[1] - _ALIGN[0]) if off < _ALIGN[1] else 0.0
+        if planned * self._dt > left_m:
+            planned = left_m / self._dt
         turn = self._gain * (v if v > self._v_turn else self._v_turn) * error
         return self._limit(planned, v * curvature + turn, v, w)
 

@@ -1,0 +1,199 @@
+"""simulate: a scene and a path go in, a Run with every column comes out."""
+
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.field.map import AnomalyMap
+from magtwin.frames import matrix_from_quat, quat_from_yaw, wrap_angle
+from magtwin.names import RefusedError
+from magtwin.path import Path, check_on_floor
+from magtwin.run import COLUMNS, Run
+from magtwin.sim.drive import Moment, wheel_rates
+from magtwin.sim.follow import follow
+from magtwin.sim.interference import ambient_field_nt, excess_current_a, platform_field_nt
+from magtwin.sim.sensors import (
+    charge,
+    lidar_on,
+    open_voltage,
+    sense_battery,
+    sense_imu,
+    sense_magnetometer,
+    sense_odometry,
+)
+from magtwin.spec import Scene
+
+Array = NDArray[np.float64]
+
+_STREAMS = ("odometry", "imu", "battery", "magnetometer")
+"""Who draws random numbers, each from a child generator of its own; append only: the order is the seed."""
+
+
+def simulate(
+    scene: Scene,
+    path: Path,
+    *,
+    anomaly_map: AnomalyMap,
+    rng: np.random.Generator,
+    speed: float = 0.2,
+    duration_s: float | None = None,
+    rate_hz: float | None = None,
+    disturbance_nt: Callable[[Run], NDArray[Any]] | None = None,
+    outside: Literal["nan", "clamp", "raise"] = "nan",
+    lidar: Literal["schedule", "on", "off"] = "schedule",
+) -> Run:
+    """Drive a scene's robot along a path and read its sensors.
+
+    b_total = b_map + b_disturbance, b_map at base_link's pose. The disturbance is what
+    `disturbance_nt` predicts; without it, b_truth - b_map: the exact field of the Earth, the scene's
+    sources and the robot itself at the magnetometer, less the map. Where the scene's Earth field is
+    known, b_truth and b_vector are given either way.
+
+    Args:
+        scene: Lab, robot and sensors.
+        path: Where to drive; the robot begins on its first point, along it.
+        anomaly_map: What `scene.map_layer` holds.
+        rng: Source of all noise.
+        speed: Forward speed where the path is straight [m/s].
+        duration_s: How long to drive [s]; None is once along the path. Longer gives further laps of
+            a closed path, and takes an open one back and forth.
+        rate_hz: Magnetometer readings a second, at t = k / rate_hz [Hz]; None takes the scene's.
+        disturbance_nt: From a Run whose columns up to `lidar_on` and `b_map_nt` are filled to the
+            disturbance of each reading [nT], shape (N,). Called once.
+        outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
+        lidar: Whether the LiDAR follows its schedule, or stays on or off.
+
+    Returns:
+        A Run with every column of `COLUMNS`, in their order. `b_sd_nt` is nan and
+        `flag_out_of_distribution` false: both are for the caller who knows a network.
+
+    Raises:
+        RefusedError: The path leaves the floor, an option is out of range, or nothing gives the
+            disturbance. Nothing has been computed then.
+    """
+    robot = scene.robot
+    rate = robot.magnetometer.rate_hz if rate_hz is None else rate_hz
+    if not 0 < rate < math.inf:
+        raise RefusedError(f"rate_hz of the magnetometer must be above 0 Hz and finite, got {rate!r}")
+    if disturbance_nt is None and scene.earth is None:
+        raise RefusedError(
+            f"scene {scene.name!r} has neither a network nor an Earth field, so nothing gives the "
+            "disturbance; name a network's weights, or give the scene an Earth field"
+        )
+    lidar_on(robot.lidar, 0.0, lidar)  # refuses an unknown mode before anything is computed
+    check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
+
+    motion = follow(path, robot.drive, speed=speed, duration_s=duration_s)
+    end = motion.duration_s if duration_s is None else duration_s
+    t = np.arange(max(1, math.ceil(end * rate - 1e-9))) / rate
+    streams = dict(zip(_STREAMS, rng.spawn(len(_STREAMS)), strict=True))
+    true = motion.at(t)
+    columns = _truth(true, t)
+    columns |= sense_odometry(motion, t, streams["odometry"])
+    columns |= sense_imu(robot.imu, motion, t, streams["imu"])
+    columns |= sense_battery(robot.battery, t, streams["battery"])
+    columns["lidar_on"] = lidar_on(robot.lidar, t, lidar)
+    columns |= _map(anomaly_map, true, outside)
+    columns |= _exact_field(scene, true, columns["lidar_on"], t)
+    columns |= _flags(scene, true)
+    columns["b_sd_nt"] = np.full(len(t), np.nan)
+    facts: dict[str, str | int | float | bool] = {
+        "scene": scene.name,
+        "path": path.name,
+        "speed_m_s": float(speed),
+        "rate_hz": float(rate),
+        "duration_s": round(float(end), 9),
+        "outside": outside,
+        "lidar": lidar,
+    }
+    if disturbance_nt is None:
+        disturbance = columns["b_truth_nt"] - columns["b_map_nt"]
+    else:
+        disturbance = np.asarray(disturbance_nt(Run(columns, facts)), float)
+        if disturbance.shape != t.shape:
+            raise RefusedError(f"disturbance_nt must give shape {t.shape}, got {disturbance.shape}")
+    columns["b_disturbance_nt"] = disturbance
+    columns["b_total_nt"] = columns["b_map_nt"] + disturbance
+    columns |= sense_magnetometer(robot.magnetometer, columns["b_total_nt"], streams["magnetometer"])
+    return Run({name: columns[name] for name in COLUMNS}, facts)
+
+
+def _truth(true: Moment, t: Array) -> dict[str, NDArray[Any]]:
+    """The columns of what the robot did and was told: a kinematic drive does what it is told."""
+    zero = np.zeros(len(t))
+    return {
+        "t": t,
+        "p_world_base": np.column_stack([true.pose[:, :2], zero]),
+        "q_world_base_xyzw": quat_from_yaw(wrap_angle(true.pose[:, 2])),
+        "yaw": wrap_angle(true.pose[:, 2]),
+        "v_base": np.column_stack([true.v, zero, zero]),
+        "w_base": np.column_stack([zero, zero, true.w]),
+        "v_cmd": true.v,
+        "w_cmd": true.w,
+        "wheel_angle": true.wheel_angle,
+    }
+
+
+def _map(
+    anomaly_map: AnomalyMap, true: Moment, outside: Literal["nan", "clamp", "raise"]
+) -> dict[str, NDArray[Any]]:
+    """Map at base_link's poses, and where there is none."""
+    xy, yaw = true.pose[:, :2], true.pose[:, 2]
+    b = anomaly_map.lookup(xy, yaw, outside=outside)
+    off = np.isnan(b)
+    if outside == "clamp":
+        off = off | ~anomaly_map.contains(xy)
+    return {"b_map_nt": b, "flag_outside_map": off}
+
+
+def _exact_field(scene: Scene, true: Moment, on: NDArray[np.bool_], t: Array) -> dict[str, NDArray[Any]]:
+    """Field at the magnetometer, vector in its axes and magnitude; nan where the Earth's is not known.
+
+    The rate in base_link axes is d/dt (R^T B) = R^T dB/dt - w x R^T B, with dB/dt by central
+    differences along the way of the magnetometer.
+    """
+    robot = scene.robot
+    if scene.earth is None:
+        return {"b_vector_nt": np.full((len(t), 3), np.nan), "b_truth_nt": np.full(len(t), np.nan)}
+    x, y, yaw = true.pose.T
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    px, py, pz = robot.p_base_magnetometer
+    p_world = np.column_stack([x + px * cos - py * sin, y + px * sin + py * cos, np.full(len(t), pz)])
+    b_world = ambient_field_nt(scene, p_world)
+    change = np.gradient(b_world, t, axis=0) if len(t) > 1 else np.zeros_like(b_world)
+    b_base = _into_base(b_world, cos, sin)
+    b_rate = _into_base(change, cos, sin)
+    b_rate[:, 0] += true.w * b_base[:, 1]
+    b_rate[:, 1] -= true.w * b_base[:, 0]
+    voltage = open_voltage(robot.battery, charge(robot.battery, t))
+    vector = platform_field_nt(
+        robot.platform,
+        b_base,
+        b_rate=b_rate,
+        wheel_rate=wheel_rates(true.v, true.w, robot.drive),
+        lidar_on=on,
+        battery_a=excess_current_a(robot.battery, voltage),
+    )
+    in_sensor = vector @ matrix_from_quat(robot.magnetometer.q_link_sensor_xyzw)
+    return {"b_vector_nt": in_sensor, "b_truth_nt": np.sqrt(np.sum(vector * vector, axis=1))}
+
+
+def _into_base(b_world: Array, cos: Array, sin: Array) -> Array:
+    """Vectors (N, 3) turned from world into base_link axes, headings given by cos and sin (N,)."""
+    bx, by, bz = b_world.T
+    return np.column_stack([cos * bx + sin * by, cos * by - sin * bx, bz])
+
+
+def _flags(scene: Scene, true: Moment) -> dict[str, NDArray[Any]]:
+    """Touching a wall; and what this simulator does not bring about, never set."""
+    half = np.array(scene.lab.floor_m) / 2
+    reach = np.abs(true.pose[:, :2]) + scene.robot.footprint_radius_m
+    never = np.zeros(len(true.v), bool)
+    return {
+        "flag_bump": np.any(reach > half + 1e-9, axis=1),
+        "flag_out_of_distribution": never,
+        "flag_lost_lock": never,
+    }
