@@ -131,7 +131,12 @@ class _Members:
         for info in infos:
             folder, _, name = info.filename.partition("/")
             folders.add(folder)
-            if not name or ".." in info.filename.split("/") or "\\" in info.filename or name in self.infos:
+            if (
+                not (folder and name)
+                or ".." in info.filename.split("/")
+                or "\\" in info.filename
+                or name in self.infos
+            ):
                 raise self.refused(f"member {_show(info.filename)} has a name that torch.save does not give")
             if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 0x1:
                 raise self.refused(
