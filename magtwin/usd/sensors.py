@@ -27,7 +27,8 @@ from magtwin.spec import (
     SourceSpec,
     Vec3,
 )
-from magtwin.usd.schema import apply_api, attribute_name, place, relative_asset, require_api
+from magtwin.usd.layers import relative_asset
+from magtwin.usd.schema import apply_api, attribute_name, place, require_api
 
 S = TypeVar("S")
 

@@ -6,10 +6,9 @@ silent about those that come later; `register` therefore asks the registry wheth
 """
 
 import json
-import os
 from pathlib import Path
 
-from pxr import Plug, Sdf, Usd
+from pxr import Plug, Usd
 
 from magtwin.names import RefusedError, find
 
@@ -115,12 +114,3 @@ def only_prim_with(root: Usd.Prim, noun: str) -> Usd.Prim:
         seen = ", ".join(str(prim.GetPath()) for prim in prims) or "none"
         raise RefusedError(f"{place(root)}: needs one prim with {NOUNS[noun]} below it, found {seen}")
     return prims[0]
-
-
-def relative_asset(layer: Sdf.Layer, path: Path) -> str:
-    """`path` as an asset path relative to `layer`'s file; absolute where the layer has none."""
-    path = path.resolve()
-    if layer.anonymous or not layer.realPath:
-        return path.as_posix()
-    relative = Path(os.path.relpath(path, Path(layer.realPath).resolve().parent)).as_posix()
-    return relative if relative.startswith("../") else f"./{relative}"

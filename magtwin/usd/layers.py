@@ -1,0 +1,76 @@
+"""Layers: new ones with units and defaults said, old ones opened, files named relative to them."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics
+
+from magtwin.files import existing, output
+from magtwin.names import RefusedError
+
+WORLD = Sdf.Path("/World")
+"""Default prim of maps and scenes."""
+
+SUFFIXES = (".usd", ".usda", ".usdc")
+
+
+@contextmanager
+def new_stage(
+    path: str | os.PathLike[str], documentation: str, *, force: bool = False
+) -> Iterator[Usd.Stage]:
+    """A stage that becomes the file `path` when the block ends: metres, kilograms, Z up, /World.
+
+    Args:
+        path: File to make; the suffix says whether it is text or crate.
+        documentation: What the layer is, for people.
+        force: Whether one that exists is replaced.
+
+    Raises:
+        RefusedError: The suffix is not USD's, or the file exists and `force` was not given.
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise RefusedError(f"{path}: a USD file ends in {', '.join(SUFFIXES)}")
+    with output(path, force=force) as aside:
+        stage = Usd.Stage.CreateNew(str(aside))
+        describe_stage(stage, documentation)
+        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, WORLD).GetPrim())
+        yield stage
+        stage.Save()
+
+
+def describe_stage(stage: Usd.Stage, documentation: str) -> None:
+    """Say a stage's units and axes, what it is and what wrote it."""
+    UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdPhysics.SetStageKilogramsPerUnit(stage, UsdPhysics.MassUnits.kilograms)
+    layer = stage.GetRootLayer()
+    layer.documentation = documentation
+    layer.customLayerData = {"creator": "magtwin"}
+
+
+def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
+    """The stage of a USD file, as it is on disk now.
+
+    Raises:
+        RefusedError: No such file, or not USD; the text says what USD said of it.
+    """
+    path = existing(path, "USD file")
+    try:
+        stage = Usd.Stage.Open(str(path))
+        stage.Reload()  # a layer that someone still holds would be shown as it was
+    except Tf.ErrorException as error:
+        reason = str(error).strip().splitlines()[-1].strip()
+        raise RefusedError(f"{path}: cannot be opened as USD: {reason}") from error
+    return stage
+
+
+def relative_asset(layer: Sdf.Layer, path: Path) -> str:
+    """`path` as an asset path relative to `layer`'s file; absolute where the layer has none."""
+    path = path.resolve()
+    if layer.anonymous or not layer.realPath:
+        return path.as_posix()
+    relative = Path(os.path.relpath(path, Path(layer.realPath).resolve().parent)).as_posix()
+    return relative if relative.startswith("../") else f"./{relative}"
