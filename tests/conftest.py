@@ -1,4 +1,4 @@
-"""What tests share: the real data beside the checkout, and scratch folders."""
+"""What tests share: the real data beside the checkout, and the default lab, authored once."""
 
 from pathlib import Path
 
@@ -7,9 +7,20 @@ import pytest
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def real_data() -> Path:
     """The real survey, network, paths and robot; a test that needs them is skipped where they are absent."""
     if not REAL.is_dir():
         pytest.skip(f"the real data are not at {REAL}; `magtwin fetch` gets them for use by hand")
     return REAL
+
+
+@pytest.fixture(scope="session")
+def lab_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Root layer of the default lab, authored once into a folder of its own; not to be changed."""
+    from magtwin.files import shipped
+    from magtwin.usd.scene import author_scene, scene_from_toml
+
+    return author_scene(
+        scene_from_toml(shipped("scenes", "lab.toml")), tmp_path_factory.mktemp("lab") / "lab"
+    )
