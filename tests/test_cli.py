@@ -51,7 +51,7 @@ def survey(folder, *, headings=(0, 90, 180, 270), field=41_000.0, edit=lambda he
 
 
 def replace_line(at, text):
-    """An edit of heading 90 that puts `text` in place of line `at` (1 is the header), or drops it for None."""
+    """An edit of heading 90 that puts `text` in place of line `at`, counted from 1, or drops it for None."""
 
     def edit(heading, lines):
         if heading != 90:
@@ -207,7 +207,7 @@ def test_options_come_from_the_environment_and_from_magtwin_toml(tmp_path, monke
     main(["run", str(lab_scene), "--duration", "2", "--parquet", "a.parquet", "--json"])
     facts = json.loads(capsys.readouterr().out)["facts"]
     assert facts["seed"] == 9
-    assert facts["speed_mps"] == 0.15
+    assert facts["speed_m_s"] == 0.15
     (tmp_path / "magtwin.toml").write_text("[run]\nspeeed = 0.15\n")
     with pytest.raises(SystemExit) as stop:
         main(["run", str(lab_scene), "--duration", "2", "--parquet", "b.parquet"])
