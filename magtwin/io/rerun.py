@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from magtwin.field.map import AnomalyMap
 from magtwin.files import existing, output
 from magtwin.frames import quat_multiply, rotate, wrap_angle
+from magtwin.io.layout import PANELS, STATES, TIMELINE, known_series, lab_view, layout
 from magtwin.io.tables import read_parquet
 from magtwin.io.viewer import show
 from magtwin.names import RefusedError, find
@@ -26,11 +27,11 @@ from magtwin.path import Path
 from magtwin.run import Run
 from magtwin.spec import MountSpec, Scene
 from magtwin.usd.geometry import BASE_LINK, Link, Shape, open_stage, read_links, read_shapes, srgb_from_linear
+from magtwin.usd.maps import HEAT_MAP, HEAT_MAP_HEIGHT_M
 
 Array = NDArray[np.float64]
 
 APPLICATION = "magtwin"
-TIMELINE = "sim_time"
 BLOCK = 8192
 """Rows sent in one chunk: few enough for the viewer to skip what it does not show."""
 
@@ -40,74 +41,8 @@ POSE_HZ = 50.0
 DOT_HZ = 10.0
 """Readings a second that are drawn along the path."""
 
-ARROW_M_PER_NT = 8e-6
-"""Length of the field's arrow: 40 cm for 50 uT."""
-
-
-@dataclass(frozen=True)
-class Series:
-    """A line of a plot: one part of a column."""
-
-    column: str
-    name: str
-    colour: tuple[int, int, int]
-    part: int = 0
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A plot: series of one unit, in one entity of the recording."""
-
-    entity: str
-    title: str
-    series: tuple[Series, ...]
-
-
-_BLUE, _ORANGE, _GREEN, _GREY = (86, 156, 255), (255, 158, 64), (92, 200, 120), (165, 165, 165)
-
-PANELS = (
-    Panel(
-        "series/field",
-        "Total field [nT]",
-        (
-            Series("b_measured_nt", "measured", _GREEN),
-            Series("b_total_nt", "total = map + disturbance", _ORANGE),
-            Series("b_map_nt", "map", _BLUE),
-            Series("b_truth_nt", "truth", _GREY),
-        ),
-    ),
-    Panel("series/disturbance", "Disturbance [nT]", (Series("b_disturbance_nt", "disturbance", _ORANGE),)),
-    Panel(
-        "series/speed",
-        "Speed [m/s]",
-        (
-            Series("odom_v", "odometry", _GREY, 0),
-            Series("v_base", "true", _BLUE, 0),
-            Series("v_cmd", "commanded", _ORANGE),
-        ),
-    ),
-    Panel(
-        "series/yaw_rate",
-        "Yaw rate [rad/s]",
-        (
-            Series("imu_w", "gyroscope", _GREY, 2),
-            Series("w_base", "true", _BLUE, 2),
-            Series("w_cmd", "commanded", _ORANGE),
-        ),
-    ),
-    Panel("series/battery_voltage", "Battery voltage [V]", (Series("battery_v", "voltage", _GREEN),)),
-    Panel("series/battery_charge", "Battery charge [0..1]", (Series("battery_fraction", "charge", _GREEN),)),
-)
-"""Every plot of the recording; series that a run has not got, or that are nan throughout, are left out."""
-
-FLAGS = {
-    "lidar_on": "LiDAR on",
-    "flag_bump": "bump",
-    "flag_outside_map": "outside map",
-    "flag_out_of_distribution": "out of distribution",
-    "flag_lost_lock": "lost lock",
-}
-"""Lanes of states: column and label."""
+ARROW_M_PER_NT = 1.4e-5
+"""Length of the field's arrow: 70 cm for 50 uT."""
 
 
 def write_rrd(
@@ -140,10 +75,12 @@ def write_rrd(
         RefusedError: The file exists and `force` was not given, the stage cannot be read, or the run
             has no rows.
     """
-    with _recording(run, path, layout=_layout(run, scene), force=force) as rec:
+    heading = _nearest_heading(field, run)
+    views = layout(run, lab_view(scene.lab, heading))
+    with _recording(run, path, views, force=force) as rec:
         stage = open_stage(scene_file)
         scale = _Scale.over(field, run)
-        _log_map(rec, field, scale, yaw=float(run["yaw"][0]))
+        _log_map(rec, field, scale, heading)
         _log_scale(rec, field, scale)
         _log_bodies(rec, run, scene, read_shapes(stage), read_links(stage))
         _log_paths(rec, run, scene, scale, planned)
@@ -167,14 +104,14 @@ def view(path: str | os.PathLike[str]) -> None:
     run = read_parquet(path)
     with tempfile.TemporaryDirectory() as folder:
         rrd = FilePath(folder) / f"{path.stem}.rrd"
-        with _recording(run, rrd, layout=_layout(run, None)) as rec:
+        with _recording(run, rrd, layout(run)) as rec:
             _log_series(rec, run)
         show(rrd)
 
 
 @contextmanager
 def _recording(
-    run: Run, path: str | os.PathLike[str], *, layout: rrb.Blueprint, force: bool = False
+    run: Run, path: str | os.PathLike[str], views: rrb.Blueprint, *, force: bool = False
 ) -> Iterator[rr.RecordingStream]:
     """A stream into a file beside `path`, with the facts of the run in it; whole at the end, or not there."""
     if not run.rows:
@@ -186,10 +123,11 @@ def _recording(
             raise RefusedError(f"{path}: Rerun is switched off by the environment variable RERUN; unset it")
         rr.set_strict_mode(True)
         try:
-            rec.save(aside, default_blueprint=layout)
+            rec.save(aside, default_blueprint=views)
             rec.send_recording_name(str(run.facts.get("path", FilePath(path).stem)))
-            if run.facts:
-                rec.send_property("run", rr.AnyValues(**{key: [value] for key, value in run.facts.items()}))
+            facts: dict[str, Any] = {key: [value] for key, value in run.facts.items()}
+            if facts:
+                rec.send_property("run", rr.AnyValues(**facts))
             rec.log("facts", rr.TextDocument(_facts(run), media_type=rr.MediaType.MARKDOWN), static=True)
             yield rec
         finally:
@@ -203,7 +141,7 @@ def _content_id(run: Run) -> str:
     digest = hashlib.sha256(json.dumps(dict(run.facts), sort_keys=True).encode())
     for name, values in run.items():
         digest.update(name.encode())
-        digest.update(np.ascontiguousarray(values))
+        digest.update(np.ascontiguousarray(values).data)
     return digest.hexdigest()[:32]
 
 
@@ -217,7 +155,7 @@ def _facts(run: Run) -> str:
         **run.facts,
     }
     rows = [f"| {key.replace('_', ' ')} | {value} |" for key, value in said.items()]
-    return "\n".join(["| run | |", "|---|---|", *rows])
+    return "\n".join(["| fact | value |", "|---|---|", *rows])
 
 
 @dataclass(frozen=True)
@@ -250,20 +188,21 @@ class _Scale:
         return out
 
 
-def _log_map(rec: rr.RecordingStream, field: AnomalyMap, scale: _Scale, *, yaw: float) -> None:
-    """The floor in the colours of the map's layer nearest to a heading, linear between nodes."""
+def _log_map(rec: rr.RecordingStream, field: AnomalyMap, scale: _Scale, heading: float) -> None:
+    """The floor in the colours of the map at a heading [rad], linear between nodes."""
     x0, x1, y0, y1 = field.extent
     cell = max(0.02, (x1 - x0) / 1024, (y1 - y0) / 1024)
     width, height = (max(1, round((b - a) / cell)) for a, b in ((x0, x1), (y0, y1)))
     x = x0 + (np.arange(width) + 0.5) * (x1 - x0) / width
     y = y1 - (np.arange(height) + 0.5) * (y1 - y0) / height  # images begin at the top
     grid = np.stack(np.meshgrid(x, y), axis=-1)
-    pixels = scale.colours(field.lookup(grid, _nearest_heading(field, yaw)))
-    _log_image(rec, "world/map", pixels, cell, (x0, y0, 0.004))
+    pixels = scale.colours(field.lookup(grid, heading))
+    _log_image(rec, "world/map", pixels, cell, (x0, y0, HEAT_MAP_HEIGHT_M), opacity=0.75)
 
 
-def _nearest_heading(field: AnomalyMap, yaw: float) -> float:
-    away = np.abs(wrap_angle(field.headings_rad - yaw))
+def _nearest_heading(field: AnomalyMap, run: Run) -> float:
+    """The heading of the map's layer that is nearest to the run's first one [rad]."""
+    away = np.abs(wrap_angle(field.headings_rad - run["yaw"][0]))
     return float(field.headings_rad[np.argmin(away)])
 
 
@@ -272,7 +211,7 @@ def _log_scale(rec: rr.RecordingStream, field: AnomalyMap, scale: _Scale) -> Non
     x0, x1, y0, _ = field.extent
     length, breadth = 0.6 * (x1 - x0), 0.03 * (x1 - x0)
     cell = length / 256
-    corner = ((x0 + x1 - length) / 2, y0 - 0.55 - breadth, 0.004)
+    corner = ((x0 + x1 - length) / 2, y0 - 0.55 - breadth, HEAT_MAP_HEIGHT_M)
     bar = np.broadcast_to(scale.table, (max(1, round(breadth / cell)), 256, 4))
     _log_image(rec, "world/scale", bar, cell, corner)
     share = np.linspace(0, 1, 5)
@@ -297,6 +236,8 @@ def _log_image(
     rgba: NDArray[np.uint8],
     cell: float,
     corner: tuple[float, float, float],
+    *,
+    opacity: float = 1.0,
 ) -> None:
     """An image lying level, its lower left corner at `corner` in world [m], `cell` [m] a pixel."""
     height, width = rgba.shape[:2]
@@ -309,6 +250,7 @@ def _log_image(
             ),
             cell_size=cell,
             translation=corner,
+            opacity=opacity,
         ),
         static=True,
     )
@@ -320,7 +262,7 @@ def _log_bodies(
     """What stands still, and the robot: one entity a link, the base posed by the run, its wheels turning."""
     rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for shape in shapes:
-        if not shape.link:
+        if not shape.link and shape.prim != str(HEAT_MAP):  # the map is drawn finer, see _log_map
             rec.log(f"world/lab{_entity(shape.prim)}", _mesh([shape]), static=True)
     rows = _thinned(run, POSE_HZ)
     _send(
@@ -351,23 +293,28 @@ def _log_bodies(
             at = np.broadcast_to(np.asarray(p, np.float32), (len(turned), 3))
             _send(rec, entity, run["t"][rows], rr.Transform3D, translation=at, quaternion=turned)
         else:
-            rec.log(entity, rr.Transform3D(translation=p, quaternion=q), static=True)
+            rec.log(entity, rr.Transform3D(translation=p, quaternion=rr.Quaternion(xyzw=q)), static=True)
     if np.isfinite(run["b_vector_nt"]).any():
         _log_vector(rec, run, scene.robot.magnetometer, rows)
 
 
 def _log_vector(rec: rr.RecordingStream, run: Run, mount: MountSpec, rows: NDArray[np.intp]) -> None:
-    """The field vector at the magnetometer, in its axes, where it is known."""
+    """The field vector through the magnetometer, in its axes, where it is known.
+
+    The sensor is at the middle of the arrow: whichever way the field dips, half of it is not in the robot.
+    """
     entity = f"world/robot/{_entity(mount.link)}/magnetometer"
     rec.log(
         entity,
-        rr.Transform3D(translation=mount.p_link_sensor, quaternion=mount.q_link_sensor_xyzw),
+        rr.Transform3D(
+            translation=mount.p_link_sensor, quaternion=rr.Quaternion(xyzw=mount.q_link_sensor_xyzw)
+        ),
         static=True,
     )
     rows = rows[np.isfinite(run["b_vector_nt"][rows]).all(axis=1)]
     arrows = (run["b_vector_nt"][rows] * ARROW_M_PER_NT).astype(np.float32)
     rec.log(f"{entity}/field", rr.Arrows3D.from_fields(colors=[(255, 255, 255)], radii=[0.006]), static=True)
-    _send(rec, f"{entity}/field", run["t"][rows], rr.Arrows3D, vectors=arrows)
+    _send(rec, f"{entity}/field", run["t"][rows], rr.Arrows3D, vectors=arrows, origins=-arrows / 2)
 
 
 def _log_paths(rec: rr.RecordingStream, run: Run, scene: Scene, scale: _Scale, planned: Path) -> None:
@@ -379,7 +326,7 @@ def _log_paths(rec: rr.RecordingStream, run: Run, scene: Scene, scale: _Scale, p
     driven = base + np.array([0, 0, 0.016])
     rec.log("world/driven", rr.LineStrips3D([driven], colors=(230, 60, 60), radii=0.006), static=True)
     sensor = (base + rotate(q, scene.robot.p_base_magnetometer)).astype(np.float32)
-    rec.log("world/readings", rr.Points3D.from_fields(radii=[0.014]), static=True)
+    rec.log("world/readings", rr.Points3D.from_fields(radii=[0.022]), static=True)
     colours = scale.colours(run["b_total_nt"][rows])
     packed = colours.astype(np.uint32) @ np.array([1 << 24, 1 << 16, 1 << 8, 1], np.uint32)
     _send(rec, "world/readings", run["t"][rows], rr.Points3D, positions=sensor, colors=packed)
@@ -388,31 +335,27 @@ def _log_paths(rec: rr.RecordingStream, run: Run, scene: Scene, scale: _Scale, p
 def _log_series(rec: rr.RecordingStream, run: Run) -> None:
     """Every plot's series at full rate, and the flags where they change."""
     for panel in PANELS:
-        series = _known(run, panel)
+        series = known_series(run, panel)
         if not series:
             continue
-        names, colours = [s.name for s in series], [s.colour for s in series]
-        rec.log(
-            panel.entity, rr.SeriesLines(names=names, colors=colours, widths=[1.5] * len(series)), static=True
+        style = rr.SeriesLines(
+            names=[s.name for s in series],
+            colors=[s.colour for s in series],
+            widths=[s.width for s in series],
         )
+        rec.log(panel.entity, style, static=True)
         values = np.column_stack([run[s.column].reshape(run.rows, -1)[:, s.part] for s in series])
         _send(rec, panel.entity, run["t"], rr.Scalars, scalars=values)
-    for column, label in FLAGS.items():
+    for column, (name, *words) in STATES.items():
         if column not in run.columns:
             continue
-        flag = run[column]
+        entity, flag = f"states/{name}", run[column]
         rows = np.flatnonzero(np.append(True, flag[1:] != flag[:-1]))
-        states = rr.StateConfiguration(
-            values=["yes", "no"], labels=[label, f"not {label}"], colors=[(255, 158, 64), (70, 70, 76)]
+        rec.log(
+            entity, rr.StateConfiguration(values=words, colors=[(70, 70, 76), (255, 158, 64)]), static=True
         )
-        rec.log(f"flags/{column}", states, static=True)
-        words = np.where(flag[rows], "yes", "no").tolist()
-        _send(rec, f"flags/{column}", run["t"][rows], rr.StateChange, state=words)
-
-
-def _known(run: Run, panel: Panel) -> list[Series]:
-    """The series of a panel that the run has."""
-    return [s for s in panel.series if s.column in run.columns and np.isfinite(run[s.column]).any()]
+        state = np.where(flag[rows], words[1], words[0]).tolist()
+        _send(rec, entity, run["t"][rows], rr.StateChange, state=state)
 
 
 def _send(rec: rr.RecordingStream, entity: str, t: Array, archetype: Any, **values: Any) -> None:
@@ -455,48 +398,3 @@ def _colours(shape: Shape) -> NDArray[np.uint8]:
 def _entity(name: str) -> str:
     """A prim's name or path as an entity path: only letters, digits, _ and - need no escape there."""
     return re.sub(r"[^\w/-]", "_", name)
-
-
-def _layout(run: Run, scene: Scene | None) -> rrb.Blueprint:
-    """The views, the 3D one of a scene first, on the timeline of the run."""
-    plots: list[Any] = [
-        rrb.TimeSeriesView(origin=panel.entity, name=panel.title, plot_legend=rrb.Corner2D.RightTop)
-        for panel in PANELS
-        if _known(run, panel)
-    ]
-    shares = [3.0, 2.0] + [1.4] * (len(plots) - 2)
-    states = rrb.StateTimelineView(origin="flags", name="States")
-    facts = rrb.TextDocumentView(origin="facts", name="Run")
-    side: Any = rrb.Vertical(*plots, row_shares=shares[: len(plots)])
-    below: Any = rrb.Horizontal(states, facts, column_shares=[1.0, 1.0])
-    root: Any = rrb.Horizontal(side, rrb.Vertical(states, facts), column_shares=[3, 1])
-    if scene is not None:
-        left = rrb.Vertical(_lab_view(scene), below, row_shares=[3.0, 1.0])
-        root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
-    time = rrb.TimePanel(state="collapsed", timeline=TIMELINE)
-    return rrb.Blueprint(
-        root, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"), time
-    )
-
-
-def _lab_view(scene: Scene) -> rrb.Spatial3DView:
-    """The lab seen whole, from the south and above; readings appear as time goes on."""
-    x, y = scene.lab.floor_m
-    away = max(x, 1.6 * y)
-    so_far = rrb.VisibleTimeRange(
-        TIMELINE,
-        start=rrb.TimeRangeBoundary.infinite(),
-        end=rrb.TimeRangeBoundary.cursor_relative(),
-    )
-    return rrb.Spatial3DView(
-        origin="world",
-        name="Lab",
-        background=(24, 26, 31),
-        line_grid=False,
-        eye_controls=rrb.EyeControls3D(
-            position=(-0.12 * away, -0.72 * away, 0.72 * away),
-            look_target=(0, -0.05 * away, 0),
-            eye_up=(0, 0, 1),
-        ),
-        overrides={"world/readings": rrb.VisibleTimeRanges(so_far)},
-    )

@@ -13,16 +13,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import rerun_cli
+import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient
 
 from magtwin.files import existing, output
+from magtwin.io.layout import TIMELINE
 from magtwin.names import RefusedError
 
 LOCALHOST = "127.0.0.1"
-TIMELINE = "sim_time"
 START_S = 60.0
 """How long the viewer may take to start on a busy machine without a graphics card [s]."""
+
+TOASTS_S = 6.0
+"""How long the viewer's notices about itself stay in the picture [s]."""
 
 
 def show(rrd: str | os.PathLike[str]) -> None:
@@ -69,9 +72,10 @@ def screenshot(
         _wait_until(lambda: _loaded(client), f"{rrd}: the viewer did not load it")
         if time_s is not None:
             client.set_time(TIMELINE, duration=time_s, play_state="paused")
-        client.save_screenshot(str(aside))  # the first one lays the views out
-        aside.unlink()
-        time.sleep(0.5)
+        client.run_command("ui.toggle_top_panel")
+        end = time.monotonic() + TOASTS_S
+        while time.monotonic() < end:  # its clock goes on only while it draws
+            client.take_screenshot(max_size=64)
         client.save_screenshot(str(aside))
         views = client.get_state().views
     return [f"{v.name}: {r.severity}: {r.summary} {r.details or ''}" for v in views for r in v.reports]
