@@ -82,7 +82,8 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
     try:
         return Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        reason = str(error).strip().splitlines()[-1].strip()
+        first = next((line for line in str(error).splitlines() if "Error in" in line), str(error))
+        reason = first.partition(" : '")[2].strip("' \n") or first.strip()
         raise RefusedError(f"{path}: cannot be opened as USD: {reason}") from error
 
 
@@ -400,7 +401,7 @@ def _display_colour(gprim: UsdGeom.Gprim) -> tuple[float, float, float, float]:
 
 
 def _display_colours(gprim: UsdGeom.Gprim, solid: _Solid, mask: NDArray) -> NDArray | None:
-    """Values of displayColor by point (P, 3), or by corner of the chosen triangles (3 F, 3); none if constant."""
+    """Its displayColor by point (P, 3), or by corner of the chosen triangles (3 F, 3); none if constant."""
     primvar = gprim.GetDisplayColorPrimvar()
     colours = primvar.ComputeFlattened()
     if not colours or len(colours) == 1:
@@ -423,3 +424,9 @@ def srgb_from_linear(colour: ArrayLike) -> NDArray[np.float64]:
     """Colours as screens want them (IEC 61966-2-1) from linear ones as USD has them, any shape, 0 to 1."""
     c = np.clip(np.asarray(colour, float), 0, 1)
     return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
+
+
+def linear_from_srgb(colour: ArrayLike) -> NDArray[np.float64]:
+    """Linear colours as USD has them from those of screens, any shape, 0 to 1: inverse of the above."""
+    c = np.clip(np.asarray(colour, float), 0, 1)
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

@@ -1,1 +1,1 @@
-"""URDF to a USD articulation."""
+"""URDF to a USD articulation: `convert_urdf` is the door, one noun a module behind it."""

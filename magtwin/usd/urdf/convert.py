@@ -1,0 +1,232 @@
+"""Convert: a URDF becomes a USD articulation that drives; the steps stand here in their order."""
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
+
+from magtwin.files import check_free, output, sha256
+from magtwin.names import RefusedError
+from magtwin.usd.geometry import open_stage
+from magtwin.usd.sensors import write_pose
+from magtwin.usd.urdf.description import Description, origin_of, read_description
+from magtwin.usd.urdf.gazebo import Surface, read_surfaces
+from magtwin.usd.urdf.joint import define_joint
+from magtwin.usd.urdf.link import define_body, define_frame, is_marker
+from magtwin.usd.urdf.material import GRIPS, LOOKS
+from magtwin.usd.urdf.mesh_layer import MeshLayer
+from magtwin.usd.urdf.shape import define_collider, define_visual, is_merged, pose_of
+
+JOINTS = "joints"
+"""Scope of the joints below the robot's prim."""
+
+ROBOT_API, ARTICULATION_API = "IsaacRobotAPI", "NewtonArticulationRootAPI"
+"""Applied schemas of Isaac Sim and Newton, by name: their plugins live elsewhere."""
+
+Place = tuple[str, NDArray[np.float64]]
+"""Name of a body, and a pose in it, shape (4, 4)."""
+
+
+def convert_urdf(
+    urdf: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    force: bool = False,
+    finish: Callable[[Usd.Prim], object] | None = None,
+) -> Path:
+    """Convert a URDF to a USD articulation with a floating base.
+
+    The robot's prim is the URDF's root link's frame. Its links lie flat below it as rigid bodies, its
+    joints in a scope of their own; links that only name a place become sites on the body they ride on.
+    What was repaired, guessed or left out is kept in the file, see `read_notes`.
+
+    Args:
+        urdf: The description; its meshes lie below its folder or in packages around it.
+        out: Root layer to write, `.usda`. Meshes go to `<stem>_meshes.usdc` beside it.
+        force: Whether files that are there are replaced.
+        finish: Called with the robot's prim before anything is written, to author more.
+
+    Returns:
+        `out`.
+
+    Raises:
+        RefusedError: The URDF or a mesh cannot be converted, or a file is there already; nothing is written.
+    """
+    out = Path(out)
+    if out.suffix != ".usda":
+        raise RefusedError(f"{out}: the robot's root layer is text; give it the suffix .usda")
+    description = read_description(urdf)
+    beside = out.with_name(f"{out.stem}_meshes.usdc")
+    meshes = _gather(description)
+    check_free(out, force=force)
+    if not meshes:
+        with output(out, force=force) as aside:
+            _write(description, meshes, aside, beside.name, out, finish)
+        return out
+    with output(beside, force=force) as aside_meshes, output(out, force=force) as aside:
+        copy = aside.with_name(beside.name)  # beside the root layer, so that references resolve
+        meshes.export(copy)
+        _write(description, meshes, aside, beside.name, out, finish)
+        shutil.move(copy, aside_meshes)
+    return out
+
+
+def read_notes(asset: str | os.PathLike[str]) -> tuple[str, ...]:
+    """What a conversion repaired, guessed or left out, one line each.
+
+    Raises:
+        RefusedError: The file is missing or is not USD.
+    """
+    stage = open_stage(asset)  # held in a name: a layer does not outlive its stage
+    facts = stage.GetRootLayer().customLayerData.get("magtwin", {})
+    return tuple(facts.get("notes", ()))
+
+
+def _gather(description: Description) -> MeshLayer:
+    """Every mesh that a link shows or touches with."""
+    meshes = MeshLayer(description)
+    for link in description.links.values():
+        for visual in link.visuals:
+            if visual.geometry.mesh is not None:
+                meshes.add(visual.geometry.mesh, merged=is_merged(visual, description))
+        for collision in link.collisions:
+            if collision.geometry.mesh is not None:
+                meshes.add(collision.geometry.mesh, merged=True)
+    return meshes
+
+
+def _write(
+    description: Description,
+    meshes: MeshLayer,
+    aside: Path,
+    mesh_layer: str,
+    out: Path,
+    finish: Callable[[Usd.Prim], object] | None,
+) -> None:
+    """Author the root layer at `aside`, with asset paths that hold once it stands at `out`."""
+    stage = Usd.Stage.CreateNew(str(aside))
+    robot = _author(stage, description, meshes, f"./{mesh_layer}")
+    if finish is not None:
+        finish(robot)
+    stage.GetRootLayer().customLayerData = {
+        "magtwin": {
+            "source": description.path.name,
+            "sourceSha256": sha256(description.path),
+            "notes": Vt.StringArray(description.notes),
+        }
+    }
+
+    def as_seen_from_out(path: str) -> str:
+        if not path.startswith("../"):
+            return path
+        return Path(os.path.relpath(aside.parent / path, out.resolve().parent)).as_posix()
+
+    UsdUtils.ModifyAssetPaths(stage.GetRootLayer(), as_seen_from_out)
+    stage.GetRootLayer().Save()
+
+
+def _author(stage: Usd.Stage, description: Description, meshes: MeshLayer, layer: str) -> Usd.Prim:
+    """The robot's prim with all that hangs from it."""
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
+    stage.GetRootLayer().documentation = f"{description.name}: converted from {description.path.name}."
+    names = _prim_names(description)
+    surfaces, places, poses = read_surfaces(description), _places(description), description.poses()
+    robot = UsdGeom.Xform.Define(stage, Sdf.Path.absoluteRootPath.AppendChild(names[""])).GetPrim()
+    stage.SetDefaultPrim(robot)
+    Usd.ModelAPI(robot).SetKind("component")
+    paths = {}
+    for name, link in description.links.items():
+        if places[name][0] != name:
+            continue
+        body = UsdGeom.Xform.Define(stage, robot.GetPath().AppendChild(names[name])).GetPrim()
+        write_pose(body, *pose_of(poses[name]))
+        paths[name] = body.GetPath()
+        define_body(body, link, description)
+        for visual in link.visuals:
+            define_visual(body, visual, description, meshes, layer)
+        for collision in link.collisions:
+            define_collider(body, collision, surfaces.get(name, Surface()), meshes, layer)
+    for name, (body_name, pose) in places.items():
+        if body_name != name:
+            frame = UsdGeom.Xform.Define(stage, paths[body_name].AppendChild(names[name])).GetPrim()
+            write_pose(frame, *pose_of(pose))
+            define_frame(frame)
+    scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(JOINTS)).GetPath()
+    joints = []
+    for child, joint in description.joints.items():
+        if child in paths and joint.parent in places and places[joint.parent][0] != child:
+            above, pose = places[joint.parent]
+            made = define_joint(
+                stage,
+                scope.AppendChild(Tf.MakeValidIdentifier(joint.name)),
+                joint,
+                (paths[above], paths[child]),
+                pose @ origin_of(joint),
+                description,
+            )
+            joints.append(made.GetPath())
+    _articulate(robot, list(paths.values()), joints)
+    return robot
+
+
+def _articulate(robot: Usd.Prim, links: list[Sdf.Path], joints: list[Sdf.Path]) -> None:
+    """Make the robot's prim one articulation that floats and does not collide with itself."""
+    UsdPhysics.ArticulationRootAPI.Apply(robot)
+    robot.AddAppliedSchema(ROBOT_API)
+    robot.AddAppliedSchema(ARTICULATION_API)
+    kinds = Sdf.ValueTypeNames
+    robot.CreateAttribute("newton:selfCollisionEnabled", kinds.Bool, custom=False).Set(False)
+    robot.CreateAttribute("physxArticulation:enabledSelfCollisions", kinds.Bool, custom=False).Set(False)
+    robot.CreateRelationship("isaac:physics:robotLinks", custom=False).SetTargets(links)
+    robot.CreateRelationship("isaac:physics:robotJoints", custom=False).SetTargets(joints)
+
+
+def _places(description: Description) -> dict[str, Place]:
+    """The body that each link is, or rides on, with its pose in it.
+
+    Links that only name a place ride on the nearest body above them; those above the first body, such
+    as base_footprint, on that.
+    """
+    base, above = description.root, [description.root]
+    while is_marker(description.links[base]):
+        below = [child for child, joint in description.joints.items() if joint.parent == base]
+        if len(below) != 1 or description.joints[below[0]].type != "fixed":
+            break
+        base = below[0]
+        above.append(base)
+    poses = description.poses()
+    places = {name: (base, np.linalg.inv(poses[base]) @ poses[name]) for name in above}
+    for name, link in description.links.items():
+        if name in places:
+            continue
+        joint = description.joints[name]
+        if is_marker(link) and joint.type == "fixed":
+            body, pose = places[joint.parent]
+            places[name] = (body, pose @ origin_of(joint))
+        else:
+            places[name] = (name, np.eye(4))
+    return places
+
+
+def _prim_names(description: Description) -> dict[str, str]:
+    """Names of the prims of the robot ("") and of its links, as USD allows them.
+
+    Raises:
+        RefusedError: Two links would get one name, or one that the robot's own scopes have.
+    """
+    names: dict[str, str] = {}
+    reserved = (JOINTS, LOOKS, GRIPS)
+    for link in ("", *description.links):
+        name = Tf.MakeValidIdentifier(link or description.name)
+        if link and (name in reserved or name in [n for key, n in names.items() if key]):
+            raise description.refused("link", link, f"would become prim {name!r}, which is taken; rename it")
+        if name != (link or description.name):
+            description.note(f"{link or description.name!r} is called {name!r} in USD")
+        names[link] = name
+    return names
