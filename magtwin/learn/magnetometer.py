@@ -160,7 +160,7 @@ class NeuralMagnetometer:
         rows = _CHUNK if len(x) > _CHUNK else -(-len(x) // _TILE) * _TILE
         z = np.zeros((rows, x.shape[1]))
         with torch.inference_mode():
-            blocks = [torch.empty(rows, len(z[0]))] + [torch.empty(rows, len(b)) for b in self._biases]
+            blocks = [torch.empty(rows, x.shape[1])] + [torch.empty(rows, len(b)) for b in self._biases]
             scaled, last = torch.from_numpy(z), blocks[-1].numpy()[:, 0]
             for start in starts:
                 block = x[start : start + _CHUNK]
