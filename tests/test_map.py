@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.interpolate import RegularGridInterpolator
 
-from magtwin.field.map import AnomalyMap, describe
+from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError
 
 FOUR = np.radians([0.0, 90.0, 180.0, 270.0])
@@ -269,7 +269,7 @@ def test_the_figures_of_a_known_field_are_its_slope_and_its_heading_wave():
     field = AnomalyMap(
         values_nt=values, origin_m=(0.0, 0.0), cell_m=(0.25, 0.25), headings_rad=FOUR, valid=valid
     )
-    got = {f.name: f.value for f in describe(field).figures}
+    got = {f.name: f.value for f in field.report().figures}
     assert got["masked nodes"] == 1
     for name in ("median gradient", "mean gradient", "greatest gradient"):
         assert got[name] == pytest.approx(5, abs=1e-3)

@@ -186,6 +186,44 @@ class AnomalyMap:
             out[part][unknown] = np.nan
         return out.reshape(shape)
 
+    def report(self) -> Report:
+        """The figures that tell one map from another, over its valid nodes.
+
+        The gradient is that of the magnitude along the floor, by central differences, one-sided at the
+        border. The heading amplitude is that of a + c cos(heading) + s sin(heading), fitted by least
+        squares to the means of the layers over the nodes valid in all of them; it needs three layers.
+        """
+        values = np.where(self.valid, self.values_nt, np.nan)
+        along_y, along_x = np.gradient(values, self.cell_m[1], self.cell_m[0], axis=(1, 2))
+        slope = np.hypot(along_x, along_y)
+        slope = slope[np.isfinite(slope)] / 1000
+        known = values[self.valid]
+        figures = [
+            Figure("headings", len(self.headings_rad)),
+            Figure("nodes", int(self.values_nt[0].size), note="a heading"),
+            Figure("masked nodes", int(np.count_nonzero(~self.valid)), note="over all headings"),
+        ]
+        if known.size:
+            figures += [
+                Figure("mean", round(float(known.mean()), 1), "nT", spread=round(float(known.std()), 1)),
+                Figure("least", round(float(known.min()), 1), "nT"),
+                Figure("greatest", round(float(known.max()), 1), "nT"),
+            ]
+        if slope.size:
+            figures += [
+                Figure("median gradient", round(float(np.median(slope)), 3), "uT/m"),
+                Figure("mean gradient", round(float(slope.mean()), 3), "uT/m"),
+                Figure("greatest gradient", round(float(slope.max()), 3), "uT/m"),
+            ]
+        everywhere = self.valid.all(axis=0)
+        if len(self.headings_rad) >= 3 and everywhere.any():
+            means = self.values_nt[:, everywhere].mean(axis=1)
+            h = self.headings_rad
+            waves = np.column_stack([np.ones_like(h), np.cos(h), np.sin(h)])
+            _, c, s = np.linalg.lstsq(waves, means, rcond=None)[0]
+            figures.append(Figure("heading amplitude", round(float(np.hypot(c, s)), 1), "nT"))
+        return Report(f"map {self.name}", tuple(figures), {"method": self.method, "licence": self.licence})
+
     def _refuse_outside(self, p: Array) -> None:
         off = ~(self.contains(p) | np.isnan(p).any(axis=-1))
         if off.any():
@@ -236,45 +274,6 @@ class AnomalyMap:
         high = low + 1
         high[high == count] = 0
         return low, high, part
-
-
-def describe(field: AnomalyMap) -> Report:
-    """The figures that tell one map from another, over its valid nodes.
-
-    The gradient is that of the magnitude along the floor, by central differences, one-sided at the
-    border. The heading amplitude is that of a + c cos(heading) + s sin(heading), fitted by least
-    squares to the means of the layers over the nodes valid in all of them; it needs three layers.
-    """
-    values = np.where(field.valid, field.values_nt, np.nan)
-    along_y, along_x = np.gradient(values, field.cell_m[1], field.cell_m[0], axis=(1, 2))
-    slope = np.hypot(along_x, along_y)
-    slope = slope[np.isfinite(slope)] / 1000
-    known = values[field.valid]
-    figures = [
-        Figure("headings", len(field.headings_rad)),
-        Figure("nodes", int(field.values_nt[0].size), note="a heading"),
-        Figure("masked nodes", int(np.count_nonzero(~field.valid)), note="over all headings"),
-    ]
-    if known.size:
-        figures += [
-            Figure("mean", round(float(known.mean()), 1), "nT", spread=round(float(known.std()), 1)),
-            Figure("least", round(float(known.min()), 1), "nT"),
-            Figure("greatest", round(float(known.max()), 1), "nT"),
-        ]
-    if slope.size:
-        figures += [
-            Figure("median gradient", round(float(np.median(slope)), 3), "uT/m"),
-            Figure("mean gradient", round(float(slope.mean()), 3), "uT/m"),
-            Figure("greatest gradient", round(float(slope.max()), 3), "uT/m"),
-        ]
-    everywhere = field.valid.all(axis=0)
-    if len(field.headings_rad) >= 3 and everywhere.any():
-        means = field.values_nt[:, everywhere].mean(axis=1)
-        h = field.headings_rad
-        waves = np.column_stack([np.ones_like(h), np.cos(h), np.sin(h)])
-        _, c, s = np.linalg.lstsq(waves, means, rcond=None)[0]
-        figures.append(Figure("heading amplitude", round(float(np.hypot(c, s)), 1), "nT"))
-    return Report(f"map {field.name}", tuple(figures), {"method": field.method, "licence": field.licence})
 
 
 def _blend(values: Array, nodes: tuple[NDArray[np.intp], ...], weights: tuple[Array, ...], row: int) -> Array:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.field.map import AnomalyMap, describe
+from magtwin.field.map import AnomalyMap
 from magtwin.files import existing, sha256
 from magtwin.frames import wrap_angle
 from magtwin.names import RefusedError
@@ -85,7 +85,7 @@ def survey_report(folder: str | os.PathLike[str], *, headings_deg: tuple[float, 
     return Report(
         f"survey {folder}",
         (
-            *describe(field).figures,
+            *field.report().figures,
             Figure("median heading deviation", round(float(np.median(every)), 3), "deg"),
             Figure(
                 "largest heading deviation",

@@ -10,16 +10,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from magtwin.usd.robot import read_robot
 from numpy.typing import NDArray
 
 from magtwin.field.earth import earth_field_nt
-from magtwin.field.map import AnomalyMap, describe
+from magtwin.field.map import AnomalyMap
 from magtwin.files import output, shipped
 from magtwin.report import Report
 from magtwin.sim.survey import survey
 from magtwin.spec import EarthFieldSpec, LabSpec, RobotSpec, Scene, SourceSpec
 from magtwin.usd.maps import save_map
-from magtwin.usd.robot import read_robot
 
 HERE = Path(__file__).resolve().parent
 SEED = 9
@@ -143,7 +143,7 @@ def build(folder: Path, *, force: bool = False) -> Report:
     """Write sources.toml, lab.usdc and map.toml to `folder`; returns the map's figures."""
     lab = scene(read_robot(shipped("robots", "turtlebot4")))
     field = lab_map(lab)
-    report = describe(field)
+    report = field.report()
     with output(folder / "sources.toml", force=force) as path:
         path.write_text(sources_toml(lab.sources), encoding="utf-8")
     with output(folder / "map.toml", force=force) as path:
