@@ -26,6 +26,15 @@ CONTROL_RATE_HZ = 50.0
 _NODE_M = 0.005
 """Spacing of a piece's nodes [m]."""
 
+_JITTER_M = 0.005
+"""Points of a path nearer than this to the last one that counts do not count [m]: a recorded path's noise."""
+
+_LOST_M = 0.05
+"""Distance from the path beyond which the robot drives straight back to where it left it [m]."""
+
+_STUCK_M = 0.03
+"""Way driven without getting abreast of the next node after which it counts as passed [m]."""
+
 _COINCIDENT_M = 1e-5
 """Smoothed nodes of a zigzag that come nearer than this are one [m]."""
 
@@ -169,7 +178,8 @@ class Follower:
     Position: the wanted heading leans towards the path, by atan(d / L) for a distance d from it.
     Heading: w = v k + (4 / L) max(v, v_turn) (wanted - actual), which for small errors is critically
     damped, with both poles at -2 / L per metre driven. Forward speed is the planned one, none while
-    the heading is far off: so corners are turned on the spot, and a start beside the path is forgiven.
+    the heading is far off: so corners are turned on the spot. A robot that was carried away drives
+    straight back to where it left the path.
     """
 
     def __init__(self, pieces: list[Piece], drive: DriveSpec, *, speed: float, dt: float) -> None:
@@ -178,9 +188,14 @@ class Follower:
         self._dt = dt
         self._gain = 4.0 / _SETTLE_M
         self._v_turn = _TURN_GAIN / self._gain
+        self._w_path = _LIMIT_SHARE * drive.w_max
+        self._brake = 2 * _LIMIT_SHARE * drive.a_max
+        self._lost2 = (_LOST_M + drive.v_max * dt) ** 2
+        self._speed = speed
         self._creep = min(_CREEP, speed)
         self._number = 0
         self._node = 0
+        self._driven = 0.0
 
     @property
     def done(self) -> bool:
@@ -202,14 +217,24 @@ class Follower:
         piece = self._pieces[self._number]
         xs, ys, headings = piece.x, piece.y, piece.heading
         i, last = self._node, len(xs) - 2
+        ex, ey = x - xs[i], y - ys[i]
+        if ex * ex + ey * ey > self._lost2:
+            planned = min(self._speed, math.sqrt(self._brake * math.hypot(ex, ey)))
+            return self._steer(planned, 0.0, math.atan2(-ey, -ex) - yaw, v, w)
+        self._driven += v * self._dt
+        if self._driven > _STUCK_M and i < last:  # a knot, in which nodes lie behind each other
+            i += 1
+            self._driven = 0.0
+            ex, ey = x - xs[i], y - ys[i]
         while True:  # the segment that the robot is abreast of, never going back
             dx, dy = xs[i + 1] - xs[i], ys[i + 1] - ys[i]
-            ex, ey = x - xs[i], y - ys[i]
             length2 = dx * dx + dy * dy
             along = (ex * dx + ey * dy) / length2
             if along < 1.0 or i == last:
                 break
             i += 1
+            self._driven = 0.0
+            ex, ey = x - xs[i], y - ys[i]
         self._node = i
         spacing = piece.spacing_m
         left_m = (last + 1 - i - along) * spacing
@@ -228,18 +253,49 @@ class Follower:
         planned = math.sqrt(speed2[j] + part * (speed2[j + 1] - speed2[j]))
         heading = headings[j] + part * (headings[j + 1] - headings[j])
         curvature = piece.curvature[j] + part * (piece.curvature[j + 1] - piece.curvature[j])
-        error = heading - math.atan(offset / _SETTLE_M) - (yaw + w * self._dt)
-        if not -math.pi <= error < math.pi:
-            error = (error + math.pi) % (2 * math.pi) - math.pi
         if planned < self._creep:
             planned = self._creep
+        if planned * self._dt > left_m:
+            planned = left_m / self._dt
+        bend = v * curvature
+        if abs(bend) > self._w_path:
+            bend = math.copysign(self._w_path, bend)
+        error = heading - math.atan(offset / _SETTLE_M) - (yaw + w * self._dt)
+        return self._steer(planned, bend, error, v, w)
+
+    def _steer(self, planned: float, bend: float, error: float, v: float, w: float) -> tuple[float, float]:
+        """The twist for a planned speed, the path's own yaw rate, and an error in heading."""
+        if not -math.pi <= error < math.pi:
+            error = (error + math.pi) % (2 * math.pi) - math.pi
         off = abs(error)
         if off > _ALIGN[0]:
             planned *= (_ALIGN[1] - off) / (_ALIGN[1] - _ALIGN[0]) if off < _ALIGN[1] else 0.0
-        if planned * self._dt > left_m:
-            planned = left_m / self._dt
         turn = self._gain * (v if v > self._v_turn else self._v_turn) * error
-        return self._limit(planned, v * curvature + turn, v, w)
+        return self._limit(planned, bend + turn, v, w)
+
+
+def drivable(path: Path) -> Path:
+    """A path without the noise of its recording: points at least 5 mm from the one before.
+
+    Its first and last points stay. A robot that was recorded while it stood leaves a knot of points,
+    which no robot could follow.
+
+    Raises:
+        RefusedError: The whole path lies within 5 mm.
+    """
+    near2 = _JITTER_M**2
+    points = path.p_xy.tolist()
+    kept = [points[0]]
+    x, y = points[0]
+    for px, py in points[1:]:
+        if (px - x) ** 2 + (py - y) ** 2 >= near2:
+            kept.append([px, py])
+            x, y = px, py
+    if len(kept) == 1:
+        raise RefusedError(f"path {path.name}: it lies within {_JITTER_M:g} m, so there is nowhere to drive")
+    if kept[-1] != points[-1]:
+        kept[-1:] = [points[-1]] if len(kept) > 2 else [kept[-1], points[-1]]
+    return Path(path.name, np.array(kept), path.closed)
 
 
 def follow(
@@ -259,7 +315,8 @@ def follow(
         speed: Wanted forward speed [m/s].
         duration_s: How long to drive [s]: further laps of a closed path, back and forth on an open
             one. None means to the end of the path, or one lap, and to stop there.
-        start: First x [m], y [m], yaw [rad] in world; None means on the path's first point, along it.
+        start: First x [m], y [m], yaw [rad] in world, from where the robot drives straight to the
+            path's first point; None means on that point, along the path.
         rate_hz: Control steps a second [Hz].
 
     Raises:
@@ -271,9 +328,14 @@ def follow(
     if duration_s is not None and not 0 < duration_s < math.inf:
         raise RefusedError(f"duration_s must be above 0 s and finite, got {duration_s!r}")
     dt = 1.0 / rate_hz
-    pieces = plan(path if duration_s is None else path.prolonged(speed * duration_s), drive, speed=speed)
+    way = drivable(path)
+    if duration_s is not None:
+        way = way.prolonged(speed * duration_s)
+    if start is not None:
+        way = Path(way.name, np.vstack([start[:2], way.p_xy]))
+    pieces = plan(way, drive, speed=speed)
     if duration_s is None:
-        steps = math.ceil((60 + 10 * len(pieces) + 2 * path.length / min(_SLOWEST, speed)) / dt)
+        steps = math.ceil((60 + 10 * len(pieces) + 4 * way.length / min(_SLOWEST, speed)) / dt)
     else:
         steps = math.ceil(duration_s / dt - 1e-9)
     x, y, yaw = start if start is not None else (pieces[0].x[0], pieces[0].y[0], pieces[0].heading[0])
@@ -298,6 +360,6 @@ def follow(
         if duration_s is None:
             raise RefusedError(
                 f"path {path.name}: its end was not reached in {steps * dt:.0f} s at {speed:g} m/s; "
-                f"start nearer to the path, or smooth it"
+                "it winds too tightly for this drive: smooth it, or drive more slowly"
             )
     return Motion(drive, dt, np.array(vs), np.array(ws), pose0)
