@@ -227,19 +227,25 @@ def narrow_figure8(*, half_length_m: float = 2.4, half_width_m: float = 0.3) -> 
     return Path("narrow_figure8", figure8(half_length_m=half_length_m, half_width_m=half_width_m).p_xy, True)
 
 
-def curvilinear(*, half_length_m: float = 2.4, half_width_m: float = 1.3, waviness: float = 0.4) -> Path:
-    """A closed curve that bends left and right: x = a cos u, y = b (sin u + c cos 3u) / (1 + c).
+def curvilinear(
+    *, half_length_m: float = 2.6, half_width_m: float = 1.55, lobes: int = 5, depth: float = 0.15
+) -> Path:
+    """A closed curve that bends left and right, an ellipse with lobes.
+
+    (x, y) = (a cos u, b sin u) (1 + c cos n u) / (1 + c)
 
     The paper calls two of its drives curvilinear and gives no equation; this one is ours.
 
     Args:
-        half_length_m: a [m].
+        half_length_m: a, which |x| does not exceed [m].
         half_width_m: b, which |y| does not exceed [m].
-        waviness: c >= 0; 0 gives an ellipse.
+        lobes: n.
+        depth: c, 0 to 1; 0 gives an ellipse.
     """
     u = np.linspace(0.0, 2 * np.pi, 2001)
-    y = half_width_m * (np.sin(u) + waviness * np.cos(3 * u)) / (1 + waviness)
-    return Path("curvilinear", np.column_stack([half_length_m * np.cos(u), y]), closed=True)
+    r = (1 + depth * np.cos(lobes * u)) / (1 + depth)
+    points = np.column_stack([half_length_m * r * np.cos(u), half_width_m * r * np.sin(u)])
+    return Path("curvilinear", points, closed=True)
 
 
 PATHS: Mapping[str, Callable[..., Path]] = MappingProxyType(
@@ -344,5 +350,6 @@ def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m:
 
 def _without_repeats(p: Array) -> Array:
     """Points of (N, 2) whose neighbours differ; the first of equals stays."""
-    apart = np.hypot(*np.diff(p, axis=0).T) >= _SAME_M
-    return p[np.concatenate([[True], apart])]
+    first = np.ones(len(p), bool)
+    first[1:] = np.hypot(*np.diff(p, axis=0).T) >= _SAME_M
+    return p[first]

@@ -1,0 +1,117 @@
+"""The differential drive: closed forms of its motion, wheels and limits."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from magtwin.names import RefusedError
+from magtwin.sim.drive import Motion, advance, integrate_twist, limiter, twist_from_wheels, wheel_rates
+from magtwin.spec import DriveSpec
+
+DRIVE = DriveSpec()
+speeds, turns = st.floats(-0.5, 0.5), st.floats(-3, 3)
+
+
+def test_a_straight_line_is_speed_times_time():
+    poses = integrate_twist([0.2] * 50, [0.0] * 50, 0.02, (1.0, 2.0, np.pi / 6))
+    assert_allclose(
+        poses[-1], [1 + 0.2 * np.cos(np.pi / 6), 2 + 0.2 * np.sin(np.pi / 6), np.pi / 6], atol=1e-14
+    )
+
+
+def test_a_constant_twist_goes_round_a_circle_of_radius_v_over_w_whatever_the_step():
+    v, w = 0.3, 0.7
+    for steps in (7, 1000):
+        poses = integrate_twist([v] * steps, [w] * steps, 2 * np.pi / w / steps)
+        assert_allclose(np.hypot(poses[:, 0], poses[:, 1] - v / w), v / w, rtol=1e-12)
+        assert_allclose(poses[-1], [0, 0, 2 * np.pi], atol=1e-12)
+
+
+def test_a_spin_stays_on_its_point():
+    poses = integrate_twist([0.0] * 100, [1.9] * 100, 0.02)
+    assert_allclose(poses[:, :2], 0, atol=1e-15)
+    assert poses[-1, 2] == pytest.approx(3.8)
+
+
+@given(v=speeds, w=turns)
+def test_driving_there_and_back_ends_at_the_start(v, w):
+    assert_allclose(integrate_twist([v, -v], [w, -w], dt=0.1)[-1], 0, atol=1e-12)
+
+
+@given(v=speeds, w=turns, parts=st.integers(1, 9))
+def test_a_step_in_parts_is_the_step(v, w, parts):
+    pose = whole = np.array([0.3, -0.2, 1.0])
+    for _ in range(parts):
+        pose = advance(pose, v, w, 1.0 / parts)
+    assert_allclose(pose, advance(whole, v, w, 1.0), atol=1e-12)
+
+
+@given(v=speeds, w=turns)
+def test_wheels_and_twists_are_each_others_inverse(v, w):
+    assert_allclose(twist_from_wheels(wheel_rates(v, w, DRIVE), DRIVE), [v, w], atol=1e-12)
+
+
+def test_turning_left_turns_the_right_wheel_forward():
+    left, right = wheel_rates(0.0, 1.0, DRIVE)
+    assert right == -left == pytest.approx(0.233 / 2 / 0.03575)
+
+
+def test_wheel_angles_are_path_length_over_radius_on_a_straight_line():
+    motion = Motion(DRIVE, 0.02, np.full(100, 0.25), np.zeros(100))
+    assert_allclose(motion.at([1.37]).wheel_angle, [[0.25 * 1.37 / 0.03575] * 2], rtol=1e-12)
+
+
+def test_the_wheels_of_a_circle_roll_along_circles_half_a_separation_apart():
+    v, w = 0.2, 0.8
+    motion = Motion(DRIVE, 0.02, np.full(500, v), np.full(500, w))
+    angle = motion.at([9.99]).wheel_angle[0]
+    radii = v / w + np.array([-1, 1]) * DRIVE.wheel_separation_m / 2
+    assert_allclose(angle * DRIVE.wheel_radius_m, w * 9.99 * radii, rtol=1e-12)
+
+
+def test_a_motion_between_its_steps_is_exact():
+    rng = np.random.default_rng(0)
+    v, w = rng.uniform(0, 0.3, 40), rng.uniform(-1.9, 1.9, 40)
+    coarse = Motion(DRIVE, 0.02, v, w, (0.5, 0.6, 0.7))
+    fine = Motion(DRIVE, 0.002, np.repeat(v, 10), np.repeat(w, 10), (0.5, 0.6, 0.7))
+    t = np.arange(400) * 0.002 + 1e-9  # just inside the fine steps
+    assert_allclose(coarse.at(t).pose, fine.at(t).pose, atol=1e-12)
+    assert_allclose(coarse.at(t).wheel_angle, fine.at(t).wheel_angle, atol=1e-10)
+
+
+def test_a_motion_stands_still_after_its_last_step():
+    motion = Motion(DRIVE, 0.02, np.full(10, 0.2), np.full(10, 1.0))
+    late = motion.at([0.2, 5.0])
+    assert_allclose(late.pose, motion.poses[[-1, -1]], atol=1e-15)
+    assert_allclose([late.v, late.w, late.a], 0)
+
+
+def test_acceleration_sums_up_to_speed():
+    v = np.array([0.01, 0.02, 0.02, 0.0])
+    motion = Motion(DRIVE, 0.02, v, np.zeros(4))
+    a = motion.at(np.arange(4) * 0.02 + 0.01).a
+    assert_allclose(np.cumsum(a) * 0.02, v, atol=1e-15)
+
+
+@given(
+    wanted=st.tuples(st.floats(-9, 9), st.floats(-99, 99)),
+    last=st.tuples(st.floats(-0.306, 0.306), st.floats(-1.9, 1.9)),
+)
+def test_a_limited_twist_keeps_every_limit_and_comes_as_near_as_they_let_it(wanted, last):
+    dt = 0.02
+    twist = limiter(DRIVE, dt)(*wanted, *last)
+    for got, want, was, top, rate in zip(
+        twist, wanted, last, (DRIVE.v_max, DRIVE.w_max), (DRIVE.a_max, DRIVE.alpha_max), strict=True
+    ):
+        assert got == np.clip(want, max(was - rate * dt, -top), min(was + rate * dt, top))
+
+
+def test_a_motion_refuses_twists_that_are_not_finite_or_do_not_match():
+    with pytest.raises(RefusedError, match="is not finite"):
+        Motion(DRIVE, 0.02, np.array([np.nan]), np.zeros(1))
+    with pytest.raises(RefusedError, match=r"one shape \(K,\)"):
+        Motion(DRIVE, 0.02, np.zeros(2), np.zeros(3))
+    with pytest.raises(RefusedError, match=r"one shape \(K,\)"):
+        Motion(DRIVE, 0.02, np.zeros(0), np.zeros(0))
