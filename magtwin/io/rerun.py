@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import re
 import tempfile
@@ -75,6 +76,7 @@ def write_rrd(
         RefusedError: The file exists and `force` was not given, the stage cannot be read, or the run
             has no rows.
     """
+    _check_rows(run, path)
     heading = _nearest_heading(field, run)
     views = layout(run, lab_view(scene.lab, heading))
     with _recording(run, path, views, force=force) as rec:
@@ -102,6 +104,7 @@ def view(path: str | os.PathLike[str]) -> None:
         return
     find("kind of recording", path.suffix, {".rrd": None, ".parquet": None})
     run = read_parquet(path)
+    _check_rows(run, path)
     with tempfile.TemporaryDirectory() as folder:
         rrd = FilePath(folder) / f"{path.stem}.rrd"
         with _recording(run, rrd, layout(run)) as rec:
@@ -109,13 +112,16 @@ def view(path: str | os.PathLike[str]) -> None:
         show(rrd)
 
 
+def _check_rows(run: Run, path: str | os.PathLike[str]) -> None:
+    if not run.rows:
+        raise RefusedError(f"{path}: the run has no rows, there is nothing to record")
+
+
 @contextmanager
 def _recording(
     run: Run, path: str | os.PathLike[str], views: rrb.Blueprint, *, force: bool = False
 ) -> Iterator[rr.RecordingStream]:
     """A stream into a file beside `path`, with the facts of the run in it; whole at the end, or not there."""
-    if not run.rows:
-        raise RefusedError(f"{path}: the run has no rows, there is nothing to record")
     strict = rr.strict_mode()
     with output(path, force=force) as aside:
         rec = rr.RecordingStream(APPLICATION, recording_id=_content_id(run), send_properties=False)
@@ -124,7 +130,7 @@ def _recording(
         rr.set_strict_mode(True)
         try:
             rec.save(aside, default_blueprint=views)
-            rec.send_recording_name(str(run.facts.get("path", FilePath(path).stem)))
+            rec.send_recording_name(_name(run) or FilePath(path).stem)
             facts: dict[str, Any] = {key: [value] for key, value in run.facts.items()}
             if facts:
                 rec.send_property("run", rr.AnyValues(**facts))
@@ -134,6 +140,11 @@ def _recording(
             rr.set_strict_mode(strict)
             rec.flush()
             rec.disconnect()
+
+
+def _name(run: Run) -> str:
+    """What the viewer calls the recording: path and seed."""
+    return ", ".join(f"{key} {run.facts[key]}" for key in ("path", "seed") if key in run.facts)
 
 
 def _content_id(run: Run) -> str:
@@ -368,8 +379,9 @@ def _send(rec: rr.RecordingStream, entity: str, t: Array, archetype: Any, **valu
 
 
 def _thinned(run: Run, rate_hz: float) -> NDArray[np.intp]:
-    """Rows at about `rate_hz`, evenly spaced, the last one always among them."""
-    stride = max(1, round((run.rows - 1) / (run.duration_s * rate_hz))) if run.duration_s else 1
+    """Rows at `rate_hz` or less, evenly spaced, and the last one."""
+    rate = (run.rows - 1) / run.duration_s if run.duration_s else 0.0
+    stride = max(1, math.ceil(rate / rate_hz - 1e-6))
     return np.unique(np.append(np.arange(0, run.rows, stride), run.rows - 1))
 
 

@@ -4,14 +4,16 @@ It is started here rather than through `rerun.spawn`, which listens on every net
 """
 
 import os
+import re
 import signal
 import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient
@@ -39,7 +41,8 @@ def show(rrd: str | os.PathLike[str]) -> None:
     result = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
     if result.returncode:
         raise RefusedError(
-            f"{rrd}: the Rerun viewer ended at once: {_reason(result.stderr)}; it needs a display"
+            f"{rrd}: the Rerun viewer opened no window: {_reason(result.stderr)}; without a display use "
+            f"a browser: rerun --web-viewer --bind {LOCALHOST} {rrd}"
         )
 
 
@@ -85,6 +88,9 @@ def screenshot(
 def headless_viewer(size: tuple[int, int] = (1600, 1000)) -> Iterator[ViewerClient]:
     """A viewer without a window that listens on this machine only; ended with the block.
 
+    Args:
+        size: Width and height of what it draws [pixels].
+
     Raises:
         RefusedError: It cannot run here; the text says what it said.
     """
@@ -94,21 +100,31 @@ def headless_viewer(size: tuple[int, int] = (1600, 1000)) -> Iterator[ViewerClie
     with tempfile.TemporaryFile("w+") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
         try:
-
-            def listening() -> bool:
-                if process.poll() is not None:
-                    log.seek(0)
-                    raise RefusedError(
-                        f"the Rerun viewer cannot draw here: {_reason(log.read())}; without a graphics card "
-                        "it needs Vulkan in software: apt install mesa-vulkan-drivers libvulkan1"
-                    )
-                with socket.socket() as probe:
-                    return probe.connect_ex((LOCALHOST, port)) == 0
-
-            _wait_until(listening, "the Rerun viewer did not start")
-            yield ViewerClient.connect(f"rerun+http://{LOCALHOST}:{port}/proxy")
+            yield _connected(process, port, log)
         finally:
             _end(process)
+
+
+def _connected(process: "subprocess.Popen[bytes]", port: int, log: IO[str]) -> ViewerClient:
+    """A client of a viewer that was just started, once it draws: it listens before it knows if it can."""
+    clients: list[ViewerClient] = []
+
+    def draws() -> bool:
+        if process.poll() is not None:
+            log.seek(0)
+            raise RefusedError(
+                f"the Rerun viewer cannot draw here: {_reason(log.read())}; without a graphics card "
+                "it needs Vulkan in software: apt install mesa-vulkan-drivers libvulkan1"
+            )
+        try:
+            clients.append(ViewerClient.connect(f"rerun+http://{LOCALHOST}:{port}/proxy"))
+            clients[-1].get_state()
+        except (ConnectionError, RuntimeError):
+            return False
+        return True
+
+    _wait_until(draws, "the Rerun viewer did not start")
+    return clients[-1]
 
 
 def _binary() -> str:
@@ -128,7 +144,7 @@ def _loaded(client: ViewerClient) -> bool:
     return not state.loading and any(recording.timelines for recording in state.recordings)
 
 
-def _wait_until(done, refusal: str) -> None:  # type: ignore[no-untyped-def]
+def _wait_until(done: Callable[[], bool], refusal: str) -> None:
     """Ask again and again; refuse after `START_S`."""
     end = time.monotonic() + START_S
     while not done():
@@ -138,9 +154,11 @@ def _wait_until(done, refusal: str) -> None:  # type: ignore[no-untyped-def]
 
 
 def _reason(log: str) -> str:
-    """The line of a log that says most: the last that is not empty."""
-    lines = [line.strip() for line in log.splitlines() if line.strip()]
-    return lines[-1] if lines else "it gave no reason"
+    """What a log says of the end of its program: its panic, its error, or else its last line."""
+    found = re.search(r"panicked at '(.+?)'|^Error: (.+)$", log, re.MULTILINE)
+    lines = [line.strip() for line in log.splitlines() if line.strip()] or ["it gave no reason"]
+    text = next(group for group in found.groups() if group) if found else lines[-1]
+    return re.sub(r"\S+ at /\S+ ", "", text).rstrip(".")  # the viewer's own file names help nobody
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:

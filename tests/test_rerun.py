@@ -1,0 +1,440 @@
+import shutil
+import subprocess
+import sys
+from pathlib import Path as FilePath
+
+import numpy as np
+import pytest
+import rerun as rr
+import rerun_cli
+from rerun.chunk import RrdReader
+
+from magtwin.field.map import AnomalyMap
+from magtwin.frames import quat_from_yaw, rotate
+from magtwin.io.layout import PANELS, STATES
+from magtwin.io.rerun import view, write_rrd
+from magtwin.io.tables import write_parquet
+from magtwin.io.viewer import headless_viewer, screenshot
+from magtwin.names import RefusedError
+from magtwin.path import figure8
+from magtwin.run import COLUMNS, Run
+from magtwin.spec import MagnetometerSpec, RobotSpec, Scene
+
+HEADER = """#usda 1.0
+(
+    defaultPrim = "lab"
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+
+def Xform "lab"
+{
+"""
+BOX = """def Cube "{name}"
+{{
+    double size = 1
+    color3f[] primvars:displayColor = [{colour}]
+    double3 xformOp:scale = {size}
+    double3 xformOp:translate = {place}
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]
+}}
+"""
+LINK = """def Xform "{name}" (prepend apiSchemas = ["PhysicsRigidBodyAPI"])
+{{
+    double xformOp:rotateX = {roll}
+    double3 xformOp:translate = {place}
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateX"]
+    def Cylinder "visual"
+    {{
+        double radius = {radius}
+        double height = {height}
+        double3 xformOp:translate = (0, 0, {lift})
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+        color3f[] primvars:displayColor = [{colour}]
+    }}
+}}
+"""
+JOINT = """def Physics{kind}Joint "{name}_joint"
+{{
+    rel physics:body0 = </lab/robot/base_link>
+    rel physics:body1 = </lab/robot/{name}>
+    uniform token physics:axis = "Z"
+}}
+"""
+
+
+def a_stage() -> str:
+    """A floor, two walls, and a robot of a base, two wheels, a post and a magnetometer."""
+    boxes = [
+        ("floor", (6, 3.5, 0.1), (0, 0, -0.05), (0.3, 0.3, 0.3)),
+        ("wall_n", (6.1, 0.05, 0.3), (0, 1.775, 0.15), (0.5, 0.5, 0.45)),
+        ("wall_e", (0.05, 3.5, 0.3), (3.025, 0, 0.15), (0.5, 0.5, 0.45)),
+    ]
+    links = [
+        ("base_link", (0, 0, 0), 0, 0.164, 0.06, 0.05, (0.1, 0.1, 0.1)),
+        ("left_wheel", (0, 0.1165, 0.04), -90, 0.03575, 0.015, 0, (0.02, 0.02, 0.02)),
+        ("right_wheel", (0, -0.1165, 0.04), -90, 0.03575, 0.015, 0, (0.02, 0.02, 0.02)),
+        ("plate", (0, 0, 0.3), 0, 0.137, 0.003, 0, (0.6, 0.6, 0.6)),
+        ("magnetometer_link", (0, 0, 0.33), 0, 0.03, 0.04, 0, (0.7, 0.1, 0.1)),
+    ]
+    text = HEADER
+    for name, size, place, colour in boxes:
+        text += BOX.format(name=name, size=size, place=place, colour=colour)
+    text += 'def Xform "robot"\n{\n'
+    for name, place, roll, radius, height, lift, colour in links:
+        text += LINK.format(
+            name=name, place=place, roll=roll, radius=radius, height=height, lift=lift, colour=colour
+        )
+        if name != "base_link":
+            text += JOINT.format(name=name, kind="Revolute" if "wheel" in name else "Fixed")
+    return text + "}\n}\n"
+
+
+def a_field() -> AnomalyMap:
+    """A map of one hill and a slope, at two headings, with a hole."""
+    x, y = np.meshgrid(np.linspace(-3, 3, 25), np.linspace(-1.75, 1.75, 15))
+    hill = 41_000 + 5_000 * np.exp(-((x - 1) ** 2 + y**2)) - 900 * x
+    values = np.stack([hill, hill + 400])
+    valid = np.ones(values.shape, bool)
+    valid[:, 2:4, 3:5] = False
+    return AnomalyMap(
+        values_nt=values, origin_m=(-3, -1.75), cell_m=(0.25, 0.25), headings_rad=[0, np.pi], valid=valid
+    )
+
+
+def a_run(field: AnomalyMap, *, rows: int = 2000, rate_hz: float = 135.0, vector: bool = True) -> Run:
+    """A robot that drives a figure of eight over a map, with every column filled."""
+    rng = np.random.default_rng(1)
+    t = np.arange(rows) / rate_hz
+    path = figure8()
+    along = np.linspace(0, 1, len(path.p_xy))
+    x, y = (np.interp(t / 65 % 1, along, path.p_xy[:, k]) for k in (0, 1))
+    yaw = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
+    v = np.hypot(np.gradient(x, t), np.gradient(y, t))
+    zero, q = np.zeros(rows), quat_from_yaw(yaw)
+    b_map = field.lookup(np.column_stack([x, y]), yaw)
+    disturbance = 300 * np.sin(yaw) + rng.normal(0, 20, rows)
+    w = np.gradient(yaw, t)
+    columns = {
+        "t": t,
+        "p_world_base": np.column_stack([x, y, zero]),
+        "q_world_base_xyzw": q,
+        "yaw": (yaw + np.pi) % (2 * np.pi) - np.pi,
+        "v_base": np.column_stack([v, zero, zero]),
+        "w_base": np.column_stack([zero, zero, w]),
+        "v_cmd": np.full(rows, 0.2),
+        "w_cmd": w,
+        "wheel_angle": np.cumsum(np.column_stack([v - 0.1 * w, v + 0.1 * w]), axis=0) / rate_hz / 0.03575,
+        "odom_v": np.column_stack([v + rng.normal(0, 0.005, rows), zero, zero]),
+        "imu_w": np.column_stack([zero, zero, w + rng.normal(0, 0.02, rows)]),
+        "battery_v": 15.7 + rng.normal(0, 0.02, rows),
+        "battery_fraction": 1 - t / 6000,
+        "lidar_on": t % 60 > 40,
+        "b_map_nt": b_map,
+        "b_disturbance_nt": disturbance,
+        "b_total_nt": b_map + disturbance,
+        "b_measured_nt": b_map + disturbance + rng.normal(0, 5, rows),
+        "b_vector_nt": np.tile([12e3, -9e3, -38e3] if vector else [np.nan] * 3, (rows, 1)),
+        "b_truth_nt": np.full(rows, np.nan),
+        "flag_outside_map": np.isnan(b_map),
+    }
+    for name, column in COLUMNS.items():
+        shape = (rows,) if column.width == 1 else (rows, column.width)
+        columns.setdefault(name, np.zeros(shape, bool if column.unit == "bool" else float))
+    return Run(
+        {name: columns[name] for name in COLUMNS},
+        {"path": "figure8", "seed": 1, "map": "hill", "magtwin": "0"},
+    )
+
+
+def a_scene(layer: FilePath) -> Scene:
+    robot = RobotSpec(
+        name="robot",
+        asset=layer,
+        p_base_magnetometer=(0, 0, 0.33),
+        magnetometer=MagnetometerSpec(link="magnetometer_link"),
+    )
+    return Scene(name="lab", map_layer=layer, robot=robot)
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory):
+    """A run, and what write_rrd needs beside it."""
+    stage = tmp_path_factory.mktemp("stage") / "lab.usda"
+    stage.write_text(a_stage())
+    field = a_field()
+    rest = {"scene": a_scene(stage), "scene_file": stage, "field": field, "planned": figure8()}
+    return a_run(field), rest
+
+
+@pytest.fixture(scope="module")
+def written(parts, tmp_path_factory):
+    run, rest = parts
+    path = tmp_path_factory.mktemp("rrd") / "run.rrd"
+    write_rrd(run, path, **rest)
+    return path
+
+
+def columns_of(rrd, entity):
+    """Times [ns] and values by component of an entity, the values nested as Rerun nests them."""
+    times, values = [], {}
+    for chunk in RrdReader(rrd).stream().to_chunks():
+        if chunk.entity_path == f"/{entity}":
+            batch = chunk.to_record_batch()
+            if "sim_time" in batch.schema.names:
+                times += batch.column("sim_time").cast("int64").to_pylist()
+            for name in batch.schema.names:
+                if ":" in name:
+                    values.setdefault(name, []).extend(batch.column(name).to_pylist())
+    return np.array(times), values
+
+
+def test_every_series_equals_its_column_at_full_rate(parts, written):
+    run, _ = parts
+    for panel in PANELS:
+        times, values = columns_of(written, panel.entity)
+        assert np.array_equal(times, np.rint(run["t"] * 1e9))  # Rerun's clock counts nanoseconds
+        names = values["SeriesLines:names"][0]
+        scalars = np.array(values["Scalars:scalars"])
+        assert scalars.shape == (run.rows, len(names))
+        for series in panel.series:
+            column = run[series.column].reshape(run.rows, -1)[:, series.part]
+            if series.name in names:
+                assert np.array_equal(scalars[:, names.index(series.name)], column, equal_nan=True)
+            else:
+                assert np.isnan(column).all(), series
+
+
+def test_states_hold_from_each_change_of_a_flag_to_the_next(parts, written):
+    run, _ = parts
+    for column, (name, false, true) in STATES.items():
+        times, values = columns_of(written, f"states/{name}")
+        words = np.array([state[0] for state in values["StateChange:state"]])
+        held = words[np.searchsorted(times, np.rint(run["t"] * 1e9), side="right") - 1]
+        assert np.array_equal(held, np.where(run[column], true, false)), column
+
+
+def test_the_robot_stands_where_the_run_has_it_at_fifty_hertz_or_less_to_the_last_row(parts, written):
+    run, _ = parts
+    times, values = columns_of(written, "world/robot")
+    rows = np.searchsorted(run["t"], times / 1e9 - 1e-6)
+    assert np.diff(times)[:-1].min() >= 1e9 / 50
+    assert rows[-1] == run.rows - 1
+    p = np.array(values["Transform3D:translation"])[:, 0]
+    q = np.array(values["Transform3D:quaternion"])[:, 0]
+    np.testing.assert_allclose(p, run["p_world_base"][rows], atol=1e-6)  # Rerun's poses are single precision
+    np.testing.assert_allclose(q, run["q_world_base_xyzw"][rows], atol=1e-6)
+
+
+def test_wheels_turn_about_their_axles_by_the_runs_angles(parts, written):
+    run, _ = parts
+    for side, name in enumerate(("left_wheel", "right_wheel")):
+        times, values = columns_of(written, f"world/robot/{name}")
+        q = np.array(values["Transform3D:quaternion"])[:, 0]
+        rows = np.searchsorted(run["t"], times / 1e9 - 1e-6)
+        axle, spoke = rotate(q, [0.0, 0, 1]), rotate(q, [1.0, 0, 0])
+        np.testing.assert_allclose(axle, np.tile([0, 1, 0], (len(q), 1)), atol=1e-6)  # y points to the left
+        angle = np.arctan2(-spoke[:, 2], spoke[:, 0])  # a wheel that rolls forward turns x downwards
+        off = np.angle(np.exp(1j * (angle - run["wheel_angle"][rows, side])))
+        np.testing.assert_allclose(off, 0, atol=1e-5)
+
+
+def test_what_stands_still_and_each_link_is_one_mesh_of_the_stages_triangles(written):
+    for entity, triangles in {
+        "world/lab/lab/floor": 12,
+        "world/robot/base_link": 128,
+        "world/robot/plate": 128,
+    }.items():
+        _, values = columns_of(written, entity)
+        assert len(values["Mesh3D:vertex_positions"][0]) == 3 * triangles, entity
+    x, y, z = np.array(columns_of(written, "world/lab/lab/floor")[1]["Mesh3D:vertex_positions"][0]).T
+    assert (np.ptp(x), np.ptp(y), z.max()) == pytest.approx((6, 3.5, 0), abs=1e-6)
+
+
+def test_readings_float_where_the_sensor_was_and_the_plan_lies_on_the_floor(parts, written):
+    run, rest = parts
+    times, values = columns_of(written, "world/readings")
+    p = np.array(values["Points3D:positions"])[:, 0]
+    rows = np.searchsorted(run["t"], times / 1e9 - 1e-6)
+    np.testing.assert_allclose(p, run["p_world_base"][rows] + [0, 0, 0.33], atol=1e-6)
+    _, plan = columns_of(written, "world/planned")
+    strip = np.array(plan["LineStrips3D:strips"][0][0])
+    np.testing.assert_allclose(strip[:, :2], rest["planned"].p_xy, atol=1e-6)
+
+
+def test_the_floor_is_viridis_of_the_map_and_see_through_where_it_is_unknown(written):
+    _, values = columns_of(written, "world/map")
+    form = values["GridMap:format"][0][0]
+    pixels = np.array(values["GridMap:data"][0][0], np.uint8).reshape(form["height"], form["width"], 4)
+    assert not pixels[::-1][:, :][int(0.6 / 0.02), int(0.9 / 0.02), 3]  # the hole, from the lower left corner
+    row, column = int((1.75 - 0) / 0.02), int((3 + 1) / 0.02)
+    assert pixels[row, column].tolist()[3] == 255
+    assert pixels[row, column, :3].sum() > pixels[row, -1, :3].sum()  # the hill is bright, the slope dark
+
+
+def test_the_field_arrow_goes_through_the_sensor_and_is_there_only_where_the_vector_is_known(
+    parts, written, tmp_path
+):
+    run, rest = parts
+    _, values = columns_of(written, "world/robot/magnetometer_link/magnetometer/field")
+    arrow, tail = (np.array(values[f"Arrows3D:{key}"][-1][0]) for key in ("vectors", "origins"))
+    b = run["b_vector_nt"][0]
+    np.testing.assert_allclose(arrow / np.linalg.norm(arrow), b / np.linalg.norm(b), atol=1e-6)
+    np.testing.assert_allclose(tail, -arrow / 2, atol=1e-6)
+    write_rrd(a_run(rest["field"], rows=50, vector=False), tmp_path / "run.rrd", **rest)
+    assert not columns_of(tmp_path / "run.rrd", "world/robot/magnetometer_link/magnetometer/field")[1]
+
+
+def test_the_facts_are_properties_of_the_recording_and_a_page_in_it(parts, written):
+    run, _ = parts
+    batch = next(c for c in RrdReader(written).stream().to_chunks() if c.entity_path == "/__properties/run")
+    told = {k: v[0][0] for k, v in batch.to_record_batch().to_pydict().items() if not k.startswith("rerun.")}
+    assert told == dict(run.facts)
+    page = columns_of(written, "facts")[1]["TextDocument:text"][0][0]
+    assert all(f"| {key} | {value} |" in page for key, value in run.facts.items())
+
+
+def rerun(*arguments):
+    """Rerun's own command line."""
+    program = FilePath(rerun_cli.__file__).with_name("rerun")
+    return subprocess.run(
+        [program, *map(str, arguments)], capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+def test_reruns_own_tool_verifies_the_file(written):
+    done = rerun("rrd", "verify", written)
+    assert done.returncode == 0, done.stderr
+
+
+def test_two_recordings_of_one_run_are_the_same_recording(parts, tmp_path):
+    run, rest = parts
+    run = run.with_columns(b_map_nt=run["t"], b_total_nt=run["t"], b_measured_nt=run["t"])  # nan != nan
+    for name in ("a.rrd", "b.rrd"):
+        write_rrd(run, tmp_path / name, **rest)
+    a, b = (RrdReader(tmp_path / name).recordings()[0].recording_id for name in ("a.rrd", "b.rrd"))
+    assert a == b
+    done = rerun("rrd", "compare", "--unordered", tmp_path / "a.rrd", tmp_path / "b.rrd")
+    assert done.returncode == 0, done.stderr[:500]
+
+
+def test_another_run_is_another_recording(parts, written, tmp_path):
+    run, rest = parts
+    write_rrd(run.with_facts(seed=2), tmp_path / "seed.rrd", **rest)
+    write_rrd(run.with_columns(yaw=run["yaw"] + 1e-9), tmp_path / "yaw.rrd", **rest)
+    ids = [
+        RrdReader(p).recordings()[0].recording_id
+        for p in (written, tmp_path / "seed.rrd", tmp_path / "yaw.rrd")
+    ]
+    assert len(set(ids)) == 3
+
+
+def test_a_recording_that_exists_is_kept_unless_forced(parts, tmp_path):
+    run, rest = parts
+    path = tmp_path / "run.rrd"
+    path.write_text("kept")
+    with pytest.raises(RefusedError, match=r"run\.rrd: exists already; give --force"):
+        write_rrd(run, path, **rest)
+    assert path.read_text() == "kept"
+    write_rrd(run, path, **rest, force=True)
+    assert RrdReader(path).recordings()
+
+
+def test_a_stage_that_is_missing_is_refused_and_nothing_is_left(parts, tmp_path):
+    run, rest = parts
+    strict = rr.strict_mode()
+    with pytest.raises(RefusedError, match=r"none\.usda: no such USD file"):
+        write_rrd(run, tmp_path / "run.rrd", **{**rest, "scene_file": tmp_path / "none.usda"})
+    assert not list(tmp_path.iterdir())
+    assert rr.strict_mode() == strict
+
+
+def test_a_run_of_no_rows_is_refused(parts, tmp_path):
+    run, rest = parts
+    with pytest.raises(RefusedError, match=r"run\.rrd: the run has no rows"):
+        write_rrd(Run({name: v[:0] for name, v in run.items()}), tmp_path / "run.rrd", **rest)
+    assert not list(tmp_path.iterdir())
+
+
+def test_rerun_switched_off_by_the_environment_is_said_rather_than_nothing_written(
+    parts, tmp_path, monkeypatch
+):
+    run, rest = parts
+    monkeypatch.setenv("RERUN", "off")
+    with pytest.raises(RefusedError, match="switched off by the environment variable RERUN; unset it"):
+        write_rrd(run, tmp_path / "run.rrd", **rest)
+    assert not list(tmp_path.iterdir())
+
+
+def test_view_refuses_what_is_missing_or_of_another_kind(tmp_path):
+    with pytest.raises(RefusedError, match=r"none\.rrd: no such recording"):
+        view(tmp_path / "none.rrd")
+    (tmp_path / "run.csv").touch()
+    with pytest.raises(RefusedError, match=r"no kind of recording '\.csv'; known: \.parquet, \.rrd"):
+        view(tmp_path / "run.csv")
+
+
+def test_view_without_a_display_is_refused_and_names_the_browser(written, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    if sys.platform != "linux":
+        pytest.skip("only on Linux a display can be taken away")
+    with pytest.raises(RefusedError, match=r"opened no window: .*DISPLAY.*; .*rerun --web-viewer --bind 127"):
+        view(written)
+
+
+def test_view_of_a_parquet_file_shows_its_series(parts, tmp_path, monkeypatch):
+    run, _ = parts
+    write_parquet(run, tmp_path / "run.parquet")
+    seen = tmp_path / "seen.rrd"
+    monkeypatch.setattr("magtwin.io.rerun.show", lambda rrd: shutil.copy(rrd, seen))
+    view(tmp_path / "run.parquet")
+    _, values = columns_of(seen, "series/disturbance")
+    assert np.array_equal(np.ravel(values["Scalars:scalars"]), run["b_disturbance_nt"])
+
+
+@pytest.fixture
+def drawable():
+    """Skips where nothing can be drawn."""
+    try:
+        with headless_viewer():
+            pass
+    except RefusedError as error:
+        if "cannot draw here" not in str(error):
+            raise
+        pytest.skip(str(error))
+
+
+@pytest.mark.usefixtures("drawable")
+def test_the_viewer_draws_every_view_without_a_complaint(written, tmp_path):
+    assert screenshot(written, tmp_path / "run.png", time_s=9.0, size=(800, 500)) == []
+    content = (tmp_path / "run.png").read_bytes()
+    assert content[:4] == b"\x89PNG"
+    assert [int.from_bytes(content[k : k + 4]) for k in (16, 20)] == [800, 500]
+
+
+@pytest.mark.usefixtures("drawable")
+def test_the_viewer_listens_on_this_machine_only_and_ends_with_its_block():
+    tables = [path for path in map(FilePath, ("/proc/net/tcp", "/proc/net/tcp6")) if path.exists()]
+    if not tables:
+        pytest.skip("listening sockets are read from /proc, which is not there")
+
+    def listening(port):
+        rows = [line.split() for table in tables for line in table.read_text().splitlines()]
+        return [row[1] for row in rows if row[1].endswith(f":{port:04X}") and row[3] == "0A"]
+
+    with headless_viewer() as client:
+        port = int(client.url.rsplit(":", 1)[1].split("/")[0])
+        assert listening(port) == [f"0100007F:{port:04X}"]
+    assert listening(port) == []
+
+
+def test_a_machine_without_graphics_is_refused_with_what_to_install(written, tmp_path, monkeypatch):
+    for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES", "__EGL_VENDOR_LIBRARY_FILENAMES"):
+        monkeypatch.setenv(name, str(tmp_path / "none"))
+    monkeypatch.setenv("WGPU_BACKEND", "vulkan")
+    with pytest.raises(
+        RefusedError, match=r"cannot draw here: .*; .*apt install mesa-vulkan-drivers libvulkan1"
+    ):
+        screenshot(written, tmp_path / "run.png")
+    assert not list(tmp_path.iterdir())
