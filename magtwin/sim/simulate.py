@@ -96,7 +96,7 @@ def simulate(
     columns |= sense_imu(robot.imu, motion, t, streams["imu"])
     columns |= sense_battery(robot.battery, t, streams["battery"])
     columns["lidar_on"] = lidar_on(robot.lidar, t, lidar)
-    columns |= _map(anomaly_map, true, outside)
+    columns |= _map(anomaly_map, true.pose[:, :2], columns["yaw"], outside)
     columns |= _exact_field(scene, true, columns["lidar_on"], t)
     columns |= _flags(scene, true)
     columns["b_sd_nt"] = np.full(len(t), np.nan)
@@ -123,12 +123,12 @@ def simulate(
 
 def _truth(true: Moment, t: Array) -> dict[str, NDArray[Any]]:
     """The columns of what the robot did and was told: a kinematic drive does what it is told."""
-    zero = np.zeros(len(t))
+    zero, yaw = np.zeros(len(t)), wrap_angle(true.pose[:, 2])
     return {
         "t": t,
         "p_world_base": np.column_stack([true.pose[:, :2], zero]),
-        "q_world_base_xyzw": quat_from_yaw(wrap_angle(true.pose[:, 2])),
-        "yaw": wrap_angle(true.pose[:, 2]),
+        "q_world_base_xyzw": quat_from_yaw(yaw),
+        "yaw": yaw,
         "v_base": np.column_stack([true.v, zero, zero]),
         "w_base": np.column_stack([zero, zero, true.w]),
         "v_cmd": true.v,
@@ -138,10 +138,9 @@ def _truth(true: Moment, t: Array) -> dict[str, NDArray[Any]]:
 
 
 def _map(
-    anomaly_map: AnomalyMap, true: Moment, outside: Literal["nan", "clamp", "raise"]
+    anomaly_map: AnomalyMap, xy: Array, yaw: Array, outside: Literal["nan", "clamp", "raise"]
 ) -> dict[str, NDArray[Any]]:
     """Map at base_link's poses, and where there is none."""
-    xy, yaw = true.pose[:, :2], true.pose[:, 2]
     b = anomaly_map.lookup(xy, yaw, outside=outside)
     off = np.isnan(b)
     if outside == "clamp":

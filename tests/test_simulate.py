@@ -1,0 +1,324 @@
+"""simulate: every column, the field's closed forms, determinism, refusals."""
+
+import dataclasses
+from pathlib import Path as FilePath
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.field.map import AnomalyMap
+from magtwin.frames import quat_from_rpy, rotate, yaw_from_quat
+from magtwin.names import RefusedError
+from magtwin.path import Path, path_named
+from magtwin.run import COLUMNS, Run
+from magtwin.sim.simulate import simulate
+from magtwin.spec import (
+    EarthFieldSpec,
+    LabSpec,
+    MagnetometerSpec,
+    PlatformFieldSpec,
+    RobotSpec,
+    Scene,
+    SourceSpec,
+)
+
+EARTH_NT = np.array([-2_600.0, 24_000.0, -38_000.0])
+EARTH = EarthFieldSpec(
+    b_world_nt=tuple(EARTH_NT.tolist()),
+    latitude_deg=29.6,
+    longitude_deg=-82.3,
+    height_m=30.0,
+    date="2026-01-01",
+)
+ROBOT = RobotSpec(
+    name="robot",
+    asset=FilePath("robot.usda"),
+    p_base_magnetometer=(0.05, 0.0, 0.36),
+    platform=PlatformFieldSpec(hard_iron_nt=(620.0, -430.0, 250.0), lidar_nt=(160.0, -90.0, 130.0)),
+)
+SOURCES = (
+    SourceSpec(name="chair", p_world=(0.5, 0.3, -0.5), m_world=(5.0, -3.0, 20.0)),
+    SourceSpec(name="desk", p_world=(-1.0, 0.8, -0.4), m_world=(-9.0, 4.0, -12.0)),
+)
+SURVEYED = Scene(name="surveyed", map_layer=FilePath("map.usdc"), robot=ROBOT)
+KNOWN = Scene(name="known", map_layer=FilePath("map.usdc"), robot=ROBOT, earth=EARTH, sources=SOURCES)
+LINE = Path("line", np.array([[-0.5, 0.2], [0.5, 0.2]]))
+
+
+def wavy_map(extent_m: tuple[float, float] = (6.0, 3.5)) -> AnomalyMap:
+    values = 41_000 + 1_000 * np.random.default_rng(5).standard_normal((4, 15, 25))
+    return AnomalyMap(
+        values_nt=values,
+        origin_m=(-extent_m[0] / 2, -extent_m[1] / 2),
+        cell_m=(extent_m[0] / 24, extent_m[1] / 14),
+        headings_rad=np.arange(4) * np.pi / 2,
+    )
+
+
+MAP = wavy_map()
+
+
+def drive(scene: Scene = KNOWN, path: Path = LINE, *, seed: int = 0, **options) -> Run:
+    options.setdefault("anomaly_map", MAP)
+    return simulate(scene, path, rng=np.random.default_rng(seed), **options)
+
+
+def with_robot(scene: Scene, **changes) -> Scene:
+    return dataclasses.replace(scene, robot=dataclasses.replace(scene.robot, **changes))
+
+
+def test_a_run_has_every_column_in_order_and_no_other():
+    run = drive()
+    assert list(run) == list(COLUMNS)
+    for name, values in run.items():
+        assert values.dtype == (bool if COLUMNS[name].unit == "bool" else float), name
+        if name != "b_sd_nt":
+            assert np.all(np.isfinite(values)), name
+    assert np.isnan(run["b_sd_nt"]).all()
+
+
+def test_facts_tell_how_the_run_came_about():
+    run = drive(speed=0.3, duration_s=2.0, lidar="on")
+    assert dict(run.facts) == {
+        "scene": "known",
+        "path": "line",
+        "speed_m_s": 0.3,
+        "rate_hz": 135.0,
+        "duration_s": 2.0,
+        "outside": "nan",
+        "lidar": "on",
+    }
+
+
+def test_readings_come_at_k_over_rate_for_the_whole_duration():
+    run = drive(duration_s=10.0)
+    assert_array_equal(run["t"], np.arange(1350) / 135.0)
+    assert_array_equal(drive(duration_s=10.0, rate_hz=7.0)["t"], np.arange(70) / 7.0)
+    whole = drive()
+    assert whole["t"][-1] == pytest.approx(whole.facts["duration_s"], abs=1 / 135)
+    assert_allclose(whole["p_world_base"][-1], [0.5, 0.2, 0.0], atol=0.002)
+
+
+def test_a_longer_duration_goes_on_along_the_path():
+    run = drive(duration_s=30.0)
+    assert run["p_world_base"][:, 0].max() == pytest.approx(0.5, abs=0.002)
+    assert run["p_world_base"][-1, 0] < 0.4  # on its way
+    assert np.abs(run["p_world_base"][:, 1] - 0.2).max() < 0.006
+
+
+def test_columns_of_the_truth_agree_with_each_other():
+    run = drive(path=path_named("figure8"), rate_hz=1000.0, duration_s=20.0)
+    assert_allclose(yaw_from_quat(run["q_world_base_xyzw"]), run["yaw"], atol=1e-12)
+    assert run["yaw"].min() >= -np.pi
+    assert run["yaw"].max() < np.pi
+    moved = np.diff(run["p_world_base"], axis=0) * 1000
+    wanted = rotate(run["q_world_base_xyzw"], run["v_base"])[:-1]
+    assert_allclose(moved, wanted, atol=2e-3)  # a reading's turn, and a step of 0.018 m/s shared by two
+    turned = np.diff(np.unwrap(run["yaw"])) * 1000
+    assert np.abs(turned - run["w_base"][:-1, 2]).mean() < 1e-3
+    assert_array_equal(run["v_cmd"], run["v_base"][:, 0])
+    assert_array_equal(run["w_cmd"], run["w_base"][:, 2])
+
+
+def test_wheels_have_turned_by_the_path_length():
+    run = drive()
+    assert_allclose(run["wheel_angle"][-1] * ROBOT.drive.wheel_radius_m, 1.0, atol=0.002)
+
+
+def test_the_map_is_read_at_base_links_pose():
+    run = drive(path=path_named("figure8"), duration_s=20.0)
+    assert_array_equal(run["b_map_nt"], MAP.lookup(run["p_world_base"][:, :2], run["yaw"]))
+    assert not run["flag_outside_map"].any()
+
+
+def test_the_total_is_map_plus_disturbance_and_by_physics_the_truth():
+    run = drive(path=path_named("figure8"), duration_s=20.0)
+    assert_allclose(run["b_total_nt"], run["b_map_nt"] + run["b_disturbance_nt"], atol=1e-9)
+    assert_allclose(run["b_total_nt"], run["b_truth_nt"], atol=1e-9)
+    assert_allclose(np.linalg.norm(run["b_vector_nt"], axis=1), run["b_truth_nt"], rtol=1e-12)
+
+
+def test_without_sources_or_iron_the_truth_is_the_earths_field_seen_from_the_robot():
+    scene = with_robot(dataclasses.replace(KNOWN, sources=()), platform=PlatformFieldSpec())
+    run = drive(scene, path_named("figure8"), duration_s=20.0)
+    assert_allclose(run["b_truth_nt"], np.linalg.norm(EARTH_NT), rtol=1e-12)
+    assert_allclose(rotate(run["q_world_base_xyzw"], run["b_vector_nt"]), [EARTH_NT] * run.rows, atol=1e-6)
+
+
+def test_hard_iron_makes_a_cosine_of_heading():
+    iron = PlatformFieldSpec(hard_iron_nt=(620.0, -430.0, 250.0))
+    scene = with_robot(dataclasses.replace(KNOWN, sources=()), platform=iron)
+    run = drive(scene, path_named("figure8"))
+    h = rotate(run["q_world_base_xyzw"], np.array(iron.hard_iron_nt))
+    assert_allclose(run["b_truth_nt"], np.linalg.norm(EARTH_NT + h, axis=1), rtol=1e-12)
+    assert np.ptp(run["b_truth_nt"]) > 500
+
+
+def test_the_field_is_that_at_the_magnetometer_not_at_base_link():
+    from magtwin.field.sources import dipole_field_nt
+
+    lever = np.array([0.1, -0.05, 0.36])
+    scene = with_robot(KNOWN, p_base_magnetometer=tuple(lever.tolist()), platform=PlatformFieldSpec())
+    run = drive(scene, path_named("figure8"), duration_s=20.0)
+    p = run["p_world_base"] + rotate(run["q_world_base_xyzw"], lever)
+    places, moments = zip(*((s.p_world, s.m_world) for s in SOURCES), strict=True)
+    field = dipole_field_nt(p, np.array(places), np.array(moments)) + EARTH_NT
+    assert_allclose(run["b_truth_nt"], np.linalg.norm(field, axis=1), rtol=1e-12)
+
+
+def test_eddy_currents_see_the_fields_rate_in_turning_axes():
+    # Spin-like circle in the Earth's field alone: db/dt = -w x b, so E = e 1 adds -e w x b.
+    e = 0.01
+    platform = PlatformFieldSpec(eddy_s=(e, 0, 0, 0, e, 0, 0, 0, e))
+    scene = with_robot(dataclasses.replace(KNOWN, sources=()), platform=platform)
+    run = drive(scene, path_named("narrow_figure8"))
+    b = rotate(run["q_world_base_xyzw"] * [-1, -1, -1, 1], np.broadcast_to(EARTH_NT, (run.rows, 3)))
+    assert_allclose(run["b_vector_nt"], b - e * np.cross(run["w_base"], b), atol=1e-6)
+
+
+def test_eddy_currents_see_the_fields_change_along_the_way():
+    e = 1.0
+    platform = PlatformFieldSpec(eddy_s=(e, 0, 0, 0, e, 0, 0, 0, e))
+    still, moving = (
+        drive(with_robot(KNOWN, platform=p))["b_vector_nt"] for p in (PlatformFieldSpec(), platform)
+    )
+    t = drive()["t"]
+    # On a straight line base_link does not turn: the eddy part is the derivative of the rest.
+    assert_allclose(moving - still, np.gradient(still, t, axis=0), atol=1e-6)
+    assert np.abs(moving - still).max() > 10
+
+
+def test_the_vector_is_in_the_sensors_axes_and_the_magnitude_is_not_changed_by_its_mount():
+    q = tuple(quat_from_rpy([0.3, -0.2, 1.0]).tolist())
+    askew = with_robot(KNOWN, magnetometer=MagnetometerSpec(q_link_sensor_xyzw=q))
+    a, b = drive(), drive(askew)
+    assert_allclose(rotate(np.array(q), b["b_vector_nt"]), a["b_vector_nt"], atol=1e-8)
+    assert_array_equal(a["b_truth_nt"], b["b_truth_nt"])
+
+
+def test_the_lidars_current_is_felt_when_it_is_on():
+    iron_free = with_robot(KNOWN, platform=PlatformFieldSpec(lidar_nt=(160.0, -90.0, 130.0)))
+    off, on = drive(iron_free, lidar="off"), drive(iron_free, lidar="on")
+    assert_allclose(on["b_vector_nt"] - off["b_vector_nt"], [[160, -90, 130]] * on.rows, atol=1e-8)
+    assert on["lidar_on"].all()
+    assert not off["lidar_on"].any()
+
+
+def test_a_network_gives_the_disturbance_from_columns_that_are_filled():
+    seen: list[Run] = []
+
+    def network(run: Run) -> np.ndarray:
+        seen.append(run)
+        return 100 + 10 * run["imu_w"][:, 2]
+
+    run = drive(SURVEYED, disturbance_nt=network)
+    assert len(seen) == 1
+    late = {"b_disturbance_nt", "b_total_nt", "b_measured_nt"}
+    assert set(seen[0]) == set(COLUMNS) - late
+    for name in set(COLUMNS) - late:
+        assert_array_equal(seen[0][name], run[name])
+    assert_array_equal(run["b_disturbance_nt"], 100 + 10 * run["imu_w"][:, 2])
+    assert np.isnan(run["b_truth_nt"]).all()
+    assert np.isnan(run["b_vector_nt"]).all()
+
+
+def test_with_a_network_the_exact_field_is_still_given_where_it_is_known():
+    run = drive(KNOWN, disturbance_nt=lambda run: np.full(run.rows, 7.0))
+    assert_array_equal(run["b_total_nt"], run["b_map_nt"] + 7.0)
+    assert_array_equal(run["b_truth_nt"], drive(KNOWN)["b_truth_nt"])
+
+
+def test_a_reading_is_the_total_with_noise_rounded_to_the_resolution():
+    spec = MagnetometerSpec(noise_std_nt=5.0, resolution_nt=0.01)
+    run = drive(with_robot(KNOWN, magnetometer=spec), path_named("figure8"))
+    noise = run["b_measured_nt"] - run["b_total_nt"]
+    assert noise.std() == pytest.approx(5.0, rel=4 / np.sqrt(2 * run.rows))
+    assert noise.mean() == pytest.approx(0.0, abs=4 * 5 / np.sqrt(run.rows))
+    steps = run["b_measured_nt"] / 0.01
+    assert_allclose(steps, np.rint(steps), atol=1e-6)
+
+
+@pytest.mark.parametrize("outside", ["nan", "clamp"])
+def test_poses_off_the_map_are_flagged_whatever_they_read(outside):
+    small = wavy_map((0.5, 3.5))
+    run = drive(anomaly_map=small, outside=outside)
+    off = np.abs(run["p_world_base"][:, 0]) > 0.25
+    assert_array_equal(run["flag_outside_map"], off)
+    assert_array_equal(np.isnan(run["b_map_nt"]), off if outside == "nan" else np.zeros_like(off))
+    assert_array_equal(np.isnan(run["b_measured_nt"]), np.isnan(run["b_map_nt"]))
+    assert np.isfinite(run["b_truth_nt"]).all()
+
+
+def test_a_path_off_the_map_can_be_refused():
+    with pytest.raises(RefusedError, match="off the map"):
+        drive(anomaly_map=wavy_map((0.5, 3.5)), outside="raise")
+
+
+def test_masked_nodes_are_flagged():
+    valid = np.ones((4, 15, 25), bool)
+    valid[:, :, 12] = False  # x = 0
+    masked = dataclasses.replace(MAP, valid=valid)
+    run = drive(anomaly_map=masked)
+    near = np.abs(run["p_world_base"][:, 0]) < 0.249
+    assert run["flag_outside_map"][near].all()
+    assert not run["flag_outside_map"][np.abs(run["p_world_base"][:, 0]) > 0.2501].any()
+
+
+def test_no_bump_where_the_path_keeps_clear():
+    assert not drive(path=path_named("lawnmower"))["flag_bump"].any()
+
+
+def test_a_wall_that_a_corner_swings_over_is_a_bump():
+    # A fold at the very edge: turning on the spot after stopping leaves the robot a fraction of a
+    # millimetre over, which a floor that ends there feels.
+    edge = Path("edge", np.array([[-0.5, 0.2], [0.5, 0.2], [0.5, -0.2]]))
+    tight = dataclasses.replace(KNOWN, lab=LabSpec(floor_m=(2 * (0.5 + 0.171), 3.5)))
+    run = drive(tight, edge)
+    reach = np.abs(run["p_world_base"][:, 0]) + 0.171
+    assert_array_equal(run["flag_bump"], reach > 0.671 + 1e-9)
+    assert run["flag_bump"].any()
+
+
+def test_one_seed_gives_identical_arrays_and_another_gives_others():
+    a, b, c = drive(seed=3), drive(seed=3), drive(seed=4)
+    for name in COLUMNS:
+        assert a[name].tobytes() == b[name].tobytes(), name
+    for name in ("odom_v", "imu_w", "imu_a", "imu_q_xyzw", "battery_v", "b_measured_nt"):
+        assert not np.array_equal(a[name], c[name]), name
+
+
+def test_each_sensor_has_noise_of_its_own():
+    louder = with_robot(KNOWN, imu=dataclasses.replace(ROBOT.imu, rate_hz=200.0, gyro_noise_std=1.0))
+    a, b = drive(), drive(louder)
+    for name in ("odom_p", "battery_v", "b_measured_nt", "odom_v"):
+        assert_array_equal(a[name], b[name])
+    assert not np.array_equal(a["imu_w"], b["imu_w"])
+
+
+def test_a_single_reading_is_a_run_too():
+    run = drive(duration_s=0.005)
+    assert run.rows == 1
+    assert np.isfinite(run["b_measured_nt"]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"speed": 0.5}, r"speed must be above 0 and at most 0\.306 m/s"),
+        ({"rate_hz": 0.0}, "rate_hz of the magnetometer must be above 0 Hz"),
+        ({"rate_hz": float("inf")}, "rate_hz of the magnetometer must be above 0 Hz and finite"),
+        ({"duration_s": -1.0}, "duration_s must be above 0 s"),
+        ({"lidar": "maybe"}, 'lidar must be "schedule", "on" or "off"'),
+        ({"outside": "guess"}, 'outside must be "nan", "clamp" or "raise"'),
+        ({"scene": SURVEYED}, r"scene 'surveyed' has neither a network nor an Earth field.*name a network"),
+        (
+            {"path": Path("far", np.array([[0.0, 0.0], [2.9, 0.0]]))},
+            r"path far leaves the floor at point 2 of 2",
+        ),
+        ({"disturbance_nt": lambda run: np.zeros(3)}, r"disturbance_nt must give shape \(\d+,\), got \(3,\)"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(options, says):
+    with pytest.raises(RefusedError, match=says):
+        drive(**options)
