@@ -54,6 +54,8 @@ def plot_map(
     Raises:
         RefusedError: No heading is to be shown, every node is masked, or `out` exists.
     """
+    from matplotlib.ticker import MaxNLocator
+
     shown = field.headings_rad if headings is None else np.asarray(headings, float)
     if len(shown) == 0:
         raise RefusedError("headings must name one heading at least, got none")
@@ -78,7 +80,8 @@ def plot_map(
     figure.suptitle(_summary(field, 100 if columns == 2 else 52), fontsize=11)
     below, above = bool(np.nanmin(layers) < limits[0]), bool(np.nanmax(layers) > limits[1])
     extend = ("both" if above else "min") if below else ("max" if above else "neither")
-    bar = figure.colorbar(mesh, ax=axes.tolist(), extend=extend, shrink=0.9, pad=0.02, format="%.0f")
+    ticks = MaxNLocator(10, steps=[1, 2, 5, 10])
+    bar = figure.colorbar(mesh, ax=axes.tolist(), extend=extend, ticks=ticks, shrink=0.9, pad=0.02)
     bar.set_label("total field [µT]")
     _save(figure, out, force)
 
