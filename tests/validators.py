@@ -19,10 +19,10 @@ def assert_valid(stage_file: Path | str, scratch: Path) -> None:
     assert len(validators) >= 30, "some of USD's validators were not loaded"
     stage = Usd.Stage.Open(str(stage_file))
     findings = UsdValidation.ValidationContext(validators).Validate(stage)
-    assert [f"{e.GetName()}: {e.GetMessage()}" for e in findings] == []
+    assert not findings, "\n".join(f"{e.GetName()}: {e.GetMessage()}" for e in findings)
     report = scratch / "nvidia.json"
     command = Path(sys.executable).with_name("nvidia_usd_validate")
     subprocess.run([command, stage_file, "--json-output", report], capture_output=True, check=False)
     issues = [issue for rule in json.loads(report.read_text())["rules"] for issue in rule["issues"]]
     bad = [i for i in issues if i["severity"] in ("ERROR", "FAILURE")]
-    assert [f"{i['rule']['name']}: {i['message']} {i['at']}" for i in bad] == []
+    assert not bad, "\n".join(f"{i['rule']['name']}: {i['message']} {i['at']}" for i in bad)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
 from magtwin.files import existing, output
 from magtwin.names import RefusedError
@@ -52,19 +52,32 @@ def describe_stage(stage: Usd.Stage, documentation: str) -> None:
 
 
 def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
-    """The stage of a USD file, as it is on disk now.
+    """The stage of a USD file, as it is on disk now, with every layer that it names.
 
     Raises:
-        RefusedError: No such file, or not USD; the text says what USD said of it.
+        RefusedError: No such file, or not USD, or one of its sublayers or references is missing; the
+            text says what USD said of it.
     """
     path = existing(path, "USD file")
+    heard = (
+        UsdUtils.CoalescingDiagnosticDelegate()
+    )  # keeps USD's warnings off the terminal: they are refusals
     try:
         stage = Usd.Stage.Open(str(path))
         stage.Reload()  # a layer that someone still holds would be shown as it was
+        errors = stage.GetCompositionErrors()
     except Tf.ErrorException as error:
         reason = str(error).strip().splitlines()[-1].strip()
         raise RefusedError(f"{path}: cannot be opened as USD: {reason}") from error
+    finally:
+        heard.TakeUncoalescedDiagnostics()
+    if errors:
+        raise RefusedError(f"{path}: {_one_line(str(errors[0]))}")
     return stage
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
 
 
 def relative_asset(layer: Sdf.Layer, path: Path) -> str:

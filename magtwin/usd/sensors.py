@@ -24,11 +24,12 @@ from magtwin.spec import (
     MountSpec,
     PlatformFieldSpec,
     Quat,
+    RobotSpec,
     SourceSpec,
     Vec3,
 )
 from magtwin.usd.layers import relative_asset
-from magtwin.usd.schema import apply_api, attribute_name, place, require_api
+from magtwin.usd.schema import apply_api, attribute_name, only_prim_with, place, require_api
 
 S = TypeVar("S")
 
@@ -37,6 +38,9 @@ POSE_FIELDS = frozenset(("link", "p_link_sensor", "q_link_sensor_xyzw"))
 
 JOINT_FIELDS = ("left_wheel_joint", "right_wheel_joint")
 """Fields of a DriveSpec that are relationships to joints."""
+
+BASE = "base_link"
+"""Name of the link that REP-105 makes the robot's own frame."""
 
 MAP_RELATIONSHIP = "magtwin:magnetometer:map"
 
@@ -129,7 +133,9 @@ def read_battery(prim: Usd.Prim) -> BatterySpec:
 
 def define_footprint(prim: Usd.Prim, footprint_radius_m: float) -> Usd.Prim:
     """Mark `prim`, an Xform, as the root of a robot that needs a clear circle of this radius [m]."""
-    apply_api(prim, "robot").GetAttribute(FOOTPRINT).Set(footprint_radius_m)
+    attribute = apply_api(prim, "robot").GetAttribute(FOOTPRINT)
+    if attribute.Get() != footprint_radius_m:
+        attribute.Set(footprint_radius_m)
     return prim
 
 
@@ -175,6 +181,42 @@ def define_platform(prim: Usd.Prim, spec: PlatformFieldSpec) -> Usd.Prim:
 def read_platform(prim: Usd.Prim) -> PlatformFieldSpec:
     """The spec of an authored platform field; refusals as for `read_magnetometer`."""
     return read_figures(PlatformFieldSpec, prim, "platform")
+
+
+def read_robot_prim(prim: Usd.Prim, asset: Path) -> RobotSpec:
+    """The spec of the robot rooted at `prim`, in its own asset or in a scene that refers to it.
+
+    Args:
+        prim: Has the robot, drive and platform schemas; one magnetometer, IMU, LiDAR and battery below it.
+        asset: USD file that the robot comes from.
+
+    Raises:
+        RefusedError: A part is missing or there twice, or a figure is out of range; names the prim.
+    """
+    magnetometer = only_prim_with(prim, "magnetometer")
+    return RobotSpec(
+        name=prim.GetName(),
+        asset=asset,
+        footprint_radius_m=read_footprint(prim),
+        p_base_magnetometer=_p_base(prim, magnetometer),
+        drive=read_drive(prim),
+        battery=read_battery(only_prim_with(prim, "battery")),
+        platform=read_platform(prim),
+        magnetometer=read_magnetometer(magnetometer),
+        imu=read_imu(only_prim_with(prim, "imu")),
+        lidar=read_lidar(only_prim_with(prim, "lidar")),
+    )
+
+
+def _p_base(root: Usd.Prim, sensor: Usd.Prim) -> Vec3:
+    """A sensor's origin in the axes of its robot's base [m], wherever in the world the robot stands.
+
+    The base is the body called base_link, or the root where there is none of that name.
+    """
+    cache = UsdGeom.XformCache()
+    base = next((p for p in Usd.PrimRange(root) if p.GetName() == BASE), root)
+    p_root = cache.ComputeRelativeTransform(sensor, root)[0].ExtractTranslation()
+    return tuple(cache.ComputeRelativeTransform(base, root)[0].GetInverse().Transform(p_root))
 
 
 def define_source(stage: Usd.Stage, parent: str | Sdf.Path, spec: SourceSpec) -> Usd.Prim:

@@ -1,0 +1,327 @@
+"""A Scene as layered USD: authored from its spec or its TOML, and read back from the composed stage."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from pxr import Sdf, Usd, UsdGeom, UsdUtils
+
+from magtwin.files import existing, from_table, output, read_toml, sha256
+from magtwin.frames import quat_from_yaw, yaw_from_quat
+from magtwin.names import RefusedError
+from magtwin.spec import ZERO3, EarthFieldSpec, LabSpec, MagnetometerSpec, RobotSpec, Scene, SourceSpec, Vec3
+from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, read_lab
+from magtwin.usd.layers import WORLD, describe_stage, new_stage, open_stage, relative_asset
+from magtwin.usd.maps import MAP, load_map, read_map
+from magtwin.usd.schema import only_prim_with, place, prims_with, require_api
+from magtwin.usd.sensors import (
+    MAP_RELATIONSHIP,
+    check_prim_name,
+    define_battery,
+    define_drive,
+    define_earth,
+    define_footprint,
+    define_imu,
+    define_lidar,
+    define_magnetometer,
+    define_platform,
+    define_source,
+    read_earth,
+    read_pose,
+    read_robot_prim,
+    read_source,
+    target,
+    write_pose,
+)
+
+EARTH = WORLD.AppendChild("Earth")
+SOURCES = WORLD.AppendChild("Sources")
+TAKEN = (LAB.name, PHYSICS_SCENE.name, MAP.name, EARTH.name, SOURCES.name)
+"""Children of /World that a robot's name must leave alone."""
+
+PARTS: dict[str, Callable[..., Usd.Prim]] = {
+    "magnetometer": define_magnetometer,
+    "imu": define_imu,
+    "lidar": define_lidar,
+    "battery": define_battery,
+}
+"""What a robot carries as prims of their own."""
+
+
+def author_scene(
+    scene: Scene, folder: str | os.PathLike[str], *, by_reference: bool = False, force: bool = False
+) -> Path:
+    """Write a scene as a folder of layers.
+
+    `<name>.usda` places the robot and says what differs from its asset; it stands over `room.usda`,
+    `magnetics.usda` (Earth's field and sources, where there are any) and the map's layer.
+
+    Args:
+        scene: What to author.
+        folder: Folder to make.
+        by_reference: Whether map, robot and weights stay where they are and are named by relative paths.
+            Otherwise they are copied into the folder, which can then be moved anywhere.
+        force: Whether a folder that exists is replaced.
+
+    Returns:
+        The root layer, `folder/<name>.usda`.
+
+    Raises:
+        RefusedError: The folder exists, a file is missing, is not what it should be, or a name cannot
+            name a file or a prim.
+    """
+    _check(scene)
+    with output(folder, force=force) as aside:
+        aside.mkdir()
+        placed = scene if by_reference else _with_copies(scene, aside)
+        sublayers = [_write_room(scene.lab, aside), *_write_magnetics(scene, aside), placed.map_layer]
+        stage = Usd.Stage.CreateNew(str(aside / f"{scene.name}.usda"))
+        root = stage.GetRootLayer()
+        describe_stage(stage, f"{scene.name}: a lab, its magnetic map and {scene.robot.name}, by magtwin")
+        stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, WORLD).GetPrim())
+        root.subLayerPaths = [relative_asset(root, layer) for layer in sublayers]
+        _define_robot(stage, placed)
+        _settle(root, aside, Path(folder).resolve())
+        stage.Save()
+    return Path(folder) / f"{scene.name}.usda"
+
+
+def read_scene(path: str | os.PathLike[str]) -> Scene:
+    """The scene of a stage.
+
+    Args:
+        path: Root layer, as `author_scene` wrote it or as others edited it. A start's yaw comes back
+            from a quaternion, so in its last bits it can differ from what was authored.
+
+    Raises:
+        RefusedError: The file or one that it names is missing, it has no lab, robot or map, a figure
+            is out of range, or the map is not what its checksum was taken of; names the prim.
+    """
+    stage = open_stage(path)
+    world = stage.GetPseudoRoot()
+    lab = read_lab(only_prim_with(world, "lab"))
+    prim = only_prim_with(world, "robot")
+    robot = read_robot_prim(prim, _asset(prim))
+    magnetometer = only_prim_with(prim, "magnetometer")
+    field_map = require_api(target(magnetometer, MAP_RELATIONSHIP), "anomalyMap")
+    read_map(field_map)
+    earths = prims_with(world, "earth")
+    if len(earths) > 1:
+        raise RefusedError(f"{place(earths[1])}: a second Earth's field; the first is {earths[0].GetPath()}")
+    p, q = read_pose(prim)
+    return Scene(
+        name=Path(path).stem,
+        map_layer=_layer_of(field_map),
+        robot=robot,
+        lab=lab,
+        earth=read_earth(earths[0]) if earths else None,
+        sources=tuple(read_source(source) for source in prims_with(world, "source")),
+        start=(p[0], p[1], float(yaw_from_quat(q))),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RobotTable:
+    """[robot] of a scene's TOML."""
+
+    asset: Path
+    network: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SourcesTable:
+    """[sources] of a scene's TOML."""
+
+    file: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SceneFile:
+    """A scene's TOML; `lab` and `earth` have the keys of their specs."""
+
+    name: str
+    robot: _RobotTable
+    map: Path | None = None
+    start: Vec3 = ZERO3
+    lab: LabSpec = field(default_factory=LabSpec)
+    earth: EarthFieldSpec | None = None
+    sources: _SourcesTable | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SourceFile:
+    """A TOML of sources, one [[source]] each."""
+
+    source: tuple[SourceSpec, ...]
+
+
+def scene_from_toml(
+    path: str | os.PathLike[str],
+    *,
+    map_layer: str | os.PathLike[str] | None = None,
+    network: str | os.PathLike[str] | None = None,
+) -> Scene:
+    """The scene that a TOML describes, as scenes/lab.toml does.
+
+    Args:
+        path: The TOML; files that it names are taken from its folder.
+        map_layer: Map to use in place of the one that it names. Its Earth's field and sources are
+            those of its own map, and are left out.
+        network: Weights to use in place of those that it names.
+
+    Raises:
+        RefusedError: A key is misspelt or missing, or a file is not there; with file and line.
+    """
+    given = from_table(_SceneFile, read_toml(path), path)
+    layer = Path(map_layer).resolve() if map_layer is not None else given.map
+    if layer is None:
+        raise RefusedError(f'{path}: names no map; add map = "FILE.usdc" to it, or give --map FILE.usdc')
+    robot = _read_asset(existing(given.robot.asset, "robot asset"))
+    weights = Path(network).resolve() if network is not None else given.robot.network
+    if weights is not None:
+        robot = replace(robot, magnetometer=_with_network(robot, existing(weights, "weights file")))
+    own_map = map_layer is None
+    return Scene(
+        name=given.name,
+        map_layer=existing(layer, "map layer"),
+        robot=robot,
+        lab=given.lab,
+        earth=given.earth if own_map else None,
+        sources=_sources(given.sources.file) if given.sources and own_map else (),
+        start=given.start,
+    )
+
+
+def _sources(path: Path) -> tuple[SourceSpec, ...]:
+    return from_table(_SourceFile, read_toml(path), path).source
+
+
+def _with_network(robot: RobotSpec, weights: Path) -> MagnetometerSpec:
+    """The robot's magnetometer with these weights, their checksum and the inputs that they name."""
+    inputs: tuple[str, ...] = ()
+    if weights.suffix == ".safetensors":
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(weights, framework="numpy") as file:
+                about = json.loads((file.metadata() or {}).get("magtwin", "{}"))
+            inputs = tuple(str(name) for name in about.get("features", ()))
+        except (SafetensorError, ValueError, AttributeError) as error:
+            raise RefusedError(f"{weights}: cannot be read as safetensors: {error}") from error
+    return replace(robot.magnetometer, network=weights, network_sha256=sha256(weights), inputs=inputs)
+
+
+def _check(scene: Scene) -> None:
+    """Refuse what would come out broken, before anything is written, by the names that the caller knows."""
+    if Path(scene.name).name != scene.name or scene.name.startswith("."):
+        raise RefusedError(f"scene {scene.name!r} cannot name a file; use letters, digits, - and _")
+    if check_prim_name(scene.robot.name, "robot") in TAKEN:
+        raise RefusedError(f"robot {scene.robot.name!r} has the name of a part of the scene; rename it")
+    names = [source.name for source in scene.sources]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise RefusedError(f"two sources are called {twice[0]!r}; give each a name of its own")
+    load_map(scene.map_layer)
+    _read_asset(scene.robot.asset)
+    if scene.robot.magnetometer.network is not None:
+        existing(scene.robot.magnetometer.network, "weights file")
+
+
+def _with_copies(scene: Scene, folder: Path) -> Scene:
+    """The scene on copies of its files in `folder`."""
+    magnetometer = scene.robot.magnetometer
+    if magnetometer.network is not None:
+        magnetometer = replace(magnetometer, network=_copied(magnetometer.network, folder / "weights"))
+    robot = replace(
+        scene.robot, asset=_copied_asset(scene.robot.asset, folder / "robot"), magnetometer=magnetometer
+    )
+    return replace(scene, map_layer=_copied(scene.map_layer, folder / "map"), robot=robot)
+
+
+def _copied(file: Path, folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return Path(shutil.copyfile(file, folder / file.name))
+
+
+def _copied_asset(asset: Path, folder: Path) -> Path:
+    """A USD file copied with every file that it names, in the same arrangement."""
+    asset = asset.resolve()
+    layers, assets, unresolved = UsdUtils.ComputeAllDependencies(str(asset))
+    if unresolved:
+        raise RefusedError(f"{asset}: names {unresolved[0]}, which is not there")
+    files = sorted({asset, *(Path(layer.realPath).resolve() for layer in layers), *map(Path, assets)})
+    common = Path(os.path.commonpath([file.parent for file in files]))
+    for file in files:
+        _copied(file, (folder / file.relative_to(common)).parent)
+    return folder / asset.relative_to(common)
+
+
+def _write_room(lab: LabSpec, folder: Path) -> Path:
+    with new_stage(folder / "room.usda", "The room, its lights and its physics, by magtwin") as stage:
+        define_lab(stage, lab)
+    return folder / "room.usda"
+
+
+def _write_magnetics(scene: Scene, folder: Path) -> list[Path]:
+    if scene.earth is None and not scene.sources:
+        return []
+    path = folder / "magnetics.usda"
+    with new_stage(path, "What makes the magnetic field: the Earth and magnetised things") as stage:
+        if scene.earth is not None:
+            define_earth(stage, EARTH, scene.earth)
+        if scene.sources:
+            UsdGeom.Xform.Define(stage, SOURCES)
+        for source in scene.sources:
+            define_source(stage, SOURCES, source)
+    return [path]
+
+
+def _define_robot(stage: Usd.Stage, scene: Scene) -> None:
+    """The robot by reference, where it starts, with overs for what differs from its asset."""
+    robot, root = scene.robot, stage.GetRootLayer()
+    prim = UsdGeom.Xform.Define(stage, WORLD.AppendChild(robot.name)).GetPrim()
+    prim.GetReferences().AddReference(relative_asset(root, robot.asset))
+    x, y, yaw = scene.start
+    write_pose(prim, (x, y, 0.0), tuple(map(float, quat_from_yaw(yaw))))  # type: ignore[arg-type]
+    define_footprint(prim, robot.footprint_radius_m)
+    define_drive(prim, robot.drive)
+    define_platform(prim, robot.platform)
+    for part, define in PARTS.items():
+        define(stage, only_prim_with(prim, part).GetPath(), getattr(robot, part))
+    relationship = only_prim_with(prim, "magnetometer").GetRelationship(MAP_RELATIONSHIP)
+    relationship.SetTargets([only_prim_with(stage.GetPrimAtPath(WORLD), "anomalyMap").GetPath()])
+
+
+def _settle(layer: Sdf.Layer, aside: Path, final: Path) -> None:
+    """Make paths that leave the folder `aside`, where the layer is written, right for `final`, its place."""
+    aside = aside.resolve()
+
+    def settled(path: str) -> str:
+        absolute = (aside / path).resolve()
+        if absolute.is_relative_to(aside):
+            return f"./{absolute.relative_to(aside).as_posix()}"
+        return Path(os.path.relpath(absolute, final)).as_posix()
+
+    UsdUtils.ModifyAssetPaths(layer, settled)
+
+
+def _layer_of(field_map: Usd.Prim) -> Path:
+    """The layer that holds a map's values."""
+    specs = field_map.GetAttribute("magtwin:anomalyMap:values").GetPropertyStack()
+    return Path(specs[0].layer.realPath).resolve()
+
+
+def _read_asset(asset: Path) -> RobotSpec:
+    stage = open_stage(asset)
+    if not stage.GetDefaultPrim():
+        raise RefusedError(f"{asset}: has no default prim, so no robot; make the asset with `magtwin robot`")
+    return read_robot_prim(stage.GetDefaultPrim(), asset.resolve())
+
+
+def _asset(prim: Usd.Prim) -> Path:
+    """The file that a robot's prim refers to; the stage's own where it refers to none."""
+    arcs = Usd.PrimCompositionQuery.GetDirectReferences(prim).GetCompositionArcs()
+    layer = arcs[0].GetTargetLayer() if arcs else prim.GetStage().GetRootLayer()
+    return Path(layer.realPath).resolve()

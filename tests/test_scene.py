@@ -1,0 +1,515 @@
+"""A Scene through its layers and back; what cannot be a scene is refused by file and prim."""
+
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade
+from validators import assert_valid
+
+from magtwin.field.map import AnomalyMap
+from magtwin.files import sha256
+from magtwin.names import RefusedError
+from magtwin.spec import (
+    BatterySpec,
+    DriveSpec,
+    EarthFieldSpec,
+    ImuSpec,
+    LabSpec,
+    LidarSpec,
+    MagnetometerSpec,
+    PlatformFieldSpec,
+    Scene,
+    SourceSpec,
+)
+from magtwin.usd import sensors
+from magtwin.usd.lab import LAB, define_lab, read_lab
+from magtwin.usd.layers import new_stage
+from magtwin.usd.maps import MAP, save_map
+from magtwin.usd.scene import author_scene, read_scene, scene_from_toml
+
+EARTH = EarthFieldSpec(
+    b_world_nt=(-2_000.5, 23_000.25, -39_000.125),
+    latitude_deg=29.6,
+    longitude_deg=-82.3,
+    height_m=20.0,
+    date="2026-01-01",
+)
+SOURCES = (
+    SourceSpec(name="beam", p_world=(1.0, 0.5, -0.4), m_world=(0.0, 3.0, -8.0)),
+    SourceSpec(name="anchor", p_world=(-1.5, -0.25, -0.3), m_world=(0.5, 0.0, 2.0)),
+)
+LINKS = {"base_link": (0.0, 0.0, 0.05), "magnetometer_link": (0.03, 0.0, 0.35), "imu_link": (0.0, 0.0, 0.1)}
+TOML = """
+name = "small"
+map = "map.usdc"
+
+[robot]
+asset = "robot/bot.usda"
+"""
+
+
+def define_robot_asset(path: Path) -> None:
+    """A robot with every part that magtwin reads, and nothing to look at."""
+    with new_stage(path, "a robot of the tests") as stage:
+        root = UsdGeom.Xform.Define(stage, "/bot").GetPrim()
+        stage.SetDefaultPrim(root)
+        stage.RemovePrim("/World")
+        for link, p in {**LINKS, "rplidar_link": (0.0, 0.0, 0.2)}.items():
+            sensors.write_pose(UsdGeom.Xform.Define(stage, f"/bot/{link}").GetPrim(), p)
+        UsdPhysics.RigidBodyAPI.Apply(stage.GetPrimAtPath("/bot/base_link"))
+        for joint in ("left_wheel_joint", "right_wheel_joint"):
+            UsdPhysics.RevoluteJoint.Define(stage, f"/bot/{joint}").CreateBody0Rel().SetTargets(
+                ["/bot/base_link"]
+            )
+        sensors.define_footprint(root, 0.2)
+        sensors.define_drive(root, DriveSpec(v_max=0.4))
+        sensors.define_platform(root, PlatformFieldSpec(hard_iron_nt=(1.0, 2.0, 3.0)))
+        sensors.define_battery(stage, "/bot/battery", BatterySpec(load_w=12.0))
+        mount = MagnetometerSpec(p_link_sensor=(0.0, 0.0, 0.01))
+        sensors.define_magnetometer(stage, "/bot/magnetometer_link/magnetometer", mount)
+        sensors.define_imu(stage, "/bot/imu_link/imu", ImuSpec())
+        sensors.define_lidar(stage, "/bot/rplidar_link/lidar", LidarSpec())
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory) -> Path:
+    """A folder with a map, a robot, weights and a TOML that names the first two; not to be changed."""
+    folder = tmp_path_factory.mktemp("parts")
+    define_robot_asset(folder / "robot" / "bot.usda")
+    save_map(small_map(), folder / "map.usdc")
+    (folder / "net.pth").write_bytes(b"weights")
+    (folder / "scene.toml").write_text(TOML)
+    return folder
+
+
+@pytest.fixture
+def own_parts(parts, tmp_path) -> Path:
+    """The same, to be changed."""
+    return Path(shutil.copytree(parts, tmp_path / "parts"))
+
+
+def small_map() -> AnomalyMap:
+    rng = np.random.default_rng(0)
+    return AnomalyMap(
+        values_nt=rng.normal(41_000, 300, (4, 3, 4)).astype(np.float32),
+        origin_m=(-3.0, -1.75),
+        cell_m=(2.0, 1.75),
+        headings_rad=np.arange(4) * np.pi / 2,
+        name="small",
+    )
+
+
+def full_scene(parts: Path) -> Scene:
+    scene = scene_from_toml(parts / "scene.toml", network=parts / "net.pth")
+    return replace(scene, earth=EARTH, sources=SOURCES, start=(1.0, -0.5, 0.0))
+
+
+def test_a_scene_survives_its_layers(parts, tmp_path):
+    scene = full_scene(parts)
+    assert scene.robot.magnetometer.network_sha256 == sha256(parts / "net.pth")
+    assert read_scene(author_scene(scene, tmp_path / "s", by_reference=True)) == scene
+
+
+number = st.floats(-1e6, 1e6)
+vec3 = st.tuples(number, number, number)
+above_zero, not_negative = st.floats(1e-6, 1e6), st.floats(0, 1e6)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    lab=st.builds(
+        LabSpec,
+        floor_m=st.tuples(st.floats(0.1, 100), st.floats(0.1, 100)),
+        wall_height_m=st.sampled_from([0.0, 0.1, 1.0]),
+        wall_thickness_m=st.floats(0.01, 1),
+        post_height_m=st.sampled_from([0.0, 1.7, 3.0]),
+    ),
+    earth=st.none() | st.just(EARTH) | st.builds(replace, st.just(EARTH), b_world_nt=vec3),
+    sources=st.lists(vec3, max_size=3).map(
+        lambda m: tuple(
+            SourceSpec(name=f"s{i}", p_world=(float(i), 0.0, 0.0), m_world=v) for i, v in enumerate(m)
+        )
+    ),
+    start=st.tuples(number, number, st.floats(-3.14, 3.14)),
+    magnetometer=st.builds(
+        MagnetometerSpec,
+        p_link_sensor=st.just((0.0, 0.0, 0.01)),
+        rate_hz=above_zero,
+        noise_std_nt=not_negative,
+        resolution_nt=not_negative,
+    ),
+    imu=st.builds(ImuSpec, rate_hz=above_zero, gyro_noise_std=not_negative),
+    lidar=st.builds(LidarSpec, on_s=not_negative, off_s=not_negative),
+    battery=st.builds(BatterySpec, load_w=not_negative, initial_fraction=st.floats(0, 1)),
+    drive=st.builds(DriveSpec, v_max=above_zero, wheel_radius_m=above_zero),
+    platform=st.builds(PlatformFieldSpec, hard_iron_nt=vec3, soft_iron=st.tuples(*[number] * 9)),
+    footprint=above_zero,
+)
+def test_any_scene_of_that_robot_survives_its_layers(
+    parts, tmp_path_factory, lab, earth, sources, start, footprint, **of_robot
+):
+    robot = replace(scene_from_toml(parts / "scene.toml").robot, footprint_radius_m=footprint, **of_robot)
+    scene = Scene(
+        name="any",
+        map_layer=parts / "map.usdc",
+        robot=robot,
+        lab=lab,
+        earth=earth,
+        sources=sources,
+        start=start,
+    )
+    read = read_scene(author_scene(scene, tmp_path_factory.mktemp("any") / "s", by_reference=True))
+    assert read.start == pytest.approx(start, rel=1e-15, abs=1e-15)  # two roundings of a quaternion
+    assert replace(read, start=start) == scene
+
+
+def test_the_magnetometers_place_in_the_base_is_read_through_the_links(parts):
+    robot = scene_from_toml(parts / "scene.toml").robot
+    assert robot.p_base_magnetometer == pytest.approx((0.03, 0.0, 0.31), abs=1e-15)  # .35 + .01 - .05
+
+
+def test_a_scenes_folder_can_be_moved_and_needs_nothing_outside_of_it(own_parts, tmp_path):
+    scene = full_scene(own_parts)
+    author_scene(scene, tmp_path / "a" / "s")
+    shutil.rmtree(own_parts)
+    (tmp_path / "a" / "s").rename(tmp_path / "moved")
+    read = read_scene(tmp_path / "moved" / "small.usda")
+    inside = replace(
+        scene,
+        map_layer=tmp_path / "moved" / "map" / "map.usdc",
+        robot=replace(
+            scene.robot,
+            asset=tmp_path / "moved" / "robot" / "bot.usda",
+            magnetometer=replace(
+                scene.robot.magnetometer, network=tmp_path / "moved" / "weights" / "net.pth"
+            ),
+        ),
+    )
+    assert read == inside
+    for layer in (tmp_path / "moved").rglob("*.usda"):
+        assert str(tmp_path) not in layer.read_text()
+
+
+def test_a_robot_of_several_files_is_copied_whole(own_parts, tmp_path):
+    folder = own_parts / "robot"
+    (folder / "base").mkdir()
+    (folder / "bot.usda").rename(folder / "base" / "body.usda")
+    with new_stage(folder / "bot.usda", "a robot in two files") as stage:
+        root = UsdGeom.Xform.Define(stage, "/bot").GetPrim()
+        stage.SetDefaultPrim(root)
+        root.GetPayloads().AddPayload("./base/body.usda")
+    scene = scene_from_toml(own_parts / "scene.toml")
+    read = read_scene(author_scene(scene, tmp_path / "s"))
+    assert (tmp_path / "s" / "robot" / "base" / "body.usda").exists()
+    assert read.robot.asset == tmp_path / "s" / "robot" / "bot.usda"
+
+
+def test_one_scene_gives_the_same_bytes_every_time(parts, tmp_path):
+    for name in "ab":
+        author_scene(full_scene(parts), tmp_path / name)
+    files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file())
+    assert len(files) == 6
+    for file in files:
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+
+
+def test_the_root_layer_is_short_text_with_units_axes_and_relative_paths(parts, tmp_path):
+    root = author_scene(full_scene(parts), tmp_path / "s")
+    text = root.read_text()
+    assert len(text.splitlines()) < 60
+    stage = Usd.Stage.Open(str(root))
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    assert UsdPhysics.GetStageKilogramsPerUnit(stage) == 1
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert stage.GetDefaultPrim().GetPath() == "/World"
+    assert list(stage.GetRootLayer().subLayerPaths) == ["./room.usda", "./magnetics.usda", "./map/map.usdc"]
+    assert "@./robot/bot.usda@" in text
+    assert "@./weights/net.pth@" in text
+    assert stage.GetRootLayer().documentation
+    assert stage.GetRootLayer().customLayerData["creator"] == "magtwin"
+
+
+def test_the_robot_stands_where_the_scene_starts(parts, tmp_path):
+    scene = replace(full_scene(parts), start=(1.0, -0.5, math.pi / 2))
+    stage = Usd.Stage.Open(str(author_scene(scene, tmp_path / "s")))
+    world = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/World/bot"))
+    assert Gf.IsClose(world.Transform(Gf.Vec3d(1, 0, 0)), Gf.Vec3d(1, 0.5, 0), 1e-12)
+
+
+def test_the_magnetometer_points_to_the_map_that_it_reads(parts, tmp_path):
+    stage = Usd.Stage.Open(str(author_scene(full_scene(parts), tmp_path / "s")))
+    magnetometer = stage.GetPrimAtPath("/World/bot/magnetometer_link/magnetometer")
+    assert magnetometer.GetRelationship(sensors.MAP_RELATIONSHIP).GetTargets() == [MAP]
+
+
+def test_a_scene_passes_the_gates(parts, tmp_path):
+    assert_valid(author_scene(full_scene(parts), tmp_path / "s"), tmp_path)
+
+
+# The lab
+
+
+def lab_stage(spec: LabSpec) -> Usd.Stage:
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    define_lab(stage, spec)
+    return stage
+
+
+def box_of(stage: Usd.Stage, path: Sdf.Path) -> Gf.Range3d:
+    return (
+        UsdGeom.BBoxCache(0, ["default"]).ComputeWorldBound(stage.GetPrimAtPath(path)).ComputeAlignedRange()
+    )
+
+
+def test_the_floor_ends_at_zero_and_the_walls_stand_just_outside_of_it():
+    spec = LabSpec(floor_m=(6.0, 3.5), wall_height_m=0.3, wall_thickness_m=0.05)
+    stage = lab_stage(spec)
+    floor = box_of(stage, LAB.AppendChild("Floor"))
+    assert floor.GetMax()[2] == pytest.approx(0)
+    east, south = box_of(stage, LAB.AppendPath("Walls/East")), box_of(stage, LAB.AppendPath("Walls/South"))
+    assert (east.GetMin()[0], east.GetMax()[0], east.GetMax()[2]) == pytest.approx((3.0, 3.05, 0.3))
+    assert (south.GetMax()[1], south.GetMin()[1], south.GetMin()[2]) == pytest.approx((-1.75, -1.8, 0.0))
+
+
+def test_posts_stand_at_the_corners_and_amid_the_long_walls_and_reach_their_height():
+    stage = lab_stage(LabSpec(floor_m=(2.0, 8.0), post_height_m=2.0))
+    frame = stage.GetPrimAtPath(LAB.AppendChild("CaptureFrame"))
+    posts = [p for p in frame.GetChildren() if p.GetName().startswith("Post")]
+    places = {tuple(np.sign(np.round(box_of(stage, p.GetPath()).GetMidpoint(), 6))[:2]) for p in posts}
+    assert places == {(-1, -1), (-1, 1), (1, -1), (1, 1), (-1, 0), (1, 0)}
+    assert all(box_of(stage, p.GetPath()).GetMax()[2] == pytest.approx(2.0) for p in posts)
+
+
+def test_cameras_look_at_the_middle_of_the_floor():
+    stage = lab_stage(LabSpec())
+    cache = UsdGeom.XformCache()
+    frame = stage.GetPrimAtPath(LAB.AppendChild("CaptureFrame"))
+    cameras = [p for p in frame.GetChildren() if p.GetName().startswith("Camera")]
+    assert len(cameras) == 6
+    for camera in cameras:
+        world = cache.GetLocalToWorldTransform(camera)
+        ahead = world.TransformDir(Gf.Vec3d(1, 0, 0))
+        home = -world.ExtractTranslation()
+        assert Gf.IsClose(ahead, home.GetNormalized(), 1e-12)
+
+
+def test_everything_in_the_lab_wears_a_material_and_floor_walls_and_posts_collide():
+    stage = lab_stage(LabSpec())
+    gprims = [p for p in stage.Traverse() if p.IsA(UsdGeom.Gprim)]
+    for prim in gprims:
+        assert UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0], prim
+    solid = {p.GetName() for p in gprims if p.HasAPI(UsdPhysics.CollisionAPI)}
+    assert {"Floor", "North", "South", "East", "West", "Post_0"} <= solid
+    material, _ = UsdShade.MaterialBindingAPI(
+        stage.GetPrimAtPath(LAB.AppendChild("Floor"))
+    ).ComputeBoundMaterial("physics")
+    assert UsdPhysics.MaterialAPI(material.GetPrim()).GetStaticFrictionAttr().Get() == pytest.approx(0.05)
+
+
+def test_the_lab_has_gravity_and_light():
+    stage = lab_stage(LabSpec())
+    scene = UsdPhysics.Scene(stage.GetPrimAtPath("/World/PhysicsScene"))
+    assert scene.GetGravityDirectionAttr().Get() == Gf.Vec3f(0, 0, -1)
+    assert scene.GetGravityMagnitudeAttr().Get() == pytest.approx(9.81)
+    assert any(p.IsA(UsdLux.DomeLight) for p in stage.Traverse())
+    assert sum(p.IsA(UsdLux.RectLight) for p in stage.Traverse()) == 4
+
+
+def test_a_lab_without_walls_and_posts_has_none():
+    spec = LabSpec(wall_height_m=0.0, post_height_m=0.0)
+    stage = lab_stage(spec)
+    assert {p.GetName() for p in stage.GetPrimAtPath(LAB).GetChildren()} == {"Looks", "Floor", "Lights"}
+    assert read_lab(stage.GetPrimAtPath(LAB)) == spec
+
+
+# A scene's TOML
+
+
+def test_a_toml_fills_in_defaults_and_takes_its_files_from_its_folder(parts):
+    scene = scene_from_toml(parts / "scene.toml")
+    assert (scene.name, scene.lab, scene.earth, scene.sources) == ("small", LabSpec(), None, ())
+    assert scene.map_layer == parts / "map.usdc"
+    assert scene.robot.asset == parts / "robot" / "bot.usda"
+    assert scene.robot.footprint_radius_m == 0.2
+    assert scene.robot.magnetometer.network is None
+
+
+def test_a_toml_gives_room_start_earth_and_sources(own_parts):
+    (own_parts / "sources.toml").write_text(
+        '[[source]]\nname = "beam"\np_world = [1, 2, -0.5]\nm_world = [0, 0, 4.5]\n'
+    )
+    (own_parts / "scene.toml").write_text(
+        TOML.replace('"map.usdc"', '"map.usdc"\nstart = [1, 0.5, 0.25]')
+        + "[lab]\nfloor_m = [5, 4]\n[sources]\nfile = 'sources.toml'\n"
+        + "[earth]\nb_world_nt = [0, 20e3, -40e3]\nlatitude_deg = 29\nlongitude_deg = -82\nheight_m = 2\n"
+        + 'date = "2026-01-01"\n'
+    )
+    scene = scene_from_toml(own_parts / "scene.toml")
+    assert scene.start == (1.0, 0.5, 0.25)
+    assert scene.lab == LabSpec(floor_m=(5.0, 4.0))
+    assert scene.earth is not None
+    assert scene.earth.b_world_nt == (0.0, 20e3, -40e3)
+    assert scene.sources == (SourceSpec(name="beam", p_world=(1.0, 2.0, -0.5), m_world=(0.0, 0.0, 4.5)),)
+    other = scene_from_toml(own_parts / "scene.toml", map_layer=own_parts / "map.usdc")
+    assert (other.earth, other.sources) == (None, ()), "what made one map does not make another"
+
+
+def test_a_network_in_safetensors_brings_its_inputs_and_its_checksum(own_parts):
+    from safetensors.numpy import save_file
+
+    about = {"magtwin": json.dumps({"features": ["yaw_deg", "v_x"]})}
+    save_file({"w": np.zeros(2, np.float32)}, own_parts / "net.safetensors", metadata=about)
+    (own_parts / "scene.toml").write_text(TOML + 'network = "net.safetensors"\n')
+    magnetometer = scene_from_toml(own_parts / "scene.toml").robot.magnetometer
+    assert magnetometer.inputs == ("yaw_deg", "v_x")
+    assert magnetometer.network_sha256 == sha256(own_parts / "net.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("name =", "nmae =", r"scene\.toml:2: unknown key 'nmae'; did you mean 'name'"),
+        ("asset =", "aset =", r"scene\.toml:6: \[robot\] unknown key 'aset'; did you mean 'asset'"),
+        ("bot.usda", "gone.usda", r"gone\.usda: no such robot asset; did you mean 'bot\.usda'"),
+        ("map.usdc", "mapp.usdc", r"mapp\.usdc: no such map layer; did you mean 'map\.usdc'"),
+        ('map = "map.usdc"', "", r"scene\.toml: names no map; add map = "),
+        ("[robot]", "[lab]\nfloor_m = [6]\n[robot]", r"scene\.toml:6: \[lab\] floor_m must be a list of 2"),
+        (
+            "[robot]",
+            "[lab]\nfloor_m = [6, -1]\n[robot]",
+            r"scene\.toml:6: \[lab\] floor_m of LabSpec must be above",
+        ),
+        ("[robot]", "[robot]\nnetwork = 'net'", r"net: no such weights file"),
+        ("[robot]", "[sources]\nfile = 'gone.toml'\n[robot]", r"gone\.toml: no such TOML file"),
+        ("small", "../small", r"scene '\.\./small' cannot name a file"),
+    ],
+)
+def test_a_broken_toml_is_refused_by_line_with_nothing_written(own_parts, tmp_path, old, new, said):
+    (own_parts / "scene.toml").write_text(TOML.replace(old, new))
+    with pytest.raises(RefusedError, match=said):
+        author_scene(scene_from_toml(own_parts / "scene.toml"), tmp_path / "s")
+    assert not (tmp_path / "s").exists()
+
+
+def test_weights_that_are_no_safetensors_are_refused(own_parts):
+    (own_parts / "net.safetensors").write_bytes(b"none")
+    with pytest.raises(RefusedError, match=r"net\.safetensors: cannot be read as safetensors"):
+        scene_from_toml(own_parts / "scene.toml", network=own_parts / "net.safetensors")
+
+
+# What cannot be authored
+
+
+def test_a_folder_that_exists_is_refused_and_kept(parts, tmp_path):
+    root = author_scene(full_scene(parts), tmp_path / "s")
+    before = root.read_bytes()
+    with pytest.raises(RefusedError, match="exists already; give --force"):
+        author_scene(replace(full_scene(parts), start=(0.0, 0.0, 0.0)), tmp_path / "s")
+    assert root.read_bytes() == before
+    author_scene(replace(full_scene(parts), start=(0.0, 0.0, 0.0)), tmp_path / "s", force=True)
+    assert read_scene(root).start == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda s: {"map_layer": s.robot.asset}, r"bot\.usda </>: needs one prim with MagtwinAnomalyMapAPI"),
+        (
+            lambda s: {"robot": replace(s.robot, asset=s.map_layer)},
+            r"needs one prim with MagtwinMagnetometerAPI",
+        ),
+        (lambda s: {"robot": replace(s.robot, name="Lab")}, "'Lab' has the name of a part of the scene"),
+        (lambda s: {"robot": replace(s.robot, name="my bot")}, "'my bot' cannot name a prim"),
+        (lambda s: {"sources": (SOURCES[0], SOURCES[0])}, "two sources are called 'beam'"),
+        (
+            lambda s: {"robot": replace(s.robot, imu=replace(s.robot.imu, link="base_link"))},
+            "sits on 'base_link', so its prim must be a child of it",
+        ),
+    ],
+)
+def test_a_scene_that_does_not_fit_is_refused_with_nothing_written(parts, tmp_path, change, said):
+    scene = full_scene(parts)
+    with pytest.raises(RefusedError, match=said):
+        author_scene(replace(scene, **change(scene)), tmp_path / "s")
+    assert list(tmp_path.iterdir()) == []
+
+
+# Broken stages
+
+
+def broken(parts: Path, folder: Path, edit) -> Path:
+    """A scene whose root layer `edit` has changed."""
+    root = author_scene(full_scene(parts), folder / "s")
+    text = root.read_text()
+    changed = edit(text)
+    assert changed != text
+    root.write_text(changed)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (
+            lambda t: t.replace("./robot/bot.usda", "./robot/gone.usda"),
+            r"gone\.usda@ for reference.*</World/bot>",
+        ),
+        (lambda t: t.replace("./map/map.usdc", "./map/gone.usdc"), r"Could not load sublayer.*gone\.usdc"),
+        (
+            lambda t: t.replace("@./map/map.usdc@", ""),
+            r"</World/bot/.*/magnetometer>: magtwin:magnetometer:map must",
+        ),
+        (
+            lambda t: t.replace("@./room.usda@,", ""),
+            r"needs one prim with MagtwinLabAPI below it, found none",
+        ),
+        (
+            lambda t: t.replace("./weights/net.pth", "./weights/gone"),
+            r"</.*magnetometer>: .*network names .*gone",
+        ),
+        (
+            lambda t: t.replace("</World/AnomalyMap>", "</World/Lab>"),
+            r"</World/Lab>: has no MagtwinAnomalyMapAPI",
+        ),
+        (lambda t: t.replace("{", "{{{", 1), r"small\.usda: cannot be opened as USD"),
+    ],
+)
+def test_a_broken_stage_is_refused_in_one_line_by_file_and_prim(parts, tmp_path, capfd, edit, said):
+    root = broken(parts, tmp_path, edit)
+    with pytest.raises(RefusedError, match=said) as refused:
+        read_scene(root)
+    assert "small.usda" in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert capfd.readouterr().err == "", "USD's own warnings stay off the terminal"
+
+
+def test_a_missing_scene_is_refused(tmp_path):
+    with pytest.raises(RefusedError, match=r"gone\.usda: no such USD file"):
+        read_scene(tmp_path / "gone.usda")
+
+
+def test_a_stage_that_is_no_scene_is_refused(parts):
+    with pytest.raises(
+        RefusedError, match=r"map\.usdc </>: needs one prim with MagtwinLabAPI below it, found none"
+    ):
+        read_scene(parts / "map.usdc")
+
+
+def test_a_map_that_was_changed_is_refused(parts, tmp_path):
+    root = author_scene(full_scene(parts), tmp_path / "s")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "s" / "map" / "map.usdc"))
+    layer.GetPrimAtPath(MAP).attributes["magtwin:anomalyMap:values"].default = [4e4] * 48
+    layer.Save()
+    with pytest.raises(
+        RefusedError, match=r"</World/AnomalyMap>: .*not those that its checksum was taken of"
+    ):
+        read_scene(root)
