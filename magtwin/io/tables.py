@@ -3,8 +3,8 @@
 A vector column of a Run becomes one table column a part (`p_world_base_x`, `p_world_base_y`, ...), not
 a column of lists: pandas then holds plain float64 (lists would be Python objects), SQL in DuckDB and
 expressions in polars need no indexing, one part can be read alone, and byte-stream-split coding works.
-What a flat table cannot say stands in the Arrow metadata, which pyarrow and polars show: on every
-field `column`, `part`, `unit`, `frame` and `doc`; on the schema `magtwin_facts`, the Run's facts in JSON.
+What a flat table cannot say stands in the metadata: on every Arrow field `column`, `part`, `unit`,
+`frame` and `doc`; on the file `magtwin_facts`, the Run's facts in JSON, which any Parquet reader shows.
 """
 
 import importlib
@@ -47,7 +47,7 @@ def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool = False
         pa.field(name, pa.from_numpy_dtype(values.dtype), nullable=False, metadata=_metadata(column, part))
         for name, (column, part, values) in flat.items()
     ]
-    schema = pa.schema(fields, metadata={_FACTS: json.dumps(dict(run.facts))})
+    schema = pa.schema(fields, metadata={_FACTS: json.dumps(dict(run.facts), ensure_ascii=False)})
     table = pa.Table.from_arrays([pa.array(values) for _, _, values in flat.values()], schema=schema)
     split = {f.name: "BYTE_STREAM_SPLIT" for f in fields if pa.types.is_floating(f.type)}
     with output(path, force=force) as aside:
