@@ -1,0 +1,154 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.field.sources import dipole_field_nt
+from magtwin.names import RefusedError
+from magtwin.sim.survey import field_at_rest_nt, survey
+from magtwin.spec import (
+    EarthFieldSpec,
+    LabSpec,
+    MagnetometerSpec,
+    PlatformFieldSpec,
+    RobotSpec,
+    Scene,
+    SourceSpec,
+)
+
+EARTH = EarthFieldSpec(
+    b_world_nt=(-2_745.6, 24_067.1, -38_418.4),
+    latitude_deg=29.65,
+    longitude_deg=-82.35,
+    height_m=50.0,
+    date="2026-11-21",
+)
+SOURCE = SourceSpec(name="pipe", p_world=(0.4, -0.2, -0.5), m_world=(2.0, 5.0, -4.0))
+
+
+def scene(**robot):
+    sensor = MagnetometerSpec(noise_std_nt=0.0, resolution_nt=0.0)
+    parts = {"p_base_magnetometer": (0.05, -0.02, 0.4), "magnetometer": sensor, **robot}
+    return Scene(
+        name="hall",
+        map_layer=Path("hall.usdc"),
+        robot=RobotSpec(name="r", asset=Path("r.usda"), **parts),
+        earth=EARTH,
+        sources=(SOURCE,),
+    )
+
+
+def rng():
+    return np.random.default_rng(0)
+
+
+def test_the_map_of_a_robot_without_magnetism_is_the_field_at_its_magnetometer():
+    field = survey(scene(), rng=rng())
+    assert field.values_nt.shape == (4, 15, 25)
+    assert field.extent == (-3.0, 3.0, -1.75, 1.75)
+    for layer, (dx, dy) in enumerate([(0.05, -0.02), (0.02, 0.05), (-0.05, 0.02), (-0.02, -0.05)]):
+        x, y = np.meshgrid(field.x_m + dx, field.y_m + dy)
+        p = np.stack([x, y, np.full_like(x, 0.4)], axis=-1)
+        want = dipole_field_nt(p, [SOURCE.p_world], [SOURCE.m_world]) + EARTH.b_world_nt
+        assert_allclose(field.values_nt[layer], np.linalg.norm(want, axis=-1), rtol=0, atol=1e-6)
+
+
+def test_hard_iron_turns_with_the_robot():
+    h = np.array([400.0, -250.0, 900.0])
+    magnetic = scene(p_base_magnetometer=(0.0, 0.0, 0.4), platform=PlatformFieldSpec(hard_iron_nt=tuple(h)))
+    field = survey(magnetic, rng=rng())
+    x, y = np.meshgrid(field.x_m, field.y_m)
+    b = dipole_field_nt(np.stack([x, y, 0 * x + 0.4], axis=-1), [SOURCE.p_world], [SOURCE.m_world])
+    for layer, turned in enumerate([(400, -250), (250, 400), (-400, 250), (-250, -400)]):
+        want = np.linalg.norm(b + EARTH.b_world_nt + [*turned, 900], axis=-1)
+        assert_allclose(field.values_nt[layer], want, rtol=0, atol=1e-6)
+
+
+def test_motors_lidar_battery_and_eddy_currents_are_not_in_the_map():
+    moving = PlatformFieldSpec(
+        eddy_s=(0.01,) * 9,
+        left_motor_nt_s=(50, 50, 50),
+        right_motor_nt_s=(50, 50, 50),
+        lidar_nt=(500, 500, 500),
+        battery_nt=(90, 90, 90),
+    )
+    assert_array_equal(
+        survey(scene(platform=moving), rng=rng()).values_nt, survey(scene(), rng=rng()).values_nt
+    )
+
+
+def test_lookup_of_the_map_at_its_nodes_is_the_field_at_rest():
+    field = survey(scene(), rng=rng(), headings_rad=(0.3, 2.0, 4.0))
+    x, y = np.meshgrid(field.x_m, field.y_m)
+    p = np.stack([x, y], axis=-1)
+    assert_allclose(field.lookup(p, 2.0), field_at_rest_nt(scene(), p, 2.0), rtol=0, atol=1e-9)
+
+
+def test_a_finer_map_comes_nearer_to_the_field_by_the_square_of_its_spacing():
+    coarse, fine = (survey(scene(), rng=rng(), spacing_m=s) for s in (0.25, 0.125))
+    p = np.random.default_rng(1).uniform((-2.8, -1.6), (2.8, 1.6), (2_000, 2))
+    exact = field_at_rest_nt(scene(), p, 0.0)
+    off_coarse, off_fine = (np.sqrt(np.mean((m.lookup(p, 0.0) - exact) ** 2)) for m in (coarse, fine))
+    assert off_coarse / off_fine == pytest.approx(4, rel=0.15)
+
+
+def test_readings_have_the_sensors_noise_and_resolution_and_the_map_its_variance():
+    noisy = scene(magnetometer=MagnetometerSpec(noise_std_nt=5.0, resolution_nt=0.5))
+    exact = survey(scene(), rng=rng()).values_nt
+    one = survey(noisy, rng=rng())
+    assert_array_equal(one.values_nt, np.rint(one.values_nt / 0.5) * 0.5)
+    for field, want in ((one, 25 + 0.25 / 12), (survey(noisy, rng=rng(), readings=9), (25 + 0.25 / 12) / 9)):
+        assert_allclose(field.variance_nt2, want, rtol=1e-12)
+        # the variance of 1,500 samples is known to sqrt(2 / 1500) = 3.7 %; 4 sigma
+        assert np.mean((field.values_nt - exact) ** 2) == pytest.approx(want, rel=0.15)
+
+
+def test_one_generator_gives_one_map():
+    noisy = scene(magnetometer=MagnetometerSpec(noise_std_nt=5.0))
+    assert survey(noisy, rng=rng()) == survey(noisy, rng=rng())
+    assert survey(noisy, rng=rng()) != survey(noisy, rng=np.random.default_rng(1))
+
+
+def test_the_map_says_what_it_is():
+    field = survey(
+        scene(), rng=rng(), readings=3, licence="Apache-2.0", source="a test", created="2026-11-21"
+    )
+    assert (field.name, field.licence, field.source) == ("hall", "Apache-2.0", "a test")
+    assert field.created == "2026-11-21"
+    assert field.method == "survey of the twin, 3 readings a node and heading, at rest"
+
+
+def test_a_grid_that_does_not_divide_the_floor_stays_on_it_and_amid_it():
+    field = survey(replace(scene(), lab=LabSpec(floor_m=(2.0, 1.1))), rng=rng(), spacing_m=0.3)
+    assert_allclose(field.extent, (-0.9, 0.9, -0.45, 0.45), atol=1e-12)
+
+
+def test_heights_and_shapes_are_broadcast():
+    p = np.zeros((3, 1, 3))
+    p[..., 2] = [[0.0], [0.1], [0.2]]
+    got = field_at_rest_nt(scene(), p, np.zeros(4))
+    assert got.shape == (3, 4)
+    assert_allclose(got[0], field_at_rest_nt(scene(), (0.0, 0.0), 0.0))
+    assert abs(got[1, 0] - got[0, 0]) > 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"spacing_m": 0.0}, "spacing_m must be above 0 m"),
+        ({"spacing_m": np.nan}, "spacing_m must be above 0 m"),
+        ({"readings": 0}, "readings at least 1"),
+        ({"spacing_m": 4.0}, r"spacing_m 4 leaves no cell on a floor of \(6.0, 3.5\) m"),
+        ({"headings_rad": (0.0, 7.0)}, "headings_rad of AnomalyMap must ascend"),
+    ],
+)
+def test_a_survey_that_cannot_be_made_is_refused(options, message):
+    with pytest.raises(RefusedError, match=message):
+        survey(scene(), rng=rng(), **options)
+
+
+def test_a_lab_without_the_earths_field_cannot_be_surveyed():
+    with pytest.raises(RefusedError, match="has no Earth's field"):
+        survey(replace(scene(), earth=None), rng=rng())
