@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from types import MappingProxyType
 
@@ -36,6 +36,9 @@ class Path:
     closed: bool = False
     """Whether it can be driven round and round."""
 
+    s: Array = field(init=False, repr=False)
+    """Arc length at each point, from 0 [m], shape (N,)."""
+
     def __post_init__(self) -> None:
         p = np.array(self.p_xy, float)
         if p.ndim != 2 or p.shape[1] != 2:
@@ -51,14 +54,9 @@ class Path:
         if self.closed:
             p[-1] = p[0]
         s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p, axis=0).T))])
-        for name, array in (("p_xy", p), ("_s", s)):
+        for name, array in (("p_xy", p), ("s", s)):
             array.flags.writeable = False
             object.__setattr__(self, name, array)
-
-    @property
-    def s(self) -> Array:
-        """Arc length at each point, from 0 [m], shape (N,)."""
-        return self._s  # type: ignore[attr-defined, no-any-return]
 
     @property
     def length(self) -> float:

@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose
 
 from magtwin.names import RefusedError
 from magtwin.path import PATHS, Path, path_named, read_path_csv
-from magtwin.sim.drive import Motion
-from magtwin.sim.follow import corners, drivable, follow, plan
+from magtwin.sim.drive import Motion, advance
+from magtwin.sim.follow import Follower, corners, drivable, follow, plan
 from magtwin.spec import DriveSpec
 
 DRIVE = DriveSpec()
@@ -174,6 +174,26 @@ def test_any_polyline_is_driven_to_its_end_within_the_limits(seed, step, size):
     assert_within_limits(motion)
     assert np.abs(cross_track(path, motion)).max() < 0.05
     assert np.hypot(*(motion.poses[-1, :2] - points[-1])) < 0.02
+
+
+def test_a_robot_that_is_carried_away_comes_back_to_where_it_left_the_path():
+    path, dt = path_named("sine"), 0.02
+    follower = Follower(plan(path, DRIVE, speed=0.2), DRIVE, speed=0.2, dt=dt)
+    pose, v, w = np.array([*path.p_xy[0], path.heading(0.0)]), 0.0, 0.0
+    poses = []
+    for k in range(6000):
+        v, w = follower.command(*pose.tolist(), v, w)
+        pose = advance(pose, v, w, dt)
+        if k == 1000:
+            left_at = pose.copy()
+            pose += [0.4, 0.5, 2.5]
+        poses.append(pose)
+    assert follower.done
+    driven = np.array(poses)
+    assert np.hypot(*(driven[1001:, :2] - left_at[:2]).T).min() < 0.06
+    back = 1001 + np.flatnonzero(np.hypot(*(driven[1001:, :2] - left_at[:2]).T) < 0.06)[0]
+    assert np.abs(path.nearest(driven[back + 150 :, :2])[1]).max() < 0.01
+    assert np.hypot(*(driven[-1, :2] - path.p_xy[-1])) < 0.002
 
 
 def test_planned_speeds_are_those_of_constant_acceleration():

@@ -1,7 +1,7 @@
 """The differential drive: exact integration of twists, wheels, limits."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -136,6 +136,15 @@ class Motion:
     pose0: Pose = (0.0, 0.0, 0.0)
     """First x [m], y [m], yaw [rad] in world."""
 
+    poses: Array = field(init=False, repr=False)
+    """x, y, yaw at the start and after each step, shape (K + 1, 3); yaw goes on beyond pi."""
+
+    acceleration: Array = field(init=False, repr=False)
+    """Change of speed that begins each step, over the step [m/s2], shape (K,)."""
+
+    wheel_angles: Array = field(init=False, repr=False)
+    """Angle turned by left and right wheel at the start and after each step [rad], shape (K + 1, 2)."""
+
     def __post_init__(self) -> None:
         v, w = np.asarray(self.v, float), np.asarray(self.w, float)
         if v.ndim != 1 or v.shape != w.shape or not len(v):
@@ -146,9 +155,9 @@ class Motion:
         for name, array in (
             ("v", v),
             ("w", w),
-            ("_poses", integrate_twist(v, w, self.dt, self.pose0)),
-            ("_wheels", np.vstack([[0.0, 0.0], rates])),
-            ("_a", np.diff(v, prepend=0.0) / self.dt),
+            ("poses", integrate_twist(v, w, self.dt, self.pose0)),
+            ("wheel_angles", np.vstack([[0.0, 0.0], rates])),
+            ("acceleration", np.diff(v, prepend=0.0) / self.dt),
         ):
             object.__setattr__(self, name, array)
 
@@ -156,11 +165,6 @@ class Motion:
     def duration_s(self) -> float:
         """Time from the start to the end of the last step [s]."""
         return len(self.v) * self.dt
-
-    @property
-    def poses(self) -> Array:
-        """x, y, yaw at the start and after each step, shape (K + 1, 3)."""
-        return self._poses  # type: ignore[attr-defined, no-any-return]
 
     def at(self, t: ArrayLike) -> Moment:
         """Pose, speeds and wheels at times `t`, exact within the steps; after the last it stands.
@@ -174,6 +178,6 @@ class Motion:
         into = np.clip(t - starts[k], 0.0, self.dt)
         v, w = self.v[k], self.w[k]
         pose = advance(self.poses[k], v, w, into)
-        turned = self._wheels[k] + wheel_rates(v, w, self.drive) * into[..., None]  # type: ignore[attr-defined]
+        turned = self.wheel_angles[k] + wheel_rates(v, w, self.drive) * into[..., None]
         moving = t < self.duration_s
-        return Moment(pose, v * moving, w * moving, self._a[k] * moving, turned)  # type: ignore[attr-defined]
+        return Moment(pose, v * moving, w * moving, self.acceleration[k] * moving, turned)
