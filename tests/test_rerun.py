@@ -1,3 +1,4 @@
+import dataclasses
 import shutil
 import subprocess
 import sys
@@ -283,6 +284,25 @@ def test_the_field_arrow_goes_through_the_sensor_and_is_there_only_where_the_vec
     np.testing.assert_allclose(tail, -arrow / 2, atol=1e-6)
     write_rrd(a_run(rest["field"], rows=50, vector=False), tmp_path / "run.rrd", **rest)
     assert not columns_of(tmp_path / "run.rrd", "world/robot/magnetometer_link/magnetometer/field")[1]
+
+
+@pytest.mark.parametrize("rows", [1, 2, 10])
+def test_a_run_of_a_few_rows_is_recorded_too(parts, rows, tmp_path):
+    run, rest = parts
+    few = Run({name: values[:rows] for name, values in run.items()}, {"note": "a | b"})
+    write_rrd(few, tmp_path / "run.rrd", **rest)
+    times, _ = columns_of(tmp_path / "run.rrd", "series/speed")
+    assert len(times) == rows
+    assert r"| note | a \| b |" in columns_of(tmp_path / "run.rrd", "facts")[1]["TextDocument:text"][0][0]
+
+
+def test_a_map_and_a_run_that_know_no_field_are_recorded_too(parts, tmp_path):
+    run, rest = parts
+    field = dataclasses.replace(rest["field"], valid=np.zeros(rest["field"].values_nt.shape, bool))
+    nothing = np.full(run.rows, np.nan)
+    run = run.with_columns(b_map_nt=nothing, b_total_nt=nothing, b_measured_nt=nothing)
+    write_rrd(run, tmp_path / "run.rrd", **{**rest, "field": field})
+    assert not columns_of(tmp_path / "run.rrd", "series/field")[1]
 
 
 def test_the_facts_are_properties_of_the_recording_and_a_page_in_it(parts, written):

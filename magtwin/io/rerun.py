@@ -165,8 +165,8 @@ def _facts(run: Run) -> str:
         "rate": f"{rate:.1f} Hz",
         **run.facts,
     }
-    rows = [f"| {key.replace('_', ' ')} | {value} |" for key, value in said.items()]
-    return "\n".join(["| fact | value |", "|---|---|", *rows])
+    cells = [(key.replace("_", " "), str(value).replace("|", r"\|")) for key, value in said.items()]
+    return "\n".join(["| fact | value |", "|---|---|", *(f"| {key} | {value} |" for key, value in cells)])
 
 
 @dataclass(frozen=True)
@@ -186,8 +186,7 @@ class _Scale:
         table = (colormaps["viridis"](np.arange(256)) * 255).round().astype(np.uint8)
         readings = run["b_total_nt"][np.isfinite(run["b_total_nt"])]
         ends = [np.percentile(v, [1, 99]) for v in (field.values_nt[field.valid], readings) if v.size]
-        low, high = np.min(ends), np.max(ends)
-        low, high = np.floor(low / 1000) * 1000, np.ceil(high / 1000) * 1000
+        low, high = np.floor(np.min(ends or 0) / 1000) * 1000, np.ceil(np.max(ends or 0) / 1000) * 1000
         return cls(float(low), float(max(high, low + 1000)), table)
 
     def colours(self, b_nt: Array) -> NDArray[np.uint8]:
@@ -274,7 +273,7 @@ def _log_bodies(
     rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for shape in shapes:
         if not shape.link and shape.prim != str(HEAT_MAP):  # the map is drawn finer, see _log_map
-            rec.log(f"world/lab{_entity(shape.prim)}", _mesh([shape]), static=True)
+            rec.log(f"world/lab/{_entity(shape.prim)}", _mesh([shape]), static=True)
     rows = _thinned(run, POSE_HZ)
     _send(
         rec,
@@ -409,4 +408,4 @@ def _colours(shape: Shape) -> NDArray[np.uint8]:
 
 def _entity(name: str) -> str:
     """A prim's name or path as an entity path: only letters, digits, _ and - need no escape there."""
-    return re.sub(r"[^\w/-]", "_", name)
+    return re.sub(r"[^\w/-]", "_", name, flags=re.ASCII).strip("/")
