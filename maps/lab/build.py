@@ -23,8 +23,13 @@ from magtwin.usd.maps import save_map
 
 HERE = Path(__file__).resolve().parent
 SEED = 9
-PLACE = {"latitude_deg": 29.65, "longitude_deg": -82.35, "height_m": 50.0, "date": "2026-11-21"}
+LATITUDE_DEG, LONGITUDE_DEG, HEIGHT_M = 29.65, -82.35, 50.0
 """Gainesville, Florida, where the survey was made that this lab is like."""
+
+DATE = "2026-11-21"
+
+INDUCED = 4e3
+"""Magnetisation of buried iron along the Earth's field, induced and settled [A/m]."""
 
 READINGS = 135
 """Readings averaged at a node: the robot stands for a second."""
@@ -32,15 +37,21 @@ READINGS = 135
 
 def earth() -> EarthFieldSpec:
     """The Earth's field in the lab, to 0.1 nT."""
-    east, north, up = (round(part, 1) for part in earth_field_nt(*PLACE.values()))  # type: ignore[arg-type]
-    return EarthFieldSpec(b_world_nt=(east, north, up), **PLACE)  # type: ignore[arg-type]
+    east, north, up = earth_field_nt(LATITUDE_DEG, LONGITUDE_DEG, HEIGHT_M, DATE)
+    return EarthFieldSpec(
+        b_world_nt=(round(east, 1), round(north, 1), round(up, 1)),
+        latitude_deg=LATITUDE_DEG,
+        longitude_deg=LONGITUDE_DEG,
+        height_m=HEIGHT_M,
+        date=DATE,
+    )
 
 
 def sources(rng: np.random.Generator, earth: EarthFieldSpec) -> tuple[SourceSpec, ...]:
     """The lab's steel, each piece a dipole of volume times magnetisation, to 1 mm and 1 mA m2.
 
-    Magnetisations are those usual for steel in buildings, 1 to 10 kA/m and of either sign where they
-    are remanent; what the Earth's field induces points along it.
+    Magnetisations are those usual for steel in buildings, some kA/m and of either sign where they are
+    remanent; what the Earth's field induces, or has settled in the steel over the years, lies along it.
     """
     down = np.array(earth.b_world_nt) / np.linalg.norm(earth.b_world_nt)
     pieces = [*_columns(rng), *_rebar(rng, down), *_pipe(rng, down), *_cabinets(rng), *_iron(rng, down)]
@@ -98,18 +109,18 @@ def _iron(rng: np.random.Generator, down: NDArray[np.float64]) -> Iterator[Piece
         yield f"iron_{i}", p, volume * (size * axis / np.linalg.norm(axis) + INDUCED * down)
 
 
-INDUCED = 4e3
-"""Magnetisation that the Earth's field induces in a compact piece, its demagnetisation included [A/m]."""
-
-
 def _rounded(v: NDArray[np.float64]) -> tuple[float, float, float]:
     x, y, z = (round(float(c), 3) + 0.0 for c in v)  # + 0.0 turns -0.0 into 0.0
     return x, y, z
 
 
+def robot() -> RobotSpec:
+    """The robot that surveys the lab."""
+    return read_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
+
+
 def scene(robot: RobotSpec) -> Scene:
     """The lab with the robot that surveys it; its map is what `build` makes."""
-    place_rng = np.random.default_rng(SEED)
     field = earth()
     return Scene(
         name="lab",
@@ -117,7 +128,7 @@ def scene(robot: RobotSpec) -> Scene:
         robot=robot,
         lab=LabSpec(),
         earth=field,
-        sources=sources(place_rng, field),
+        sources=sources(np.random.default_rng(SEED), field),
     )
 
 
@@ -129,7 +140,7 @@ def lab_map(scene: Scene) -> AnomalyMap:
         readings=READINGS,
         source=f"maps/lab/build.py, seed {SEED}, robot {scene.robot.name}, {len(scene.sources)} dipoles",
         licence="Apache-2.0",
-        created=PLACE["date"],  # type: ignore[arg-type]
+        created=DATE,
     )
     variance = field.variance_nt2
     return replace(
@@ -141,13 +152,13 @@ def lab_map(scene: Scene) -> AnomalyMap:
 
 def build(folder: Path, *, force: bool = False) -> Report:
     """Write sources.toml, lab.usdc and map.toml to `folder`; returns the map's figures."""
-    lab = scene(read_robot(shipped("robots", "turtlebot4")))
+    lab = scene(robot())
     field = lab_map(lab)
     report = field.report()
     with output(folder / "sources.toml", force=force) as path:
         path.write_text(sources_toml(lab.sources), encoding="utf-8")
     with output(folder / "map.toml", force=force) as path:
-        path.write_text(map_toml(field, lab, report), encoding="utf-8")
+        path.write_text(map_toml(field, lab, earth(), report), encoding="utf-8")
     save_map(field, folder / "lab.usdc", force=force)
     return report
 
@@ -161,7 +172,7 @@ def sources_toml(sources: tuple[SourceSpec, ...]) -> str:
     )
 
 
-def map_toml(field: AnomalyMap, lab: Scene, report: Report) -> str:
+def map_toml(field: AnomalyMap, lab: Scene, earth: EarthFieldSpec, report: Report) -> str:
     """What the map is, for people and for tools that do not read USD."""
     figures = {f.name.replace(" ", "_"): f for f in report.figures}
     x0, x1, y0, y1 = field.extent
@@ -183,11 +194,13 @@ def map_toml(field: AnomalyMap, lab: Scene, report: Report) -> str:
         f'method = "{field.method}"',
         f'source = "{field.source}"',
         "",
-        "[earth]  # IGRF-14 at the lab",
+        "[earth]  # by the IGRF-14, in world axes",
+        f"b_world_nt = {list(earth.b_world_nt)}",
+        f"latitude_deg = {earth.latitude_deg}",
+        f"longitude_deg = {earth.longitude_deg}",
+        f"height_m = {earth.height_m}",
+        f'date = "{earth.date}"',
     ]
-    if lab.earth is not None:
-        lines += [f"b_world_nt = {list(lab.earth.b_world_nt)}"]
-        lines += [f"{key} = {value!r}".replace("'", '"') for key, value in PLACE.items()]
     lines += ["", "[statistics]"]
     for name, figure in figures.items():
         note = " ".join(word for word in (figure.unit, figure.note) if word)

@@ -1,0 +1,143 @@
+"""The default map: made by the committed script and robot, with the figures of the published survey."""
+
+import importlib.util
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from magtwin.field.map import AnomalyMap
+from magtwin.files import from_table, read_toml, shipped
+from magtwin.path import path_named
+from magtwin.sim.simulate import simulate
+from magtwin.spec import EarthFieldSpec, SourceSpec
+from magtwin.usd.maps import load_map
+
+LAB = shipped("maps", "lab")
+
+
+@pytest.fixture(scope="module")
+def script():
+    """maps/lab/build.py as a module."""
+    spec = importlib.util.spec_from_file_location("build_lab", LAB / "build.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def fresh(script, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lab")
+    script.build(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def committed() -> AnomalyMap:
+    return load_map(LAB / "lab.usdc")
+
+
+@pytest.fixture(scope="module")
+def figures(committed):
+    return {f.name: f for f in committed.report().figures}
+
+
+@pytest.mark.parametrize("name", ["sources.toml", "map.toml"])
+def test_a_fresh_build_equals_the_committed_texts(fresh, name):
+    assert (fresh / name).read_text() == (LAB / name).read_text()
+
+
+def test_a_fresh_build_equals_the_committed_map(fresh, committed):
+    assert load_map(fresh / "lab.usdc") == committed
+
+
+def test_the_layer_holds_the_map_to_the_last_digit(script, committed):
+    assert script.lab_map(script.scene(script.robot())) == committed
+
+
+def test_the_map_has_the_extent_of_the_published_survey(committed):
+    assert committed.values_nt.shape == (4, 15, 25)
+    assert committed.extent == (-3.0, 3.0, -1.75, 1.75)
+    assert committed.valid.all()
+    assert committed.licence == "Apache-2.0"
+
+
+def test_the_map_has_the_statistics_of_the_published_survey(figures):
+    # the published: mean 40.9 uT, sd 3.0, gradient 4.1-4.4 (median) and 5.7 uT/m (mean), amplitude 482 nT
+    assert figures["mean"].value == pytest.approx(41_000, abs=300)
+    assert figures["mean"].spread == pytest.approx(3_000, abs=150)
+    assert figures["median gradient"].value == pytest.approx(4.3, abs=0.4)
+    assert 5 < figures["mean gradient"].value < 6
+    assert figures["greatest gradient"].value < 36
+    assert figures["heading amplitude"].value == pytest.approx(482, abs=15)
+    assert figures["least"].value > 30_000
+    assert figures["greatest"].value < 55_000
+
+
+def test_map_toml_says_what_the_layer_holds(committed, figures):
+    table = read_toml(LAB / "map.toml")
+    assert table["unit"] == "nT"
+    assert table["licence"] == committed.licence
+    assert table["source"] == committed.source
+    assert tuple(table["shape"]) == committed.values_nt.shape
+    assert tuple(table["origin_m"]) == committed.origin_m
+    assert np.allclose(np.radians(table["headings_deg"]), committed.headings_rad, rtol=0, atol=1e-9)
+    for name, figure in figures.items():
+        assert table["statistics"][name.replace(" ", "_")] == figure.value
+
+
+def test_map_toml_gives_the_earths_field_of_the_day(script):
+    assert (
+        from_table(EarthFieldSpec, read_toml(LAB / "map.toml")["earth"], LAB / "map.toml") == script.earth()
+    )
+
+
+def test_sources_have_names_of_their_own_that_usd_admits():
+    sources = read_sources()
+    names = [s.name for s in sources]
+    assert len(set(names)) == len(names)
+    assert 40 <= len(names) <= 80
+    assert all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) for name in names)
+
+
+def test_no_source_lies_where_the_robot_drives():
+    half = np.array([3.0, 1.75])
+    for source in read_sources():
+        beside = np.any(np.abs(source.p_world[:2]) > half)
+        assert beside or source.p_world[2] <= -0.2, source.name
+
+
+def read_sources():
+    rows = read_toml(LAB / "sources.toml")["source"]
+    return [from_table(SourceSpec, row, LAB / "sources.toml", "source") for row in rows]
+
+
+def test_the_committed_sources_and_no_others_make_the_map(script):
+    assert script.scene(script.robot()).sources == tuple(read_sources())
+
+
+@pytest.mark.parametrize("name", ["figure8", "lawnmower", "sine", "curvilinear"])
+def test_a_moving_robot_differs_from_the_map_as_much_as_real_labels_do(script, committed, name):
+    # labels of the real robot: 367 +- 525 nT over many sessions; one run on one battery varies less
+    run = simulate(
+        script.scene(script.robot()),
+        path_named(name),
+        anomaly_map=committed,
+        rng=np.random.default_rng(0),
+        rate_hz=20.0,
+    )
+    disturbance = run["b_disturbance_nt"]
+    assert np.isfinite(disturbance).all()
+    assert 200 < disturbance.std() < 500
+    assert 100 < disturbance.mean() < 600
+    on = run["lidar_on"]
+    assert disturbance[on].mean() > disturbance[~on].mean() + 100
+    assert 30_000 < run["b_truth_nt"].min() < run["b_truth_nt"].max() < 55_000
+
+
+def test_another_seed_makes_another_lab(script):
+    lab = script.scene(script.robot())
+    other = script.sources(np.random.default_rng(script.SEED + 1), script.earth())
+    assert other != lab.sources
+    assert script.lab_map(replace(lab, sources=other)) != script.lab_map(lab)
