@@ -89,6 +89,10 @@ def test_a_fresh_generation_equals_what_is_committed(tmp_path):
         )
 
 
+def test_the_reference_for_people_says_what_the_source_says():
+    assert generate.REFERENCE.read_text() == generate.reference(), "run `make schema`"
+
+
 def test_the_library_holds_the_schemas_that_the_table_names_and_no_other():
     plugin = json.loads((schema.FOLDER / "plugInfo.json").read_text())["Plugins"][0]
     assert set(plugin["Info"]["Types"]) == set(schema.NOUNS.values())

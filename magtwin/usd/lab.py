@@ -16,6 +16,9 @@ LOOKS = LAB.AppendChild("Looks")
 
 GRAVITY_M_S2 = 9.81
 FLOOR_THICKNESS_M = 0.1
+APRON_M = 0.2
+"""Slab that shows outside of the walls."""
+
 POST_WIDTH_M = 0.04
 """Width of the aluminium profile of the motion-capture frame."""
 
@@ -99,7 +102,7 @@ def _define_looks(stage: Usd.Stage) -> None:
 
 def _define_floor(stage: Usd.Stage, spec: LabSpec) -> None:
     x, y = spec.floor_m
-    edge = 2 * spec.wall_thickness_m if spec.wall_height_m else 0.0  # the walls stand on the slab
+    edge = 2 * (spec.wall_thickness_m + APRON_M)  # walls and posts stand on the slab too
     size = (x + edge, y + edge, FLOOR_THICKNESS_M)
     _box(stage, LAB.AppendChild("Floor"), (0, 0, -FLOOR_THICKNESS_M / 2), size, "Floor", collides=True)
 

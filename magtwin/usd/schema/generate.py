@@ -1,6 +1,7 @@
-"""Make generatedSchema.usda and plugInfo.json from schema.usda: `python magtwin/usd/schema/generate.py`.
+"""Make what follows from schema.usda: `python magtwin/usd/schema/generate.py`, or `make schema`.
 
-Run as a script, so that it works while the generated files are broken. Needs jinja2.
+generatedSchema.usda and plugInfo.json are for USD, docs/schema.md is for people. Run as a script, so that it
+works while the generated files are broken. Needs jinja2.
 """
 
 import json
@@ -10,9 +11,19 @@ import sys
 import tempfile
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).resolve().parent
 GENERATED = ("generatedSchema.usda", "plugInfo.json")
+REFERENCE = HERE.parents[2] / "docs" / "schema.md"
+INTRODUCTION = """\
+# magtwin's USD schemas
+
+Made from [schema.usda](../magtwin/usd/schema/schema.usda) by `make schema`. The library is codeless: applied API
+schemas on plain `Xform` prims, so a runtime that does not have it still places everything and keeps every value.
+`import magtwin.usd` registers it; other programs find it through `PXR_PLUGINPATH_NAME=.../magtwin/usd/schema`.
+Lengths are metres, angles radians, fields nT, unless a name or a text says otherwise.
+"""
 
 
 def generate(folder: Path) -> None:
@@ -37,5 +48,36 @@ def generate(folder: Path) -> None:
         shutil.copyfile(Path(scratch) / "generatedSchema.usda", folder / "generatedSchema.usda")
 
 
+def reference() -> str:
+    """The schemas for people, in Markdown: every attribute with type, fallback and meaning."""
+    from pxr import Sdf
+
+    layer = Sdf.Layer.FindOrOpen(str(HERE / "schema.usda"))
+    parts = [INTRODUCTION]
+    for schema in layer.rootPrims:
+        if schema.specifier != Sdf.SpecifierClass:
+            continue
+        lines = [line.strip() for line in schema.documentation.strip().splitlines()]
+        parts.append(f"\n## {schema.name}\n\n" + "\n".join(lines) + "\n")
+        parts.append("\n| property | type | fallback | meaning |\n|---|---|---|---|\n")
+        for item in schema.properties:
+            attribute = isinstance(item, Sdf.AttributeSpec)
+            kind = str(item.typeName) if attribute else "rel"
+            fallback = f"`{_said(item)}`" if attribute and _said(item) else ""
+            parts.append(f"| `{item.name}` | {kind} | {fallback} | {item.documentation} |\n")
+    return "".join(parts)
+
+
+def _said(attribute: Any) -> str:
+    """An attribute's fallback as USD's text says it; "" where it is empty."""
+    value = attribute.default
+    if isinstance(value, float):
+        return f"{value:g}"
+    text = str(value)
+    return "" if text in ("[]", "@@") else " ".join(text.split())
+
+
 if __name__ == "__main__":
     generate(HERE)
+    if REFERENCE.parent.is_dir():
+        REFERENCE.write_text(reference(), encoding="utf-8")
