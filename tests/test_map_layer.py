@@ -214,6 +214,7 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
             Gf.Vec2d(0, 1),
             "cell_m of AnomalyMap must",
         ),
+        ("magtwin:anomalyMap:unit", Sdf.ValueTypeNames.Token, "uT", "the map is in 'uT', magtwin reads nT"),
         (VALUES, Sdf.ValueTypeNames.String, "many", r"values must be a float\[\]"),
     ],
 )

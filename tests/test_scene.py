@@ -480,6 +480,14 @@ def broken(parts: Path, folder: Path, edit) -> Path:
             lambda t: t.replace("</World/AnomalyMap>", "</World/Lab>"),
             r"</World/Lab>: has no MagtwinAnomalyMapAPI",
         ),
+        (
+            lambda t: t.replace("metersPerUnit = 1", "metersPerUnit = 0.01"),
+            "0.01 m a unit and Z up; magtwin reads metres",
+        ),
+        (
+            lambda t: t.replace('upAxis = "Z"', 'upAxis = "Y"'),
+            "1 m a unit and Y up; magtwin reads metres with Z up",
+        ),
         (lambda t: t.replace("{", "{{{", 1), r"small\.usda: cannot be opened as USD"),
     ],
 )

@@ -23,6 +23,7 @@ HEAT_MAP_HEIGHT_M = 0.004
 UNKNOWN_COLOUR = (0.2, 0.2, 0.2)
 """Linear colour of nodes without a value."""
 
+UNIT = "nT"
 TEXTS = ("name", "method", "source", "licence", "created")
 
 
@@ -61,6 +62,8 @@ def load_map(path: str | os.PathLike[str]) -> AnomalyMap:
 
 def read_map(prim: Usd.Prim) -> AnomalyMap:
     """The map of a prim; refusals as for `load_map`."""
+    if (unit := _get(prim, "unit")) != UNIT:
+        raise RefusedError(f"{place(prim)}: the map is in {unit!r}, magtwin reads {UNIT}; make the map anew")
     checksum = _get(prim, "checksum")
     arrays = {name: np.array(_get(prim, name)) for name in ("values", "valid", "variance")}
     if checksum != _checksum(*arrays.values()):
@@ -103,7 +106,7 @@ def _write_arrays(prim: Usd.Prim, field: AnomalyMap) -> None:
         "origin": Gf.Vec2d(*field.origin_m),
         "cellSize": Gf.Vec2d(*field.cell_m),
         "headings": Vt.DoubleArray(np.rad2deg(field.headings_rad).tolist()),
-        "unit": "nT",
+        "unit": UNIT,
         "checksum": _checksum(values, valid, variance),
         **{name: getattr(field, name) for name in TEXTS},
     }
@@ -148,7 +151,7 @@ def _define_heat_map(stage: Usd.Stage, field: AnomalyMap) -> None:
     known = field.values_nt[field.valid]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     mesh.GetPrim().SetCustomData(
-        {"magtwin": {"colourMap": "viridis", "least": low, "greatest": high, "unit": "nT"}}
+        {"magtwin": {"colourMap": "viridis", "least": low, "greatest": high, "unit": UNIT}}
     )
     primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
         "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex

@@ -101,6 +101,7 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
             is out of range, or the map is not what its checksum was taken of; names the prim.
     """
     stage = open_stage(path)
+    _check_axes(stage, path)
     world = stage.GetPseudoRoot()
     lab = read_lab(only_prim_with(world, "lab"))
     prim = only_prim_with(world, "robot")
@@ -227,6 +228,14 @@ def _check(scene: Scene) -> None:
     _read_asset(scene.robot.asset)
     if scene.robot.magnetometer.network is not None:
         existing(scene.robot.magnetometer.network, "weights file")
+
+
+def _check_axes(stage: Usd.Stage, path: str | os.PathLike[str]) -> None:
+    metres, up = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)
+    if not (UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters) and up == UsdGeom.Tokens.z):
+        raise RefusedError(
+            f"{path}: the stage has {metres:g} m a unit and {up} up; magtwin reads metres with Z up"
+        )
 
 
 def _with_copies(scene: Scene, folder: Path) -> Scene:
