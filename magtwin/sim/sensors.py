@@ -20,7 +20,7 @@ from magtwin.frames import (
 )
 from magtwin.names import RefusedError
 from magtwin.sim.drive import Motion, twist_from_wheels, wheel_rates
-from magtwin.spec import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec
+from magtwin.spec import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MountSpec
 
 Array = NDArray[np.float64]
 Columns = dict[str, NDArray[np.float64]]
@@ -43,6 +43,12 @@ def held(t: ArrayLike, rate_hz: float) -> tuple[Array, NDArray[np.intp]]:
     stamps = np.arange(int(t[-1] * rate_hz) + 2) / rate_hz
     stamps = stamps[: int(np.searchsorted(stamps, t[-1], side="right"))]
     return stamps, np.searchsorted(stamps, t, side="right") - 1
+
+
+def into_sensor(v_link: Array, mount: MountSpec) -> Array:
+    """Vectors (N, 3) turned from a link's axes into those of a sensor mounted on it."""
+    # einsum, as a product of so few columns is no work for the threads of a BLAS that `@` wakes.
+    return np.einsum("ni,ij->nj", v_link, matrix_from_quat(mount.q_link_sensor_xyzw))
 
 
 def sense_odometry(motion: Motion, t: ArrayLike, rng: np.random.Generator) -> Columns:
@@ -93,9 +99,8 @@ def sense_imu(spec: ImuSpec, motion: Motion, t: ArrayLike, rng: np.random.Genera
     true = motion.at(stamps)
     zero = np.zeros(len(stamps))
     noise = rng.standard_normal((len(stamps), 9))
-    to_sensor = matrix_from_quat(spec.q_link_sensor_xyzw)  # rows v_link @ R are v_sensor
-    rates = np.column_stack([zero, zero, true.w]) @ to_sensor
-    acceleration = np.column_stack([true.a, true.v * true.w, zero]) @ to_sensor
+    rates = into_sensor(np.column_stack([zero, zero, true.w]), spec)
+    acceleration = into_sensor(np.column_stack([true.a, true.v * true.w, zero]), spec)
     q = quat_multiply(quat_from_yaw(true.pose[:, 2]), spec.q_link_sensor_xyzw)
     q = quat_multiply(q, quat_from_rpy(spec.orientation_noise_std * noise[:, :3]))
     return {

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.field.map import AnomalyMap
-from magtwin.frames import matrix_from_quat, quat_from_yaw, wrap_angle
+from magtwin.frames import quat_from_yaw, wrap_angle
 from magtwin.names import RefusedError
 from magtwin.path import Path, check_on_floor
 from magtwin.run import COLUMNS, Run
@@ -17,6 +17,7 @@ from magtwin.sim.follow import follow
 from magtwin.sim.interference import ambient_field_nt, excess_current_a, platform_field_nt
 from magtwin.sim.sensors import (
     charge,
+    into_sensor,
     lidar_on,
     open_voltage,
     sense_battery,
@@ -176,8 +177,10 @@ def _exact_field(scene: Scene, true: Moment, on: NDArray[np.bool_], t: Array) ->
         lidar_on=on,
         battery_a=excess_current_a(robot.battery, voltage),
     )
-    in_sensor = vector @ matrix_from_quat(robot.magnetometer.q_link_sensor_xyzw)
-    return {"b_vector_nt": in_sensor, "b_truth_nt": np.sqrt(np.sum(vector * vector, axis=1))}
+    return {
+        "b_vector_nt": into_sensor(vector, robot.magnetometer),
+        "b_truth_nt": np.sqrt(np.sum(vector * vector, axis=1)),
+    }
 
 
 def _into_base(b_world: Array, cos: Array, sin: Array) -> Array:
