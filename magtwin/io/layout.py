@@ -87,8 +87,14 @@ def known_series(run: Run, panel: Panel) -> list[Series]:
     return [s for s in panel.series if s.column in run.columns and np.isfinite(run[s.column]).any()]
 
 
-def layout(run: Run, lab: rrb.Spatial3DView | None = None) -> rrb.Blueprint:
-    """The views, that of the lab first where there is one, on the timeline of the run."""
+def layout(run: Run, lab: LabSpec | None = None, *, heading: float = 0.0) -> rrb.Blueprint:
+    """The views of a run, on its timeline; the lab and the robot in 3D first, where a lab is given.
+
+    Args:
+        run: What its plots show.
+        lab: The room; none for plots only.
+        heading: Heading of the map on its floor [rad], for the title.
+    """
     whole = rrb.TimeAxis(
         view_range=rr.TimeRange(
             start=rrb.TimeRangeBoundary.absolute(seconds=float(run["t"][0])),
@@ -113,12 +119,12 @@ def layout(run: Run, lab: rrb.Spatial3DView | None = None) -> rrb.Blueprint:
     states = rrb.StateTimelineView(
         origin="states", contents=[f"$origin/{name}" for name in raised], name="States", time_view=whole
     )
-    facts = rrb.TextDocumentView(origin="facts", name="Run")
-    below: list[Any] = [states, facts] if "lidar_on" in run.columns else [facts]
+    about = rrb.Vertical(states, rrb.TextDocumentView(origin="facts", name="Run"))
     if lab is None:
-        root = rrb.Horizontal(side, rrb.Vertical(*below), column_shares=[3.0, 1.0])
+        root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
     else:
-        left = rrb.Vertical(lab, rrb.Horizontal(*below), row_shares=[3.0, 1.0])
+        below = rrb.Horizontal(_robot_view(), about)
+        left = rrb.Vertical(_lab_view(lab, heading), below, row_shares=[2.2, 1.0])
         root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
     return rrb.Blueprint(
         root,
@@ -132,29 +138,38 @@ def _raised(run: Run, column: str) -> bool:
     return column in run.columns and bool(run[column].any())
 
 
-def lab_view(lab: LabSpec, heading: float) -> rrb.Spatial3DView:
-    """The lab seen whole, from the south and above; readings appear as time goes on.
-
-    Args:
-        lab: The room.
-        heading: Heading of the map on the floor [rad], for the title.
-    """
+def _lab_view(lab: LabSpec, heading: float) -> rrb.Spatial3DView:
+    """The lab seen whole, so steeply that the near rail of the capture frame stays off the floor."""
     x, y = lab.floor_m
-    away = max(x, 1.6 * y)
+    away = max(x, 1.7 * y)
+    return _view_3d(
+        "world",
+        f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, readings along the path",
+        position=(0, -0.37 * away, 0.85 * away),
+        look_target=(0, -0.05 * away, 0),
+    )
+
+
+def _robot_view() -> rrb.Spatial3DView:
+    """The robot from behind its left shoulder; the view's axes are the robot's, so that it stays in sight."""
+    return _view_3d("world/robot", "Robot", position=(-0.62, 0.42, 0.55), look_target=(0.08, 0, 0.17))
+
+
+def _view_3d(
+    origin: str, name: str, *, position: tuple[float, ...], look_target: tuple[float, ...]
+) -> rrb.Spatial3DView:
+    """The world in the axes of `origin`, from a position [m]; readings appear as time goes on."""
     so_far = rrb.VisibleTimeRange(
         TIMELINE,
         start=rrb.TimeRangeBoundary.infinite(),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
     return rrb.Spatial3DView(
-        origin="world",
-        name=f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, readings along the path",
+        origin=origin,
+        contents="/world/**",
+        name=name,
         background=(24, 26, 31),
         line_grid=False,
-        eye_controls=rrb.EyeControls3D(
-            position=(-0.05 * away, -0.69 * away, 0.66 * away),
-            look_target=(0, -0.07 * away, 0),
-            eye_up=(0, 0, 1),
-        ),
+        eye_controls=rrb.EyeControls3D(position=position, look_target=look_target, eye_up=(0, 0, 1)),
         overrides={"world/readings": rrb.VisibleTimeRanges(so_far)},
     )

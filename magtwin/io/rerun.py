@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from magtwin.field.map import AnomalyMap
 from magtwin.files import existing, output
 from magtwin.frames import quat_multiply, rotate, wrap_angle
-from magtwin.io.layout import PANELS, STATES, TIMELINE, known_series, lab_view, layout
+from magtwin.io.layout import PANELS, STATES, TIMELINE, known_series, layout
 from magtwin.io.tables import read_parquet
 from magtwin.io.viewer import show
 from magtwin.names import RefusedError, find
@@ -78,8 +78,7 @@ def write_rrd(
     """
     _check_rows(run, path)
     heading = _nearest_heading(field, run)
-    views = layout(run, lab_view(scene.lab, heading))
-    with _recording(run, path, views, force=force) as rec:
+    with _recording(run, path, layout(run, scene.lab, heading=heading), force=force) as rec:
         stage = open_stage(scene_file)
         scale = _Scale.over(field, run)
         _log_map(rec, field, scale, heading)
@@ -221,7 +220,7 @@ def _log_scale(rec: rr.RecordingStream, field: AnomalyMap, scale: _Scale) -> Non
     x0, x1, y0, _ = field.extent
     length, breadth = 0.6 * (x1 - x0), 0.03 * (x1 - x0)
     cell = length / 256
-    corner = ((x0 + x1 - length) / 2, y0 - 0.55 - breadth, HEAT_MAP_HEIGHT_M)
+    corner = ((x0 + x1 - length) / 2, y0 - 0.42 - breadth, HEAT_MAP_HEIGHT_M)
     bar = np.broadcast_to(scale.table, (max(1, round(breadth / cell)), 256, 4))
     _log_image(rec, "world/scale", bar, cell, corner)
     share = np.linspace(0, 1, 5)
@@ -336,7 +335,7 @@ def _log_paths(rec: rr.RecordingStream, run: Run, scene: Scene, scale: _Scale, p
     driven = base + np.array([0, 0, 0.016])
     rec.log("world/driven", rr.LineStrips3D([driven], colors=(230, 60, 60), radii=0.006), static=True)
     sensor = (base + rotate(q, scene.robot.p_base_magnetometer)).astype(np.float32)
-    rec.log("world/readings", rr.Points3D.from_fields(radii=[0.022]), static=True)
+    rec.log("world/readings", rr.Points3D.from_fields(radii=[0.017]), static=True)
     colours = scale.colours(run["b_total_nt"][rows])
     packed = colours.astype(np.uint32) @ np.array([1 << 24, 1 << 16, 1 << 8, 1], np.uint32)
     _send(rec, "world/readings", run["t"][rows], rr.Points3D, positions=sensor, colors=packed)
