@@ -142,8 +142,10 @@ def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: f
     longer = np.vstack([before, p, after])
     x, y = (np.convolve(axis, window / window.sum(), mode="valid") for axis in longer.T)
     apart = np.hypot(np.diff(x, prepend=np.inf), np.diff(y, prepend=np.inf)) > _COINCIDENT_M
-    apart[-1] = True
-    x, y = x[apart], y[apart]
+    keep = np.flatnonzero(apart[:-1])
+    if not apart[-1] and len(keep) > 1:
+        keep = keep[:-1]  # so that the end stays, and no segment is without length
+    x, y = np.append(x[keep], x[-1]), np.append(y[keep], y[-1])
 
     dx, dy = np.gradient(x), np.gradient(y)
     ds = np.maximum(np.hypot(dx, dy), 1e-9)
@@ -240,7 +242,7 @@ class Follower:
         left_m = (last + 1 - i - along) * spacing
         if left_m < _ARRIVED_M:
             self._number += 1
-            self._node = 0
+            self._node, self._driven = 0, 0.0
             return self._limit(0.0, 0.0, v, w)
         offset = (dx * ey - dy * ex) / math.sqrt(length2)
         # The plan is read where this step will end.
@@ -294,7 +296,9 @@ def drivable(path: Path) -> Path:
     if len(kept) == 1:
         raise RefusedError(f"path {path.name}: it lies within {_JITTER_M:g} m, so there is nowhere to drive")
     if kept[-1] != points[-1]:
-        kept[-1:] = [points[-1]] if len(kept) > 2 else [kept[-1], points[-1]]
+        if len(kept) > 2:
+            kept.pop()
+        kept.append(points[-1])
     return Path(path.name, np.array(kept), path.closed)
 
 
@@ -323,8 +327,8 @@ def follow(
         RefusedError: `speed`, `duration_s` or `rate_hz` is out of range, or the end of the path was
             not reached in a time that suffices for any path.
     """
-    if not rate_hz > 0:
-        raise RefusedError(f"rate_hz of a controller must be above 0 Hz, got {rate_hz!r}")
+    if not 0 < rate_hz < math.inf:
+        raise RefusedError(f"rate_hz of a controller must be above 0 Hz and finite, got {rate_hz!r}")
     if duration_s is not None and not 0 < duration_s < math.inf:
         raise RefusedError(f"duration_s must be above 0 s and finite, got {duration_s!r}")
     dt = 1.0 / rate_hz
