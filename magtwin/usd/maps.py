@@ -157,14 +157,13 @@ def _define_heat_map(stage: Usd.Stage, field: AnomalyMap) -> None:
         "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
     )
     variants = mesh.GetPrim().GetVariantSets().AddVariantSet("heading")
-    names = heading_variants(field.headings_rad)
+    names, palette = heading_variants(field.headings_rad), viridis()
     for name, layer, valid in zip(names, field.values_nt, field.valid, strict=True):
         variants.AddVariant(name)
         variants.SetVariantSelection(name)
         with variants.GetVariantEditContext():
-            colours = viridis(layer, valid, low, high).reshape(-1, 3)
-            palette, index = np.unique(colours, axis=0, return_inverse=True)
-            primvar.Set(Vt.Vec3fArray.FromNumpy(palette))
+            used, index = np.unique(colour_index(layer, valid, low, high), return_inverse=True)
+            primvar.Set(Vt.Vec3fArray.FromNumpy(palette[used]))
             primvar.SetIndices(Vt.IntArray.FromNumpy(index.astype(np.int32).ravel()))
     variants.SetVariantSelection(names[0])
 
@@ -176,14 +175,19 @@ def heading_variants(headings_rad: NDArray) -> list[str]:
     return names if len(set(names)) == len(names) else [f"{n}_{i}" for i, n in enumerate(names)]
 
 
-def viridis(values: NDArray, valid: NDArray, low: float, high: float) -> NDArray[np.float32]:
-    """Colours of values between `low` and `high`, linear as USD wants them, shape (...) -> (..., 3)."""
+def viridis() -> NDArray[np.float32]:
+    """Linear colours: the 256 of the colour map, then that of nodes without a value, shape (257, 3)."""
     from matplotlib import colormaps
 
-    part = (np.where(valid, values, low) - low) / max(high - low, np.finfo(float).tiny)
-    srgb = colormaps["viridis"](part)[..., :3]
+    srgb = np.array(colormaps["viridis"].colors)  # type: ignore[attr-defined]
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-    return np.where(valid[..., None], linear, UNKNOWN_COLOUR).astype(np.float32)
+    return np.vstack([linear, UNKNOWN_COLOUR]).astype(np.float32)
+
+
+def colour_index(values: NDArray, valid: NDArray, low: float, high: float) -> NDArray[np.int32]:
+    """Rows of `viridis()` for values between `low` and `high`, any shape."""
+    part = (np.where(valid, values, low) - low) / max(high - low, np.finfo(float).tiny)
+    return np.where(valid, np.clip(256 * part, 0, 255).astype(np.int32), 256).astype(np.int32)
 
 
 def _define_material(stage: Usd.Stage) -> UsdShade.Material:
