@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pxr import Gf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade
 
-from magtwin.files import existing
 from magtwin.frames import IDENTITY_XYZW, canonical
 from magtwin.names import RefusedError
 from magtwin.spec import ZERO3, Quat, Vec3
+from magtwin.usd.layers import open_stage
 
 SEGMENTS = 32
 """Sides of the polygon that stands for a circle."""
@@ -72,19 +72,21 @@ class Link:
     """Axes in world, as the stage stands."""
 
 
-def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
-    """The stage of a USD file.
+@dataclass(frozen=True)
+class ColourScale:
+    """What the colours of a stage's heat-map mean."""
 
-    Raises:
-        RefusedError: No such file, or not USD; the text says what USD said of it.
-    """
-    path = existing(path, "USD file")
-    try:
-        return Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        first = next((line for line in str(error).splitlines() if "Error in" in line), str(error))
-        reason = first.partition(" : '")[2].strip("' \n") or first.strip()
-        raise RefusedError(f"{path}: cannot be opened as USD: {reason}") from error
+    name: str
+    """Name of the colour map, matplotlib's."""
+
+    least: float
+    """Value of its first colour."""
+
+    greatest: float
+    """Value of its last colour."""
+
+    unit: str
+    """Unit of both."""
 
 
 def read_shapes(stage: Usd.Stage | str | os.PathLike[str]) -> list[Shape]:
@@ -154,6 +156,15 @@ def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
             q_world_link_xyzw=q_world,
         )
     return links
+
+
+def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
+    """The scale of the first visible heat-map of a stage; none where there is none."""
+    for prim in _prims(stage):
+        facts = prim.GetCustomDataByKey("magtwin") or {}
+        if "colourMap" in facts and UsdGeom.Imageable(prim).ComputeVisibility() != "invisible":
+            return ColourScale(facts["colourMap"], facts["least"], facts["greatest"], facts["unit"])
+    return None
 
 
 def _prims(stage: Usd.Stage) -> Iterator[Usd.Prim]:

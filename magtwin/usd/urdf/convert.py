@@ -11,7 +11,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 
 from magtwin.files import check_free, output, sha256
 from magtwin.names import RefusedError
-from magtwin.usd.geometry import open_stage
+from magtwin.usd.layers import describe_stage, open_stage
 from magtwin.usd.sensors import write_pose
 from magtwin.usd.urdf.description import Description, origin_of, read_description
 from magtwin.usd.urdf.gazebo import Surface, read_surfaces
@@ -113,11 +113,12 @@ def _write(
     if finish is not None:
         finish(robot)
     stage.GetRootLayer().customLayerData = {
+        **stage.GetRootLayer().customLayerData,
         "magtwin": {
             "source": description.path.name,
             "sourceSha256": sha256(description.path),
             "notes": Vt.StringArray(description.notes),
-        }
+        },
     }
 
     def as_seen_from_out(path: str) -> str:
@@ -131,10 +132,7 @@ def _write(
 
 def _author(stage: Usd.Stage, description: Description, meshes: MeshLayer, layer: str) -> Usd.Prim:
     """The robot's prim with all that hangs from it."""
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
-    stage.GetRootLayer().documentation = f"{description.name}: converted from {description.path.name}."
+    describe_stage(stage, f"{description.name}: converted from {description.path.name}.")
     names = _prim_names(description)
     surfaces, places, poses = read_surfaces(description), _places(description), description.poses()
     robot = UsdGeom.Xform.Define(stage, Sdf.Path.absoluteRootPath.AppendChild(names[""])).GetPrim()

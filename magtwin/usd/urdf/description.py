@@ -180,13 +180,13 @@ def _check_names(xml: ElementTree.Element, lines: Mapping[ElementTree.Element, i
         raise RefusedError(f"{path}:{lines[xml]}: the robot has no <link>")
     for joint in xml.findall("joint"):
         for end in ("parent", "child"):
-            element = joint.find(end)
-            if element is None or not element.get("link"):
+            named = joint.find(end)
+            if named is None or not named.get("link"):
                 raise RefusedError(f"{path}:{lines[joint]}: joint {joint.get('name')!r} has no <{end} link=>")
 
 
 def _read(text: bytes, path: Path) -> Any:
-    """yourdfpy's robot; its meshes and its scene graph are left alone, they are read elsewhere."""
+    """Yourdfpy's robot; its meshes and its scene graph are left alone, they are read elsewhere."""
     import yourdfpy
 
     try:

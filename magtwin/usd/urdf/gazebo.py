@@ -31,7 +31,7 @@ def read_surfaces(description: Description) -> dict[str, Surface]:
     """
     surfaces, others = {}, 0
     for block in description.xml.findall("gazebo"):
-        link, mu = block.get("reference"), block.find("mu1")
+        link, mu = block.get("reference", ""), block.find("mu1")
         if link in description.links and mu is not None:
             where = f"{description.path}:{description.lines[mu]}"
             try:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from pxr import Gf, Sdf, Usd, UsdPhysics
 
 from magtwin.frames import wxyz_from_xyzw
-from magtwin.usd.urdf.description import Description, origin_of
+from magtwin.usd.urdf.description import Description
 from magtwin.usd.urdf.inertia import quaternion
 
 JOINT_API, NEWTON_API = "IsaacJointAPI", "NewtonJointAPI"
@@ -126,8 +126,8 @@ def _drive(prim: Usd.Prim, joint: Any, description: Description) -> None:
     effort = None if limit is None else limit.effort
     if not effort:
         description.note(
-            f"joint {joint.name!r} gives {'no effort' if effort is None else 'an effort of 0'}: its drive may "
-            f"use {DEFAULT_EFFORT:g} {'N m' if angular else 'N'}"
+            f"joint {joint.name!r} gives {'no effort' if effort is None else 'an effort of 0'}: "
+            f"its drive may use {DEFAULT_EFFORT:g} {'N m' if angular else 'N'}"
         )
         effort = DEFAULT_EFFORT
     if effort < 0 or not np.isfinite(effort):

@@ -63,8 +63,8 @@ def mesh_path(filename: str, urdf: Path) -> Path:
         found = next((p for p in around if p.name == name and p.is_dir()), None)
         if found is None:
             raise RefusedError(
-                f"{urdf}: mesh {filename!r} is in a package {name!r}, and no folder of that name holds the URDF "
-                "or lies beside it; put the package there"
+                f"{urdf}: mesh {filename!r} is in a package {name!r}, and no folder of that name holds the "
+                "URDF or lies beside it; put the package there"
             )
         folder = found
     path = Path(os.path.normpath(folder / rest))
@@ -202,7 +202,7 @@ def _mend_colours(text: str) -> tuple[str, list[str]]:
             numbers = []
         if len(tokens) == 4 and numbers and len(numbers) == 4:
             return match[0]
-        numbers = numbers + [1.0] if len(numbers) == 3 else numbers
+        numbers = [*numbers, 1.0] if len(numbers) == 3 else numbers
         numbers = numbers if len(numbers) == 4 else [0.5, 0.5, 0.5, 1.0]
         new = " ".join(f"{n:g}" for n in numbers)
         mended.append(f"malformed colour {match[2].strip()!r} read as {new!r}")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf, Tf, Usd, UsdGeom, Vt
 
+from magtwin.usd.layers import describe_stage
 from magtwin.usd.urdf.description import Description
 from magtwin.usd.urdf.mesh import Mesh, MeshPart, Rgba, mesh_path, read_mesh
 
@@ -35,9 +36,7 @@ class MeshLayer:
     def __init__(self, description: Description) -> None:
         self._description = description
         self._stage = Usd.Stage.CreateInMemory()
-        UsdGeom.SetStageUpAxis(self._stage, UsdGeom.Tokens.z)
-        UsdGeom.SetStageMetersPerUnit(self._stage, 1.0)
-        self._stage.SetMetadata("kilogramsPerUnit", 1.0)
+        describe_stage(self._stage, f"{description.name}: triangles of its meshes.")
         self._stage.SetDefaultPrim(UsdGeom.Scope.Define(self._stage, ROOT).GetPrim())
         self._files: dict[Path, Mesh] = {}
         self._entries: dict[tuple[Path, tuple[float, ...], bool], tuple[Entry, ...]] = {}

@@ -1,0 +1,268 @@
+"""Pictures: a stage as a PNG, drawn off screen, with or without a graphics card."""
+
+import ctypes
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.files import output
+from magtwin.frames import rotate
+from magtwin.names import RefusedError
+from magtwin.spec import Vec3
+from magtwin.usd.geometry import (
+    Shape,
+    read_colour_scale,
+    read_links,
+    read_shapes,
+    srgb_from_linear,
+)
+from magtwin.usd.layers import open_stage
+
+MARGIN = 1.08
+"""How much farther away the camera stands than what is seen would need."""
+
+GL_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri libosmesa6 libxrender1"
+"""Debian's packages that draw without a screen."""
+
+BACKGROUND = "#e9edf1"
+
+INK = "#20262d"
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where a picture is taken from."""
+
+    azimuth_deg: float = 40.0
+    """Direction from the target to the camera about world z, from x towards y [deg]."""
+
+    elevation_deg: float = 22.0
+    """Height of the camera above the target's horizon [deg]."""
+
+    distance_m: float | None = None
+    """Distance from the target [m]; none means that everything just fits."""
+
+    target: Vec3 | None = None
+    """Point in the middle of the picture, in world [m]; none means the middle of everything."""
+
+    view_angle_deg: float = 30.0
+    """Angle between the upper and the lower edge [deg]."""
+
+    def __post_init__(self) -> None:
+        if not (-90 <= self.elevation_deg <= 90):
+            raise RefusedError(f"elevation_deg of Camera must lie in -90..90, got {self.elevation_deg!r}")
+        if not (1 <= self.view_angle_deg <= 120):
+            raise RefusedError(f"view_angle_deg of Camera must lie in 1..120, got {self.view_angle_deg!r}")
+        if self.distance_m is not None and not self.distance_m > 0:
+            raise RefusedError(f"distance_m of Camera must be above 0, got {self.distance_m!r}")
+
+
+def picture_of_stage(
+    path: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    size: tuple[int, int] = (1600, 1000),
+    camera: Camera | None = None,
+    title: str | None = None,
+    legend: bool = True,
+    ground: bool | None = None,
+    force: bool = False,
+) -> Path:
+    """Draw a stage as it stands and write a PNG.
+
+    Args:
+        path: USD file.
+        out: PNG to write.
+        size: Width and height [pixel].
+        camera: Where from; by default three quarters from the front, everything in view.
+        title: A line at the top.
+        legend: Whether a stage with an anomaly map gets the colour bar of its heat-map.
+        ground: Whether to draw a floor below everything; by default where the stage has nothing but
+            moving bodies, a robot alone.
+        force: Whether a file that is there is replaced.
+
+    Returns:
+        `out`.
+
+    Raises:
+        RefusedError: The stage is missing, is not USD or shows nothing; `out` is no PNG or is there
+            already; or this machine has nothing to draw with (the packages are named).
+    """
+    out = Path(out)
+    if out.suffix.lower() != ".png":
+        raise RefusedError(f"{out}: pictures are PNG; give it the suffix .png")
+    if not (min(size) >= 16 and max(size) <= 16384):
+        raise RefusedError(f"size must lie in 16..16384 pixels each way, got {size[0]} x {size[1]}")
+    stage = open_stage(path)
+    shapes = read_shapes(stage)
+    if not shapes:
+        raise RefusedError(f"{path}: shows nothing; a picture needs at least one visible shape")
+    links = read_links(stage)
+    worlds = [
+        rotate(links[s.link].q_world_link_xyzw, s.vertices) + links[s.link].p_world_link
+        if s.link
+        else s.vertices.astype(float)
+        for s in shapes
+    ]
+    scale = read_colour_scale(stage) if legend else None
+    with output(out, force=force) as aside:
+        plotter = _plotter(size)
+        try:
+            everything = np.vstack(worlds)
+            for shape, vertices in zip(shapes, worlds, strict=True):
+                _add(plotter, shape, vertices)
+            if ground if ground is not None else all(s.link for s in shapes):
+                _add_ground(plotter, everything)
+            _light(plotter, everything)
+            _aim(plotter, camera or Camera(), everything, size)
+            if scale is not None:
+                _add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
+            if title:
+                plotter.add_text(title, position="upper_left", font_size=round(size[1] / 70), color=INK)
+            plotter.screenshot(str(aside), window_size=list(size))
+        finally:
+            plotter.close()
+    return out
+
+
+def view_distance(
+    points: ArrayLike, target: ArrayLike, axes: ArrayLike, half_angles: tuple[float, float]
+) -> float:
+    """Least distance at which a camera sees all points.
+
+    A point at (r, u, b) along the camera's right, up and back axes stands D - b before it, and is seen
+    where |r| <= (D - b) tan(h), |u| <= (D - b) tan(v).
+
+    Args:
+        points: Points in world [m], shape (N, 3).
+        target: Point that the camera looks at [m], shape (3,).
+        axes: Right, up and back axes of the camera in world, rows, shape (3, 3).
+        half_angles: Half the horizontal and vertical angle of view [rad].
+
+    Returns:
+        Distance D from the target [m].
+    """
+    r, u, b = ((np.asarray(points, float) - target) @ np.asarray(axes, float).T).T
+    h, v = half_angles
+    return float(np.max(b + np.maximum(np.abs(r) / np.tan(h), np.abs(u) / np.tan(v))))
+
+
+def _plotter(size: tuple[int, int]) -> Any:
+    """An off-screen plotter.
+
+    Raises:
+        RefusedError: There is nothing to draw with. VTK itself would end the process.
+    """
+    import vtkmodules.vtkRenderingOpenGL2
+    from vtkmodules.vtkCommonCore import vtkLogger
+    from vtkmodules.vtkRenderingCore import vtkRenderWindow
+
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it tells of each way to draw that is not there
+    window = vtkRenderWindow()  # VTK picks the first that works: a screen, EGL, at last OSMesa, untried
+    if isinstance(window, vtkmodules.vtkRenderingOpenGL2.vtkOSOpenGLRenderWindow) and not _has_osmesa():
+        raise RefusedError(
+            f"no OpenGL here, so no picture can be drawn; install it: apt-get install {GL_PACKAGES}"
+        )
+    import pyvista
+
+    plotter = pyvista.Plotter(off_screen=True, window_size=list(size), lighting="none")
+    plotter.set_background(BACKGROUND)
+    plotter.enable_anti_aliasing("ssaa")
+    return plotter
+
+
+def _has_osmesa() -> bool:
+    for name in ("libOSMesa.so", "libOSMesa.so.8", "libOSMesa.so.6"):
+        try:
+            ctypes.CDLL(name)
+        except OSError:
+            continue
+        return True
+    return False
+
+
+def _add(plotter: Any, shape: Shape, vertices: NDArray) -> None:
+    """One shape in its colours, shaded smooth but for its creases."""
+    import pyvista
+
+    mesh = pyvista.PolyData.from_regular_faces(vertices.astype(np.float32), shape.faces)
+    style: dict[str, Any] = {"ambient": 0.22, "diffuse": 0.8, "specular": 0.25, "specular_power": 25}
+    if shape.vertex_colours is not None:  # a map's colours mean numbers: light must not change them
+        colours = (255 * srgb_from_linear(shape.vertex_colours)).round().astype(np.uint8)
+        style = {"scalars": colours, "rgb": True, "lighting": False}
+    else:
+        style["color"] = tuple(srgb_from_linear(shape.colour[:3]))
+        mesh = mesh.compute_normals(
+            cell_normals=False, split_vertices=True, feature_angle=35, consistent_normals=False
+        )
+    plotter.add_mesh(mesh, opacity=shape.colour[3], smooth_shading=shape.vertex_colours is None, **style)
+
+
+def _add_ground(plotter: Any, everything: NDArray) -> None:
+    """A floor just below everything, of the background's colour: it shows by what stands on it only."""
+    import pyvista
+
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    reach = 3 * float(np.max(high - low))
+    middle = (*((low + high) / 2)[:2], low[2] - 1e-3 * reach)
+    floor = pyvista.Disc(center=middle, inner=0, outer=reach, normal=(0, 0, 1), c_res=64)
+    plotter.add_mesh(floor, color=BACKGROUND, lighting=False)
+
+
+def _light(plotter: Any, everything: NDArray) -> None:
+    """A key light with soft shadow in corners, a fill from the other side, and a light from above."""
+    import pyvista
+
+    middle = everything.mean(axis=0)
+    reach = float(np.linalg.norm(np.ptp(everything, axis=0)))
+    for direction, strength in (((0.6, 0.9, 1.4), 0.75), ((0.9, -1.0, 0.6), 0.4), ((-0.8, 0.1, 0.9), 0.3)):
+        light = pyvista.Light(
+            position=middle + 3 * reach * np.array(direction), focal_point=middle, intensity=strength
+        )
+        light.positional = False
+        plotter.add_light(light)
+    plotter.enable_ssao(radius=0.06 * reach, bias=0.002 * reach, kernel_size=64, blur=True)
+
+
+def _aim(plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int]) -> None:
+    """Set the camera, at the distance from which everything is seen unless it gives its own."""
+    target = (everything.min(axis=0) + everything.max(axis=0)) / 2
+    target = target if camera.target is None else np.array(camera.target)
+    a, e = np.radians([camera.azimuth_deg, camera.elevation_deg])
+    back = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.array([-np.sin(a), np.cos(a), 0.0])
+    up = np.cross(back, right)
+    v = np.radians(camera.view_angle_deg) / 2
+    h = np.arctan(np.tan(v) * size[0] / size[1])
+    distance = camera.distance_m or MARGIN * view_distance(everything, target, [right, up, back], (h, v))
+    plotter.camera.position = target + distance * back
+    plotter.camera.focal_point = target
+    plotter.camera.up = up
+    plotter.camera.view_angle = camera.view_angle_deg
+    plotter.renderer.ResetCameraClippingRange()
+
+
+def _add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: str) -> None:
+    """A colour bar, in uT where the map is in nT."""
+    import pyvista
+
+    unit, factor = ("uT", 1e-3) if unit == "nT" else (unit, 1.0)
+    table = pyvista.LookupTable(colour_map, scalar_range=(least * factor, greatest * factor))
+    points = pyvista.PolyData(np.zeros((2, 3)))
+    points["field"] = np.array([least, greatest]) * factor
+    actor = plotter.add_mesh(points, scalars="field", cmap=table, opacity=0, show_scalar_bar=False)
+    plotter.add_scalar_bar(
+        title=f"total field [{unit}]",
+        mapper=actor.mapper,
+        vertical=True,
+        position_x=0.92,
+        position_y=0.2,
+        height=0.6,
+        width=0.05,
+        fmt="%.1f",
+        color=INK,
+    )
