@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from magtwin.usd.robot import read_robot
 from numpy.typing import NDArray
 
 from magtwin.field.earth import earth_field_nt
@@ -20,6 +19,7 @@ from magtwin.report import Report
 from magtwin.sim.survey import survey
 from magtwin.spec import EarthFieldSpec, LabSpec, RobotSpec, Scene, SourceSpec
 from magtwin.usd.maps import save_map
+from magtwin.usd.robot import read_robot
 
 HERE = Path(__file__).resolve().parent
 SEED = 9
