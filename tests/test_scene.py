@@ -1,7 +1,9 @@
 """A Scene through its layers and back; what cannot be a scene is refused by file and prim."""
 
+import importlib.util
 import json
 import math
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +15,9 @@ from hypothesis import strategies as st
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade
 from validators import assert_valid
 
+from magtwin.field.earth import earth_field_nt
 from magtwin.field.map import AnomalyMap
-from magtwin.files import sha256
+from magtwin.files import sha256, shipped
 from magtwin.names import RefusedError
 from magtwin.spec import (
     BatterySpec,
@@ -111,10 +114,11 @@ def full_scene(parts: Path) -> Scene:
     return replace(scene, earth=EARTH, sources=SOURCES, start=(1.0, -0.5, 0.0))
 
 
-def test_a_scene_survives_its_layers(parts, tmp_path):
+def test_a_scene_survives_its_layers(parts, tmp_path, capfd):
     scene = full_scene(parts)
     assert scene.robot.magnetometer.network_sha256 == sha256(parts / "net.pth")
     assert read_scene(author_scene(scene, tmp_path / "s", by_reference=True)) == scene
+    assert capfd.readouterr().err == "", "USD has nothing to warn of"
 
 
 number = st.floats(-1e6, 1e6)
@@ -404,6 +408,54 @@ def test_weights_that_are_no_safetensors_are_refused(own_parts):
     (own_parts / "net.safetensors").write_bytes(b"none")
     with pytest.raises(RefusedError, match=r"net\.safetensors: cannot be read as safetensors"):
         scene_from_toml(own_parts / "scene.toml", network=own_parts / "net.safetensors")
+
+
+# What ships
+
+
+def build_lab(folder: Path) -> Path:
+    """`scenes/build.py` run for another folder."""
+    script = importlib.util.spec_from_file_location("build_scenes", shipped("scenes", "build.py"))
+    assert script is not None
+    assert script.loader is not None
+    module = importlib.util.module_from_spec(script)
+    script.loader.exec_module(module)
+    return module.build(folder)
+
+
+def without_ways(layer: Path) -> str:
+    """A layer's text, each relative path without the way up to where the project's folders part."""
+    return re.sub(r"@(\.\./)[^@]*?((maps|robots|weights)/[^@]*)@", r"@\2@", layer.read_text())
+
+
+def test_the_labs_stage_is_what_a_fresh_build_gives(tmp_path):
+    fresh, committed = build_lab(tmp_path / "lab").parent, shipped("scenes", "lab")
+    assert sorted(p.name for p in fresh.iterdir()) == sorted(p.name for p in committed.iterdir())
+    for layer in fresh.iterdir():
+        assert without_ways(layer) == without_ways(committed / layer.name), (
+            f"run scenes/build.py: {layer.name}"
+        )
+
+
+def test_the_labs_stage_holds_what_its_toml_says():
+    assert read_scene(shipped("scenes", "lab", "lab.usda")) == scene_from_toml(shipped("scenes", "lab.toml"))
+
+
+def test_the_lab_passes_the_gates(tmp_path, lab_scene):
+    assert_valid(shipped("scenes", "lab", "lab.usda"), tmp_path)
+    assert_valid(lab_scene, tmp_path)
+
+
+def test_the_labs_earth_is_the_igrfs_to_a_tenth_of_a_nanotesla():
+    earth = scene_from_toml(shipped("scenes", "lab.toml")).earth
+    assert earth is not None
+    field = earth_field_nt(earth.latitude_deg, earth.longitude_deg, earth.height_m, earth.date)
+    assert earth.b_world_nt == pytest.approx(field, abs=0.06)
+
+
+def test_the_real_lab_asks_for_its_map():
+    with pytest.raises(RefusedError, match=r"aprilab\.toml: names no map; .*give --map FILE\.usdc"):
+        scene_from_toml(shipped("scenes", "aprilab.toml"))
 
 
 # What cannot be authored

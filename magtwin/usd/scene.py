@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pxr import Sdf, Usd, UsdGeom, UsdUtils
+from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 
 from magtwin.files import existing, from_table, output, read_toml, sha256
 from magtwin.frames import quat_from_yaw, yaw_from_quat
@@ -16,6 +16,7 @@ from magtwin.spec import ZERO3, EarthFieldSpec, LabSpec, MagnetometerSpec, Robot
 from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, read_lab
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, open_stage, relative_asset
 from magtwin.usd.maps import MAP, load_map, read_map
+from magtwin.usd.robot import read_robot, robot_of
 from magtwin.usd.schema import only_prim_with, place, prims_with, require_api
 from magtwin.usd.sensors import (
     MAP_RELATIONSHIP,
@@ -31,7 +32,6 @@ from magtwin.usd.sensors import (
     define_source,
     read_earth,
     read_pose,
-    read_robot_prim,
     read_source,
     target,
     write_pose,
@@ -78,14 +78,16 @@ def author_scene(
         aside.mkdir()
         placed = scene if by_reference else _with_copies(scene, aside)
         sublayers = [_write_room(scene.lab, aside), *_write_magnetics(scene, aside), placed.map_layer]
-        stage = Usd.Stage.CreateNew(str(aside / f"{scene.name}.usda"))
-        root = stage.GetRootLayer()
+        root = Sdf.Layer.CreateNew(str(aside / f"{scene.name}.usda"))
+        stage = Usd.Stage.Open(root)
         describe_stage(stage, f"{scene.name}: a lab, its magnetic map and {scene.robot.name}, by magtwin")
         stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, WORLD).GetPrim())
+        Usd.ModelAPI(stage.GetDefaultPrim()).SetKind(Kind.Tokens.assembly)
         root.subLayerPaths = [relative_asset(root, layer) for layer in sublayers]
         _define_robot(stage, placed)
+        del stage  # what follows is right only at the layer's later place
         _settle(root, aside, Path(folder).resolve())
-        stage.Save()
+        root.Save()
     return Path(folder) / f"{scene.name}.usda"
 
 
@@ -105,7 +107,7 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     world = stage.GetPseudoRoot()
     lab = read_lab(only_prim_with(world, "lab"))
     prim = only_prim_with(world, "robot")
-    robot = read_robot_prim(prim, _asset(prim))
+    robot = robot_of(prim)
     magnetometer = only_prim_with(prim, "magnetometer")
     field_map = require_api(target(magnetometer, MAP_RELATIONSHIP), "anomalyMap")
     read_map(field_map)
@@ -180,7 +182,7 @@ def scene_from_toml(
     layer = Path(map_layer).resolve() if map_layer is not None else given.map
     if layer is None:
         raise RefusedError(f'{path}: names no map; add map = "FILE.usdc" to it, or give --map FILE.usdc')
-    robot = _read_asset(existing(given.robot.asset, "robot asset"))
+    robot = read_robot(given.robot.asset)
     weights = Path(network).resolve() if network is not None else given.robot.network
     if weights is not None:
         robot = replace(robot, magnetometer=_with_network(robot, existing(weights, "weights file")))
@@ -225,7 +227,7 @@ def _check(scene: Scene) -> None:
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise RefusedError(f"two sources are called {twice[0]!r}; give each a name of its own")
     load_map(scene.map_layer)
-    _read_asset(scene.robot.asset)
+    read_robot(scene.robot.asset)
     if scene.robot.magnetometer.network is not None:
         existing(scene.robot.magnetometer.network, "weights file")
 
@@ -320,17 +322,3 @@ def _layer_of(field_map: Usd.Prim) -> Path:
     """The layer that holds a map's values."""
     specs = field_map.GetAttribute("magtwin:anomalyMap:values").GetPropertyStack()
     return Path(specs[0].layer.realPath).resolve()
-
-
-def _read_asset(asset: Path) -> RobotSpec:
-    stage = open_stage(asset)
-    if not stage.GetDefaultPrim():
-        raise RefusedError(f"{asset}: has no default prim, so no robot; make the asset with `magtwin robot`")
-    return read_robot_prim(stage.GetDefaultPrim(), asset.resolve())
-
-
-def _asset(prim: Usd.Prim) -> Path:
-    """The file that a robot's prim refers to; the stage's own where it refers to none."""
-    arcs = Usd.PrimCompositionQuery.GetDirectReferences(prim).GetCompositionArcs()
-    layer = arcs[0].GetTargetLayer() if arcs else prim.GetStage().GetRootLayer()
-    return Path(layer.realPath).resolve()
