@@ -129,7 +129,11 @@ def simulate(
         outside=outside,
         lidar=lidar,
     )
-    facts = {"seed": seed, "map": twin.field.name, "map_sha256": sha256(twin.scene.map_layer)}
+    facts: dict[str, str | int | float | bool] = {
+        "seed": seed,
+        "map": twin.field.name,
+        "map_sha256": sha256(twin.scene.map_layer),
+    }
     if magnetometer:
         noise = twin.scene.robot.magnetometer.noise_std_nt
         run = run.with_columns(
