@@ -166,7 +166,7 @@ def main(repetitions: int = 5) -> None:
     print(f"{'simulate and read sensors':32s}{median['run']:8.3f} s")
     for key in parts:
         print(f"{key:32s}{median[key]:8.3f} s")
-    print(f"{'  the rest':32s}{median['run'] - sum(median[key] for key in parts):8.3f} s")
+    print(f"{'  drive, sensors, exact field':32s}{median['run'] - sum(median[key] for key in parts):8.3f} s")
     print(f"{'write Parquet':32s}{median['parquet']:8.3f} s  {sizes['run.parquet']:6.1f} MB")
     print(f"{'write .rrd':32s}{median['rrd']:8.3f} s  {sizes['run.rrd']:6.1f} MB")
     print(f"{'total':32s}{median['total']:8.3f} s  {DURATION_S / median['total']:6.0f} x real time")

@@ -26,6 +26,9 @@ LOCALHOST = "127.0.0.1"
 START_S = 60.0
 """How long the viewer may take to start on a busy machine without a graphics card [s]."""
 
+TITLE_BAR = 36
+"""Height of the bar that the viewer keeps for its window, without anything in it [pixels]."""
+
 TOASTS_S = 6.0
 """How long the viewer's notices about itself stay in the picture [s]."""
 
@@ -70,7 +73,8 @@ def screenshot(
         RefusedError: The recording is missing or the picture exists, or the machine has no Vulkan.
     """
     rrd = existing(rrd, "recording").resolve()
-    with output(png, force=force) as aside, headless_viewer(size) as client:
+    window = (size[0], size[1] + TITLE_BAR)
+    with output(png, force=force) as aside, headless_viewer(window) as client:
         client.open(str(rrd))
         _wait_until(lambda: _loaded(client), f"{rrd}: the viewer did not load it")
         if time_s is not None:
@@ -80,6 +84,7 @@ def screenshot(
         while time.monotonic() < end:  # its clock goes on only while it draws
             client.take_screenshot(max_size=64)
         client.save_screenshot(str(aside))
+        _crop(aside)
         views = client.get_state().views
     return [f"{v.name}: {r.severity}: {r.summary} {r.details or ''}" for v in views for r in v.reports]
 
@@ -125,6 +130,13 @@ def _connected(process: "subprocess.Popen[bytes]", port: int, log: IO[str]) -> V
 
     _wait_until(draws, "the Rerun viewer did not start")
     return clients[-1]
+
+
+def _crop(png: Path) -> None:
+    """Take the empty title bar off a picture."""
+    from matplotlib.image import imread, imsave
+
+    imsave(png, imread(png)[TITLE_BAR:], metadata={"Software": "magtwin"}, pil_kwargs={"optimize": True})
 
 
 def _binary() -> str:
