@@ -32,6 +32,7 @@ from magtwin.spec import (
     SourceSpec,
 )
 from magtwin.usd import sensors
+from magtwin.usd.figures import write_pose
 from magtwin.usd.lab import LAB, define_lab, read_lab
 from magtwin.usd.layers import new_stage
 from magtwin.usd.maps import MAP, save_map
@@ -65,7 +66,7 @@ def define_robot_asset(path: Path) -> None:
         stage.SetDefaultPrim(root)
         stage.RemovePrim("/World")
         for link, p in {**LINKS, "rplidar_link": (0.0, 0.0, 0.2)}.items():
-            sensors.write_pose(UsdGeom.Xform.Define(stage, f"/bot/{link}").GetPrim(), p)
+            write_pose(UsdGeom.Xform.Define(stage, f"/bot/{link}").GetPrim(), p)
         UsdPhysics.RigidBodyAPI.Apply(stage.GetPrimAtPath("/bot/base_link"))
         for joint in ("left_wheel_joint", "right_wheel_joint"):
             UsdPhysics.RevoluteJoint.Define(stage, f"/bot/{joint}").CreateBody0Rel().SetTargets(

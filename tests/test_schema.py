@@ -12,6 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils, Vt
 from magtwin import spec
 from magtwin.names import RefusedError
 from magtwin.usd import schema, sensors
+from magtwin.usd.figures import plain_value, write_pose
 from magtwin.usd.schema import generate
 
 SPECS = {
@@ -49,7 +50,7 @@ def stage_with(noun: str) -> tuple[Usd.Stage, Usd.Prim]:
     prim = UsdGeom.Xform.Define(stage, "/thing").GetPrim()
     stage.SetDefaultPrim(prim)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-    sensors.write_pose(prim, (1.0, 2.0, 3.0))
+    write_pose(prim, (1.0, 2.0, 3.0))
     return stage, schema.apply_api(prim, noun)
 
 
@@ -164,7 +165,7 @@ def test_fallbacks_are_the_defaults_of_the_spec(noun):
     _, prim = stage_with(noun)
     defaults = {f.name: f.default for f in fields(SPECS[noun]) if f.default is not MISSING}
     for field in defaults.keys() - ELSEWHERE - set(sensors.JOINT_FIELDS):
-        assert sensors.plain_value(prim.GetAttribute(schema.attribute_name(noun, field))) == defaults[field]
+        assert plain_value(prim.GetAttribute(schema.attribute_name(noun, field))) == defaults[field]
 
 
 def test_the_footprints_fallback_is_the_default_of_the_robot():

@@ -20,6 +20,7 @@ from magtwin.spec import (
     SourceSpec,
 )
 from magtwin.usd import sensors
+from magtwin.usd.figures import read_pose
 
 LINK = "/robot/some_link"
 
@@ -181,7 +182,7 @@ def test_a_pose_that_others_wrote_as_a_matrix_is_read():
     stage = stage_with_link()
     matrix = Gf.Matrix4d(Gf.Rotation(Gf.Vec3d(0, 0, 1), 90), Gf.Vec3d(1, 2, 3))
     UsdGeom.Xformable(stage.GetPrimAtPath(LINK)).MakeMatrixXform().Set(matrix)
-    p, q = sensors.read_pose(stage.GetPrimAtPath(LINK))
+    p, q = read_pose(stage.GetPrimAtPath(LINK))
     assert p == (1, 2, 3)
     assert q == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
 

@@ -6,9 +6,9 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
 
 from magtwin.frames import quat_from_rpy
 from magtwin.spec import LabSpec
+from magtwin.usd.figures import read_figures, write_figures, write_pose
 from magtwin.usd.layers import WORLD
 from magtwin.usd.schema import apply_api
-from magtwin.usd.sensors import read_figures, write_figures, write_pose
 
 LAB = WORLD.AppendChild("Lab")
 PHYSICS_SCENE = WORLD.AppendChild("PhysicsScene")

@@ -13,6 +13,7 @@ from magtwin.files import existing, from_table, output, read_toml, sha256
 from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.names import RefusedError
 from magtwin.spec import ZERO3, EarthFieldSpec, LabSpec, MagnetometerSpec, RobotSpec, Scene, SourceSpec, Vec3
+from magtwin.usd.figures import check_prim_name, read_pose, target, write_pose
 from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, read_lab
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, open_stage, relative_asset
 from magtwin.usd.maps import MAP, load_map, read_map
@@ -20,7 +21,6 @@ from magtwin.usd.robot import read_robot, robot_of
 from magtwin.usd.schema import only_prim_with, place, prims_with, require_api
 from magtwin.usd.sensors import (
     MAP_RELATIONSHIP,
-    check_prim_name,
     define_battery,
     define_drive,
     define_earth,
@@ -31,10 +31,7 @@ from magtwin.usd.sensors import (
     define_platform,
     define_source,
     read_earth,
-    read_pose,
     read_source,
-    target,
-    write_pose,
 )
 
 EARTH = WORLD.AppendChild("Earth")
