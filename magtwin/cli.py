@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -56,14 +57,13 @@ def demo(*, out: Path = Path("demo"), seed: int = 0, force: Force = False, json:
     steps = _steps(quiet=json)
     with output(out, force=force) as folder:
         steps("Authoring the TurtleBot 4 from its URDF")
-        robot_folder = shipped("robots", "turtlebot4")
-        build_robot(
-            robot_folder / "turtlebot4.urdf",
-            robot_folder / "robot.toml",
-            folder / "robot" / "turtlebot4.usda",
+        source = shipped("robots", "turtlebot4")
+        asset = build_robot(
+            source / "turtlebot4.urdf", source / "robot.toml", folder / "robot" / "turtlebot4.usda"
         )
         steps("Authoring the lab around it, with its magnetic map")
         scene = scene_from_toml(shipped("scenes", "lab.toml"))
+        scene = replace(scene, robot=replace(scene.robot, asset=asset))
         scene_file = author_scene(scene, folder / "scene")
         report = _run(
             scene_file, "figure8", folder, steps=steps, seed=seed, speed=0.2, title=f"Demo in {out}"
@@ -143,7 +143,7 @@ def map_import(
     json
         Print the summary as JSON.
     """
-    from magtwin.field.survey import import_survey
+    from magtwin.field.survey import import_survey, survey_report
     from magtwin.files import check_free
     from magtwin.usd.maps import save_map
 
@@ -151,7 +151,7 @@ def map_import(
     check_free(out, force=force)
     field = import_survey(folder, name=name or folder.resolve().name, licence=licence)
     save_map(field, out, force=force)
-    _print_report(field.report(), json)
+    _print_report(survey_report(folder), json)
     if not json:
         _say(f"Wrote {out}")
 

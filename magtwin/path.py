@@ -320,7 +320,7 @@ def read_path_csv(file: str | os.PathLike[str]) -> Path:
     p = _without_repeats(np.array(points))
     if len(p) < 2:
         raise RefusedError(f"{file}: only one point in it; a path needs two that differ")
-    return Path(str(file), p, closed=len(p) > 2 and math.dist(p[0], p[-1]) < _SAME_M)
+    return Path(file.name, p, closed=len(p) > 2 and math.dist(p[0], p[-1]) < _SAME_M)
 
 
 def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> None:

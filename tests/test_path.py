@@ -216,7 +216,7 @@ def test_resolve_takes_a_name_or_a_file_and_names_the_near_one(tmp_path):
     file = tmp_path / "p.csv"
     file.write_text("0,0\n1,2\n")
     assert resolve_path("figure8").name == "figure8"
-    assert resolve_path(file).name == str(file)
+    assert resolve_path(file).name == "p.csv"
     with pytest.raises(RefusedError, match="did you mean 'figure8'"):
         resolve_path("figure9")
     with pytest.raises(RefusedError, match="no such path file"):

@@ -5,26 +5,10 @@ from pathlib import Path
 
 from pxr import Usd, UsdGeom, UsdPhysics
 
-from magtwin.files import existing
-from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
+from magtwin.usd.layers import open_stage
 
 _PREFIX, _SOURCE = "Magtwin", "MagtwinMagneticSourceAPI"
-
-
-def open_stage(path: Path) -> Usd.Stage:
-    """The stage of a file.
-
-    Raises:
-        RefusedError: The file is missing or is not USD.
-    """
-    from pxr import Tf
-
-    existing(path, "USD file")
-    try:
-        return Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        raise RefusedError(f"{path}: cannot be read as USD: {str(error).splitlines()[-1].strip()}") from error
 
 
 def info_of_stage(path: Path) -> Report:
