@@ -119,7 +119,7 @@ def layout(run: Run, lab: LabSpec | None = None, *, heading: float = 0.0) -> rrb
     states = rrb.StateTimelineView(
         origin="states", contents=[f"$origin/{name}" for name in raised], name="States", time_view=whole
     )
-    about = rrb.Vertical(states, rrb.TextDocumentView(origin="facts", name="Run"))
+    about = rrb.Vertical(states, rrb.TextDocumentView(origin="facts", name="Run"), row_shares=[1.0, 1.5])
     if lab is None:
         root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
     else:

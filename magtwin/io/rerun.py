@@ -157,14 +157,8 @@ def _content_id(run: Run) -> str:
 
 def _facts(run: Run) -> str:
     """The facts of a run as a Markdown table."""
-    rate = (run.rows - 1) / run.duration_s if run.duration_s else 0.0
-    said = {
-        "readings": f"{run.rows:,}",
-        "duration": f"{run.duration_s:.1f} s",
-        "rate": f"{rate:.1f} Hz",
-        **run.facts,
-    }
-    cells = [(key.replace("_", " "), str(value).replace("|", r"\|")) for key, value in said.items()]
+    said = {"readings": f"{run.rows:,} in {run.duration_s:.1f} s", **run.facts}
+    cells = [(key, str(value).replace("|", r"\|")) for key, value in said.items()]
     return "\n".join(["| fact | value |", "|---|---|", *(f"| {key} | {value} |" for key, value in cells)])
 
 
