@@ -82,7 +82,7 @@ def picture_of_stage(
         title: A line at the top.
         legend: Whether a stage with an anomaly map gets the colour bar of its heat-map.
         ground: Whether to draw a floor below everything; by default where the stage has nothing but
-            moving bodies, a robot alone.
+            moving bodies, a robot alone, and the camera looks down on them.
         force: Whether a file that is there is replaced.
 
     Returns:
@@ -97,6 +97,7 @@ def picture_of_stage(
         raise RefusedError(f"{out}: pictures are PNG; give it the suffix .png")
     if not (min(size) >= 16 and max(size) <= 16384):
         raise RefusedError(f"size must lie in 16..16384 pixels each way, got {size[0]} x {size[1]}")
+    camera = camera or Camera()
     stage = open_stage(path)
     shapes = read_shapes(stage)
     if not shapes:
@@ -115,10 +116,12 @@ def picture_of_stage(
             everything = np.vstack(worlds)
             for shape, vertices in zip(shapes, worlds, strict=True):
                 _add(plotter, shape, vertices)
-            if ground if ground is not None else all(s.link for s in shapes):
+            if ground is None:
+                ground = camera.elevation_deg > 0 and all(s.link for s in shapes)
+            if ground:
                 _add_ground(plotter, everything)
             _light(plotter, everything)
-            _aim(plotter, camera or Camera(), everything, size)
+            _aim(plotter, camera, everything, size)
             if scale is not None:
                 _add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
             if title:
@@ -210,22 +213,27 @@ def _add_ground(plotter: Any, everything: NDArray) -> None:
     reach = 3 * float(np.max(high - low))
     middle = (*((low + high) / 2)[:2], low[2] - 1e-3 * reach)
     floor = pyvista.Disc(center=middle, inner=0, outer=reach, normal=(0, 0, 1), c_res=64)
-    plotter.add_mesh(floor, color=BACKGROUND, lighting=False)
+    plotter.add_mesh(floor, color=BACKGROUND, ambient=1.0, diffuse=0.0, specular=0.0)
 
 
 def _light(plotter: Any, everything: NDArray) -> None:
-    """A key light with soft shadow in corners, a fill from the other side, and a light from above."""
+    """Light from four sides, the strongest from the upper left, and soft shadow in corners."""
     import pyvista
 
     middle = everything.mean(axis=0)
     reach = float(np.linalg.norm(np.ptp(everything, axis=0)))
-    for direction, strength in (((0.6, 0.9, 1.4), 0.75), ((0.9, -1.0, 0.6), 0.4), ((-0.8, 0.1, 0.9), 0.3)):
+    for direction, strength in (
+        ((0.6, 0.9, 1.4), 0.75),
+        ((0.9, -1.0, 0.5), 0.45),
+        ((-0.9, 0.2, 0.6), 0.4),
+        ((0.1, 0.0, -1.0), 0.3),
+    ):
         light = pyvista.Light(
             position=middle + 3 * reach * np.array(direction), focal_point=middle, intensity=strength
         )
         light.positional = False
         plotter.add_light(light)
-    plotter.enable_ssao(radius=0.06 * reach, bias=0.002 * reach, kernel_size=64, blur=True)
+    plotter.enable_ssao(radius=0.08 * reach, bias=0.002 * reach, kernel_size=64, blur=True)
 
 
 def _aim(plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int]) -> None:

@@ -17,9 +17,9 @@ from magtwin.usd.urdf.description import Description, origin_of, read_descriptio
 from magtwin.usd.urdf.gazebo import Surface, read_surfaces
 from magtwin.usd.urdf.joint import define_joint
 from magtwin.usd.urdf.link import define_body, define_frame, is_marker
-from magtwin.usd.urdf.material import GRIPS, LOOKS
+from magtwin.usd.urdf.material import LOOKS
 from magtwin.usd.urdf.mesh_layer import MeshLayer
-from magtwin.usd.urdf.shape import define_collider, define_visual, is_merged, pose_of
+from magtwin.usd.urdf.shape import COLLIDER_FORM, define_collider, define_visual, form_of, pose_of
 
 JOINTS = "joints"
 """Scope of the joints below the robot's prim."""
@@ -92,10 +92,10 @@ def _gather(description: Description) -> MeshLayer:
     for link in description.links.values():
         for visual in link.visuals:
             if visual.geometry.mesh is not None:
-                meshes.add(visual.geometry.mesh, merged=is_merged(visual, description))
+                meshes.add(visual.geometry.mesh, form_of(visual, description))
         for collision in link.collisions:
             if collision.geometry.mesh is not None:
-                meshes.add(collision.geometry.mesh, merged=True)
+                meshes.add(collision.geometry.mesh, COLLIDER_FORM)
     return meshes
 
 
@@ -219,7 +219,7 @@ def _prim_names(description: Description) -> dict[str, str]:
         RefusedError: Two links would get one name, or one that the robot's own scopes have.
     """
     names: dict[str, str] = {}
-    reserved = (JOINTS, LOOKS, GRIPS)
+    reserved = (JOINTS, LOOKS)
     for link in ("", *description.links):
         name = Tf.MakeValidIdentifier(link or description.name)
         if link and (name in reserved or name in [n for key, n in names.items() if key]):

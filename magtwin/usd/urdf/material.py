@@ -11,8 +11,8 @@ Rgba = tuple[float, float, float, float]
 GREY: Rgba = (0.5, 0.5, 0.5, 1.0)
 """Look of what has none, as RViz shows it."""
 
-LOOKS, GRIPS = "Looks", "PhysicsMaterials"
-"""Scopes below the robot's prim."""
+LOOKS = "Looks"
+"""Scope of all materials below the robot's prim."""
 
 
 def define_look(robot: Usd.Prim, rgba: Rgba, name: str = "") -> UsdShade.Material:
@@ -54,12 +54,12 @@ def define_grip(robot: Usd.Prim, surface: Surface) -> UsdShade.Material:
     """The physics material of a friction, shared by all that have it.
 
     Args:
-        robot: Root prim; physics materials lie in a scope below it.
+        robot: Root prim; physics materials lie among its looks.
         surface: Coefficients of friction [-] and restitution [-].
     """
     stage = robot.GetStage()
-    scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(GRIPS)).GetPath()
-    path = scope.AppendChild(Tf.MakeValidIdentifier(f"mu_{surface.friction:g}"))
+    scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(LOOKS)).GetPath()
+    path = scope.AppendChild(Tf.MakeValidIdentifier(f"friction_{surface.friction:g}"))
     if stage.GetPrimAtPath(path):
         return UsdShade.Material(stage.GetPrimAtPath(path))
     material = UsdShade.Material.Define(stage, path)
@@ -70,9 +70,11 @@ def define_grip(robot: Usd.Prim, surface: Surface) -> UsdShade.Material:
     return material
 
 
-def bind(prim: Usd.Prim, look: UsdShade.Material, grip: UsdShade.Material | None = None) -> None:
-    """Give a gprim its look, and a collider its grip too."""
+def wear(prim: Usd.Prim, look: UsdShade.Material, grip: UsdShade.Material | None = None) -> None:
+    """Give a gprim its look, as displayColor too for viewers without materials, and a collider its grip."""
     api = UsdShade.MaterialBindingAPI.Apply(prim)
     api.Bind(look)
+    surface = look.ComputeSurfaceSource()[0]
+    UsdGeom.Gprim(prim).CreateDisplayColorAttr([surface.GetInput("diffuseColor").Get()])
     if grip is not None:
         api.Bind(grip, UsdShade.Tokens.weakerThanDescendants, "physics")

@@ -46,6 +46,25 @@ class Mesh:
         faces = [part.faces + n for part, n in zip(self.parts, counts, strict=False)]
         return _clean(np.vstack([part.vertices for part in self.parts]), np.vstack(faces), None)[0]
 
+    def hull(self) -> MeshPart:
+        """The convex hull of all parts."""
+        from scipy.spatial import ConvexHull, QhullError
+
+        points = self.merged().vertices
+        try:
+            hull = ConvexHull(points)
+        except QhullError as error:
+            raise RefusedError(
+                f"{self.path}: is flat and has no convex hull to collide with; use a box instead"
+            ) from error
+        faces, normals = hull.simplices, hull.equations[:, :3]
+        a, b, c = np.moveaxis(points[faces], 1, 0)
+        inwards = np.sum(np.cross(b - a, c - a) * normals, axis=1) < 0
+        faces = np.where(inwards[:, None], faces[:, ::-1], faces)
+        first = np.argmin(faces, axis=1)[:, None]  # each from its least corner, then in order of corners
+        faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+        return _clean(points, faces[np.lexsort(faces.T[::-1])], None)[0]
+
 
 def mesh_path(filename: str, urdf: Path) -> Path:
     """The file that a `<mesh filename=>` means: relative to the URDF's folder, or in a package.

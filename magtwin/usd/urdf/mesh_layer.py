@@ -5,12 +5,13 @@ The readable root layer references them; arrays of more than 64 elements do not 
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf, Tf, Usd, UsdGeom, Vt
 
+from magtwin.names import RefusedError
 from magtwin.usd.layers import describe_stage
 from magtwin.usd.urdf.description import Description
 from magtwin.usd.urdf.mesh import Mesh, MeshPart, Rgba, mesh_path, read_mesh
@@ -19,6 +20,8 @@ CREASE = np.radians(35)
 """Faces that meet at a smaller angle than this are shaded as one smooth surface [rad]."""
 
 ROOT = Sdf.Path("/Meshes")
+
+Form = Literal["parts", "whole", "hull"]
 
 
 @dataclass(frozen=True)
@@ -39,29 +42,38 @@ class MeshLayer:
         describe_stage(self._stage, f"{description.name}: triangles of its meshes.")
         self._stage.SetDefaultPrim(UsdGeom.Scope.Define(self._stage, ROOT).GetPrim())
         self._files: dict[Path, Mesh] = {}
-        self._entries: dict[tuple[Path, tuple[float, ...], bool], tuple[Entry, ...]] = {}
+        self._entries: dict[tuple[Path, tuple[float, ...], Form], tuple[Entry, ...]] = {}
 
     def __len__(self) -> int:
         return len(self._entries)
 
-    def add(self, mesh: Any, *, merged: bool) -> tuple[Entry, ...]:
-        """The prims of a URDF `<mesh>`, one a colour; `merged` makes it one without colour.
+    def add(self, mesh: Any, form: Form) -> tuple[Entry, ...]:
+        """The prims of a URDF `<mesh>`.
+
+        Args:
+            mesh: yourdfpy's mesh.
+            form: "parts" makes one prim a colour, "whole" one without colour, "hull" the convex hull.
 
         Raises:
-            RefusedError: The file is missing, out of bounds, unreadable or empty.
+            RefusedError: The file is missing, out of bounds, unreadable or empty, or the scale is none.
         """
-        path = mesh_path(mesh.filename, self._description.path)
-        scale = np.broadcast_to(1.0 if mesh.scale is None else mesh.scale, 3).astype(float)
-        key = (path, tuple(scale), merged)
+        urdf = self._description.path
+        path = mesh_path(mesh.filename, urdf)
+        factors = np.atleast_1d(1.0 if mesh.scale is None else np.asarray(mesh.scale, float))
+        if len(factors) not in (1, 3) or not np.isfinite(factors).all() or not factors.all():
+            raise RefusedError(
+                f"{urdf}: mesh {mesh.filename!r} has scale {factors.tolist()}; give three numbers but 0"
+            )
+        scale = np.broadcast_to(factors, 3)
+        key = (path, tuple(scale), form)
         if key not in self._entries:
             if path not in self._files:
                 self._files[path] = read_mesh(path)
                 for note in self._files[path].notes:
                     self._description.note(note)
-            parts = (self._files[path].merged(),) if merged else self._files[path].parts
-            name = Tf.MakeValidIdentifier(path.stem) + (
-                "_whole" if merged and len(self._files[path].parts) > 1 else ""
-            )
+            file = self._files[path]
+            parts = {"parts": file.parts, "whole": (file.merged(),), "hull": (file.hull(),)}[form]
+            name = Tf.MakeValidIdentifier(path.stem) + ("" if form == "parts" else f"_{form}")
             self._entries[key] = tuple(
                 Entry(self._define(part, scale, name if len(parts) == 1 else f"{name}_{i}"), part.colour)
                 for i, part in enumerate(parts)

@@ -10,12 +10,18 @@ from magtwin.usd.sensors import write_pose
 from magtwin.usd.urdf.description import Description, origin_of
 from magtwin.usd.urdf.gazebo import Surface
 from magtwin.usd.urdf.inertia import quaternion
-from magtwin.usd.urdf.material import GREY, bind, define_grip, define_look
+from magtwin.usd.urdf.material import GREY, define_grip, define_look, wear
 from magtwin.usd.urdf.mesh import Rgba
-from magtwin.usd.urdf.mesh_layer import MeshLayer
+from magtwin.usd.urdf.mesh_layer import Form, MeshLayer
 
 VISUALS, COLLISIONS = "visuals", "collisions"
 """Xforms below a link's prim."""
+
+COLLIDER_FORM: Form = "hull"
+"""What of a mesh collides."""
+
+NEWTON_MESH_API = "NewtonMeshCollisionAPI"
+"""Newton's applied schema, by name: its plugin lives elsewhere."""
 
 
 def define_visual(
@@ -32,8 +38,8 @@ def define_visual(
     """
     name, given = _material(visual, description)
     made = []
-    for gprim, colour in _define(body, VISUALS, visual, meshes, layer, merged=given is not None):
-        bind(gprim, define_look(body.GetParent(), given or colour or GREY, name))
+    for gprim, colour in _define(body, VISUALS, visual, meshes, layer, form_of(visual, description)):
+        wear(gprim, define_look(body.GetParent(), given or colour or GREY, name))
         made.append(gprim)
     return made
 
@@ -46,19 +52,20 @@ def define_collider(
     It is of purpose guide, so that no viewer shows it unasked. Other args as for `define_visual`.
     """
     made = []
-    for gprim, _ in _define(body, COLLISIONS, collision, meshes, layer, merged=True):
+    for gprim, _ in _define(body, COLLISIONS, collision, meshes, layer, COLLIDER_FORM):
         UsdGeom.Imageable(gprim).CreatePurposeAttr(UsdGeom.Tokens.guide)
         UsdPhysics.CollisionAPI.Apply(gprim).CreateCollisionEnabledAttr(True)
         if gprim.IsA(UsdGeom.Mesh):
             UsdPhysics.MeshCollisionAPI.Apply(gprim).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
-        bind(gprim, define_look(body.GetParent(), GREY), define_grip(body.GetParent(), surface))
+            gprim.AddAppliedSchema(NEWTON_MESH_API)
+        wear(gprim, define_look(body.GetParent(), GREY), define_grip(body.GetParent(), surface))
         made.append(gprim)
     return made
 
 
-def is_merged(visual: Any, description: Description) -> bool:
-    """Whether the URDF's own material covers all of a visual's mesh."""
-    return _material(visual, description)[1] is not None
+def form_of(visual: Any, description: Description) -> Form:
+    """Whether a visual's mesh comes in its own colours, or whole because the URDF's material covers it."""
+    return "parts" if _material(visual, description)[1] is None else "whole"
 
 
 def _material(visual: Any, description: Description) -> tuple[str, Rgba | None]:
@@ -77,7 +84,7 @@ def _material(visual: Any, description: Description) -> tuple[str, Rgba | None]:
 
 
 def _define(
-    body: Usd.Prim, scope: str, shape: Any, meshes: MeshLayer, layer: str, *, merged: bool
+    body: Usd.Prim, scope: str, shape: Any, meshes: MeshLayer, layer: str, form: Form
 ) -> list[tuple[Usd.Prim, Rgba | None]]:
     """Prims of a geometry, with the colours that its file gives."""
     stage, geometry = body.GetStage(), shape.geometry
@@ -85,7 +92,7 @@ def _define(
     pose = origin_of(shape)
     if geometry.mesh is not None:
         made = []
-        for entry in meshes.add(geometry.mesh, merged=merged):
+        for entry in meshes.add(geometry.mesh, form):
             prim = stage.DefinePrim(_free(parent, shape.name or entry.path.name), "Mesh")
             prim.GetReferences().AddReference(layer, entry.path)
             _place(prim, pose)
