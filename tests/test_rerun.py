@@ -413,6 +413,14 @@ def test_view_of_a_parquet_file_shows_its_series(parts, tmp_path, monkeypatch):
     assert np.array_equal(np.ravel(values["Scalars:scalars"]), run["b_disturbance_nt"])
 
 
+def test_view_of_a_parquet_file_with_nothing_to_plot_is_refused(tmp_path):
+    write_parquet(Run({"t": np.arange(3.0), "est_bias_nt": np.zeros(3)}), tmp_path / "run.parquet")
+    with pytest.raises(
+        RefusedError, match=r"run\.parquet: holds none of the columns that are plotted: b_total"
+    ):
+        view(tmp_path / "run.parquet")
+
+
 @pytest.fixture
 def drawable():
     """Skips where nothing can be drawn."""

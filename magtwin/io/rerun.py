@@ -104,6 +104,9 @@ def view(path: str | os.PathLike[str]) -> None:
     find("kind of recording", path.suffix, {".rrd": None, ".parquet": None})
     run = read_parquet(path)
     _check_rows(run, path)
+    if not any(known_series(run, panel) for panel in PANELS):
+        plotted = ", ".join(series.column for panel in PANELS for series in panel.series)
+        raise RefusedError(f"{path}: holds none of the columns that are plotted: {plotted}")
     with tempfile.TemporaryDirectory() as folder:
         rrd = FilePath(folder) / f"{path.stem}.rrd"
         with _recording(run, rrd, layout(run)) as rec:
