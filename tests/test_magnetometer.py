@@ -1,3 +1,6 @@
+import importlib.util
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -5,10 +8,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_features import a_run
 from test_model import RELEASED, a_net
 
-from magtwin.files import sha256
+from magtwin.files import sha256, shipped
 from magtwin.learn.features import FULL, features
 from magtwin.learn.magnetometer import NeuralMagnetometer
 from magtwin.names import RefusedError
+from magtwin.path import path_named
 
 
 def forward64(net, x):
@@ -139,3 +143,48 @@ def test_another_checksum_is_refused(tmp_path):
 def test_features_of_another_width_are_refused(paper):
     with pytest.raises(RefusedError, match=r"reads 20 features a row, shape \(N, 20\); got \(5, 19\)"):
         paper.predict(np.zeros((5, 19)))
+
+
+# The network that ships
+
+
+@pytest.fixture(scope="module")
+def shipped_network():
+    return NeuralMagnetometer.load(shipped("weights", "lab.safetensors"))
+
+
+@pytest.fixture(scope="module")
+def train_lab():
+    """The script that trained it."""
+    spec = importlib.util.spec_from_file_location("train_lab", shipped("weights", "train_lab.py"))
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["train_lab"] = module  # its dataclasses look themselves up there
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["train_lab"]
+
+
+def test_the_shipped_network_has_the_papers_shape_and_reads_its_inputs(shipped_network):
+    assert shipped_network.facts["network_layers"] == "20-512-512-512-512-1"
+    assert shipped_network.features == FULL
+
+
+def test_the_shipped_network_was_trained_on_the_shipped_map(shipped_network):
+    assert shipped_network.net.facts["map_sha256"] == sha256(shipped("maps", "lab", "lab.usdc"))
+
+
+def test_the_card_is_of_the_shipped_network(shipped_network):
+    assert f"SHA-256 `{shipped_network.sha256}`" in shipped("weights", "lab.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("kind", ["narrow_figure8", "curvilinear"])
+def test_the_shipped_network_more_than_halves_the_error_on_a_new_run_of_a_kind_it_never_saw(
+    shipped_network, train_lab, kind
+):
+    scene = train_lab.lab()
+    plan = train_lab.Drive(path_named(kind), 0.2, "schedule", 0.9, once=True)
+    field = train_lab.load_map(scene.map_layer)
+    new = train_lab.drive(scene, field, plan, np.random.default_rng(2026))
+    naive = np.abs(new.y - float(shipped_network.net.y_mean)).mean()
+    assert np.abs(shipped_network.predict(new.x) - new.y).mean() < naive / 2  # the card: 0.31 and 0.38
+    assert shipped_network.outside(new.x).mean() < 0.01
