@@ -57,6 +57,12 @@ def test_one_network_gives_one_file_byte_for_byte(tmp_path):
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
+def test_a_weights_file_has_the_rights_of_any_new_file(tmp_path):
+    a_net().save(tmp_path / "n.safetensors")
+    (tmp_path / "plain").write_bytes(b"")
+    assert (tmp_path / "n.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
 def test_the_metadata_name_features_with_their_units(tmp_path):
     a_net().save(tmp_path / "n.safetensors")
     with safe_open(tmp_path / "n.safetensors", framework="np") as file:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from magtwin.files import existing, output, sha256
 from magtwin.learn.checkpoint import Checkpoint, read_checkpoint
@@ -165,7 +165,7 @@ class FieldNet(torch.nn.Module):
         # One key, because safetensors orders several at random.
         metadata = {"magtwin": json.dumps(about, sort_keys=True, allow_nan=False)}
         with output(path, force=force) as aside:
-            save_file(tensors, aside, metadata=metadata)
+            aside.write_bytes(save(tensors, metadata))  # save_file would leave it readable by its owner alone
 
     def report(self, title: str) -> Report:
         """What the network is, in figures."""
