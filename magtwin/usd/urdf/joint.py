@@ -148,7 +148,19 @@ def _drive(prim: Usd.Prim, joint: Any, description: Description) -> None:
     if limit is not None and limit.velocity:
         tuning["velocityLimit"] = limit.velocity / unit
     if dynamics is not None:
-        tuning["damping"] = (dynamics.damping or 0.0) * unit
-        tuning["friction"] = dynamics.friction or 0.0
+        tuning["damping"] = _passive(joint, "damping", description) * unit
+        tuning["friction"] = _passive(joint, "friction", description)
     for name, value in tuning.items():
         prim.CreateAttribute(f"newton:{name}", names.Float, custom=False).Set(float(value))
+
+
+def _passive(joint: Any, name: str, description: Description) -> float:
+    """A figure of a joint's `<dynamics>`, which yourdfpy leaves as text; 0 where there is none."""
+    text = getattr(joint.dynamics, name)
+    try:
+        value = float(text or 0.0)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value < np.inf:
+        raise description.refused("joint", joint.name, f"has a {name} of {text!r}; give a number from 0 up")
+    return value

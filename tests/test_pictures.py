@@ -1,0 +1,163 @@
+import ctypes
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pxr import Sdf, Usd, UsdGeom, UsdShade
+
+from magtwin.files import shipped
+from magtwin.io.pictures import BACKGROUND, Camera, picture_of_stage, view_distance
+from magtwin.names import RefusedError
+
+SIZE = (240, 160)
+BEHIND = np.array([int(BACKGROUND[i : i + 2], 16) for i in (1, 3, 5)])
+
+
+def pixels(path):
+    """Red, green, blue of a PNG, shape (height, width, 3)."""
+    import matplotlib.image
+
+    return np.round(255 * matplotlib.image.imread(path)[..., :3]).astype(int)
+
+
+def drawn(image):
+    """Where a picture differs from its background, shape (height, width)."""
+    return (np.abs(image - BEHIND) > 8).any(axis=-1)
+
+
+@pytest.fixture
+def stage(tmp_path):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "stage.usda"))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    return stage
+
+
+def draw(stage, tmp_path, **options):
+    stage.Save()
+    return pixels(
+        picture_of_stage(tmp_path / "stage.usda", tmp_path / "a.png", size=SIZE, force=True, **options)
+    )
+
+
+def cube(stage, path, colour, place=(0.0, 0.0, 0.0)):
+    made = UsdGeom.Cube.Define(stage, path)
+    made.CreateSizeAttr(1.0)
+    made.CreateDisplayColorAttr([colour])
+    made.AddTranslateOp().Set(place)
+
+
+def test_a_thing_fills_the_picture_without_touching_its_edges(stage, tmp_path):
+    cube(stage, "/cube", (1, 0, 0))
+    there = drawn(draw(stage, tmp_path))
+    rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
+    assert there.shape == SIZE[::-1]
+    assert 0 < rows[0] < 0.15 * SIZE[1]
+    assert 0.85 * SIZE[1] < rows[-1] < SIZE[1] - 1
+    assert abs(columns.mean() - SIZE[0] / 2) < 0.05 * SIZE[0]
+
+
+def test_colours_arrive_and_y_is_on_the_right_to_who_looks_at_the_front(stage, tmp_path):
+    cube(stage, "/red", (1, 0, 0), (0, -1, 0))
+    cube(stage, "/blue", (0, 0, 1), (0, 1, 0))
+    image = draw(stage, tmp_path, camera=Camera(azimuth_deg=0, elevation_deg=0))
+    red = (image[..., 0] > 80) & (image[..., 2] < 60)
+    blue = (image[..., 2] > 80) & (image[..., 0] < 60)
+    assert min(red.sum(), blue.sum()) > 1000
+    assert np.flatnonzero(red.any(axis=0)).max() < np.flatnonzero(blue.any(axis=0)).min()
+
+
+def heat_map(stage, values):
+    """A square whose left half and right half have two colours, with a scale in its customData."""
+    mesh = UsdGeom.Mesh.Define(stage, "/World/AnomalyMap/HeatMap")
+    mesh.CreatePointsAttr([(x, y, 0) for y in (-1, 1) for x in (-1, 0, 1)])
+    mesh.CreateFaceVertexCountsAttr([4, 4])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 4, 3, 1, 2, 5, 4])
+    mesh.CreateDisplayColorPrimvar("uniform").Set(values)
+    scale = {"colourMap": "viridis", "least": 36000.0, "greatest": 52000.0, "unit": "nT"}
+    mesh.GetPrim().SetCustomData({"magtwin": scale})
+    material = UsdShade.Material.Define(stage, "/World/look")
+    surface = UsdShade.Shader.Define(stage, "/World/look/surface")
+    surface.CreateIdAttr("UsdPreviewSurface")
+    reader = UsdShade.Shader.Define(stage, "/World/look/reader")
+    reader.CreateIdAttr("UsdPrimvarReader_float3")
+    kinds = Sdf.ValueTypeNames
+    surface.CreateInput("diffuseColor", kinds.Color3f).ConnectToSource(
+        reader.CreateOutput("result", kinds.Float3)
+    )
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", kinds.Token))
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+
+
+def test_a_maps_colours_reach_the_screen_unchanged_by_light(stage, tmp_path):
+    heat_map(stage, [(0.5, 0.1, 0.0), (0.0, 0.1, 0.5)])
+    image = draw(stage, tmp_path, camera=Camera(azimuth_deg=-90, elevation_deg=90), legend=False)
+    quarter, middle = SIZE[0] // 4, SIZE[1] // 2
+    left, right = image[middle, SIZE[0] // 2 - quarter // 2], image[middle, SIZE[0] // 2 + quarter // 2]
+    screen = [188, 89, 0]  # sRGB of linear 0.5, 0.1, 0
+    assert np.abs(left - screen).max() <= 2
+    assert np.abs(right - screen[::-1]).max() <= 2
+
+
+def test_a_stage_with_a_map_gets_its_colour_bar(stage, tmp_path):
+    heat_map(stage, [(0.5, 0.1, 0.0), (0.0, 0.1, 0.5)])
+    camera = Camera(azimuth_deg=-90, elevation_deg=90)
+    plain = drawn(draw(stage, tmp_path, camera=camera, legend=False))
+    barred = drawn(draw(stage, tmp_path, camera=camera))
+    right = slice(int(0.9 * SIZE[0]), None)
+    assert not plain[:, right].any()
+    assert barred[:, right].sum() > 100
+
+
+def test_the_turtlebot_is_drawn(tmp_path):
+    out = picture_of_stage(shipped("robots", "turtlebot4", "turtlebot4.usda"), tmp_path / "r.png", size=SIZE)
+    image = pixels(out)
+    blue = (image[..., 2] > image[..., 0] + 60) & (image[..., 2] > 90)
+    assert blue.sum() > 20  # the magnetometer's head
+    assert 0.1 < drawn(image).mean() < 0.6
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(-2, 2)] * 3), min_size=1, max_size=8),
+    st.tuples(st.floats(0.1, 0.8), st.floats(0.1, 0.8)),
+)
+def test_at_the_view_distance_all_points_are_within_the_angles_and_one_is_on_the_edge(points, half):
+    D = view_distance(points, [0, 0, 0], np.eye(3), half)
+    r, u, b = np.array(points).T
+    outside = np.maximum(np.abs(r) - (D - b) * np.tan(half[0]), np.abs(u) - (D - b) * np.tan(half[1]))
+    np.testing.assert_allclose(outside.max(), 0, atol=1e-9)
+
+
+def test_what_cannot_be_drawn_is_refused(stage, tmp_path):
+    stage.Save()
+    source, out = tmp_path / "stage.usda", tmp_path / "a.png"
+    with pytest.raises(RefusedError, match=r"stage\.usda: shows nothing; a picture needs at least one"):
+        picture_of_stage(source, out)
+    with pytest.raises(RefusedError, match=r"a\.jpg: pictures are PNG; give it the suffix \.png"):
+        picture_of_stage(source, tmp_path / "a.jpg")
+    with pytest.raises(RefusedError, match=r"size must lie in 16\.\.16384 pixels each way, got 0 x 5"):
+        picture_of_stage(source, out, size=(0, 5))
+    with pytest.raises(RefusedError, match=r"elevation_deg of Camera must lie in -90\.\.90, got 91"):
+        Camera(elevation_deg=91)
+    with pytest.raises(RefusedError, match=r"distance_m of Camera must be above 0, got 0"):
+        Camera(distance_m=0)
+    with pytest.raises(RefusedError, match=r"view_angle_deg of Camera must lie in 1\.\.120"):
+        Camera(view_angle_deg=0)
+    assert not out.exists()
+
+
+def test_a_machine_without_opengl_is_told_the_packages(stage, tmp_path, monkeypatch):
+    cube(stage, "/cube", (1, 0, 0))
+    stage.Save()
+
+    def missing(name, *_, **__):
+        raise OSError(name)
+
+    monkeypatch.setenv("VTK_DEFAULT_OPENGL_WINDOW", "vtkOSOpenGLRenderWindow")
+    monkeypatch.setattr(ctypes, "CDLL", missing)
+    with pytest.raises(
+        RefusedError, match=r"no OpenGL here, .*: apt-get install libegl1 libgl1 .*libosmesa6"
+    ):
+        picture_of_stage(tmp_path / "stage.usda", tmp_path / "a.png")
+    assert not (tmp_path / "a.png").exists()
