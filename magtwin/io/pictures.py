@@ -125,7 +125,9 @@ def picture_of_stage(
             if scale is not None:
                 _add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
             if title:
-                plotter.add_text(title, position="upper_left", font_size=round(size[1] / 70), color=INK)
+                plotter.add_text(
+                    title, position=(0.02, 0.93), viewport=True, font_size=round(size[1] / 80), color=INK
+                )
             plotter.screenshot(str(aside), window_size=list(size))
         finally:
             plotter.close()
