@@ -193,7 +193,7 @@ class DriveSpec:
     odometry_rate_hz: float = 62.0
     """Odometry samples a second [Hz]."""
 
-    odometry_noise_std: float = 0.01
+    odometry_noise_std: float = 0.002
     """Relative standard deviation of the wheels' scale, drawn once a run: what makes odometry drift."""
 
     def __post_init__(self) -> None:
