@@ -98,8 +98,9 @@ def robot(
         Print the summary as JSON.
     """
     from magtwin.files import existing, output
+    from magtwin.usd.info import info_of_stage
     from magtwin.usd.robot import build_robot
-    from magtwin.usd.urdf import convert_urdf
+    from magtwin.usd.urdf import convert_urdf, read_notes
 
     existing(urdf, "URDF")
     with output(out, force=force) as folder:
@@ -108,11 +109,13 @@ def robot(
             convert_urdf(urdf, file)
         else:
             build_robot(urdf, settings, file)
-        from magtwin.usd.info import info_of_stage
-
+        notes = read_notes(file)
         report = info_of_stage(file)
+    report = replace(report, title=str(out / file.name), facts={"notes": notes} if json else {})
     _print_report(report, json)
     if not json:
+        for note in notes:
+            _say(f"Note: {note}")
         _say(f"Wrote {out / file.name}")
 
 

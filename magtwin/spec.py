@@ -255,6 +255,9 @@ class RobotSpec:
     footprint_radius_m: float = 0.171
     """Radius of the circle that must stay clear of walls [m]."""
 
+    base_height_m: float = 0.0
+    """Height of base_link above the floor that the robot stands on [m]; read from the asset."""
+
     p_base_magnetometer: Vec3 = ZERO3
     """Magnetometer's origin in base_link at rest, through the links between [m]; read from the asset."""
 

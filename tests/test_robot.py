@@ -75,6 +75,8 @@ def test_the_asset_gives_the_settings_back(links):
         "lidar",
     ):
         assert getattr(robot, name) == getattr(settings, name)
+    assert robot.base_height_m == pytest.approx(links["base_link"].p_world_link[2], abs=1e-12)
+    assert robot.base_height_m == pytest.approx(0.03575 - 0.0402, abs=1e-12)  # the wheels touch the floor
     assert_allclose(robot.p_base_magnetometer, links["magnetometer_link"].p_base_link, atol=1e-12)
 
 

@@ -68,7 +68,7 @@ def test_odometry_without_error_is_the_motion_seen_from_its_start():
 def test_odometry_drifts_by_the_wheels_errors():
     straight = Motion(DriveSpec(), 0.02, np.full(3000, 0.2), np.zeros(3000))
     odometry = sense_odometry(straight, T, generator(4))
-    left, right = 1 + 0.01 * generator(4).standard_normal(2)
+    left, right = 1 + DriveSpec().odometry_noise_std * generator(4).standard_normal(2)
     w = 0.2 * (right - left) / 0.233
     assert_allclose(odometry["odom_w"][5], [0, 0, w])
     assert_allclose(odometry["odom_v"][5], [0.2 * (left + right) / 2, 0, 0])

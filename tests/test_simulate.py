@@ -159,8 +159,10 @@ def test_the_field_is_that_at_the_magnetometer_not_at_base_link():
     from magtwin.field.sources import dipole_field_nt
 
     lever = np.array([0.1, -0.05, 0.36])
-    scene = with_robot(KNOWN, p_base_magnetometer=tuple(lever.tolist()), platform=PlatformFieldSpec())
+    parts = {"p_base_magnetometer": tuple(lever.tolist()), "base_height_m": -0.02}
+    scene = with_robot(KNOWN, **parts, platform=PlatformFieldSpec())
     run = drive(scene, path_named("figure8"), duration_s=20.0)
+    assert_allclose(run["p_world_base"][:, 2], -0.02)
     p = run["p_world_base"] + rotate(run["q_world_base_xyzw"], lever)
     places, moments = zip(*((s.p_world, s.m_world) for s in SOURCES), strict=True)
     field = dipole_field_nt(p, np.array(places), np.array(moments)) + EARTH_NT

@@ -92,7 +92,7 @@ def simulate(
     t = np.arange(max(1, math.ceil(end * rate - 1e-9))) / rate
     streams = dict(zip(_STREAMS, rng.spawn(len(_STREAMS)), strict=True))
     true = motion.at(t)
-    columns = _truth(true, t)
+    columns = _truth(true, t, robot.base_height_m)
     columns |= sense_odometry(motion, t, streams["odometry"])
     columns |= sense_imu(robot.imu, motion, t, streams["imu"])
     columns |= sense_battery(robot.battery, t, streams["battery"])
@@ -122,12 +122,12 @@ def simulate(
     return Run({name: columns[name] for name in COLUMNS}, facts)
 
 
-def _truth(true: Moment, t: Array) -> dict[str, NDArray[Any]]:
+def _truth(true: Moment, t: Array, height_m: float) -> dict[str, NDArray[Any]]:
     """The columns of what the robot did and was told: a kinematic drive does what it is told."""
     zero, yaw = np.zeros(len(t)), wrap_angle(true.pose[:, 2])
     return {
         "t": t,
-        "p_world_base": np.column_stack([true.pose[:, :2], zero]),
+        "p_world_base": np.column_stack([true.pose[:, :2], zero + height_m]),
         "q_world_base_xyzw": quat_from_yaw(yaw),
         "yaw": yaw,
         "v_base": np.column_stack([true.v, zero, zero]),
@@ -161,7 +161,9 @@ def _exact_field(scene: Scene, true: Moment, on: NDArray[np.bool_], t: Array) ->
     x, y, yaw = true.pose.T
     cos, sin = np.cos(yaw), np.sin(yaw)
     px, py, pz = robot.p_base_magnetometer
-    p_world = np.column_stack([x + px * cos - py * sin, y + px * sin + py * cos, np.full(len(t), pz)])
+    p_world = np.column_stack(
+        [x + px * cos - py * sin, y + px * sin + py * cos, np.full(len(t), robot.base_height_m + pz)]
+    )
     b_world = ambient_field_nt(scene, p_world)
     change = np.gradient(b_world, t, axis=0) if len(t) > 1 else np.zeros_like(b_world)
     b_base = _into_base(b_world, cos, sin)

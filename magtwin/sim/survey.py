@@ -24,7 +24,7 @@ def field_at_rest_nt(scene: Scene, p_world_base: ArrayLike, yaw: ArrayLike) -> A
 
     Args:
         scene: A scene whose Earth's field is known.
-        p_world_base: Positions of base_link [m], shape (..., 3), or (..., 2) on the floor.
+        p_world_base: Positions of base_link [m], shape (..., 3), or (..., 2) for a robot on the floor.
         yaw: Headings [rad], shape (...); the two shapes are broadcast.
 
     Returns:
@@ -32,7 +32,7 @@ def field_at_rest_nt(scene: Scene, p_world_base: ArrayLike, yaw: ArrayLike) -> A
     """
     p, yaw = np.asarray(p_world_base, float), np.asarray(yaw, float)
     if p.shape[-1] == 2:
-        p = np.concatenate([p, np.zeros((*p.shape[:-1], 1))], axis=-1)
+        p = np.concatenate([p, np.full((*p.shape[:-1], 1), scene.robot.base_height_m)], axis=-1)
     shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
     turn = quat_from_yaw(np.broadcast_to(yaw, shape))
     p_world = p + rotate(turn, np.broadcast_to(scene.robot.p_base_magnetometer, (*shape, 3)))

@@ -21,7 +21,7 @@ from magtwin.usd.sensors import (
 )
 from magtwin.usd.urdf.convert import convert_urdf
 
-COMPUTED = ("asset", "p_base_magnetometer")
+COMPUTED = ("asset", "base_height_m", "p_base_magnetometer")
 """Fields of a RobotSpec that come from the asset, not from its settings."""
 
 

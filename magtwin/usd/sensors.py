@@ -195,6 +195,7 @@ def read_robot_prim(prim: Usd.Prim, asset: Path) -> RobotSpec:
         name=prim.GetName(),
         asset=asset,
         footprint_radius_m=read_footprint(prim),
+        base_height_m=_p_root(prim, _base(prim))[2],
         p_base_magnetometer=_p_base(prim, magnetometer),
         drive=read_drive(prim),
         battery=read_battery(only_prim_with(prim, "battery")),
@@ -205,15 +206,20 @@ def read_robot_prim(prim: Usd.Prim, asset: Path) -> RobotSpec:
     )
 
 
-def _p_base(root: Usd.Prim, sensor: Usd.Prim) -> Vec3:
-    """A sensor's origin in the axes of its robot's base [m], wherever in the world the robot stands.
+def _base(root: Usd.Prim) -> Usd.Prim:
+    """The body of a robot called base_link, or the root where there is none of that name."""
+    return next((p for p in Usd.PrimRange(root) if p.GetName() == BASE), root)
 
-    The base is the body called base_link, or the root where there is none of that name.
-    """
-    cache = UsdGeom.XformCache()
-    base = next((p for p in Usd.PrimRange(root) if p.GetName() == BASE), root)
-    p_root = cache.ComputeRelativeTransform(sensor, root)[0].ExtractTranslation()
-    return tuple(cache.ComputeRelativeTransform(base, root)[0].GetInverse().Transform(p_root))
+
+def _p_root(root: Usd.Prim, prim: Usd.Prim) -> Vec3:
+    """A prim's origin in the axes of its robot's root [m], wherever in the world the robot stands."""
+    return tuple(UsdGeom.XformCache().ComputeRelativeTransform(prim, root)[0].ExtractTranslation())
+
+
+def _p_base(root: Usd.Prim, sensor: Usd.Prim) -> Vec3:
+    """A sensor's origin in the axes of its robot's base [m], wherever in the world the robot stands."""
+    to_root = UsdGeom.XformCache().ComputeRelativeTransform(_base(root), root)[0]
+    return tuple(to_root.GetInverse().Transform(_p_root(root, sensor)))
 
 
 def define_source(stage: Usd.Stage, parent: str | Sdf.Path, spec: SourceSpec) -> Usd.Prim:

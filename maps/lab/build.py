@@ -190,7 +190,7 @@ def map_toml(field: AnomalyMap, lab: Scene, earth: EarthFieldSpec, report: Repor
         f"shape = {list(b.shape)}  # headings, rows along y, columns along x",
         f"extent_m = {[x0, x1, y0, y1]}  # least and greatest x, least and greatest y",
         f"headings_deg = {[round(float(h), 6) for h in np.degrees(field.headings_rad)]}",
-        f"magnetometer_height_m = {lab.robot.p_base_magnetometer[2]:.4f}",
+        f"magnetometer_height_m = {lab.robot.base_height_m + lab.robot.p_base_magnetometer[2]:.4f}",
         f'licence = "{field.licence}"',
         f'created = "{field.created}"',
         f'method = "{field.method}"',
