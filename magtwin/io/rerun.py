@@ -329,7 +329,7 @@ def _log_paths(rec: rr.RecordingStream, run: Run, scene: Scene, scale: _Scale, p
     rec.log("world/planned", rr.LineStrips3D([plan], colors=(255, 255, 255), radii=0.008), static=True)
     rows = _thinned(run, DOT_HZ)
     base, q = run["p_world_base"][rows], run["q_world_base_xyzw"][rows]
-    driven = base + np.array([0, 0, 0.016])
+    driven = np.column_stack([base[:, :2], np.full(len(base), 0.016)])  # as seen from above, over the plan
     rec.log("world/driven", rr.LineStrips3D([driven], colors=(230, 60, 60), radii=0.006), static=True)
     sensor = (base + rotate(q, scene.robot.p_base_magnetometer)).astype(np.float32)
     rec.log("world/readings", rr.Points3D.from_fields(radii=[0.017]), static=True)
