@@ -1,0 +1,75 @@
+"""What a user may ask of a conversion."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from magtwin.names import RefusedError
+
+Collision = Literal["hull", "decomposition", "mesh"]
+Profile = Literal["general", "diff-drive"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveRule:
+    """How the joints whose name fits a pattern are driven."""
+
+    joints: str
+    """Pattern of joint names, as in a shell: `*_wheel_joint`."""
+
+    type: Literal["velocity", "position", "none"] = "velocity"
+    """What the drive holds; none leaves the joint free."""
+
+    stiffness: float = 0.0
+    """Gain on the error of position [N m/rad or N/m]."""
+
+    damping: float = 0.0
+    """Gain on the error of velocity [N m s/rad or N s/m]."""
+
+    max_force: float | None = None
+    """Highest torque or force [N m or N]; the joint's effort unless given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What a conversion does where a URDF leaves a choice."""
+
+    packages: Mapping[str, Path] = field(default_factory=dict)
+    """Folders of packages by name, before those that are found."""
+
+    arguments: Mapping[str, str] = field(default_factory=dict)
+    """Arguments of a xacro."""
+
+    collision: Collision = "hull"
+    """What a mesh collides as: its convex hull, a convex decomposition (extra `decomposition`), or itself."""
+
+    fix_base: bool = False
+    """Whether the base is bolted to the world."""
+
+    merge_fixed: bool = False
+    """Whether links on fixed joints become part of the body that they ride on; their frames stay as sites."""
+
+    profile: Profile = "general"
+    """diff-drive: velocity drives on wheels, slippery casters, dead suspensions welded."""
+
+    drives: tuple[DriveRule, ...] = ()
+    """How joints are driven; the first rule that fits wins, before what the URDF says."""
+
+    density: float | None = None
+    """Density of links without inertia [kg/m3]; None leaves them as they are."""
+
+    single_file: bool = False
+    """Whether one root layer holds all but the meshes, in place of Isaac Sim's layers."""
+
+    strict: bool = False
+    """Whether a conversion that lost anything is refused."""
+
+    mass: float | None = None
+    """Mass of a data sheet to hold the robot's against [kg]."""
+
+    def __post_init__(self) -> None:
+        for name in ("density", "mass"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise RefusedError(f"{name} must be above 0, got {value!r}")
