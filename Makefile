@@ -18,7 +18,7 @@ test: $(VENV)/.dev  ## Run all tests
 
 lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies
 	$(BIN)/ruff format --check .
-	$(BIN)/ruff check .
+	$(BIN)/ruff check --no-cache .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/deptry .
