@@ -19,6 +19,7 @@ from magtwin.usd.urdf.joint import define_joint
 from magtwin.usd.urdf.link import define_body, define_frame, is_marker
 from magtwin.usd.urdf.material import LOOKS
 from magtwin.usd.urdf.mesh_layer import MeshLayer
+from magtwin.usd.urdf.options import DEFAULTS, Options
 from magtwin.usd.urdf.shape import COLLIDER_FORM, define_collider, define_visual, form_of, pose_of
 
 JOINTS = "joints"
@@ -35,6 +36,7 @@ def convert_urdf(
     urdf: str | os.PathLike[str],
     out: str | os.PathLike[str],
     *,
+    options: Options = DEFAULTS,
     force: bool = False,
     finish: Callable[[Usd.Prim], object] | None = None,
 ) -> Path:
@@ -47,6 +49,7 @@ def convert_urdf(
     Args:
         urdf: The description; its meshes lie below its folder or in packages around it.
         out: Root layer to write, `.usda`. Meshes go to `<stem>_meshes.usdc` beside it.
+        options: What is done where the URDF leaves a choice.
         force: Whether files that are there are replaced.
         finish: Called with the robot's prim before anything is written, to author more.
 
@@ -65,12 +68,12 @@ def convert_urdf(
     check_free(out, force=force)
     if not meshes:
         with output(out, force=force) as aside:
-            _write(description, meshes, aside, beside.name, out, finish)
+            _write(description, options, meshes, aside, beside.name, out, finish)
         return out
     with output(beside, force=force) as aside_meshes, output(out, force=force) as aside:
         copy = aside.with_name(beside.name)  # beside the root layer, so that references resolve
         meshes.export(copy)
-        _write(description, meshes, aside, beside.name, out, finish)
+        _write(description, options, meshes, aside, beside.name, out, finish)
         shutil.move(copy, aside_meshes)
     return out
 
@@ -101,6 +104,7 @@ def _gather(description: Description) -> MeshLayer:
 
 def _write(
     description: Description,
+    options: Options,
     meshes: MeshLayer,
     aside: Path,
     mesh_layer: str,
@@ -109,7 +113,7 @@ def _write(
 ) -> None:
     """Author the root layer at `aside`, with asset paths that hold once it stands at `out`."""
     stage = Usd.Stage.CreateNew(str(aside))
-    robot = _author(stage, description, meshes, f"./{mesh_layer}")
+    robot = _author(stage, description, options, meshes, f"./{mesh_layer}")
     if finish is not None:
         finish(robot)
     stage.GetRootLayer().customLayerData = {
@@ -130,7 +134,9 @@ def _write(
     stage.GetRootLayer().Save()
 
 
-def _author(stage: Usd.Stage, description: Description, meshes: MeshLayer, layer: str) -> Usd.Prim:
+def _author(
+    stage: Usd.Stage, description: Description, options: Options, meshes: MeshLayer, layer: str
+) -> Usd.Prim:
     """The robot's prim with all that hangs from it."""
     describe_stage(stage, f"{description.name}: converted from {description.path.name}.")
     names = _prim_names(description)

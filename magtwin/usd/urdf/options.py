@@ -41,6 +41,9 @@ class Options:
     arguments: Mapping[str, str] = field(default_factory=dict)
     """Arguments of a xacro."""
 
+    missing_meshes: Literal["refuse", "note"] = "refuse"
+    """What is done about a mesh that is not there: note leaves its visual or collider out and says so."""
+
     collision: Collision = "hull"
     """What a mesh collides as: its convex hull, a convex decomposition (extra `decomposition`), or itself."""
 
@@ -73,3 +76,6 @@ class Options:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise RefusedError(f"{name} must be above 0, got {value!r}")
+
+
+DEFAULTS = Options()
