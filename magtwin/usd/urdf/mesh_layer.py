@@ -80,6 +80,12 @@ class MeshLayer:
             )
         return self._entries[key]
 
+    def vertices(self, mesh: Any) -> NDArray[np.float64]:
+        """Vertices of a URDF `<mesh>` that was added, as its file has them, scaled [m], shape (V, 3)."""
+        scale = np.broadcast_to(1.0 if mesh.scale is None else np.asarray(mesh.scale, float), 3)
+        file = self._files[mesh_path(mesh.filename, self._description.path)]
+        return np.vstack([part.vertices for part in file.parts]) * scale
+
     def export(self, path: Path) -> None:
         """Write the layer."""
         self._stage.GetRootLayer().Export(str(path))
