@@ -1,6 +1,5 @@
 """The command line: one typed function a subcommand, nothing else."""
 
-import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -138,7 +137,7 @@ def map_import(
     out
         Map layer to write, a .usdc file.
     name
-        Name of the map; the folder's unless given.
+        Name of the map; the file's unless given.
     licence
         Licence of the survey, an SPDX identifier such as MIT.
     force
@@ -152,7 +151,7 @@ def map_import(
 
     _check_suffix(out, (".usdc", ".usd"), "a map layer")
     check_free(out, force=force)
-    field = import_survey(folder, name=name or folder.resolve().name, licence=licence)
+    field = import_survey(folder, name=name or out.stem, licence=licence)
     save_map(field, out, force=force)
     _print_report(survey_report(folder), json)
     if not json:
@@ -228,7 +227,7 @@ def scene(
     from magtwin.usd.scene import author_scene, scene_from_toml
 
     file = Path(spec)
-    if not file.suffix and not file.exists():
+    if not file.suffix and not file.is_file():
         from magtwin.names import find
 
         file = find("scene", spec, {f.stem: f for f in sorted(shipped("scenes").glob("*.toml"))})
@@ -480,21 +479,30 @@ def _print_report(report: Any, as_json: bool) -> None:
         return
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=report.title, title_justify="left", show_header=False, box=None, pad_edge=False)
-    for column in ("name", "value", "unit", "note"):
-        table.add_column(
-            column,
-            style="dim" if column == "note" else None,
-            justify="right" if column == "value" else "left",
-        )
+    console = Console(highlight=False)
+    numbers, words = ((Table(show_header=False, box=None, pad_edge=False)) for _ in range(2))
+    for column in ("name", "value", "spread", "unit", "note"):
+        numbers.add_column(column, justify="right" if column == "value" else "left", overflow="fold")
+    for column in ("name", "text"):
+        words.add_column(column, overflow="fold")
     for figure in report.figures:
-        value = f"{figure.value:.6g}" if isinstance(figure.value, float) else str(figure.value)
-        spread = f" ± {figure.spread:.3g}" if figure.spread is not None else ""
-        table.add_row(figure.name, value + spread, figure.unit, figure.note)
+        if isinstance(figure.value, str):
+            note = f"  ({figure.note})" if figure.note else ""
+            words.add_row(figure.name, Text(f"{figure.value} {figure.unit}{note}".strip()))
+        else:
+            value = f"{figure.value:,.6g}" if isinstance(figure.value, float) else f"{figure.value:,}"
+            spread = f"± {figure.spread:,.3g}" if figure.spread is not None else ""
+            numbers.add_row(figure.name, value, spread, figure.unit, Text(figure.note, style="dim"))
     for name, fact in report.facts.items():
-        table.add_row(name, "", "", json.dumps(fact) if isinstance(fact, dict | list) else str(fact))
-    Console().print(table)
+        entries = fact.items() if isinstance(fact, dict) else [("", fact)]
+        for key, entry in entries:
+            words.add_row(f"{name} {key}".strip(), Text(str(entry)))
+    console.print(Text(report.title, style="bold"))
+    for table in (numbers, words):
+        if table.row_count:
+            console.print(table)
 
 
 def _open_map(file: Path) -> Any:

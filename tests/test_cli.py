@@ -142,6 +142,19 @@ def test_a_scene_file_with_a_misspelt_key_is_refused_by_the_near_name(tmp_path, 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["my.toml"]
 
 
+def test_a_shipped_scene_is_found_beside_a_folder_of_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lab").mkdir()
+    main(["scene", "lab", "--out", "out", "--json"])
+    assert (tmp_path / "out" / "lab.usda").is_file()
+
+
+def test_a_misspelt_scene_is_refused_by_the_near_name(tmp_path, capsys):
+    assert "no scene 'labb'; did you mean 'lab'" in refused(
+        capsys, "scene", "labb", "--out", tmp_path / "out"
+    )
+
+
 def test_a_checkpoint_with_foreign_types_is_refused_by_name_and_not_run(tmp_path, capsys):
     import pickle
     import zipfile
