@@ -56,10 +56,20 @@ class Description:
     notes: list[str] = field(default_factory=list)
     """What was repaired, guessed or left out on the way to USD: one line each, nothing silent."""
 
-    def note(self, text: str) -> None:
-        """Put down something that the user ought to know of the conversion, once."""
+    dropped: list[str] = field(default_factory=list)
+    """Those of the notes that tell of something lost."""
+
+    def note(self, text: str, *, lost: bool = False) -> None:
+        """Put down something that the user ought to know of the conversion, once.
+
+        Args:
+            text: What was repaired, guessed or left out, and where.
+            lost: Whether the stage has less than the description: `Options.strict` refuses that.
+        """
         if text not in self.notes:
             self.notes.append(text)
+            if lost:
+                self.dropped.append(text)
 
     def refused(self, kind: str, name: str, text: str) -> RefusedError:
         """A refusal that names the line of the link or joint called `name`."""
