@@ -1,7 +1,7 @@
 """Shape and Link: what a stage shows, as triangles, and the bodies that carry it."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,9 @@ SEGMENTS = 32
 
 GREY = (0.5, 0.5, 0.5, 1.0)
 """Colour of what has none."""
+
+SHOWN = (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
+"""Purposes of what a viewer shows."""
 
 BASE_LINK = "base_link"
 """Name of the link whose frame is the robot's, as in REP-105."""
@@ -89,15 +92,16 @@ class ColourScale:
     """Unit of both."""
 
 
-def read_shapes(stage: Usd.Stage | str | os.PathLike[str]) -> list[Shape]:
+def read_shapes(stage: Usd.Stage | str | os.PathLike[str], *, purposes: Sequence[str] = SHOWN) -> list[Shape]:
     """Everything that a viewer shows of a stage, as triangles, in order of the prims.
 
     Meshes, cubes, spheres, cylinders, cones, capsules and planes, those in instances included, that
-    are visible and of purpose default or render: colliders (guide) and proxies stay out. Subdivision
-    surfaces come as their control mesh.
+    are visible and of one of the purposes: colliders (guide) and proxies stay out unless asked for.
+    Subdivision surfaces come as their control mesh.
 
     Args:
         stage: A stage, or the path of a USD file.
+        purposes: USD's purposes of what is wanted.
 
     Raises:
         RefusedError: The file is missing or is not USD, or a mesh contradicts itself; the text names
@@ -108,7 +112,7 @@ def read_shapes(stage: Usd.Stage | str | os.PathLike[str]) -> list[Shape]:
     shapes: list[Shape] = []
     for prim in _prims(stage):
         gprim = UsdGeom.Gprim(prim)
-        if not gprim or not _is_shown(gprim):
+        if not gprim or not _is_shown(gprim, purposes):
             continue
         solid = _solid(gprim)
         if solid is None:
@@ -234,11 +238,8 @@ def _pose(matrix: Gf.Matrix4d) -> tuple[Vec3, Quat]:
     return (float(px), float(py), float(pz)), (x, y, z, w)
 
 
-def _is_shown(gprim: UsdGeom.Gprim) -> bool:
-    return gprim.ComputeVisibility() != UsdGeom.Tokens.invisible and gprim.ComputePurpose() in (
-        UsdGeom.Tokens.default_,
-        UsdGeom.Tokens.render,
-    )
+def _is_shown(gprim: UsdGeom.Gprim, purposes: Sequence[str]) -> bool:
+    return gprim.ComputeVisibility() != UsdGeom.Tokens.invisible and gprim.ComputePurpose() in purposes
 
 
 @dataclass(frozen=True)

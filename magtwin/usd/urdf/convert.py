@@ -20,6 +20,7 @@ from magtwin.usd.urdf.link import define_body, define_frame, is_marker
 from magtwin.usd.urdf.material import LOOKS
 from magtwin.usd.urdf.mesh_layer import MeshLayer
 from magtwin.usd.urdf.options import DEFAULTS, Options
+from magtwin.usd.urdf.report import ConversionReport, Ledger, make_report
 from magtwin.usd.urdf.shape import COLLIDER_FORM, define_collider, define_visual, form_of, pose_of
 
 JOINTS = "joints"
@@ -40,7 +41,26 @@ def convert_urdf(
     force: bool = False,
     finish: Callable[[Usd.Prim], object] | None = None,
 ) -> Path:
-    """Convert a URDF to a USD articulation with a floating base.
+    """Convert a URDF to a USD articulation with a floating base: `convert_with_report` without its report.
+
+    Args, refusals and what is authored as there.
+
+    Returns:
+        `out`.
+    """
+    convert_with_report(urdf, out, options=options, force=force, finish=finish)
+    return Path(out)
+
+
+def convert_with_report(
+    urdf: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    options: Options = DEFAULTS,
+    force: bool = False,
+    finish: Callable[[Usd.Prim], object] | None = None,
+) -> ConversionReport:
+    """Convert a URDF to a USD articulation with a floating base, and say what became of it.
 
     The robot's prim is the URDF's root link's frame. Its links lie flat below it as rigid bodies, its
     joints in a scope of their own; links that only name a place become sites on the body they ride on.
@@ -54,10 +74,11 @@ def convert_urdf(
         finish: Called with the robot's prim before anything is written, to author more.
 
     Returns:
-        `out`.
+        Every link, joint and geometry, in and out, with what was repaired, guessed or left out.
 
     Raises:
-        RefusedError: The URDF or a mesh cannot be converted, or a file is there already; nothing is written.
+        RefusedError: The URDF or a mesh cannot be converted, something was lost and `options.strict`
+            forbids that, or a file is there already; nothing is written.
     """
     out = Path(out)
     if out.suffix != ".usda":
@@ -68,14 +89,13 @@ def convert_urdf(
     check_free(out, force=force)
     if not meshes:
         with output(out, force=force) as aside:
-            _write(description, options, meshes, aside, beside.name, out, finish)
-        return out
+            return _write(description, options, meshes, aside, beside.name, out, finish)
     with output(beside, force=force) as aside_meshes, output(out, force=force) as aside:
         copy = aside.with_name(beside.name)  # beside the root layer, so that references resolve
         meshes.export(copy)
-        _write(description, options, meshes, aside, beside.name, out, finish)
+        report = _write(description, options, meshes, aside, beside.name, out, finish)
         shutil.move(copy, aside_meshes)
-    return out
+    return report
 
 
 def read_notes(asset: str | os.PathLike[str]) -> tuple[str, ...]:
@@ -110,17 +130,20 @@ def _write(
     mesh_layer: str,
     out: Path,
     finish: Callable[[Usd.Prim], object] | None,
-) -> None:
+) -> ConversionReport:
     """Author the root layer at `aside`, with asset paths that hold once it stands at `out`."""
-    stage = Usd.Stage.CreateNew(str(aside))
-    robot = _author(stage, description, options, meshes, f"./{mesh_layer}")
+    stage, ledger, checksum = Usd.Stage.CreateNew(str(aside)), Ledger(), sha256(description.path)
+    robot = _author(stage, description, options, meshes, f"./{mesh_layer}", ledger)
     if finish is not None:
         finish(robot)
+    report = make_report(description, meshes, stage, ledger, name=out.name, sha256=checksum)
+    if options.strict:
+        report.refuse_losses()
     stage.GetRootLayer().customLayerData = {
         **stage.GetRootLayer().customLayerData,
         "magtwin": {
             "source": description.path.name,
-            "sourceSha256": sha256(description.path),
+            "sourceSha256": checksum,
             "notes": Vt.StringArray(description.notes),
         },
     }
@@ -132,10 +155,16 @@ def _write(
 
     UsdUtils.ModifyAssetPaths(stage.GetRootLayer(), as_seen_from_out)
     stage.GetRootLayer().Save()
+    return report
 
 
 def _author(
-    stage: Usd.Stage, description: Description, options: Options, meshes: MeshLayer, layer: str
+    stage: Usd.Stage,
+    description: Description,
+    options: Options,
+    meshes: MeshLayer,
+    layer: str,
+    ledger: Ledger,
 ) -> Usd.Prim:
     """The robot's prim with all that hangs from it."""
     describe_stage(stage, f"{description.name}: converted from {description.path.name}.")
@@ -152,15 +181,18 @@ def _author(
         write_pose(body, *pose_of(poses[name]))
         paths[name] = body.GetPath()
         define_body(body, link, description)
-        for visual in link.visuals:
-            define_visual(body, visual, description, meshes, layer)
-        for collision in link.collisions:
-            define_collider(body, collision, surfaces.get(name, Surface()), meshes, layer)
+        ledger.link(name, "body", body)
+        for i, visual in enumerate(link.visuals):
+            ledger.shape(name, "visual", i, define_visual(body, visual, description, meshes, layer))
+        for i, collision in enumerate(link.collisions):
+            surface = surfaces.get(name, Surface())
+            ledger.shape(name, "collision", i, define_collider(body, collision, surface, meshes, layer))
     for name, (body_name, pose) in places.items():
         if body_name != name:
             frame = UsdGeom.Xform.Define(stage, paths[body_name].AppendChild(names[name])).GetPrim()
             write_pose(frame, *pose_of(pose))
             define_frame(frame)
+            ledger.link(name, "frame", frame)
     scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(JOINTS)).GetPath()
     joints = []
     for child, joint in description.joints.items():
@@ -175,6 +207,7 @@ def _author(
                 description,
             )
             joints.append(made.GetPath())
+            ledger.joint(joint.name, made)
     _articulate(robot, list(paths.values()), joints)
     return robot
 
