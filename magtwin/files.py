@@ -191,6 +191,10 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
         if any(dataclasses.is_dataclass(a) for a in args):
             return tuple(from_table(a, v, where.path, section) for a, v in zip(args, value, strict=True))
         return tuple(_value(a, v, where, key) for a, v in zip(args, value, strict=True))
+    if origin is dict:
+        if not isinstance(value, dict):
+            raise wrong
+        return {name: _value(args[1], entry, where, name) for name, entry in value.items()}
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)
     if kind is Path and isinstance(value, str):

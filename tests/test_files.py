@@ -27,6 +27,7 @@ class Cart:
     place: tuple[float, float] = (0.0, 0.0)
     asset: Path | None = None
     laps: int = 1
+    cargo: dict[str, Path] = field(default_factory=dict)
 
 
 def read_cart(tmp_path, text):
@@ -39,7 +40,7 @@ def test_a_table_becomes_the_dataclass_with_nested_tables_and_paths_from_its_fol
     cart = read_cart(
         tmp_path,
         'name = "a"\nplace = [1, 2.5]\nasset = "x/y.usda"\n'
-        "[spare]\nradius_m = 2\n[[wheels]]\nradius_m = 3.0\n",
+        '[spare]\nradius_m = 2\n[cargo]\nbox = "b"\n[[wheels]]\nradius_m = 3.0\n',
     )
     assert cart == Cart(
         name="a",
@@ -47,6 +48,7 @@ def test_a_table_becomes_the_dataclass_with_nested_tables_and_paths_from_its_fol
         spare=Wheel(radius_m=2.0),
         place=(1.0, 2.5),
         asset=tmp_path / "x" / "y.usda",
+        cargo={"box": tmp_path / "b"},
     )
 
 
@@ -59,6 +61,7 @@ def test_a_table_becomes_the_dataclass_with_nested_tables_and_paths_from_its_fol
             r"cart.toml:3: \[spare\] unknown key 'radius'; did you mean 'radius_m'",
         ),
         ("laps = 2", r"cart.toml: key 'name' is missing"),
+        ('name = "a"\ncargo = 3', r"cart.toml:2: cargo must be a table, got 3"),
         ('name = "a"\nlaps = 2.5', r"cart.toml:2: laps must be a whole number, got 2.5"),
         ('name = "a"\nlaps = true', r"cart.toml:2: laps must be a whole number, got True"),
         ('name = "a"\nplace = [1]', r"cart.toml:2: place must be a list of 2, each a number, got \[1\]"),
