@@ -9,7 +9,7 @@ import tempfile
 import tomllib
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -191,7 +191,11 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
         if any(dataclasses.is_dataclass(a) for a in args):
             return tuple(from_table(a, v, where.path, section) for a, v in zip(args, value, strict=True))
         return tuple(_value(a, v, where, key) for a, v in zip(args, value, strict=True))
-    if origin is dict:
+    if origin is typing.Literal:
+        if value not in args:
+            raise where.refused(key, f"{key} must be one of {', '.join(map(repr, args))}, got {value!r}")
+        return value
+    if origin in (dict, Mapping):
         if not isinstance(value, dict):
             raise wrong
         return {name: _value(args[1], entry, where, name) for name, entry in value.items()}

@@ -1,7 +1,9 @@
 """Outputs are whole or absent; settings are checked key by key."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
@@ -27,7 +29,8 @@ class Cart:
     place: tuple[float, float] = (0.0, 0.0)
     asset: Path | None = None
     laps: int = 1
-    cargo: dict[str, Path] = field(default_factory=dict)
+    cargo: Mapping[str, Path] = field(default_factory=dict)
+    gear: Literal["low", "high"] = "low"
 
 
 def read_cart(tmp_path, text):
@@ -60,6 +63,7 @@ def test_a_table_becomes_the_dataclass_with_nested_tables_and_paths_from_its_fol
             'name = "a"\n[spare]\nradius = 2',
             r"cart.toml:3: \[spare\] unknown key 'radius'; did you mean 'radius_m'",
         ),
+        ('name = "a"\ngear = "hgh"', r"cart.toml:2: gear must be one of 'low', 'high', got 'hgh'"),
         ("laps = 2", r"cart.toml: key 'name' is missing"),
         ('name = "a"\ncargo = 3', r"cart.toml:2: cargo must be a table, got 3"),
         ('name = "a"\nlaps = 2.5', r"cart.toml:2: laps must be a whole number, got 2.5"),
