@@ -22,6 +22,7 @@ from magtwin.usd.urdf.mesh_layer import MeshLayer
 from magtwin.usd.urdf.options import DEFAULTS, Options
 from magtwin.usd.urdf.report import ConversionReport, Ledger, make_report
 from magtwin.usd.urdf.shape import COLLIDER_FORM, define_collider, define_visual, form_of, pose_of
+from magtwin.usd.urdf.source import read_source
 
 JOINTS = "joints"
 """Scope of the joints below the robot's prim."""
@@ -83,7 +84,8 @@ def convert_with_report(
     out = Path(out)
     if out.suffix != ".usda":
         raise RefusedError(f"{out}: the robot's root layer is text; give it the suffix .usda")
-    description = read_description(urdf)
+    source = read_source(urdf, packages=options.packages, arguments=options.arguments)
+    description = read_description(source)
     beside = out.with_name(f"{out.stem}_meshes.usdc")
     meshes = _gather(description)
     check_free(out, force=force)

@@ -1,36 +1,52 @@
 """Description: a URDF that was read and checked, links and joints in the order of their tree.
 
-yourdfpy reads links, joints and materials; what it drops (`<gazebo>` and the like) stays at hand as XML.
+yourdfpy reads links, joints and materials; what it drops (capsules, `<gazebo>` and the like) is read from
+the same XML, or stays at hand there.
 """
 
 import io
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 from xml.etree import ElementTree
-from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.files import existing
 from magtwin.names import RefusedError, hint
+from magtwin.usd.urdf.grammar import check_grammar
+from magtwin.usd.urdf.source import Source, read_source
 
-JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic")
-"""Joints that can be converted; `planar` and `floating` are refused by name."""
+JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating")
+"""Joints that can be converted."""
 
-MOVING = JOINT_TYPES[1:]
+AXIAL = JOINT_TYPES[1:5]
+"""Those with an axis; a planar joint's is the normal of its plane."""
+
+MOVING = JOINT_TYPES[1:4]
+"""Those with one degree of freedom."""
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """A `<capsule>`, which yourdfpy does not know; it stands in `geometry.capsule`."""
+
+    radius: float
+    """Radius of the cylinder and of its round ends [m]."""
+
+    length: float
+    """Length along z, without the ends [m]."""
 
 
 @dataclass(frozen=True)
 class Description:
     """A robot as its URDF has it: a tree of links held by joints."""
 
-    path: Path
-    """The file."""
+    source: Source
+    """The file, with what lies around it."""
 
     name: str
     """Name of the robot."""
@@ -44,20 +60,43 @@ class Description:
     joints: Mapping[str, Any]
     """yourdfpy's joints by the name of the link that they hold, parents before children."""
 
-    materials: Mapping[str, Any]
+    materials: Mapping[str, Any] = field(default_factory=dict)
     """yourdfpy's robot-wide materials by name."""
-
-    xml: ElementTree.Element
-    """The whole file, for what yourdfpy does not read."""
-
-    lines: Mapping[ElementTree.Element, int]
-    """Line of each element's start."""
 
     notes: list[str] = field(default_factory=list)
     """What was repaired, guessed or left out on the way to USD: one line each, nothing silent."""
 
     dropped: list[str] = field(default_factory=list)
     """Those of the notes that tell of something lost."""
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.source.path
+
+    @property
+    def xml(self) -> ElementTree.Element:
+        """The whole `<robot>`, for what yourdfpy does not read."""
+        return self.source.xml
+
+    @property
+    def lines(self) -> Mapping[ElementTree.Element, int]:
+        """Line of each element's start, in its own file: `where` gives both."""
+        return {element: line for element, (_, line) in self.source.places.items()}
+
+    def where(self, element: ElementTree.Element | None) -> str:
+        """`file:line` of an element of `xml`."""
+        return self.source.where(element)
+
+    def find_file(self, filename: str, what: str) -> Path:
+        """The file that a `filename=` means, such as a mesh's: see `Source.find_file`.
+
+        Raises:
+            MissingFileError: It is not there.
+            RefusedError: It may not be read, or its package is not there.
+        """
+        named = (e for e in self.xml.iter() if e.get("filename") == filename)
+        return self.source.find_file(filename, what, next(named, None))
 
     def note(self, text: str, *, lost: bool = False) -> None:
         """Put down something that the user ought to know of the conversion, once.
@@ -74,8 +113,7 @@ class Description:
     def refused(self, kind: str, name: str, text: str) -> RefusedError:
         """A refusal that names the line of the link or joint called `name`."""
         element = next((e for e in self.xml.findall(kind) if e.get("name") == name), None)
-        line = "" if element is None else f":{self.lines[element]}"
-        return RefusedError(f"{self.path}{line}: {kind} {name!r} {text}")
+        return RefusedError(f"{self.source.where(element)}: {kind} {name!r} {text}")
 
     def poses(self) -> dict[str, NDArray[np.float64]]:
         """T_root_link of each link with every joint at zero, shape (4, 4)."""
@@ -90,35 +128,30 @@ def origin_of(part: Any) -> NDArray[np.float64]:
     return np.eye(4) if part.origin is None else np.asarray(part.origin, float)
 
 
-def read_description(path: str | os.PathLike[str]) -> Description:
+def read_description(source: Source | str | os.PathLike[str]) -> Description:
     """Read and check a URDF.
 
+    Args:
+        source: What `read_source` gave, or a file for it to read without options.
+
     Raises:
-        RefusedError: The file is missing; is not XML (the line is given); has a DOCTYPE, through which
-            entities could reach other files or fill the memory; is not a URDF; or its links and joints
-            are not one tree.
+        RefusedError: See `read_source`; or a link or joint is not as the URDF grammar has it; or links and
+            joints are not one tree. File and line are given.
     """
-    path = existing(path, "URDF file")
-    try:
-        text = path.read_bytes()
-    except OSError as error:
-        raise RefusedError(f"{path}: cannot be read ({error.strerror}); a URDF file is wanted") from error
-    xml, lines = _parse(text, path)
-    if xml.tag != "robot":
-        raise RefusedError(f"{path}:{lines[xml]}: a URDF begins with <robot>, this file with <{xml.tag}>")
-    _check_names(xml, lines, path)
-    robot = _read(text, path)
+    if not isinstance(source, Source):
+        source = read_source(source)
+    _check_names(source)
+    description = Description(source=source, name=source.xml.get("name", ""), root="", links={}, joints={})
+    for note in source.notes:
+        description.note(note)
+    robot = _read(description)
     links = {link.name: link for link in robot.links}
     held = {joint.child: joint for joint in robot.joints}
-    description = Description(
-        path=path,
-        name=robot.name,
-        root="",
+    description = replace(
+        description,
         links=links,
         joints=held,
         materials=MappingProxyType({m.name: m for m in robot.materials}),
-        xml=xml,
-        lines=lines,
     )
     _check_joints(description, robot.joints)
     roots = [name for name in links if name not in held]
@@ -133,87 +166,109 @@ def read_description(path: str | os.PathLike[str]) -> Description:
     if len(order) < len(links):
         astray = next(name for name in links if name not in order)
         raise description.refused("joint", held[astray].name, "closes a circle; remove one joint of it")
-    return Description(
-        path=path,
-        name=robot.name,
+    return replace(
+        description,
         root=roots[0],
         links=MappingProxyType({name: links[name] for name in order}),
         joints=MappingProxyType({name: held[name] for name in order if name in held}),
-        materials=description.materials,
-        xml=xml,
-        lines=lines,
     )
 
 
-def _parse(text: bytes, path: Path) -> tuple[ElementTree.Element, dict[ElementTree.Element, int]]:
-    """The elements of an XML file and the line that each starts on; comments are dropped."""
-    builder, lines = ElementTree.TreeBuilder(), {}
-    parser = expat.ParserCreate()
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        lines[builder.start(tag, attributes)] = parser.CurrentLineNumber
-
-    def doctype(*_: Any) -> None:
-        raise RefusedError(
-            f"{path}:{parser.CurrentLineNumber}: has a DOCTYPE, whose entities are not followed; "
-            "remove it and write values out"
-        )
-
-    parser.StartElementHandler = start
-    parser.EndElementHandler = builder.end
-    parser.CharacterDataHandler = builder.data
-    parser.StartDoctypeDeclHandler = doctype
-    try:
-        parser.Parse(text, True)
-    except expat.ExpatError as error:
-        reason = expat.errors.messages[error.code]
-        raise RefusedError(f"{path}:{error.lineno}: not XML: {reason} (column {error.offset})") from error
-    return builder.close(), lines
-
-
-def _check_names(xml: ElementTree.Element, lines: Mapping[ElementTree.Element, int], path: Path) -> None:
+def _check_names(source: Source) -> None:
     """Every link and joint has a name, and no two have the same."""
+    xml, where = source.xml, source.where
     if not xml.get("name"):
-        raise RefusedError(f"{path}:{lines[xml]}: <robot> has no name")
+        raise RefusedError(f"{where(xml)}: <robot> has no name")
     for kind in ("link", "joint"):
-        seen: dict[str, int] = {}
+        seen: dict[str, ElementTree.Element] = {}
         for element in xml.findall(kind):
-            name, line = element.get("name"), lines[element]
+            name = element.get("name")
             if not name:
-                raise RefusedError(f"{path}:{line}: a <{kind}> has no name")
+                raise RefusedError(f"{where(element)}: a <{kind}> has no name")
             if name in seen:
+                file, line = source.places[seen[name]]
+                first = f"line {line}" if file == source.places[element][0] else f"{file}:{line}"
                 raise RefusedError(
-                    f"{path}:{line}: {kind} {name!r} is there twice, first on line {seen[name]}; rename one"
+                    f"{where(element)}: {kind} {name!r} is there twice, first on {first}; rename one"
                 )
-            seen[name] = line
+            seen[name] = element
     if not xml.findall("link"):
-        raise RefusedError(f"{path}:{lines[xml]}: the robot has no <link>")
+        raise RefusedError(f"{where(xml)}: the robot has no <link>")
     for joint in xml.findall("joint"):
         for end in ("parent", "child"):
             named = joint.find(end)
             if named is None or not named.get("link"):
-                raise RefusedError(f"{path}:{lines[joint]}: joint {joint.get('name')!r} has no <{end} link=>")
+                raise RefusedError(f"{where(joint)}: joint {joint.get('name')!r} has no <{end} link=>")
 
 
-def _read(text: bytes, path: Path) -> Any:
-    """Yourdfpy's robot; its meshes and its scene graph are left alone, they are read elsewhere."""
+def _read(description: Description) -> Any:
+    """Yourdfpy's robot, with capsules; its meshes and its scene graph are left alone.
+
+    yourdfpy is given links, joints and materials as the grammar has them, a capsule as a cylinder.
+    """
     import yourdfpy
 
+    clean = ElementTree.Element("robot", name=description.name)
+    for part in description.xml:
+        if part.tag in ("link", "joint", "material"):
+            clean.append(
+                check_grammar(part, description.source.where, lambda text: description.note(text, lost=True))
+            )
+    capsules = list(clean.iter("capsule"))
+    for capsule in capsules:
+        capsule.tag = "cylinder"
     try:
-        return yourdfpy.URDF.load(
-            io.BytesIO(text), build_scene_graph=False, load_meshes=False, load_collision_meshes=False
+        robot = yourdfpy.URDF.load(
+            io.BytesIO(ElementTree.tostring(clean)),
+            build_scene_graph=False,
+            load_meshes=False,
+            load_collision_meshes=False,
         ).robot
     except (ValueError, KeyError, IndexError, AttributeError, TypeError) as error:
-        raise RefusedError(f"{path}: not a URDF: {type(error).__name__}: {error}") from error
+        raise RefusedError(f"{description.path}: not a URDF: {type(error).__name__}: {error}") from error
+    for link, element in zip(robot.links, clean.findall("link"), strict=True):
+        link.visuals = _shapes(link.visuals, element.findall("visual"), capsules, link.name, description)
+        link.collisions = _shapes(
+            link.collisions, element.findall("collision"), capsules, link.name, description
+        )
+    return robot
+
+
+def _shapes(
+    shapes: list[Any],
+    elements: list[ElementTree.Element],
+    capsules: list[ElementTree.Element],
+    link: str,
+    description: Description,
+) -> list[Any]:
+    """Visuals or collisions of a link, capsules put right, those without any size left out with a note."""
+    kept = []
+    for shape, element in zip(shapes, elements, strict=True):
+        (form,) = element.find("geometry") or [None]
+        assert form is not None  # the grammar saw to it
+        shape.geometry.capsule = None
+        if form in capsules:
+            made = shape.geometry.cylinder
+            shape.geometry.cylinder, shape.geometry.capsule = None, Capsule(made.radius, made.length)
+        sizes = [float(word) for name in ("size", "radius", "length") for word in form.get(name, "").split()]
+        if form.tag != "mesh" and 0 in sizes and not (form in capsules and sizes[0] > 0):
+            kind = "capsule" if form in capsules else form.tag
+            description.note(f"link {link!r}: a {element.tag} {kind} of size 0 is left out", lost=True)
+            continue
+        kept.append(shape)
+    return kept
 
 
 def _check_joints(description: Description, joints: list[Any]) -> None:
-    """Each joint is of a known type, has an axis, holds a link that is there and is held by no other."""
+    """Each joint is of a known type, has an axis and a range, and holds a link that no other holds."""
     held: dict[str, str] = {}
+    named = {joint.name: joint for joint in joints}
     for joint in joints:
         if joint.type not in JOINT_TYPES:
             raise description.refused(
-                "joint", joint.name, f"is of type {joint.type!r}; known: {', '.join(JOINT_TYPES)}"
+                "joint",
+                joint.name,
+                f"is of type {joint.type!r}; known: {', '.join(JOINT_TYPES)}",
             )
         for link in (joint.parent, joint.child):
             if link not in description.links:
@@ -225,15 +280,53 @@ def _check_joints(description: Description, joints: list[Any]) -> None:
                 "joint", joint.name, f"holds {joint.child!r}, which {held[joint.child]!r} holds already"
             )
         held[joint.child] = joint.name
-        if joint.type in MOVING and not np.linalg.norm(joint.axis) > 0:
+        if joint.type in AXIAL and not np.linalg.norm(joint.axis) > 0:
             raise description.refused("joint", joint.name, "moves about an axis of length 0")
+        _check_limit(description, joint)
+        if joint.mimic is not None:
+            _check_mimic(description, joint, named)
+
+
+def _check_limit(description: Description, joint: Any) -> None:
+    """The range of a joint does not stand on its head."""
+    limit = joint.limit
+    if limit is None or limit.lower is None or limit.upper is None or joint.type in ("fixed", "continuous"):
+        return
+    if limit.lower > limit.upper:
+        raise description.refused(
+            "joint", joint.name, f"has its lower limit {limit.lower:g} above its upper {limit.upper:g}"
+        )
+
+
+def _check_mimic(description: Description, joint: Any, named: Mapping[str, Any]) -> None:
+    """What a joint mimics is there, moves, and does not mimic it in turn."""
+    chain = [joint.name]
+    while (mimic := named[chain[-1]].mimic) is not None:
+        if mimic.joint not in named:
+            raise description.refused(
+                "joint", chain[-1], f"mimics no joint {mimic.joint!r}; {hint(mimic.joint, named)}"
+            )
+        if mimic.joint in chain:
+            raise description.refused(
+                "joint", joint.name, f"mimics itself: {' -> '.join([*chain, mimic.joint])}"
+            )
+        chain.append(mimic.joint)
+    if named[chain[-1]].type not in MOVING:
+        raise description.refused(
+            "joint",
+            joint.name,
+            f"mimics {chain[-1]!r}, which is {named[chain[-1]].type}; give one that moves",
+        )
 
 
 def _order(root: str, joints: list[Any]) -> list[str]:
     """Links from the root outwards, depth first, each parent's joints in the order of the file."""
+    below: dict[str, list[str]] = {}
+    for joint in joints:
+        below.setdefault(joint.parent, []).append(joint.child)
     order, pending = [], [root]
     while pending:
         link = pending.pop()
         order.append(link)
-        pending += [joint.child for joint in reversed(joints) if joint.parent == link]
+        pending += reversed(below.get(link, []))
     return order

@@ -1,0 +1,184 @@
+"""Grammar: which elements and attributes a URDF's links and joints have, and what may stand in them.
+
+After the URDF XML specification (wiki.ros.org/urdf/XML), with the capsule of urdfdom 4.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from xml.etree import ElementTree
+
+from magtwin.names import RefusedError, hint
+
+Element = ElementTree.Element
+
+
+@dataclass(frozen=True)
+class Number:
+    """What an attribute's numbers must be."""
+
+    counts: tuple[int, ...] = (1,)
+    """How many there may be."""
+
+    required: bool = False
+
+    least: float = -math.inf
+
+    endless: bool = False
+    """Whether they may be infinite."""
+
+
+XYZ = Number(counts=(3,))
+SIZE = Number(required=True, least=0.0)
+AMOUNT = Number(least=0.0)
+
+NUMBERS: Mapping[str, Mapping[str, Number]] = {
+    "origin": {"xyz": XYZ, "rpy": XYZ},
+    "mass": {"value": Number(required=True, least=0.0)},
+    "inertia": {name: Number() for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")},
+    "box": {"size": Number(counts=(3,), required=True, least=0.0)},
+    "cylinder": {"radius": SIZE, "length": SIZE},
+    "capsule": {"radius": SIZE, "length": SIZE},
+    "sphere": {"radius": SIZE},
+    "mesh": {"scale": Number(counts=(1, 3))},
+    "color": {"rgba": Number(counts=(3, 4), required=True)},
+    "axis": {"xyz": XYZ},
+    "limit": {
+        "lower": Number(endless=True),
+        "upper": Number(endless=True),
+        "effort": Number(endless=True),
+        "velocity": Number(least=0.0, endless=True),
+    },
+    "dynamics": {"damping": AMOUNT, "friction": AMOUNT},
+    "mimic": {"multiplier": Number(), "offset": Number()},
+    "calibration": {"rising": Number(), "falling": Number()},
+    "safety_controller": {
+        "soft_lower_limit": Number(),
+        "soft_upper_limit": Number(),
+        "k_position": Number(),
+        "k_velocity": Number(),
+    },
+}
+"""Attributes that hold numbers, by element."""
+
+SHAPES = ("box", "capsule", "cylinder", "mesh", "sphere")
+
+CHILDREN: Mapping[str, tuple[str, ...]] = {
+    "link": ("inertial", "visual", "collision"),
+    "inertial": ("origin", "mass", "inertia"),
+    "visual": ("origin", "geometry", "material"),
+    "collision": ("origin", "geometry"),
+    "geometry": SHAPES,
+    "material": ("color", "texture"),
+    "joint": (
+        "origin",
+        "parent",
+        "child",
+        "axis",
+        "calibration",
+        "dynamics",
+        "limit",
+        "mimic",
+        "safety_controller",
+    ),
+}
+"""Elements that an element may hold."""
+
+MANY = frozenset({"visual", "collision"})
+"""Elements of which there may be several side by side."""
+
+NEEDED: Mapping[str, str] = {"visual": "geometry", "collision": "geometry"}
+"""Element that an element must hold."""
+
+TEXTS: Mapping[str, str] = {"mesh": "filename", "texture": "filename", "mimic": "joint"}
+"""Attribute that an element must have, a text."""
+
+
+def check_grammar(part: Element, where: Callable[[Element], str], note: Callable[[str], None]) -> Element:
+    """Check a link, joint or material; what is not of the grammar is left out with a note.
+
+    Args:
+        part: The element.
+        where: File and line of an element, for refusals.
+        note: Takes what was left out.
+
+    Returns:
+        `part` as the grammar has it: known elements and attributes, numbers apart by blanks.
+
+    Raises:
+        RefusedError: A number is missing, is none, is not finite or too small; there are too many or too
+            few of them; a geometry has no shape, several or an unknown one.
+    """
+    return _clean(part, f"{part.tag} {part.get('name')!r}", where, note)
+
+
+def _clean(
+    element: Element, label: str, where: Callable[[Element], str], note: Callable[[str], None]
+) -> Element:
+    start = f"{where(element)}: {label}"
+    clean = Element(element.tag, _attributes(element, start, note))
+    known = CHILDREN.get(element.tag, ())
+    seen: set[str] = set()
+    for child in element:
+        if child.tag not in known:
+            if element.tag == "geometry":
+                raise RefusedError(
+                    f"{where(child)}: {label} has a geometry {child.tag!r}; {hint(child.tag, SHAPES)}"
+                )
+            near = hint(child.tag, known) if known else ""
+            note(
+                f"{label}: <{child.tag}> is unknown in <{element.tag}> and left out"
+                + (f"; {near}" if near.startswith("did") else "")
+            )
+            continue
+        if child.tag in seen and child.tag not in MANY:
+            note(f"{label}: a second <{child.tag}> in <{element.tag}> is left out")
+            continue
+        seen.add(child.tag)
+        clean.append(_clean(child, label, where, note))
+    if element.tag == "geometry" and len(clean) != 1:
+        raise RefusedError(
+            f"{start} has a <geometry> of {len(clean)} shapes; give one of {', '.join(SHAPES)}"
+        )
+    if NEEDED.get(element.tag, element.tag) not in {element.tag, *seen}:
+        raise RefusedError(f"{start} has a <{element.tag}> without <{NEEDED[element.tag]}>")
+    return clean
+
+
+def _attributes(element: Element, start: str, note: Callable[[str], None]) -> dict[str, str]:
+    """An element's attributes, its numbers checked."""
+    numbers = NUMBERS.get(element.tag, {})
+    made = {name: value for name, value in element.items() if name not in numbers and ":" not in name}
+    made.pop("xmlns", None)
+    text = TEXTS.get(element.tag)
+    if text is not None and not made.get(text):
+        raise RefusedError(f"{start} has a <{element.tag}> without {text}=")
+    for name, kind in numbers.items():
+        given = element.get(name)
+        if given is None or not given.strip():
+            if kind.required:
+                raise RefusedError(f"{start} has a <{element.tag}> without {name}=")
+            continue
+        made[name] = _numbers(given, kind, f"{start}: {name} of <{element.tag}>", note)
+    return made
+
+
+def _numbers(given: str, kind: Number, start: str, note: Callable[[str], None]) -> str:
+    """Numbers of an attribute, apart by blanks; refused where they are not what they must be."""
+    words = given.replace(",", " ").split()
+    counts = " or ".join(map(str, kind.counts))
+    if len(words) not in kind.counts:
+        plural = "number" if kind.counts == (1,) else "numbers"
+        raise RefusedError(f"{start} must be {counts} {plural}, got {given!r}")
+    for word in words:
+        try:
+            value = float(word)
+        except ValueError:
+            value = math.nan
+        if "_" in word or math.isnan(value) or (math.isinf(value) and not kind.endless):
+            raise RefusedError(
+                f"{start} must be {counts} finite number{'s'[: len(words) > 1]}, got {given!r}"
+            )
+        if value < kind.least:
+            raise RefusedError(f"{start} must not be below {kind.least:g}, got {given!r}")
+    return " ".join(words)
