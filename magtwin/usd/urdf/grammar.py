@@ -167,18 +167,16 @@ def _numbers(given: str, kind: Number, start: str, note: Callable[[str], None]) 
     """Numbers of an attribute, apart by blanks; refused where they are not what they must be."""
     words = given.replace(",", " ").split()
     counts = " or ".join(map(str, kind.counts))
-    if len(words) not in kind.counts:
-        plural = "number" if kind.counts == (1,) else "numbers"
-        raise RefusedError(f"{start} must be {counts} {plural}, got {given!r}")
+    wanted = "a finite number" if kind.counts == (1,) else f"{counts} finite numbers"
     for word in words:
         try:
             value = float(word)
         except ValueError:
             value = math.nan
         if "_" in word or math.isnan(value) or (math.isinf(value) and not kind.endless):
-            raise RefusedError(
-                f"{start} must be {counts} finite number{'s'[: len(words) > 1]}, got {given!r}"
-            )
+            raise RefusedError(f"{start} must be {wanted}, got {given!r}")
         if value < kind.least:
             raise RefusedError(f"{start} must not be below {kind.least:g}, got {given!r}")
+    if len(words) not in kind.counts:
+        raise RefusedError(f"{start} must be {wanted}, got {given!r}")
     return " ".join(words)
