@@ -5,8 +5,6 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 
 from magtwin.files import check_free, output, sha256
@@ -14,24 +12,25 @@ from magtwin.names import RefusedError
 from magtwin.usd.layers import describe_stage, open_stage
 from magtwin.usd.sensors import write_pose
 from magtwin.usd.urdf.description import Description, origin_of, read_description
+from magtwin.usd.urdf.drive import check_rules
 from magtwin.usd.urdf.gazebo import Surface, read_surfaces
-from magtwin.usd.urdf.joint import define_joint
-from magtwin.usd.urdf.link import define_body, define_frame, is_marker
+from magtwin.usd.urdf.joint import define_joint, define_mimic, define_root_joint
+from magtwin.usd.urdf.link import Rider, define_body, define_frame, is_marker
 from magtwin.usd.urdf.material import LOOKS
+from magtwin.usd.urdf.mechanism import Mechanism, read_mechanism
+from magtwin.usd.urdf.merge import WORLD, Place, carried, place_links, riders
 from magtwin.usd.urdf.mesh_layer import MeshLayer
 from magtwin.usd.urdf.options import DEFAULTS, Options
 from magtwin.usd.urdf.report import ConversionReport, Ledger, make_report
 from magtwin.usd.urdf.shape import COLLIDER_FORM, define_collider, define_visual, form_of, pose_of
 from magtwin.usd.urdf.source import read_source
+from magtwin.usd.urdf.wheel import find_wheels, grip
 
 JOINTS = "joints"
 """Scope of the joints below the robot's prim."""
 
 ROBOT_API, ARTICULATION_API = "IsaacRobotAPI", "NewtonArticulationRootAPI"
 """Applied schemas of Isaac Sim and Newton, by name: their plugins live elsewhere."""
-
-Place = tuple[str, NDArray[np.float64]]
-"""Name of a body, and a pose in it, shape (4, 4)."""
 
 
 def convert_urdf(
@@ -171,47 +170,85 @@ def _author(
     """The robot's prim with all that hangs from it."""
     describe_stage(stage, f"{description.name}: converted from {description.path.name}.")
     names = _prim_names(description)
-    surfaces, places, poses = read_surfaces(description), _places(description), description.poses()
+    mechanism = read_mechanism(description, options)
+    check_rules(mechanism, options)
+    surfaces, wheels = read_surfaces(description), ()
+    if options.profile == "diff-drive":
+        wheels = find_wheels(mechanism)
+        surfaces = grip(mechanism, wheels, surfaces)
+    places, poses = place_links(mechanism, merge=options.merge_fixed), mechanism.poses()
     robot = UsdGeom.Xform.Define(stage, Sdf.Path.absoluteRootPath.AppendChild(names[""])).GetPrim()
     stage.SetDefaultPrim(robot)
     Usd.ModelAPI(robot).SetKind("component")
-    paths = {}
-    for name, link in description.links.items():
+    paths = {WORLD: robot.GetPath()}
+    for name in description.links:
         if places[name][0] != name:
             continue
         body = UsdGeom.Xform.Define(stage, robot.GetPath().AppendChild(names[name])).GetPrim()
         write_pose(body, *pose_of(poses[name]))
         paths[name] = body.GetPath()
-        define_body(body, link, description)
         ledger.link(name, "body", body)
-        for i, visual in enumerate(link.visuals):
-            ledger.shape(name, "visual", i, define_visual(body, visual, description, meshes, layer))
-        for i, collision in enumerate(link.collisions):
-            surface = surfaces.get(name, Surface())
-            ledger.shape(name, "collision", i, define_collider(body, collision, surface, meshes, layer))
-    for name, (body_name, pose) in places.items():
-        if body_name != name:
-            frame = UsdGeom.Xform.Define(stage, paths[body_name].AppendChild(names[name])).GetPrim()
+        parts = []
+        for part, pose in riders(places, name):
+            link, surface = description.links[part], surfaces.get(part, Surface())
+            parts.append(Rider(link, pose))
+            for i, visual in enumerate(carried(link.visuals, pose, part, name)):
+                made = define_visual(body, visual, description, meshes, layer)
+                ledger.shape(part, "visual", i, made)
+                parts[-1].visuals.extend(made)
+            for i, collision in enumerate(carried(link.collisions, pose, part, name)):
+                made = define_collider(body, collision, surface, meshes, layer)
+                ledger.shape(part, "collision", i, made)
+                parts[-1].colliders.extend(made)
+        define_body(body, parts, description, options.density)
+    for name, (above, pose) in places.items():
+        if above != name:
+            frame = UsdGeom.Xform.Define(stage, paths[above].AppendChild(names[name])).GetPrim()
             write_pose(frame, *pose_of(pose))
             define_frame(frame)
-            ledger.link(name, "frame", frame)
+            ledger.link(name, "frame" if is_marker(description.links[name]) else "merged", frame)
     scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(JOINTS)).GetPath()
-    joints = []
-    for child, joint in description.joints.items():
-        if child in paths and joint.parent in places and places[joint.parent][0] != child:
-            above, pose = places[joint.parent]
-            made = define_joint(
-                stage,
-                scope.AppendChild(Tf.MakeValidIdentifier(joint.name)),
-                joint,
-                (paths[above], paths[child]),
-                pose @ origin_of(joint),
-                description,
-            )
-            joints.append(made.GetPath())
-            ledger.joint(joint.name, made)
-    _articulate(robot, list(paths.values()), joints)
+    joints = _define_joints(stage, scope, mechanism, options, wheels, places, paths, ledger)
+    _articulate(robot, [path for name, path in paths.items() if name != WORLD], joints)
     return robot
+
+
+def _define_joints(
+    stage: Usd.Stage,
+    scope: Sdf.Path,
+    mechanism: Mechanism,
+    options: Options,
+    wheels: tuple[str, ...],
+    places: dict[str, Place],
+    paths: dict[str, Sdf.Path],
+    ledger: Ledger,
+) -> list[Sdf.Path]:
+    """The joints between bodies, those to the world first; a floating one is none."""
+    description, made = mechanism.description, {}
+    names = _joint_names(description)
+    base = next((name for name, (above, _) in places.items() if above == name), WORLD)
+    if options.fix_base and places[description.root][0] != WORLD and base != WORLD:
+        pose = mechanism.poses()[base]
+        root = define_root_joint(stage, scope.AppendChild(names[""]), (paths[WORLD], paths[base]), pose)
+        made[""] = root
+    for child, joint in description.joints.items():
+        above, pose = places[joint.parent]
+        if child not in paths or above == child or (child == base and joint.type == "floating"):
+            continue
+        if joint.type == "floating":
+            description.note(
+                f"joint {joint.name!r} is floating: link {child!r} is a body of its own, held by nothing"
+            )
+            continue
+        path, ends = scope.AppendChild(names[joint.name]), (paths[above], paths[child])
+        at = mechanism.pose(joint) if joint.name in mechanism.welded else origin_of(joint)
+        prim = define_joint(stage, path, joint, ends, pose @ at, mechanism, options, wheels)
+        made[joint.name] = prim
+        ledger.joint(joint.name, prim)
+    joints = {joint.name: joint for joint in description.joints.values()}
+    for name, mimic in mechanism.mimics.items():
+        define_mimic(made[name], made[mimic.leader], joints[name], joints[mimic.leader], mechanism)
+    return [prim.GetPath() for prim in made.values()]
 
 
 def _articulate(robot: Usd.Prim, links: list[Sdf.Path], joints: list[Sdf.Path]) -> None:
@@ -226,31 +263,25 @@ def _articulate(robot: Usd.Prim, links: list[Sdf.Path], joints: list[Sdf.Path]) 
     robot.CreateRelationship("isaac:physics:robotJoints", custom=False).SetTargets(joints)
 
 
-def _places(description: Description) -> dict[str, Place]:
-    """The body that each link is, or rides on, with its pose in it.
+def _joint_names(description: Description) -> dict[str, str]:
+    """Names of the prims of the root joint ("") and of the joints, as USD allows them.
 
-    Links that only name a place ride on the nearest body above them; those above the first body, such
-    as base_footprint, on that.
+    Raises:
+        RefusedError: Two joints would get one name.
     """
-    base, above = description.root, [description.root]
-    while is_marker(description.links[base]):
-        below = [child for child, joint in description.joints.items() if joint.parent == base]
-        if len(below) != 1 or description.joints[below[0]].type != "fixed":
-            break
-        base = below[0]
-        above.append(base)
-    poses = description.poses()
-    places = {name: (base, np.linalg.inv(poses[base]) @ poses[name]) for name in above}
-    for name, link in description.links.items():
-        if name in places:
-            continue
-        joint = description.joints[name]
-        if is_marker(link) and joint.type == "fixed":
-            body, pose = places[joint.parent]
-            places[name] = (body, pose @ origin_of(joint))
-        else:
-            places[name] = (name, np.eye(4))
-    return places
+    names: dict[str, str] = {}
+    for joint in description.joints.values():
+        name = Tf.MakeValidIdentifier(joint.name)
+        if name in names.values():
+            raise description.refused(
+                "joint", joint.name, f"would become prim {name!r}, which is taken; rename it"
+            )
+        if name != joint.name:
+            description.note(f"joint {joint.name!r} is called {name!r} in USD")
+        names[joint.name] = name
+    free = ("root_joint", *(f"root_joint_{i}" for i in range(2, len(names) + 3)))
+    names[""] = next(name for name in free if name not in names.values())
+    return names
 
 
 def _prim_names(description: Description) -> dict[str, str]:

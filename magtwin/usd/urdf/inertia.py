@@ -1,5 +1,7 @@
-"""Inertia: a tensor as USD has it, principal moments and the axes that they are about."""
+"""Inertia: what bodies weigh, together too, and a tensor as USD has it, principal moments and their axes."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
@@ -10,6 +12,40 @@ from magtwin.names import RefusedError
 
 NEAR_MISS = 0.02
 """Part of the largest moment by which it may exceed the sum of the others and still be repaired."""
+
+
+@dataclass(frozen=True)
+class MassProperties:
+    """Mass, centre and inertia of a body in some frame."""
+
+    mass: float
+    """Mass [kg]."""
+
+    centre: NDArray[np.float64]
+    """Centre of mass [m], shape (3,)."""
+
+    inertia: NDArray[np.float64]
+    """Tensor about the centre of mass, in the frame's axes [kg m2], shape (3, 3)."""
+
+    def moved(self, T: ArrayLike) -> "MassProperties":
+        """The body seen from the frame in which its own stands at T, shape (4, 4)."""
+        T = np.asarray(T, float)
+        R = T[:3, :3]
+        return MassProperties(self.mass, R @ self.centre + T[:3, 3], R @ self.inertia @ R.T)
+
+
+def combined(bodies: Sequence[MassProperties]) -> MassProperties:
+    """Bodies of one frame as one, by the parallel axis theorem (Goldstein 2002, section 5.3).
+
+    I = sum_b I_b + m_b (|d_b|^2 1 - d_b d_b^T), d_b = c_b - c, c the common centre.
+    """
+    mass = sum(body.mass for body in bodies)
+    centre = sum((body.mass * body.centre for body in bodies), np.zeros(3)) / mass
+    inertia = np.zeros((3, 3))
+    for body in bodies:
+        d = body.centre - centre
+        inertia += body.inertia + body.mass * (d @ d * np.eye(3) - np.outer(d, d))
+    return MassProperties(mass, centre, inertia)
 
 
 def principal_axes(inertia: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:

@@ -1,9 +1,10 @@
-"""Joint: how one body holds another, and the drive that moves it.
+"""Joint: how one body holds another, and how it may move.
 
 URDF's joint frame is the child link's; UsdPhysics wants an axis X, Y or Z of a frame on each body, so
 an oblique axis turns both frames. URDF's radians are degrees in UsdPhysics.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,32 +13,28 @@ from pxr import Gf, Sdf, Usd, UsdPhysics
 
 from magtwin.frames import wxyz_from_xyzw
 from magtwin.usd.urdf.description import Description
+from magtwin.usd.urdf.drive import choose_drive, define_drive
 from magtwin.usd.urdf.inertia import quaternion
+from magtwin.usd.urdf.mechanism import Mechanism
+from magtwin.usd.urdf.options import DEFAULTS, Options
 
-JOINT_API, NEWTON_API = "IsaacJointAPI", "NewtonJointAPI"
-"""Applied schemas of Isaac Sim and Newton, by name: their plugins live elsewhere."""
+JOINT_API, NEWTON_API, NEWTON_MIMIC_API = "IsaacJointAPI", "NewtonJointAPI", "NewtonMimicAPI"
+PHYSX_API, PHYSX_AXIS_API, PHYSX_MIMIC_API = "PhysxJointAPI", "PhysxJointAxisAPI", "PhysxMimicJointAPI"
+"""Applied schemas of Isaac Sim, Newton and PhysX, by name: their plugins live elsewhere."""
 
-WHEEL_DAMPING = 5.0
-"""Gain of a continuous joint's velocity drive [N m s/rad]: stiff enough for Newton to hold a commanded
-speed of a 4 kg robot to 1 %, soft enough to be stable at 60 steps a second."""
+KINDS = {
+    "revolute": UsdPhysics.RevoluteJoint,
+    "continuous": UsdPhysics.RevoluteJoint,
+    "prismatic": UsdPhysics.PrismaticJoint,
+    "planar": UsdPhysics.Joint,
+}
+"""UsdPhysics' joints by URDF's types; floating is none at all."""
 
-POSITION_STIFFNESS = 100.0
-"""Gain of a limited joint's position drive [N m/rad, N/m]."""
+LOCKED = (1.0, -1.0)
+"""Limits of an axis that cannot move: UsdPhysics has the lower one above the upper."""
 
-DEFAULT_EFFORT = 10.0
-"""Largest effort of a drive where the URDF gives none [N m, N]."""
-
-
-def is_welded(joint: Any) -> bool:
-    """Whether a joint cannot move: fixed, or by its own limits (no effort and no speed, or no room)."""
-    limit = joint.limit
-    if joint.type == "fixed":
-        return True
-    if limit is None:
-        return False
-    if limit.effort == 0 and limit.velocity == 0:
-        return True
-    return joint.type != "continuous" and limit.lower is not None and limit.lower == limit.upper
+MIMIC_FREQUENCY = 100.0
+"""Natural frequency of PhysX's mimic [1/s]; with a damping ratio of 0 the coupling is hard whatever it is."""
 
 
 def define_joint(
@@ -46,45 +43,125 @@ def define_joint(
     joint: Any,
     ends: tuple[Sdf.Path, Sdf.Path],
     T: NDArray,
-    description: Description,
+    mechanism: Mechanism,
+    options: Options = DEFAULTS,
+    wheels: Iterable[str] = (),
 ) -> Usd.Prim:
-    """Author a joint between two bodies.
+    """Author a joint between two bodies; its mimic comes later, see `define_mimic`.
+
+    A planar joint is a plain PhysicsJoint whose slide along the axis and whose turns across it are
+    locked, the other three axes being limited to -inf..inf, since Newton takes an axis for free only
+    where it says so. PhysX holds such a joint outside its reduced coordinates.
 
     Args:
         stage: Written to in its edit target.
         path: Path of the joint's prim.
-        joint: yourdfpy's joint.
+        joint: yourdfpy's joint; not a floating one.
         ends: Paths of the parent's and the child's body.
-        T: Pose of the joint in the parent's body, shape (4, 4).
-        description: Takes notes of what was guessed.
+        T: Pose in the parent's body of the joint at 0, or at rest if it is welded, shape (4, 4).
+        mechanism: Joints of the description; its description takes notes of what was guessed.
+        options: Drives and profile.
+        wheels: Names of the joints of driven wheels.
 
     Raises:
         RefusedError: A limit is missing, upside down, or not above 0; the text gives the line.
     """
-    if is_welded(joint):
-        made = UsdPhysics.FixedJoint.Define(stage, path)
-        if joint.type != "fixed":
-            description.note(f"joint {joint.name!r} ({joint.type}) cannot move by its own limits: welded")
-    elif joint.type == "prismatic":
-        made = UsdPhysics.PrismaticJoint.Define(stage, path)
-    else:
-        made = UsdPhysics.RevoluteJoint.Define(stage, path)
+    description, reason = mechanism.description, mechanism.welded.get(joint.name)
+    made = (UsdPhysics.FixedJoint if reason is not None else KINDS[joint.type]).Define(stage, path)
+    if reason:
+        description.note(f"joint {joint.name!r} ({joint.type}) {reason}: welded")
     made.CreateBody0Rel().SetTargets([ends[0]])
     made.CreateBody1Rel().SetTargets([ends[1]])
     turn = np.eye(3)
-    if not is_welded(joint):
+    if reason is None:
         token, turn = _axis(joint.axis)
-        made.CreateAxisAttr(token)
-        _limit(made, joint, description)
-        _drive(made.GetPrim(), joint, description)
+        axes = _free_axes(made, joint, token, description)
+        drive = choose_drive(joint, mechanism, options, wheels)
+        if drive is not None:
+            for axis in axes:
+                define_drive(made.GetPrim(), axis, drive)
+        _tune(made.GetPrim(), joint, axes, options, description)
     made.CreateLocalPos0Attr(Gf.Vec3f(*(round(float(v), 12) + 0.0 for v in T[:3, 3])))
     made.CreateLocalRot0Attr(_quatf(T[:3, :3] @ turn))
     made.CreateLocalPos1Attr(Gf.Vec3f(0))
     made.CreateLocalRot1Attr(_quatf(turn))
     made.GetPrim().AddAppliedSchema(JOINT_API)
-    if joint.mimic is not None:
-        description.note(f"joint {joint.name!r}: that it mimics {joint.mimic.joint!r} is not converted")
     return made.GetPrim()
+
+
+def define_root_joint(
+    stage: Usd.Stage, path: Sdf.Path, ends: tuple[Sdf.Path, Sdf.Path], T: NDArray
+) -> Usd.Prim:
+    """Bolt a robot's base to the world, where the robot's prim stands.
+
+    Args:
+        stage: Written to in its edit target.
+        path: Path of the joint's prim.
+        ends: Paths of the robot's prim, which is no body, and of the base.
+        T: Pose of the base in the robot's prim, shape (4, 4).
+    """
+    made = UsdPhysics.FixedJoint.Define(stage, path)
+    made.CreateBody0Rel().SetTargets([ends[0]])
+    made.CreateBody1Rel().SetTargets([ends[1]])
+    made.CreateLocalPos0Attr(Gf.Vec3f(*(round(float(v), 12) + 0.0 for v in T[:3, 3])))
+    made.CreateLocalRot0Attr(_quatf(T[:3, :3]))
+    made.CreateLocalPos1Attr(Gf.Vec3f(0))
+    made.CreateLocalRot1Attr(Gf.Quatf(1))
+    made.GetPrim().AddAppliedSchema(JOINT_API)
+    return made.GetPrim()
+
+
+def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Any, lead: Any, mechanism: Mechanism) -> None:
+    """Author that a joint follows another, for Newton and for PhysX.
+
+    Newton: q = coef0 + coef1 q_leader, coef0 in degrees where the follower turns. PhysX, until it reads
+    Newton's: q + gearing q_leader + offset = 0, all in degrees or metres; it needs limits on a joint
+    that turns. The follower has no drive of its own, so that the coupling owns it; a runtime that knows
+    neither lets it swing.
+
+    Args:
+        prim: The follower's.
+        leader: The leader's.
+        joint: yourdfpy's joint of the follower.
+        lead: yourdfpy's joint of the leader.
+        mechanism: Joints of the description.
+    """
+    mimic, kinds = mechanism.mimics[joint.name], Sdf.ValueTypeNames
+    unit, lead_unit = _unit(joint), _unit(lead)
+    prim.AddAppliedSchema(NEWTON_MIMIC_API)
+    prim.CreateRelationship("newton:mimicJoint", custom=False).SetTargets([leader.GetPath()])
+    _write(prim, "newton:mimicCoef0", kinds.Float, mimic.offset * unit)
+    _write(prim, "newton:mimicCoef1", kinds.Float, mimic.multiplier)
+    if joint.type == "continuous" or lead.type == "continuous":
+        mechanism.description.note(
+            f"joint {joint.name!r} follows {lead.name!r} without limits: for Newton, not for older PhysX"
+        )
+        return
+    instance, lead_axis = f"rot{_axis(joint.axis)[0]}", f"rot{_axis(lead.axis)[0]}"
+    prim.AddAppliedSchema(f"{PHYSX_MIMIC_API}:{instance}")
+    space = f"physxMimicJoint:{instance}"
+    prim.CreateRelationship(f"{space}:referenceJoint", custom=False).SetTargets([leader.GetPath()])
+    axis = prim.CreateAttribute(f"{space}:referenceJointAxis", kinds.Token, False, Sdf.VariabilityUniform)
+    axis.Set(lead_axis)
+    _write(prim, f"{space}:gearing", kinds.Float, -mimic.multiplier * unit / lead_unit)
+    _write(prim, f"{space}:offset", kinds.Float, -mimic.offset * unit)
+    _write(prim, f"{space}:naturalFrequency", kinds.Float, MIMIC_FREQUENCY)
+    _write(prim, f"{space}:dampingRatio", kinds.Float, 0.0)
+
+
+def _free_axes(made: Any, joint: Any, token: str, description: Description) -> list[str]:
+    """Author axis and limits of a joint that moves; returns the names of the axes that are free."""
+    if joint.type != "planar":
+        made.CreateAxisAttr(token)
+        _limit(made, joint, description)
+        return ["linear" if joint.type == "prismatic" else "angular"]
+    free = [f"trans{other}" for other in "XYZ" if other != token] + [f"rot{token}"]
+    for axis in (f"{kind}{letter}" for kind in ("trans", "rot") for letter in "XYZ"):
+        limit = UsdPhysics.LimitAPI.Apply(made.GetPrim(), axis)
+        low, high = (-np.inf, np.inf) if axis in free else LOCKED
+        limit.CreateLowAttr(low)
+        limit.CreateHighAttr(high)
+    return free
 
 
 def _axis(axis: ArrayLike) -> tuple[str, NDArray[np.float64]]:
@@ -102,6 +179,16 @@ def _quatf(R: NDArray) -> Gf.Quatf:
     return Gf.Quatf(*(round(float(v), 9) + 0.0 for v in wxyz_from_xyzw(quaternion(R))))
 
 
+def _unit(joint: Any) -> float:
+    """UsdPhysics' measure of a joint's value, over URDF's."""
+    return 1.0 if joint.type == "prismatic" else 180 / np.pi
+
+
+def _write(prim: Usd.Prim, name: str, kind: Sdf.ValueTypeName, value: object) -> None:
+    """Author an attribute of a schema whose plugin is not here."""
+    prim.CreateAttribute(name, kind, custom=False).Set(value)
+
+
 def _limit(made: Any, joint: Any, description: Description) -> None:
     """Range of a revolute or prismatic joint; a continuous one has none."""
     if joint.type == "continuous":
@@ -113,50 +200,50 @@ def _limit(made: Any, joint: Any, description: Description) -> None:
         raise description.refused(
             "joint", joint.name, f"has its lower limit {limit.lower:g} above its upper {limit.upper:g}"
         )
-    unit = 180 / np.pi if joint.type == "revolute" else 1.0
-    made.CreateLowerLimitAttr(limit.lower * unit)
-    made.CreateUpperLimitAttr(limit.upper * unit)
-
-
-def _drive(prim: Usd.Prim, joint: Any, description: Description) -> None:
-    """A velocity drive on a continuous joint, a position drive on a limited one, of finite effort."""
-    limit, dynamics = joint.limit, joint.dynamics
-    angular = joint.type != "prismatic"
-    unit = np.pi / 180 if angular else 1.0  # gains are per degree in UsdPhysics
-    effort = None if limit is None else limit.effort
-    if not effort:
+    if not limit.lower <= 0 <= limit.upper:
         description.note(
-            f"joint {joint.name!r} gives {'no effort' if effort is None else 'an effort of 0'}: "
-            f"its drive may use {DEFAULT_EFFORT:g} {'N m' if angular else 'N'}"
+            f"joint {joint.name!r} stands at 0, outside its limits {limit.lower:g} to {limit.upper:g}: "
+            "engines push it inside at their first step"
         )
-        effort = DEFAULT_EFFORT
-    if effort < 0 or not np.isfinite(effort):
-        raise description.refused("joint", joint.name, f"has an effort of {effort:g}; give one above 0")
-    drive = UsdPhysics.DriveAPI.Apply(prim, "angular" if angular else "linear")
-    drive.CreateTypeAttr(UsdPhysics.Tokens.force)
-    drive.CreateMaxForceAttr(effort)
-    if joint.type == "continuous":
-        drive.CreateStiffnessAttr(0.0)
-        drive.CreateDampingAttr(round(WHEEL_DAMPING * unit, 9))
-        drive.CreateTargetVelocityAttr(0.0)
-    else:
-        drive.CreateStiffnessAttr(round(POSITION_STIFFNESS * unit, 9))
-        drive.CreateDampingAttr(round(POSITION_STIFFNESS / 10 * unit, 9))
-        drive.CreateTargetPositionAttr(0.0)
+    made.CreateLowerLimitAttr(limit.lower * _unit(joint))
+    made.CreateUpperLimitAttr(limit.upper * _unit(joint))
+
+
+def _tune(prim: Usd.Prim, joint: Any, axes: list[str], options: Options, description: Description) -> None:
+    """Highest speed, damping and friction of a joint, as Newton and PhysX read them."""
+    names, unit = Sdf.ValueTypeNames.Float, _unit(joint)
+    damping, friction = (_passive(joint, name, description) for name in ("damping", "friction"))
+    speed = _speed(joint, options, description)
     prim.AddAppliedSchema(NEWTON_API)
-    names, tuning = Sdf.ValueTypeNames, {}
-    if limit is not None and limit.velocity:
-        tuning["velocityLimit"] = limit.velocity / unit
-    if dynamics is not None:
-        tuning["damping"] = _passive(joint, "damping", description) * unit
-        tuning["friction"] = _passive(joint, "friction", description)
-    for name, value in tuning.items():
-        prim.CreateAttribute(f"newton:{name}", names.Float, custom=False).Set(float(value))
+    if speed is not None and joint.type != "planar":
+        _write(prim, "newton:velocityLimit", names, speed * unit)
+        prim.AddAppliedSchema(PHYSX_API)
+        _write(prim, "physxJoint:maxJointVelocity", names, speed * unit)
+    if joint.dynamics is None:
+        return
+    _write(prim, "newton:damping", names, damping / unit)
+    _write(prim, "newton:friction", names, friction)
+    for axis in axes if damping or friction else ():
+        prim.AddAppliedSchema(f"{PHYSX_AXIS_API}:{axis}")
+        per = 1.0 if axis.startswith(("linear", "trans")) else 180 / np.pi
+        _write(prim, f"physxJointAxis:{axis}:staticFrictionEffort", names, friction)
+        _write(prim, f"physxJointAxis:{axis}:dynamicFrictionEffort", names, friction)
+        _write(prim, f"physxJointAxis:{axis}:viscousFrictionCoefficient", names, damping / per)
+        if speed is not None and joint.type != "planar":
+            _write(prim, f"physxJointAxis:{axis}:maxJointVelocity", names, speed * unit)
+
+
+def _speed(joint: Any, options: Options, description: Description) -> float | None:
+    """The URDF's highest speed [rad/s or m/s]; None if it gives none."""
+    speed = None if joint.limit is None else joint.limit.velocity
+    if speed is not None and (speed < 0 or np.isnan(speed)):
+        raise description.refused("joint", joint.name, f"has a velocity of {speed:g}; give one above 0")
+    return speed if speed and np.isfinite(speed) else None
 
 
 def _passive(joint: Any, name: str, description: Description) -> float:
     """A figure of a joint's `<dynamics>`, which yourdfpy leaves as text; 0 where there is none."""
-    text = getattr(joint.dynamics, name)
+    text = getattr(joint.dynamics, name, None)
     try:
         value = float(text or 0.0)
     except ValueError:

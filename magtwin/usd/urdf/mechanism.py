@@ -1,0 +1,166 @@
+"""Mechanism: which joints move, which follow another, and where each rests."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.names import hint
+from magtwin.usd.urdf.description import Description, origin_of
+from magtwin.usd.urdf.options import DEFAULTS, Options
+
+SINGLE = ("revolute", "continuous", "prismatic")
+"""Joints of one degree of freedom: the only ones that drives and mimics are for."""
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """That a joint follows another: q = multiplier q_leader + offset."""
+
+    leader: str
+    """Name of the joint that is followed; it follows none itself."""
+
+    multiplier: float
+    """Ratio of the two values [1, or rad/m and m/rad where one turns and the other slides]."""
+
+    offset: float
+    """Value where the leader's is 0 [rad or m]."""
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """The joints of a description by their names."""
+
+    description: Description
+
+    welded: Mapping[str, str]
+    """Joints that cannot move, with the reason: "" for those of type fixed."""
+
+    mimics: Mapping[str, Mimic]
+    """Joints that follow another."""
+
+    rests: Mapping[str, float]
+    """Value at which the robot is authored [rad or m], of the joints where it is not 0."""
+
+    def pose(self, joint: Any) -> NDArray[np.float64]:
+        """T_parent_child of a joint's links at rest, shape (4, 4)."""
+        T, rest = origin_of(joint), self.rests.get(joint.name, 0.0)
+        return T @ displacement(joint, rest) if rest else T
+
+    def poses(self) -> dict[str, NDArray[np.float64]]:
+        """T_root_link of each link at rest, shape (4, 4)."""
+        poses = {self.description.root: np.eye(4)}
+        for child, joint in self.description.joints.items():
+            poses[child] = poses[joint.parent] @ self.pose(joint)
+        return poses
+
+
+def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mechanism:
+    """Find out which joints move.
+
+    A joint is welded that is fixed, that has no room between its limits, or that its limits give neither
+    effort nor speed; with the profile diff-drive also a slide without one of the two, which stands for a
+    suspension whose spring the URDF cannot hold. What follows a welded joint is welded too.
+
+    Raises:
+        RefusedError: A joint mimics one that is not there or has no single value, or joints mimic each
+            other in a circle; the text gives the line.
+    """
+    joints = {joint.name: joint for joint in description.joints.values()}
+    welded = {}
+    for joint in joints.values():
+        reason = _welded(joint, options)
+        if reason is not None:
+            welded[joint.name] = reason
+    mimics, rests = {}, {}
+    for name, joint in joints.items():
+        if name in welded:
+            limit = joint.limit
+            if welded[name] and limit.lower is not None and limit.lower == limit.upper != 0:
+                rests[name] = float(limit.lower)
+            continue
+        if joint.mimic is None:
+            continue
+        mimic = _resolved(joint, joints, description)
+        if mimic.leader in welded:
+            welded[name] = f"follows {mimic.leader!r}, which cannot move"
+        else:
+            mimics[name] = mimic
+        start = mimic.multiplier * _rest_of(joints[mimic.leader], welded) + mimic.offset
+        if start:
+            rests[name] = start
+    return Mechanism(description, welded, mimics, rests)
+
+
+def displacement(joint: Any, value: float) -> NDArray[np.float64]:
+    """Motion of a joint's child from its place at 0: a turn about the axis, or a slide along it, (4, 4).
+
+    R = 1 + sin(q) K + (1 - cos(q)) K^2, K the cross product with the unit axis (Rodrigues).
+    """
+    T, axis = np.eye(4), np.asarray(joint.axis, float) / np.linalg.norm(joint.axis)
+    if joint.type == "prismatic":
+        T[:3, 3] = value * axis
+        return T
+    K = np.cross(np.eye(3), axis)
+    T[:3, :3] += np.sin(value) * K + (1 - np.cos(value)) * K @ K
+    return T
+
+
+def _welded(joint: Any, options: Options) -> str | None:
+    """Why a joint cannot move; "" if it is fixed, None if it can."""
+    limit = joint.limit
+    if joint.type == "fixed":
+        return ""
+    if limit is None:
+        return None
+    if limit.effort == 0 and limit.velocity == 0:
+        return "cannot move by its own limits"
+    if joint.type in ("revolute", "prismatic") and limit.lower is not None and limit.lower == limit.upper:
+        return "cannot move by its own limits"
+    if options.profile == "diff-drive" and joint.type == "prismatic" and 0 in (limit.effort, limit.velocity):
+        return "is a suspension without effort or speed"
+    return None
+
+
+def _resolved(joint: Any, joints: Mapping[str, Any], description: Description) -> Mimic:
+    """What a joint follows in the end, through joints that follow others themselves."""
+    multiplier, offset, seen, at = 1.0, 0.0, [joint.name], joint
+    while at.mimic is not None:
+        leader = at.mimic.joint
+        if leader not in joints:
+            raise description.refused(
+                "joint", at.name, f"mimics no joint {leader!r}; {hint(str(leader), joints)}"
+            )
+        if leader in seen:
+            raise description.refused(
+                "joint", joint.name, f"mimics itself in the end: {' -> '.join([*seen, leader])}"
+            )
+        step = [1.0 if at.mimic.multiplier is None else float(at.mimic.multiplier)]
+        step.append(0.0 if at.mimic.offset is None else float(at.mimic.offset))
+        if not np.isfinite(step).all() or step[0] == 0:
+            raise description.refused(
+                "joint",
+                at.name,
+                f"mimics with multiplier {step[0]:g} and offset {step[1]:g}; weld it instead",
+            )
+        multiplier, offset = multiplier * step[0], offset + multiplier * step[1]
+        at = joints[leader]
+        seen.append(leader)
+    for end in (joint, at):
+        if end.type not in (*SINGLE, "fixed"):
+            raise description.refused(
+                "joint",
+                joint.name,
+                f"mimics {at.name!r}, but {end.name!r} is {end.type} and has no one value",
+            )
+    return Mimic(at.name, multiplier, offset)
+
+
+def _rest_of(leader: Any, welded: Mapping[str, str]) -> float:
+    """Where a joint that follows none rests."""
+    limit = leader.limit
+    if welded.get(leader.name) and limit.lower is not None and limit.lower == limit.upper:
+        return float(limit.lower)
+    return 0.0
