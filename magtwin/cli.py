@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
 from cyclopts import App, Parameter
@@ -57,9 +58,8 @@ def demo(*, out: Path = Path("demo"), seed: int = 0, force: Force = False, json:
     with output(out, force=force) as folder:
         steps("Authoring the TurtleBot 4 from its URDF")
         source = shipped("robots", "turtlebot4")
-        asset = build_robot(
-            source / "turtlebot4.urdf", source / "robot.toml", folder / "robot" / "turtlebot4.usda"
-        )
+        asset = folder / "robot" / "turtlebot4.usda"
+        build_robot(source / "turtlebot4.urdf", source / "robot.toml", asset)
         steps("Authoring the lab around it, with its magnetic map")
         scene = scene_from_toml(shipped("scenes", "lab.toml"))
         scene = replace(scene, robot=replace(scene.robot, asset=asset))
@@ -79,43 +79,102 @@ def demo(*, out: Path = Path("demo"), seed: int = 0, force: Force = False, json:
 
 @app.command
 def robot(
-    urdf: Path, *, out: Path, settings: Path | None = None, force: Force = False, json: Json = False
+    urdf: Path,
+    *,
+    out: Path,
+    settings: Path | None = None,
+    package: Annotated[list[str] | None, Parameter(negative="")] = None,
+    arg: Annotated[list[str] | None, Parameter(negative="")] = None,
+    missing_meshes: Literal["refuse", "note"] | None = None,
+    collision: Literal["hull", "decomposition", "mesh"] | None = None,
+    profile: Literal["general", "diff-drive"] | None = None,
+    drive: Annotated[list[str] | None, Parameter(negative="")] = None,
+    fix_base: bool | None = None,
+    merge_fixed: bool | None = None,
+    density: float | None = None,
+    mass: float | None = None,
+    single_file: bool | None = None,
+    strict: bool | None = None,
+    report: Path | None = None,
+    force: Force = False,
+    json: Json = False,
 ) -> None:
-    """Convert a URDF to a USD articulation that drives.
+    """Convert a URDF or a xacro to a USD articulation that drives.
 
     Parameters
     ----------
     urdf
-        The robot's URDF.
+        The robot's description, .urdf or .xacro.
     out
-        Folder to make; it will hold <name>.usda and the layers it refers to.
+        Folder to make; it will hold NAME.usda and the layers it refers to.
     settings
-        TOML with drive, battery, platform field and sensor mounts, such as robots/turtlebot4/robot.toml.
+        TOML with drive, battery, platform field, sensor mounts and conversion, such as
+        robots/turtlebot4/robot.toml; options given here come before its [conversion].
+    package
+        NAME=DIR: where a package lies that package:// or $(find) names; may be given again.
+    arg
+        NAME=VALUE: an argument of the xacro; may be given again.
+    missing_meshes
+        What to do about a mesh that is not there: refuse, or leave it out and note it.
+    collision
+        What a mesh collides as: its convex hull, a convex decomposition (extra "decomposition"), or itself.
+    profile
+        diff-drive: velocity drives on wheels, slippery casters, dead suspensions welded.
+    drive
+        PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X], TYPE velocity, position or none: how joints
+        whose name fits are driven; may be given again, the first that fits wins.
+    fix_base
+        Bolt the base to the world.
+    merge_fixed
+        Merge links on fixed joints into the body that they ride on; their frames stay.
+    density
+        Density of links without inertia [kg/m3].
+    mass
+        Mass of a data sheet to hold the robot's against [kg].
+    single_file
+        One root layer and its meshes, in place of Isaac Sim's layers.
+    strict
+        Refuse a conversion that loses anything.
+    report
+        Where to write the whole report, a .json file.
     force
-        Replace the folder if it exists.
+        Replace what exists.
     json
         Print the summary as JSON.
     """
-    from magtwin.files import existing, output
-    from magtwin.usd.info import info_of_stage
-    from magtwin.usd.robot import build_robot
-    from magtwin.usd.urdf import convert_urdf, read_notes
+    from magtwin.files import check_free, output
+    from magtwin.robot import DriveRule, from_urdf
 
-    existing(urdf, "URDF")
-    with output(out, force=force) as folder:
-        file = folder / f"{urdf.stem}.usda"
-        if settings is None:
-            convert_urdf(urdf, file)
-        else:
-            build_robot(urdf, settings, file)
-        notes = read_notes(file)
-        report = info_of_stage(file)
-    report = replace(report, title=str(out / file.name), facts={"notes": notes} if json else {})
-    _print_report(report, json)
+    if report is not None:
+        _check_suffix(report, (".json",), "a report")
+        check_free(report, force=force)
+    choices = {
+        "packages": {k: Path(v) for k, v in _pairs("package", package).items()} if package else None,
+        "arguments": _pairs("arg", arg) if arg else None,
+        "missing_meshes": missing_meshes,
+        "collision": collision,
+        "profile": profile,
+        "drives": tuple(DriveRule.parse(text) for text in drive) if drive else None,
+        "fix_base": fix_base,
+        "merge_fixed": merge_fixed,
+        "density": density,
+        "mass": mass,
+        "single_file": single_file,
+        "strict": strict,
+    }
+    made = from_urdf(
+        urdf,
+        out,
+        settings=settings,
+        force=force,
+        **{name: choice for name, choice in choices.items() if choice is not None},
+    )
+    if report is not None:
+        with output(report, force=force) as aside:
+            aside.write_text(made.report.to_json(), encoding="utf-8")
+    _print_report(made.report.summary(), json)
     if not json:
-        for note in notes:
-            _say(f"Note: {note}")
-        _say(f"Wrote {out / file.name}")
+        _say(f"Wrote {made.asset}")
 
 
 @map_app.command(name="import")
@@ -231,7 +290,9 @@ def scene(
         from magtwin.names import find
 
         file = find("scene", spec, {f.stem: f for f in sorted(shipped("scenes").glob("*.toml"))})
-    root = author_scene(scene_from_toml(file, map_layer=map, network=net), out, force=force)
+    with TemporaryDirectory() as workshop:
+        scene = scene_from_toml(file, map_layer=map, network=net, workshop=workshop)
+        root = author_scene(scene, out, force=force)
     _print_report(info_of_stage(root), json)
     if not json:
         _say(f"Wrote {root}")
@@ -465,6 +526,15 @@ def _progress(title: str) -> Iterator[Any]:
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task(title, total=None, what="")
         yield lambda done, total, what: progress.update(task, completed=done, total=total, what=what)
+
+
+def _pairs(option: str, texts: list[str]) -> dict[str, str]:
+    """NAME=VALUE texts as a table."""
+    pairs = [text.partition("=") for text in texts]
+    for text, (name, equals, _) in zip(texts, pairs, strict=True):
+        if not (name and equals):
+            raise RefusedError(f"--{option} {text!r}: NAME=VALUE is wanted")
+    return {name: value for name, _, value in pairs}
 
 
 def _check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:

@@ -6,12 +6,11 @@ from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
 from validators import assert_valid
 
-from magtwin.files import from_table, read_toml, shipped
+from magtwin.files import shipped
 from magtwin.frames import rotate
 from magtwin.names import RefusedError
-from magtwin.spec import RobotSpec
 from magtwin.usd.geometry import read_links, read_shapes
-from magtwin.usd.robot import build_robot, read_robot, robot_of
+from magtwin.usd.robot import build_robot, read_robot, read_settings, robot_of
 from magtwin.usd.urdf import read_notes
 
 HOME = shipped("robots", "turtlebot4")
@@ -41,7 +40,8 @@ def solid(links):
 
 
 def test_a_fresh_build_equals_the_committed_asset_byte_for_byte(tmp_path):
-    built = build_robot(HOME / "turtlebot4.urdf", HOME / "robot.toml", tmp_path / "turtlebot4.usda")
+    built = tmp_path / "turtlebot4.usda"
+    build_robot(HOME / "turtlebot4.urdf", HOME / "robot.toml", built)
     for name in FILES:
         assert built.with_name(name).read_bytes() == (HOME / name).read_bytes(), (
             f"{name} is out of date: python robots/turtlebot4/build.py"
@@ -59,9 +59,7 @@ def test_the_meshes_and_the_urdf_are_what_the_script_draws(tmp_path):
 
 
 def test_the_asset_gives_the_settings_back(links):
-    settings = from_table(
-        RobotSpec, {**read_toml(HOME / "robot.toml"), "asset": str(ASSET)}, HOME / "robot.toml"
-    )
+    settings = read_settings(HOME / "robot.toml")
     robot = read_robot(ASSET)
     assert robot.asset == ASSET
     for name in (
@@ -203,7 +201,7 @@ REFUSED = {
         "no joint 'left_joint' for left_wheel_joint; did you mean",
     ),
     "key": (("v_max =", "v_mx ="), r"robot\.toml:\d+: \[drive\] unknown key 'v_mx'; did you mean 'v_max'"),
-    "computed": (('name = "turtlebot4"', 'asset = "x.usda"'), "'asset' is read from the asset; remove it"),
+    "computed": (('name = "turtlebot4"', 'asset = "x.usda"'), r"robot\.toml:\d+: unknown key 'asset'"),
 }
 
 
@@ -235,6 +233,7 @@ def test_a_network_named_in_the_settings_is_found_from_the_asset(tmp_path):
     settings = tmp_path / "robot.toml"
     text = (HOME / "robot.toml").read_text()
     settings.write_text(text.replace("[imu]", 'network = "weights/net.safetensors"\n\n[imu]'))
-    out = build_robot(HOME / "turtlebot4.urdf", settings, tmp_path / "robots" / "turtlebot4.usda")
+    out = tmp_path / "robots" / "turtlebot4.usda"
+    build_robot(HOME / "turtlebot4.urdf", settings, out)
     assert "@../weights/net.safetensors@" in out.read_text()
     assert read_robot(out).magnetometer.network == network

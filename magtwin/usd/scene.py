@@ -3,8 +3,8 @@
 import json
 import os
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
@@ -17,7 +17,7 @@ from magtwin.usd.figures import check_prim_name, read_pose, target, write_pose
 from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, read_lab
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, open_stage, relative_asset
 from magtwin.usd.maps import MAP, load_map, read_map
-from magtwin.usd.robot import read_robot, robot_of
+from magtwin.usd.robot import RobotSettings, build_robot, read_robot, robot_of
 from magtwin.usd.schema import only_prim_with, place, prims_with, require_api
 from magtwin.usd.sensors import (
     MAP_RELATIONSHIP,
@@ -124,10 +124,11 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _RobotTable:
-    """[robot] of a scene's TOML."""
+class _RobotTable(RobotSettings):
+    """[robot] of a scene's TOML: an asset, or a URDF with what a URDF cannot say."""
 
-    asset: Path
+    asset: Path | None = None
+    urdf: Path | None = None
     network: Path | None = None
 
 
@@ -163,6 +164,7 @@ def scene_from_toml(
     *,
     map_layer: str | os.PathLike[str] | None = None,
     network: str | os.PathLike[str] | None = None,
+    workshop: str | os.PathLike[str] | None = None,
 ) -> Scene:
     """The scene that a TOML describes, as scenes/lab.toml does.
 
@@ -171,15 +173,18 @@ def scene_from_toml(
         map_layer: Map to use in place of the one that it names. Its Earth's field and sources are
             those of its own map, and are left out.
         network: Weights to use in place of those that it names.
+        workshop: Folder in which the asset is built of a robot that the TOML names by its URDF; a
+            self-contained scene copies it from there.
 
     Raises:
         RefusedError: A key is misspelt or missing, or a file is not there; with file and line.
     """
-    given = from_table(_SceneFile, read_toml(path), path)
+    table = read_toml(path)
+    given = from_table(_SceneFile, table, path)
     layer = Path(map_layer).resolve() if map_layer is not None else given.map
     if layer is None:
         raise RefusedError(f'{path}: names no map; add map = "FILE.usdc" to it, or give --map FILE.usdc')
-    robot = read_robot(given.robot.asset)
+    robot = _robot(given.robot, table["robot"], path, workshop)
     weights = Path(network).resolve() if network is not None else given.robot.network
     if weights is not None:
         robot = replace(robot, magnetometer=_with_network(robot, existing(weights, "weights file")))
@@ -193,6 +198,30 @@ def scene_from_toml(
         sources=_sources(given.sources.file) if given.sources and own_map else (),
         start=given.start,
     )
+
+
+def _robot(
+    table: _RobotTable,
+    keys: Collection[str],
+    path: str | os.PathLike[str],
+    workshop: str | os.PathLike[str] | None,
+) -> RobotSpec:
+    """The robot of a scene's TOML, built from its URDF where it names one."""
+    if table.asset is not None and table.urdf is None:
+        if others := sorted(set(keys) - {"asset", "network"}):
+            raise RefusedError(f"{path}: [robot] {others[0]} goes with urdf; the asset says it already")
+        return read_robot(table.asset)
+    if table.urdf is None or table.asset is not None:
+        raise RefusedError(f'{path}: [robot] needs asset = "FILE.usda" or urdf = "FILE.urdf", one of the two')
+    if workshop is None:
+        raise RefusedError(f"{path}: names a URDF; name a workshop, a folder to build the robot in")
+    settings = RobotSettings(**{f.name: getattr(table, f.name) for f in fields(RobotSettings)})
+    asset = Path(workshop) / f"{table.urdf.name.split('.')[0]}.usda"
+    try:
+        build_robot(table.urdf, settings, asset)
+    except RefusedError as error:
+        raise RefusedError(f"{path}: [robot] {error}") from error
+    return read_robot(asset)
 
 
 def _sources(path: Path) -> tuple[SourceSpec, ...]:

@@ -534,5 +534,5 @@ def write(folder):
 if __name__ == "__main__":
     from magtwin.usd.robot import build_robot
 
-    built = build_robot(write(HERE), HERE / "robot.toml", HERE / "turtlebot4.usda", force=True)
-    sys.stdout.write(f"{built}\n")
+    report = build_robot(write(HERE), HERE / "robot.toml", HERE / "turtlebot4.usda", force=True)
+    sys.stdout.write(f"{report.summary().title}\n")

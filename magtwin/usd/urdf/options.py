@@ -3,12 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from magtwin.names import RefusedError
 
 Collision = Literal["hull", "decomposition", "mesh"]
 Profile = Literal["general", "diff-drive"]
+_Kind = Literal["velocity", "position", "none"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +19,7 @@ class DriveRule:
     joints: str
     """Pattern of joint names, as in a shell: `*_wheel_joint`."""
 
-    type: Literal["velocity", "position", "none"] = "velocity"
+    type: _Kind = "velocity"
     """What the drive holds; none leaves the joint free."""
 
     stiffness: float = 0.0
@@ -29,6 +30,25 @@ class DriveRule:
 
     max_force: float | None = None
     """Highest torque or force [N m or N]; the joint's effort unless given."""
+
+    @classmethod
+    def parse(cls, text: str) -> "DriveRule":
+        """The rule of `PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X]`.
+
+        Raises:
+            RefusedError: The text is not of that form.
+        """
+        joints, kind, *figures = text.split(":") if ":" in text else (text, "")
+        gains = dict(figure.partition("=")[::2] for figure in figures)
+        try:
+            if joints and kind in get_args(_Kind) and gains.keys() <= {"stiffness", "damping", "max_force"}:
+                return cls(joints=joints, type=kind, **{name: float(x) for name, x in gains.items()})  # type: ignore[arg-type]
+        except ValueError:
+            pass
+        raise RefusedError(
+            f"drive {text!r}: PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X] is wanted, "
+            f"TYPE one of {', '.join(get_args(_Kind))}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
