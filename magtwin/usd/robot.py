@@ -1,7 +1,7 @@
 """Robot: an asset with drive, battery and sensors, from a URDF and what a URDF cannot say."""
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -155,7 +155,7 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
         if given is None and spec.link not in links:
             base = _base(robot)
             notes.append(f"no {name} is told of: one is thought to sit at {base.name}'s origin")
-            define(stage, base.AppendChild(name), spec)
+            define(stage, base.AppendChild(name), replace(spec, link=base.name))
         else:
             define(stage, _mount(links, name, given or spec), given or spec)
     return notes
