@@ -15,6 +15,7 @@ from magtwin.usd.urdf.description import Description, origin_of, read_descriptio
 from magtwin.usd.urdf.drive import check_rules
 from magtwin.usd.urdf.gazebo import Surface, read_surfaces
 from magtwin.usd.urdf.joint import define_joint, define_mimic, define_root_joint
+from magtwin.usd.urdf.layout import GEOMETRIES, PAYLOADS, check_payloads, write_layers
 from magtwin.usd.urdf.link import Rider, define_body, define_frame, is_marker
 from magtwin.usd.urdf.material import LOOKS
 from magtwin.usd.urdf.mechanism import Mechanism, read_mechanism
@@ -68,7 +69,8 @@ def convert_with_report(
 
     Args:
         urdf: The description; its meshes lie below its folder or in packages around it.
-        out: Root layer to write, `.usda`. Meshes go to `<stem>_meshes.usdc` beside it.
+        out: Root layer to write, `.usda`; the folder `payloads` beside it has the others, see `layout`.
+            With `options.single_file` there is one other at most, `<stem>_meshes.usdc`.
         options: What is done where the URDF leaves a choice.
         force: Whether files that are there are replaced.
         finish: Called with the robot's prim before anything is written, to author more.
@@ -85,17 +87,30 @@ def convert_with_report(
         raise RefusedError(f"{out}: the robot's root layer is text; give it the suffix .usda")
     source = read_source(urdf, packages=options.packages, arguments=options.arguments)
     description = read_description(source)
-    beside = out.with_name(f"{out.stem}_meshes.usdc")
     meshes = _gather(description)
     check_free(out, force=force)
-    if not meshes:
-        with output(out, force=force) as aside:
+    if not options.single_file:
+        folder = check_payloads(out, force=force)
+        with output(folder, force=force) as aside_folder, output(out, force=force) as aside:
+            work = aside.with_name(PAYLOADS)  # beside the root layer, so that references resolve
+            work.mkdir()
+            if meshes:
+                meshes.export(work / GEOMETRIES)
+            stage, report = _author_all(
+                description, options, meshes, aside, f"./{PAYLOADS}/{GEOMETRIES}", out, finish
+            )
+            write_layers(stage.GetRootLayer(), aside, work, out)
+            shutil.move(work, aside_folder)
+        return report
+    beside = out.with_name(f"{out.stem}_meshes.usdc")
+    with output(out, force=force) as aside:
+        if not meshes:
             return _write(description, options, meshes, aside, beside.name, out, finish)
-    with output(beside, force=force) as aside_meshes, output(out, force=force) as aside:
-        copy = aside.with_name(beside.name)  # beside the root layer, so that references resolve
-        meshes.export(copy)
-        report = _write(description, options, meshes, aside, beside.name, out, finish)
-        shutil.move(copy, aside_meshes)
+        with output(beside, force=force) as aside_meshes:
+            copy = aside.with_name(beside.name)
+            meshes.export(copy)
+            report = _write(description, options, meshes, aside, beside.name, out, finish)
+            shutil.move(copy, aside_meshes)
     return report
 
 
@@ -132,9 +147,31 @@ def _write(
     out: Path,
     finish: Callable[[Usd.Prim], object] | None,
 ) -> ConversionReport:
-    """Author the root layer at `aside`, with asset paths that hold once it stands at `out`."""
+    """Write the root layer at `aside`, with asset paths that hold once it stands at `out`."""
+    stage, report = _author_all(description, options, meshes, aside, f"./{mesh_layer}", out, finish)
+
+    def as_seen_from_out(path: str) -> str:
+        if not path.startswith("../"):
+            return path
+        return Path(os.path.relpath(aside.parent / path, out.resolve().parent)).as_posix()
+
+    UsdUtils.ModifyAssetPaths(stage.GetRootLayer(), as_seen_from_out)
+    stage.GetRootLayer().Save()
+    return report
+
+
+def _author_all(
+    description: Description,
+    options: Options,
+    meshes: MeshLayer,
+    aside: Path,
+    mesh_layer: str,
+    out: Path,
+    finish: Callable[[Usd.Prim], object] | None,
+) -> tuple[Usd.Stage, ConversionReport]:
+    """Author the whole robot in one layer at `aside`, and compare it with its description."""
     stage, ledger, checksum = Usd.Stage.CreateNew(str(aside)), Ledger(), sha256(description.path)
-    robot = _author(stage, description, options, meshes, f"./{mesh_layer}", ledger)
+    robot = _author(stage, description, options, meshes, mesh_layer, ledger)
     if finish is not None:
         finish(robot)
     report = make_report(description, meshes, stage, ledger, name=out.name, sha256=checksum)
@@ -148,15 +185,7 @@ def _write(
             "notes": Vt.StringArray(description.notes),
         },
     }
-
-    def as_seen_from_out(path: str) -> str:
-        if not path.startswith("../"):
-            return path
-        return Path(os.path.relpath(aside.parent / path, out.resolve().parent)).as_posix()
-
-    UsdUtils.ModifyAssetPaths(stage.GetRootLayer(), as_seen_from_out)
-    stage.GetRootLayer().Save()
-    return report
+    return stage, report
 
 
 def _author(
