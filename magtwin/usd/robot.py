@@ -1,14 +1,26 @@
 """Robot: an asset with drive, battery and sensors, from a URDF and what a URDF cannot say."""
 
 import os
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from pxr import Sdf, Usd, UsdPhysics
 
 from magtwin.files import existing, from_table, read_toml
 from magtwin.names import RefusedError, hint
-from magtwin.spec import MountSpec, RobotSpec
+from magtwin.spec import (
+    BatterySpec,
+    DriveSpec,
+    ImuSpec,
+    LidarSpec,
+    MagnetometerSpec,
+    MountSpec,
+    PlatformFieldSpec,
+    RobotSpec,
+)
 from magtwin.usd.layers import open_stage
+from magtwin.usd.schema import prims_with
 from magtwin.usd.sensors import (
     define_battery,
     define_drive,
@@ -19,62 +31,83 @@ from magtwin.usd.sensors import (
     define_platform,
     read_robot_prim,
 )
-from magtwin.usd.urdf.convert import convert_urdf
-from magtwin.usd.urdf.options import Options
+from magtwin.usd.urdf.convert import convert_with_report
+from magtwin.usd.urdf.options import DEFAULTS, Options
+from magtwin.usd.urdf.report import ConversionReport
 
-COMPUTED = ("asset", "base_height_m", "p_base_magnetometer")
-"""Fields of a RobotSpec that come from the asset, not from its settings."""
+_DEFAULTS = RobotSpec(name="", asset=Path())
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotSettings:
+    """What a URDF cannot say of a robot; a robot.toml, or [robot] of a scene's TOML, holds its fields.
+
+    What is None is taken from the URDF's own tags where it has them, else it is the default of its
+    spec, on the base where the URDF has no link of the default's name.
+    """
+
+    name: str = ""
+    """Name that the URDF must give the robot; "" takes any."""
+
+    footprint_radius_m: float = _DEFAULTS.footprint_radius_m
+    """Radius of the circle that must stay clear of walls [m]."""
+
+    drive: DriveSpec | None = None
+    battery: BatterySpec = field(default_factory=BatterySpec)
+    platform: PlatformFieldSpec = field(default_factory=PlatformFieldSpec)
+    magnetometer: MagnetometerSpec | None = None
+    imu: ImuSpec | None = None
+    lidar: LidarSpec | None = None
+
+    conversion: Options = DEFAULTS
+    """How the URDF is converted."""
 
 
 def build_robot(
     urdf: str | os.PathLike[str],
-    settings: str | os.PathLike[str],
+    settings: str | os.PathLike[str] | RobotSettings,
     out: str | os.PathLike[str],
     *,
+    options: Options | None = None,
     force: bool = False,
-) -> Path:
+) -> ConversionReport:
     """Convert a URDF and author its drive, battery, own magnetic field and sensors.
 
     Args:
         urdf: The description, see `convert_urdf`.
-        settings: TOML with the fields of a RobotSpec but those of COMPUTED; sensors name their links.
-        out: Root layer to write, `.usda`.
+        settings: RobotSettings, or a TOML with their fields; sensors name their links.
+        out: Root layer to write, `.usda`; `read_robot` gives its spec.
+        options: How the URDF is converted, in place of what the settings say.
         force: Whether files that are there are replaced.
 
     Returns:
-        `out`; `read_robot` gives its spec.
+        What became of the URDF.
 
     Raises:
         RefusedError: The URDF or the settings cannot be used (file, line and key are given), or a file
             is there already; nothing is written.
     """
-    out = Path(out)
-    spec = read_settings(settings, out)
+    where = "" if isinstance(settings, RobotSettings) else f"{settings}: "
+    given = settings if isinstance(settings, RobotSettings) else read_settings(settings)
 
-    def finish(robot: Usd.Prim) -> None:
-        if robot.GetName() != spec.name:
-            raise RefusedError(
-                f"{settings}: name is {spec.name!r}, but the URDF's robot is {robot.GetName()!r}"
-            )
+    def finish(robot: Usd.Prim) -> list[str]:
+        if given.name and robot.GetName() != given.name:
+            raise RefusedError(f"{where}name is {given.name!r}, but the URDF's robot is {robot.GetName()!r}")
         try:
-            _equip(robot, spec)
+            return _equip(robot, given)
         except RefusedError as error:
-            raise RefusedError(f"{settings}: {error}") from error
+            raise RefusedError(f"{where}{error}") from error
 
-    return convert_urdf(urdf, out, options=Options(single_file=True), force=force, finish=finish)
+    return convert_with_report(urdf, out, options=options or given.conversion, force=force, finish=finish)
 
 
-def read_settings(settings: str | os.PathLike[str], asset: Path) -> RobotSpec:
-    """The spec that a TOML of settings gives the robot whose asset is `asset`.
+def read_settings(settings: str | os.PathLike[str]) -> RobotSettings:
+    """The settings of a TOML.
 
     Raises:
         RefusedError: The file is missing or not TOML, or a key or value is wrong; the line is given.
     """
-    table = read_toml(settings)
-    for key in COMPUTED:
-        if key in table:
-            raise RefusedError(f"{settings}: {key!r} is read from the asset; remove it")
-    return from_table(RobotSpec, {**table, "asset": str(asset.resolve())}, settings)
+    return from_table(RobotSettings, read_toml(settings), settings)
 
 
 def read_robot(asset: str | os.PathLike[str]) -> RobotSpec:
@@ -101,18 +134,31 @@ def robot_of(prim: Usd.Prim) -> RobotSpec:
     return read_robot_prim(prim, Path(layer.realPath).resolve())
 
 
-def _equip(robot: Usd.Prim, spec: RobotSpec) -> None:
-    """Author what a spec says at a converted robot's prim and on its links."""
-    stage = robot.GetStage()
+def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
+    """Author what settings say at a converted robot's prim and on its links; notes of what was guessed."""
+    stage, links, notes = robot.GetStage(), _links(robot), list[str]()
     robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set("Wheeled")
-    define_footprint(robot, spec.footprint_radius_m)
-    define_drive(robot, spec.drive)
-    define_platform(robot, spec.platform)
-    links = _links(robot)
-    define_battery(stage, _base(robot).AppendChild("battery"), spec.battery)
-    define_magnetometer(stage, _mount(links, "magnetometer", spec.magnetometer), spec.magnetometer)
-    define_imu(stage, _mount(links, "imu", spec.imu), spec.imu)
-    define_lidar(stage, _mount(links, "lidar", spec.lidar), spec.lidar)
+    define_footprint(robot, settings.footprint_radius_m)
+    if settings.drive is not None or not prims_with(robot, "drive"):
+        define_drive(robot, settings.drive or DriveSpec())
+    define_platform(robot, settings.platform)
+    define_battery(stage, _base(robot).AppendChild("battery"), settings.battery)
+    magnetometer = settings.magnetometer or MagnetometerSpec()
+    define_magnetometer(stage, _mount(links, "magnetometer", magnetometer), magnetometer)
+    told: tuple[tuple[str, Any, Any, Any], ...] = (
+        ("imu", settings.imu, ImuSpec(), define_imu),
+        ("lidar", settings.lidar, LidarSpec(), define_lidar),
+    )
+    for name, given, spec, define in told:
+        if given is None and prims_with(robot, name):
+            continue
+        if given is None and spec.link not in links:
+            base = _base(robot)
+            notes.append(f"no {name} is told of: one is thought to sit at {base.name}'s origin")
+            define(stage, base.AppendChild(name), replace(spec, link=base.name))
+        else:
+            define(stage, _mount(links, name, given or spec), given or spec)
+    return notes
 
 
 def _links(robot: Usd.Prim) -> dict[str, Sdf.Path]:
