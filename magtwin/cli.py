@@ -566,7 +566,10 @@ def _print_report(report: Any, as_json: bool) -> None:
             spread = f"± {figure.spread:,.3g}" if figure.spread is not None else ""
             numbers.add_row(figure.name, value, spread, figure.unit, Text(figure.note, style="dim"))
     for name, fact in report.facts.items():
-        entries = fact.items() if isinstance(fact, dict) else [("", fact)]
+        if isinstance(fact, dict):
+            entries = list(fact.items())
+        else:
+            entries = [("", entry) for entry in (fact if isinstance(fact, list) else [fact])]
         for key, entry in entries:
             words.add_row(f"{name} {key}".strip(), Text(str(entry)))
     console.print(Text(report.title, style="bold"))

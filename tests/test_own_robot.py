@@ -1,0 +1,143 @@
+"""A user's own robot: from its URDF into the lab, with a magnetometer on its mast."""
+
+import json
+from pathlib import Path
+
+import pytest
+from pxr import Usd, UsdPhysics
+
+from magtwin.cli import main
+from magtwin.files import shipped
+from magtwin.names import RefusedError
+from magtwin.robot import RobotSettings, from_urdf
+from magtwin.spec import DriveSpec, MagnetometerSpec
+
+CART = Path(__file__).parent / "data" / "robots" / "cart.urdf"
+
+SCENE = f"""
+name = "mine"
+map = "{shipped("maps", "lab", "lab.usdc")}"
+
+[robot]
+urdf = "{CART}"
+network = "{shipped("weights", "lab.safetensors")}"
+footprint_radius_m = 0.3
+
+[robot.drive]
+left_wheel_joint = "left"
+right_wheel_joint = "right"
+wheel_separation_m = 0.34
+wheel_radius_m = 0.08
+
+[robot.magnetometer]
+link = "mast"
+p_link_sensor = [0.0, 0.0, 0.42]
+"""
+
+
+def scene(tmp_path, text=SCENE):
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    return file
+
+
+def test_a_scene_that_names_a_urdf_is_driven_in_two_commands(tmp_path, capsys):
+    main(["scene", str(scene(tmp_path)), "--out", str(tmp_path / "mine")])
+    main(
+        [
+            *("run", str(tmp_path / "mine" / "mine.usda"), "--duration", "3", "--json"),
+            *("--parquet", str(tmp_path / "run.parquet"), "--rrd", str(tmp_path / "run.rrd")),
+        ]
+    )
+    out = capsys.readouterr().out
+    facts = json.loads(out[out.rindex('{\n  "title"') :])["facts"]
+    assert facts["scene"] == "mine"
+    from magtwin.usd.scene import read_scene
+
+    robot = read_scene(tmp_path / "mine" / "mine.usda").robot
+    assert robot.name == "cart"
+    assert robot.magnetometer.link == "mast"
+    assert robot.p_base_magnetometer == pytest.approx((-0.15, 0.0, 0.57))
+    assert robot.drive.wheel_separation_m == 0.34
+    assert robot.imu.link == "chassis"  # the URDF tells of none: on the base, and noted
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('link = "mast"', 'link = "mst"', r"mine.toml: .*no link 'mst'; did you mean 'mast'"),
+        ('joint = "left"', 'joint = "lft"', r"no joint 'lft' for left_wheel_joint; did you mean 'left'"),
+        ("cart.urdf", "cat.urdf", r"cat.urdf: no such .*did you mean 'cart.urdf'"),
+        ("urdf =", "udrf =", r"mine.toml:6: \[robot\] unknown key 'udrf'; did you mean 'urdf'"),
+        ("urdf =", 'asset = "a.usda"\nurdf =', "needs asset .* or urdf .* one of the two"),
+        ('[robot.magnetometer]\nlink = "mast"', "[robot.magnetometer]", "no link 'magnetometer_link'"),
+    ],
+)
+def test_a_scene_that_does_not_fit_its_urdf_is_refused_and_nothing_is_written(
+    tmp_path, capsys, old, new, message
+):
+    assert old in SCENE
+    file = scene(tmp_path, SCENE.replace(old, new))
+    with pytest.raises(RefusedError, match=message):
+        main(["scene", str(file), "--out", str(tmp_path / "mine"), "--debug"])
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.toml"]
+
+
+def test_keys_of_a_urdf_are_refused_beside_an_asset(tmp_path):
+    from magtwin.usd.scene import scene_from_toml
+
+    asset = shipped("robots", "turtlebot4", "turtlebot4.usda")
+    file = scene(tmp_path, SCENE.replace(f'urdf = "{CART}"', f'asset = "{asset}"'))
+    with pytest.raises(RefusedError, match=r"\[robot\] drive goes with urdf; the asset says it already"):
+        scene_from_toml(file)
+
+
+def test_from_urdf_gives_asset_spec_and_report(tmp_path):
+    settings = RobotSettings(
+        drive=DriveSpec(left_wheel_joint="left", right_wheel_joint="right"),
+        magnetometer=MagnetometerSpec(link="mast"),
+    )
+    made = from_urdf(CART, tmp_path / "cart", settings=settings, single_file=True)
+    assert made.asset == tmp_path / "cart" / "cart.usda"
+    assert made.spec is not None
+    assert made.spec.drive.left_wheel_joint == "left"
+    assert made.report.mass_in_kg == pytest.approx(6.0)
+    assert any("lidar" in note for note in made.report.notes)
+
+
+def test_options_of_the_command_reach_the_conversion(tmp_path, capsys):
+    report = tmp_path / "report.json"
+    main(
+        [
+            *("robot", str(CART), "--out", str(tmp_path / "cart"), "--fix-base", "--report", str(report)),
+            *("--drive", "left:position:stiffness=7:damping=2:max_force=4", "--mass", "9"),
+        ]
+    )
+    stage = Usd.Stage.Open(str(tmp_path / "cart" / "cart.usda"))
+    joints = {p.GetName(): p for p in stage.Traverse() if p.IsA(UsdPhysics.Joint)}
+    drive = UsdPhysics.DriveAPI(joints["left"], "angular")
+    assert drive.GetMaxForceAttr().Get() == pytest.approx(4)
+    assert drive.GetStiffnessAttr().Get() == pytest.approx(7 * 3.141592653589793 / 180)
+    rooted = [j for j in joints.values() if not UsdPhysics.Joint(j).GetBody0Rel().GetTargets()]
+    assert len(rooted) == 1
+    told = json.loads(report.read_text())
+    assert told["mass_out_kg"] == pytest.approx(6.0)
+    assert any("9" in line for line in told["lint"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--drive", "left"], "TYPE"),
+        (["--drive", "left:fast"], "velocity, position, none"),
+        (["--drive", "left:velocity:dampening=3"], "PATTERN:TYPE"),
+        (["--drive", "left:velocity:damping=much"], "PATTERN:TYPE"),
+        (["--package", "mine"], "NAME=VALUE is wanted"),
+        (["--density", "-1"], "density must be above 0"),
+        (["--report", "report.txt"], "a report ends in .json"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(tmp_path, arguments, message):
+    with pytest.raises(RefusedError, match=message):
+        main(["robot", str(CART), "--out", str(tmp_path / "cart"), *arguments, "--debug"])
+    assert not list(tmp_path.iterdir())
