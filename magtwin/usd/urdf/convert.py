@@ -17,6 +17,7 @@ from magtwin.usd.urdf.gazebo import Surface, read_surfaces
 from magtwin.usd.urdf.joint import define_joint, define_mimic, define_root_joint
 from magtwin.usd.urdf.layout import GEOMETRIES, PAYLOADS, check_payloads, write_layers
 from magtwin.usd.urdf.link import Rider, define_body, define_frame, is_marker
+from magtwin.usd.urdf.lint import lint
 from magtwin.usd.urdf.material import LOOKS
 from magtwin.usd.urdf.mechanism import Mechanism, read_mechanism
 from magtwin.usd.urdf.merge import WORLD, Place, carried, place_links, riders
@@ -174,7 +175,15 @@ def _author_all(
     robot = _author(stage, description, options, meshes, mesh_layer, ledger)
     if finish is not None:
         finish(robot)
-    report = make_report(description, meshes, stage, ledger, name=out.name, sha256=checksum)
+    report = make_report(
+        description,
+        meshes,
+        stage,
+        ledger,
+        name=out.name,
+        sha256=checksum,
+        lint=lint(description, mass=options.mass, vertices=meshes.vertices),
+    )
     if options.strict:
         report.refuse_losses()
     stage.GetRootLayer().customLayerData = {

@@ -96,7 +96,10 @@ class Description:
             RefusedError: It may not be read, or its package is not there.
         """
         named = (e for e in self.xml.iter() if e.get("filename") == filename)
-        return self.source.find_file(filename, what, next(named, None))
+        try:
+            return self.source.find_file(filename, what, next(named, None))
+        finally:
+            self._take_notes()
 
     def note(self, text: str, *, lost: bool = False) -> None:
         """Put down something that the user ought to know of the conversion, once.
@@ -114,6 +117,11 @@ class Description:
         """A refusal that names the line of the link or joint called `name`."""
         element = next((e for e in self.xml.findall(kind) if e.get("name") == name), None)
         return RefusedError(f"{self.source.where(element)}: {kind} {name!r} {text}")
+
+    def _take_notes(self) -> None:
+        """Put down what was met while reading, which goes on as files are looked for."""
+        for note in (*self.source.notes, *self.source.packages.notes):
+            self.note(note)
 
     def poses(self) -> dict[str, NDArray[np.float64]]:
         """T_root_link of each link with every joint at zero, shape (4, 4)."""
@@ -142,8 +150,7 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
         source = read_source(source)
     _check_names(source)
     description = Description(source=source, name=source.xml.get("name", ""), root="", links={}, joints={})
-    for note in source.notes:
-        description.note(note)
+    description._take_notes()
     robot = _read(description)
     links = {link.name: link for link in robot.links}
     held = {joint.child: joint for joint in robot.joints}
@@ -211,9 +218,7 @@ def _read(description: Description) -> Any:
     clean = ElementTree.Element("robot", name=description.name)
     for part in description.xml:
         if part.tag in ("link", "joint", "material"):
-            clean.append(
-                check_grammar(part, description.source.where, lambda text: description.note(text, lost=True))
-            )
+            clean.append(check_grammar(part, description.where, description.note))
     capsules = list(clean.iter("capsule"))
     for capsule in capsules:
         capsule.tag = "cylinder"

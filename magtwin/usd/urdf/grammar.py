@@ -6,11 +6,19 @@ After the URDF XML specification (wiki.ros.org/urdf/XML), with the capsule of ur
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Protocol
 from xml.etree import ElementTree
 
 from magtwin.names import RefusedError, hint
 
 Element = ElementTree.Element
+
+
+class Note(Protocol):
+    """Takes a line that the user ought to see; `lost` where something was left out."""
+
+    def __call__(self, text: str, *, lost: bool = False) -> None:
+        """Take it."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +31,16 @@ class Number:
     required: bool = False
 
     least: float = -math.inf
+    """Smaller ones are refused."""
+
+    most: float = math.inf
+    """Greater ones are brought down to it."""
 
     endless: bool = False
     """Whether they may be infinite."""
+
+    rest: str = ""
+    """What completes the least count to the greatest."""
 
 
 XYZ = Number(counts=(3,))
@@ -41,7 +56,7 @@ NUMBERS: Mapping[str, Mapping[str, Number]] = {
     "capsule": {"radius": SIZE, "length": SIZE},
     "sphere": {"radius": SIZE},
     "mesh": {"scale": Number(counts=(1, 3))},
-    "color": {"rgba": Number(counts=(3, 4), required=True)},
+    "color": {"rgba": Number(counts=(3, 4), required=True, least=0.0, most=1.0, rest="1")},
     "axis": {"xyz": XYZ},
     "limit": {
         "lower": Number(endless=True),
@@ -94,13 +109,13 @@ TEXTS: Mapping[str, str] = {"mesh": "filename", "texture": "filename", "mimic": 
 """Attribute that an element must have, a text."""
 
 
-def check_grammar(part: Element, where: Callable[[Element], str], note: Callable[[str], None]) -> Element:
+def check_grammar(part: Element, where: Callable[[Element], str], note: Note) -> Element:
     """Check a link, joint or material; what is not of the grammar is left out with a note.
 
     Args:
         part: The element.
         where: File and line of an element, for refusals.
-        note: Takes what was left out.
+        note: Takes what was repaired or left out.
 
     Returns:
         `part` as the grammar has it: known elements and attributes, numbers apart by blanks.
@@ -112,11 +127,9 @@ def check_grammar(part: Element, where: Callable[[Element], str], note: Callable
     return _clean(part, f"{part.tag} {part.get('name')!r}", where, note)
 
 
-def _clean(
-    element: Element, label: str, where: Callable[[Element], str], note: Callable[[str], None]
-) -> Element:
+def _clean(element: Element, label: str, where: Callable[[Element], str], note: Note) -> Element:
     start = f"{where(element)}: {label}"
-    clean = Element(element.tag, _attributes(element, start, note))
+    clean = Element(element.tag, _attributes(element, where(element), label, note))
     known = CHILDREN.get(element.tag, ())
     seen: set[str] = set()
     for child in element:
@@ -128,11 +141,12 @@ def _clean(
             near = hint(child.tag, known) if known else ""
             note(
                 f"{label}: <{child.tag}> is unknown in <{element.tag}> and left out"
-                + (f"; {near}" if near.startswith("did") else "")
+                + (f"; {near}" if near.startswith("did") else ""),
+                lost=True,
             )
             continue
         if child.tag in seen and child.tag not in MANY:
-            note(f"{label}: a second <{child.tag}> in <{element.tag}> is left out")
+            note(f"{label}: a second <{child.tag}> in <{element.tag}> is left out", lost=True)
             continue
         seen.add(child.tag)
         clean.append(_clean(child, label, where, note))
@@ -145,8 +159,9 @@ def _clean(
     return clean
 
 
-def _attributes(element: Element, start: str, note: Callable[[str], None]) -> dict[str, str]:
+def _attributes(element: Element, place: str, label: str, note: Note) -> dict[str, str]:
     """An element's attributes, its numbers checked."""
+    start = f"{place}: {label}"
     numbers = NUMBERS.get(element.tag, {})
     made = {name: value for name, value in element.items() if name not in numbers and ":" not in name}
     made.pop("xmlns", None)
@@ -159,12 +174,13 @@ def _attributes(element: Element, start: str, note: Callable[[str], None]) -> di
             if kind.required:
                 raise RefusedError(f"{start} has a <{element.tag}> without {name}=")
             continue
-        made[name] = _numbers(given, kind, f"{start}: {name} of <{element.tag}>", note)
+        made[name] = _numbers(given, kind, place, f"{label}: {name} of <{element.tag}>", note)
     return made
 
 
-def _numbers(given: str, kind: Number, start: str, note: Callable[[str], None]) -> str:
+def _numbers(given: str, kind: Number, place: str, label: str, note: Note) -> str:
     """Numbers of an attribute, apart by blanks; refused where they are not what they must be."""
+    start = f"{place}: {label}"
     words = given.replace(",", " ").split()
     counts = " or ".join(map(str, kind.counts))
     wanted = "a finite number" if kind.counts == (1,) else f"{counts} finite numbers"
@@ -179,4 +195,10 @@ def _numbers(given: str, kind: Number, start: str, note: Callable[[str], None]) 
             raise RefusedError(f"{start} must not be below {kind.least:g}, got {given!r}")
     if len(words) not in kind.counts:
         raise RefusedError(f"{start} must be {wanted}, got {given!r}")
+    if any(float(word) > kind.most for word in words):
+        note(f"{label} is above {kind.most:g} in {given!r}: brought down to it")
+        words = [word if float(word) <= kind.most else f"{kind.most:g}" for word in words]
+    if len(words) < max(kind.counts) and kind.rest:
+        note(f"{label} has {len(words)} numbers in {given!r}: completed by {kind.rest}")
+        words += [kind.rest] * (max(kind.counts) - len(words))
     return " ".join(words)

@@ -51,7 +51,8 @@ class Packages:
         if name in found:
             first, *others = found[name]
             if others:
-                note = f"package {name!r} is there {len(others) + 1} times; {first} is used"
+                used = Path(os.path.relpath(first, self._folder)).as_posix()
+                note = f"package {name!r} is there {len(others) + 1} times; {used} is used"
                 if note not in self.notes:
                     self.notes.append(note)
             return first
