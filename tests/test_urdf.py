@@ -15,8 +15,7 @@ from magtwin.usd.geometry import read_links, read_shapes
 from magtwin.usd.urdf import convert_urdf, read_notes
 from magtwin.usd.urdf.description import read_description
 from magtwin.usd.urdf.inertia import principal_axes, quaternion
-from magtwin.usd.urdf.mesh import read_mesh
-from magtwin.usd.urdf.mesh_layer import corner_normals
+from magtwin.usd.urdf.mesh import corner_normals, read_mesh
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 BALL = '<geometry><sphere radius="0.1"/></geometry>'
@@ -204,8 +203,9 @@ def test_meshes_of_every_format_arrive_scaled_and_facing_outwards(tmp_path, suff
     )
     stage, robot = convert(path)
     (seen,) = read_shapes(stage)
-    corners = np.array([[0, 0, 0], [1, 2, 3]]) * scale
-    assert_allclose([seen.vertices.min(0), seen.vertices.max(0)], [corners.min(0), corners.max(0)], atol=1e-6)
+    corners = np.array([[0, -3, 0], [1, 0, 2]] if suffix == "glb" else [[0, 0, 0], [1, 2, 3]]) * scale
+    corners = np.sort(corners, axis=0)  # glTF's Y is up: (x, y, z) lies at (x, -z, y)
+    assert_allclose([seen.vertices.min(0), seen.vertices.max(0)], corners, atol=1e-6)
     a, b, c = np.moveaxis(seen.vertices[seen.faces].astype(float), 1, 0)
     assert_allclose(np.sum(a * np.cross(b, c)) / 6, np.prod(np.abs(scale)), rtol=1e-5)
     collider = robot.GetPrimAtPath("base_link/collisions").GetChildren()[0]
@@ -277,11 +277,10 @@ def test_the_quaternion_of_a_rotation_gives_it_back(rpy):
 
 def test_a_ball_is_shaded_smooth_and_a_box_sharp():
     ball = trimesh.creation.icosphere(subdivisions=3)
-    normals, index = corner_normals(ball.vertices, ball.faces)
-    assert_allclose(normals[index], ball.vertices[ball.faces.ravel()], atol=0.02)
+    assert_allclose(corner_normals(ball.vertices, ball.faces), ball.vertices[ball.faces], atol=0.02)
     box = trimesh.creation.box()
-    normals, index = corner_normals(box.vertices, box.faces)
-    assert_allclose(normals[index], np.repeat(box.face_normals, 3, axis=0), atol=1e-6)
+    corners = np.repeat(box.face_normals[:, None], 3, axis=1)
+    assert_allclose(corner_normals(box.vertices, box.faces), corners, atol=1e-6)
 
 
 # --- COLLADA --------------------------------------------------------------------------------------
@@ -310,9 +309,9 @@ DAE = """<?xml version="1.0"?>
 def test_nested_nodes_of_collada_compose_outside_in_and_its_unit_applies(tmp_path):
     path = tmp_path / "t.dae"
     path.write_text(DAE.format(unit=0.1, colour="0.2 0.4 0.6 1"))
-    (part,) = read_mesh(path).parts  # moved by 10 along x, then turned by 90 degrees: to +y
-    assert_allclose([part.vertices.min(0), part.vertices.max(0)], [[-0.1, 1.0, 0], [0, 1.1, 0]], atol=1e-6)
-    assert_allclose(part.colour, (0.2, 0.4, 0.6, 1))
+    mesh = read_mesh(path)  # moved by 10 along x, then turned by 90 degrees: to +y
+    assert_allclose([mesh.points.min(0), mesh.points.max(0)], [[-0.1, 1.0, 0], [0, 1.1, 0]], atol=1e-6)
+    assert_allclose(mesh.paints[0].rgba, (0.2, 0.4, 0.6, 1))
 
 
 @pytest.mark.parametrize(
@@ -323,8 +322,9 @@ def test_a_malformed_colour_is_mended_with_a_note_and_its_geometry_kept(tmp_path
     path = tmp_path / "t.dae"
     path.write_text(DAE.format(unit=1, colour=colour))
     mesh = read_mesh(path)
-    assert_allclose(mesh.parts[0].colour, read)
-    assert mesh.notes == (f"t.dae: malformed colour {colour!r} read as {' '.join(f'{c:g}' for c in read)!r}",)
+    assert_allclose(mesh.paints[0].rgba, read)
+    words = " ".join(f"{c:g}" for c in read)
+    assert [note.text for note in mesh.notes] == [f"t.dae: malformed colour {colour!r} read as {words!r}"]
 
 
 # --- refusals -------------------------------------------------------------------------------------
@@ -346,12 +346,12 @@ REFUSED = {
     "no name": ("<link/>", r"arm\.urdf:3: a <link> has no name"),
     "no link": ("", r"arm\.urdf:2: the robot has no <link>"),
     "two roots": (LINK + '<link name="b"/>', "link 'b' hangs in the air: a robot has one root, this has"),
-    "mesh missing": (mesh_link("no.stl"), r"arm\.urdf: mesh 'no\.stl' is missing; looked for .*no\.stl"),
-    "mesh above": (mesh_link("../up.stl"), r"mesh '\.\./up\.stl' lies outside .*; meshes are read from"),
+    "mesh missing": (mesh_link("no.stl"), r"arm\.urdf:3: mesh 'no\.stl' is missing; looked for .*no\.stl"),
+    "mesh above": (mesh_link("../up.stl"), r"mesh '\.\./up\.stl' lies outside .*; files are read from there"),
     "mesh absolute": (mesh_link("/etc/x.stl"), r"mesh '/etc/x\.stl' lies outside"),
     "mesh format": (mesh_link("a.blend"), r"mesh 'a\.blend' is of no known format \(\.dae, \.glb"),
     "mesh scale": (mesh_link('t.stl" scale="1 0 1'), r"mesh 't\.stl' has scale \[1\.0, 0\.0, 1\.0\]; give"),
-    "package": (mesh_link("package://nowhere/a.stl"), "is in a package 'nowhere', and no folder of that"),
+    "package": (mesh_link("package://nowhere/a.stl"), "is in a package: no package 'nowhere' around it; give"),
     "package above": (mesh_link("package://arms/../../a.stl"), r"mesh .* lies outside .*arms"),
     "no mass": (NO_MASS, r":3: link 'b' has a mass of 0"),
     "inertia": (f'<link name="b">{FLAT}</link>', r":3: link 'b' has an impossible inertia: no body has"),

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
@@ -21,11 +21,12 @@ from magtwin.usd.urdf.lint import lint
 from magtwin.usd.urdf.material import LOOKS
 from magtwin.usd.urdf.mechanism import Mechanism, read_mechanism
 from magtwin.usd.urdf.merge import WORLD, Place, carried, place_links, riders
-from magtwin.usd.urdf.mesh_layer import MeshLayer
+from magtwin.usd.urdf.mesh_layer import MeshLayer, gather
 from magtwin.usd.urdf.options import DEFAULTS, Options
 from magtwin.usd.urdf.report import ConversionReport, Ledger, make_report
-from magtwin.usd.urdf.shape import COLLIDER_FORM, define_collider, define_visual, form_of, pose_of
+from magtwin.usd.urdf.shape import define_collider, define_visual, pose_of
 from magtwin.usd.urdf.source import read_source
+from magtwin.usd.urdf.texture import TEXTURES
 from magtwin.usd.urdf.wheel import find_wheels, grip
 
 JOINTS = "joints"
@@ -41,7 +42,7 @@ def convert_urdf(
     *,
     options: Options = DEFAULTS,
     force: bool = False,
-    finish: Callable[[Usd.Prim], object] | None = None,
+    finish: Callable[[Usd.Prim], Iterable[str]] | None = None,
 ) -> Path:
     """Convert a URDF to a USD articulation with a floating base: `convert_with_report` without its report.
 
@@ -60,7 +61,7 @@ def convert_with_report(
     *,
     options: Options = DEFAULTS,
     force: bool = False,
-    finish: Callable[[Usd.Prim], object] | None = None,
+    finish: Callable[[Usd.Prim], Iterable[str]] | None = None,
 ) -> ConversionReport:
     """Convert a URDF to a USD articulation with a floating base, and say what became of it.
 
@@ -74,7 +75,7 @@ def convert_with_report(
             With `options.single_file` there is one other at most, `<stem>_meshes.usdc`.
         options: What is done where the URDF leaves a choice.
         force: Whether files that are there are replaced.
-        finish: Called with the robot's prim before anything is written, to author more.
+        finish: Called with the robot's prim before anything is written, to author more; gives notes.
 
     Returns:
         Every link, joint and geometry, in and out, with what was repaired, guessed or left out.
@@ -88,7 +89,9 @@ def convert_with_report(
         raise RefusedError(f"{out}: the robot's root layer is text; give it the suffix .usda")
     source = read_source(urdf, packages=options.packages, arguments=options.arguments)
     description = read_description(source)
-    meshes = _gather(description)
+    beside, pictures = (out.with_name(f"{out.stem}_{what}") for what in ("meshes.usdc", "textures"))
+    textures = pictures.name if options.single_file else f"{PAYLOADS}/{TEXTURES}"
+    meshes = gather(description, options, f"./{textures}")
     check_free(out, force=force)
     if not options.single_file:
         folder = check_payloads(out, force=force)
@@ -100,10 +103,11 @@ def convert_with_report(
             stage, report = _author_all(
                 description, options, meshes, aside, f"./{PAYLOADS}/{GEOMETRIES}", out, finish
             )
+            if meshes.textures:
+                meshes.textures.export(work / TEXTURES)
             write_layers(stage.GetRootLayer(), aside, work, out)
             shutil.move(work, aside_folder)
         return report
-    beside = out.with_name(f"{out.stem}_meshes.usdc")
     with output(out, force=force) as aside:
         if not meshes:
             return _write(description, options, meshes, aside, beside.name, out, finish)
@@ -112,6 +116,9 @@ def convert_with_report(
             meshes.export(copy)
             report = _write(description, options, meshes, aside, beside.name, out, finish)
             shutil.move(copy, aside_meshes)
+            if meshes.textures:
+                with output(pictures, force=force) as aside_pictures:
+                    meshes.textures.export(aside_pictures)
     return report
 
 
@@ -126,19 +133,6 @@ def read_notes(asset: str | os.PathLike[str]) -> tuple[str, ...]:
     return tuple(facts.get("notes", ()))
 
 
-def _gather(description: Description) -> MeshLayer:
-    """Every mesh that a link shows or touches with."""
-    meshes = MeshLayer(description)
-    for link in description.links.values():
-        for visual in link.visuals:
-            if visual.geometry.mesh is not None:
-                meshes.add(visual.geometry.mesh, form_of(visual, description))
-        for collision in link.collisions:
-            if collision.geometry.mesh is not None:
-                meshes.add(collision.geometry.mesh, COLLIDER_FORM)
-    return meshes
-
-
 def _write(
     description: Description,
     options: Options,
@@ -146,7 +140,7 @@ def _write(
     aside: Path,
     mesh_layer: str,
     out: Path,
-    finish: Callable[[Usd.Prim], object] | None,
+    finish: Callable[[Usd.Prim], Iterable[str]] | None,
 ) -> ConversionReport:
     """Write the root layer at `aside`, with asset paths that hold once it stands at `out`."""
     stage, report = _author_all(description, options, meshes, aside, f"./{mesh_layer}", out, finish)
@@ -168,13 +162,14 @@ def _author_all(
     aside: Path,
     mesh_layer: str,
     out: Path,
-    finish: Callable[[Usd.Prim], object] | None,
+    finish: Callable[[Usd.Prim], Iterable[str]] | None,
 ) -> tuple[Usd.Stage, ConversionReport]:
     """Author the whole robot in one layer at `aside`, and compare it with its description."""
     stage, ledger, checksum = Usd.Stage.CreateNew(str(aside)), Ledger(), sha256(description.path)
     robot = _author(stage, description, options, meshes, mesh_layer, ledger)
     if finish is not None:
-        finish(robot)
+        for note in finish(robot):
+            description.note(note)
     report = make_report(
         description,
         meshes,

@@ -1,252 +1,338 @@
-"""Mesh: triangles of a mesh file, by colour, repaired where that is harmless and with a note of it."""
+"""Mesh: the triangles of a mesh file with all that lies on them, in metres."""
 
-import os
-import re
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.names import RefusedError
+from magtwin.usd.urdf.reading import Note, Reading
+from magtwin.usd.urdf.texture import Image
 
-SUFFIXES = (".dae", ".glb", ".obj", ".ply", ".stl")
-"""Formats that can be read; textures are not."""
+SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
+"""Formats that can be read."""
 
 Rgba = tuple[float, float, float, float]
 
+CREASE = np.radians(35)
+"""Faces that meet at a smaller angle than this are shaded as one smooth surface [rad]."""
+
+FAN = 64
+"""Where more faces than this meet, at tips and in the middle of discs, each keeps its own normal."""
+
 
 @dataclass(frozen=True)
-class MeshPart:
-    """Triangles of one colour."""
+class Paint:
+    """How a mesh file says that some of its triangles look."""
 
-    vertices: NDArray[np.float64]
-    """Vertices, no two alike [m], shape (V, 3)."""
+    name: str = ""
+    """Its name in the file."""
 
-    faces: NDArray[np.int64]
-    """Corners of the triangles, shape (F, 3)."""
+    rgba: Rgba = (1.0, 1.0, 1.0, 1.0)
+    """Colour and opacity as screens show them (sRGB), 0 to 1; of a textured surface, what multiplies it."""
 
-    colour: Rgba | None
-    """Colour that the file gives, as screens show it (sRGB), 0 to 1; none where it gives none."""
+    image: Image | None = None
+    """Texture of the colour."""
+
+    roughness: float = 0.5
+    """0 is a mirror, 1 is chalk."""
+
+    metallic: float = 0.0
+    """0 is an insulator, 1 is metal."""
+
+    see_through: bool = False
+    """Whether the texture's opacity counts."""
+
+    cutoff: float = 0.0
+    """Opacity below which nothing is shown, and above which all is; 0 blends."""
+
+    double_sided: bool = False
+    """Whether it is seen from behind."""
+
+    by_vertex: bool = False
+    """Whether the colours at the corners are shown in place of `rgba`."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Triangles of one paint, as a reader finds them. What a file does not give is none."""
+
+    points: NDArray
+    """Vertices [m], shape (V, 3)."""
+
+    faces: NDArray
+    """Corners of the triangles, counter-clockwise from outside, shape (F, 3)."""
+
+    paint: Paint | None = None
+
+    normals: NDArray | None = None
+    """Normal at each corner of each face, shape (F, 3, 3)."""
+
+    uvs: NDArray | None = None
+    """Texture coordinates at each corner from the picture's lower left, shape (F, 3, 2)."""
+
+    colours: NDArray | None = None
+    """Linear red, green, blue at each corner, 0 to 1, shape (F, 3, 3)."""
+
+    def moved(self, T: NDArray) -> "Piece":
+        """The piece under an affine map T, shape (4, 4), still facing outwards where that mirrors.
+
+        Normals turn by the inverse transpose of the linear part A, n' ~ A^-T n, times det A's sign so
+        that they still point outwards.
+        """
+        A = T[:3, :3]
+        det = np.linalg.det(A)
+        if det == 0:
+            raise ValueError("a node's transform flattens the mesh")
+        points = self.points @ A.T + T[:3, 3]
+        normals = None if self.normals is None else self.normals @ np.linalg.inv(A)
+        made = replace(self, points=points, normals=normals)
+        return made.flipped() if det < 0 else made
+
+    def flipped(self) -> "Piece":
+        """The piece with its faces wound the other way, their normals as they are."""
+        corners = {
+            name: None if (values := getattr(self, name)) is None else values[:, ::-1]
+            for name in ("normals", "uvs", "colours")
+        }
+        return replace(self, faces=self.faces[:, ::-1], **corners)
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh file."""
+    """A mesh file. Values at corners are none where no piece gives them, nan at pieces that do not."""
 
     path: Path
-    parts: tuple[MeshPart, ...]
-    notes: tuple[str, ...]
-    """What was repaired, one line each."""
 
-    def merged(self) -> MeshPart:
-        """All parts as one, without colour."""
-        counts = np.cumsum([0, *(len(part.vertices) for part in self.parts)])
-        faces = [part.faces + n for part, n in zip(self.parts, counts, strict=False)]
-        return _clean(np.vstack([part.vertices for part in self.parts]), np.vstack(faces), None)[0]
+    points: NDArray[np.float32]
+    """Vertices, no two alike [m], shape (V, 3)."""
 
-    def hull(self) -> MeshPart:
-        """The convex hull of all parts."""
-        from scipy.spatial import ConvexHull, QhullError
+    faces: NDArray[np.int64]
+    """Corners of the triangles, counter-clockwise from outside, shape (F, 3)."""
 
-        points = self.merged().vertices
-        try:
-            hull = ConvexHull(points)
-        except QhullError as error:
-            raise RefusedError(
-                f"{self.path}: is flat and has no convex hull to collide with; use a box instead"
-            ) from error
-        faces, normals = hull.simplices, hull.equations[:, :3]
-        a, b, c = np.moveaxis(points[faces], 1, 0)
-        inwards = np.sum(np.cross(b - a, c - a) * normals, axis=1) < 0
-        faces = np.where(inwards[:, None], faces[:, ::-1], faces)
-        first = np.argmin(faces, axis=1)[:, None]  # each from its least corner, then in order of corners
-        faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
-        return _clean(points, faces[np.lexsort(faces.T[::-1])], None)[0]
+    paints: tuple[Paint | None, ...]
+    """Looks that the file gives; none stands for triangles to which it gives no look."""
 
+    paint: NDArray[np.int64]
+    """Index of each triangle's paint, shape (F,)."""
 
-def mesh_path(filename: str, urdf: Path) -> Path:
-    """The file that a `<mesh filename=>` means: relative to the URDF's folder, or in a package.
+    normals: NDArray | None
+    """Unit normals at the corners, shape (F, 3, 3)."""
 
-    `package://NAME/rest` is looked for in the folders called NAME that hold the URDF or lie beside
-    it or its parents.
+    uvs: NDArray | None
+    """Texture coordinates at the corners, shape (F, 3, 2)."""
 
-    Raises:
-        RefusedError: The file is missing, lies outside that folder, or is of an unknown format.
-    """
-    folder, rest = urdf.resolve().parent, filename.removeprefix("file://")
-    if filename.startswith(("package://", "model://")):
-        name, _, rest = filename.partition("://")[2].partition("/")
-        around = [p for parent in (folder, *folder.parents) for p in (parent, parent / name)]
-        found = next((p for p in around if p.name == name and p.is_dir()), None)
-        if found is None:
-            raise RefusedError(
-                f"{urdf}: mesh {filename!r} is in a package {name!r}, and no folder of that name holds the "
-                "URDF or lies beside it; put the package there"
-            )
-        folder = found
-    path = Path(os.path.normpath(folder / rest))
-    if not path.resolve().is_relative_to(folder):
-        raise RefusedError(
-            f"{urdf}: mesh {filename!r} lies outside {folder}; meshes are read from there only, move it in"
+    colours: NDArray | None
+    """Linear colours at the corners, shape (F, 3, 3)."""
+
+    notes: tuple[Note, ...] = ()
+    """What was repaired, guessed or left out."""
+
+    def shaded(self) -> NDArray[np.float32]:
+        """Unit normals at the corners, the file's where it has them, else from the faces; shape (F, 3, 3)."""
+        if self.normals is not None and np.isfinite(self.normals).all():
+            return self.normals
+        computed = corner_normals(self.points, self.faces)
+        return (
+            computed if self.normals is None else np.where(np.isfinite(self.normals), self.normals, computed)
         )
-    if path.suffix.lower() not in SUFFIXES:
-        raise RefusedError(f"{urdf}: mesh {filename!r} is of no known format ({', '.join(SUFFIXES)})")
-    if not path.is_file():
-        raise RefusedError(f"{urdf}: mesh {filename!r} is missing; looked for {path}")
-    return path
 
 
-def read_mesh(path: Path) -> Mesh:
+Reader = Callable[[Reading], list[Piece]]
+
+
+def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mesh:
     """Read a mesh file.
 
-    Lengths are metres; a COLLADA file's unit is applied, its up axis is not, as in RViz.
+    COLLADA's unit is applied and its up axis is not; glTF is turned from Y up to Z up: both as RViz
+    does it (rviz_rendering, assimp_loader.cpp).
+
+    Args:
+        path: The file; its suffix says its format.
+        may_read: Whether a file that this one names (a material library, a texture, a buffer) may be
+            read; by default those in its own folder and below.
 
     Raises:
-        RefusedError: The file cannot be read, or holds no triangle.
+        RefusedError: The file cannot be read, holds no triangle, or points that are no numbers.
     """
-    notes: list[str] = []
+    folder = path.resolve().parent
+    allowed = may_read or (lambda other: other.resolve().is_relative_to(folder))
+    reading = Reading(path, allowed)
     try:
-        raw = _read_collada(path, notes) if path.suffix.lower() == ".dae" else _read_other(path)
+        pieces = _reader(path)(reading)
     except RefusedError:
         raise
-    except Exception as error:  # mesh readers raise whatever they stumble upon
+    except Exception as error:  # readers raise whatever they stumble upon in a damaged file
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise RefusedError(f"{path}: cannot be read as a mesh: {reason[0]}; export it again") from error
-    by_colour: dict[Rgba | None, list[tuple[NDArray, NDArray]]] = {}
-    for vertices, faces, colour in raw:
-        by_colour.setdefault(colour, []).append((vertices, faces))
-    parts, lost = [], 0
-    for colour, pieces in by_colour.items():
-        counts = np.cumsum([0, *(len(v) for v, _ in pieces)])
-        faces = np.vstack([f + n for (_, f), n in zip(pieces, counts, strict=False)])
-        part, dropped = _clean(np.vstack([v for v, _ in pieces]), faces, colour)
-        lost += dropped
-        if len(part.faces):
-            parts.append(part)
-    if not parts:
+    return _join(reading, pieces)
+
+
+def _reader(path: Path) -> Reader:
+    """The reader of a format, imported when it is first needed."""
+    suffix = path.suffix.lower()
+    if suffix == ".dae":
+        from magtwin.usd.urdf.collada import read_collada
+
+        return read_collada
+    if suffix in (".glb", ".gltf"):
+        from magtwin.usd.urdf.gltf import read_gltf
+
+        return read_gltf
+    if suffix == ".obj":
+        from magtwin.usd.urdf.wavefront import read_wavefront
+
+        return read_wavefront
+    if suffix in (".stl", ".ply"):
+        from magtwin.usd.urdf.scan import read_scan
+
+        return read_scan
+    raise RefusedError(f"{path}: is of no known mesh format ({', '.join(SUFFIXES)})")
+
+
+def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
+    """All pieces as one mesh: like points made one, triangles without an area left out."""
+    path, pieces = reading.path, [piece for piece in pieces if len(piece.faces)]
+    if not pieces:
         raise RefusedError(f"{path}: holds no triangle; export it again, or use a primitive")
+    for piece in pieces:
+        if not 0 <= piece.faces.min() <= piece.faces.max() < len(piece.points):
+            raise RefusedError(
+                f"{path}: a face names vertex {piece.faces.max()} of {len(piece.points)}; export it again"
+            )
+    first = np.cumsum([0, *(len(piece.points) for piece in pieces)])
+    points = np.vstack([piece.points for piece in pieces]).astype(np.float32)
+    faces = np.vstack([piece.faces + n for piece, n in zip(pieces, first, strict=False)]).astype(np.int64)
+    if not np.isfinite(points[faces]).all():
+        raise RefusedError(f"{path}: has vertices that are not finite numbers; export it again")
+    pieces = [_coloured(piece, reading) for piece in pieces]
+    paints = tuple(dict.fromkeys(piece.paint for piece in pieces))
+    paint = np.repeat([paints.index(p.paint) for p in pieces], [len(p.faces) for p in pieces])
+    kept, index = distinct(points)
+    points, faces = points[kept], index[faces]
+    solid = _has_area(points, faces)
+    if not solid.any():
+        raise RefusedError(f"{path}: holds no triangle with an area; export it again, or use a primitive")
+    lost = int(len(faces) - solid.sum())
     if lost:
-        notes.append(f"{path.name}: {lost} triangles without an area left out")
-    return Mesh(path, tuple(parts), tuple(notes))
+        reading.note(f"{lost} triangles without an area left out")
+    faces, paint = faces[solid], paint[solid]
+    used = np.zeros(len(points), bool)
+    used[faces] = True
+    shown = np.unique(paint)
+    return Mesh(
+        path=path,
+        points=points[used],
+        faces=(np.cumsum(used) - 1)[faces],
+        paints=tuple(paints[i] for i in shown),
+        paint=np.searchsorted(shown, paint),
+        normals=_unit(_at_corners([p.normals for p in pieces], pieces, 3, solid)),
+        uvs=_at_corners([p.uvs for p in pieces], pieces, 2, solid),
+        colours=_at_corners([p.colours for p in pieces], pieces, 3, solid),
+        notes=tuple(reading.notes),
+    )
 
 
-def _read_other(path: Path) -> list[tuple[NDArray, NDArray, Rgba | None]]:
-    """STL, OBJ, PLY and glTF by trimesh: vertices, faces and colour of each piece."""
-    import trimesh
-
-    scene = trimesh.load_scene(path, process=False, skip_materials=path.suffix.lower() != ".glb")
-    pieces = []
-    for node in sorted(scene.graph.nodes_geometry):
-        to_world, name = scene.graph[node]
-        mesh = scene.geometry[name]
-        if not hasattr(mesh, "faces"):
-            continue
-        vertices = mesh.vertices @ to_world[:3, :3].T + to_world[:3, 3]
-        faces = mesh.faces[:, ::-1] if np.linalg.det(to_world[:3, :3]) < 0 else mesh.faces
-        colour = None
-        if path.suffix.lower() == ".glb" and hasattr(mesh.visual, "material"):
-            r, g, b, a = (float(c) / 255 for c in mesh.visual.material.main_color)
-            colour = (r, g, b, a)
-        pieces.append((np.asarray(vertices, float), np.asarray(faces, int), colour))
-    return pieces
+def _coloured(piece: Piece, reading: Reading) -> Piece:
+    """A piece whose colours at corners are its look, where it has no other, or are left out."""
+    if piece.colours is None or (piece.paint is not None and piece.paint.by_vertex):
+        return piece
+    if piece.paint is None:
+        return replace(piece, paint=Paint("vertex_colours", by_vertex=True))
+    reading.lose("colours of vertices are left out where a material covers them")
+    return replace(piece, colours=None)
 
 
-def _read_collada(path: Path, notes: list[str]) -> list[tuple[NDArray, NDArray, Rgba | None]]:
-    """COLLADA by pycollada, which composes the nodes' transforms in the order that they nest.
+def _at_corners(
+    values: Sequence[NDArray | None], pieces: Sequence[Piece], width: int, kept: NDArray
+) -> NDArray | None:
+    """Values at the corners of all pieces, nan where one has none; none where all have none."""
+    if all(value is None for value in values):
+        return None
+    filled = [
+        np.full((len(piece.faces), 3, width), np.nan) if value is None else value
+        for value, piece in zip(values, pieces, strict=True)
+    ]
+    return np.vstack(filled).astype(np.float32)[kept]
 
-    Malformed colours make it drop the effect, then the material, then the geometry; they are mended
-    in the text first.
+
+def _unit(normals: NDArray | None) -> NDArray | None:
+    """Normals of length 1; nan at those that have no direction."""
+    if normals is None:
+        return None
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(length > 1e-12, normals / length, np.nan).astype(np.float32)
+
+
+def _has_area(points: NDArray, faces: NDArray) -> NDArray[np.bool_]:
+    """Whether each triangle has an area, against the square of its longest edge."""
+    a, b, c = (points[faces[:, i]].astype(float) for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    longest = np.max([np.sum((q - p) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    return area > 1e-9 * longest
+
+
+def distinct(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The distinct rows of an array of floats, in the order in which they first appear.
+
+    Sorting one 64-bit hash a row is several times quicker than sorting rows; should two rows that
+    differ have one hash, rows are sorted after all.
+
+    Args:
+        rows: Taken in single precision, shape (N, K).
+
+    Returns:
+        Index of the first row of each kind, shape (D,), and which kind each row is, shape (N,).
     """
-    import io
-
-    import collada
-    from collada.common import DaeError
-
-    text, mended = _mend_colours(path.read_text(encoding="utf-8", errors="replace"))
-    notes += [f"{path.name}: {line}" for line in mended]
-    file = collada.Collada(io.BytesIO(text.encode()), ignore=[DaeError])
-    if file.assetInfo.upaxis not in (None, collada.asset.UP_AXIS.Z_UP):
-        notes.append(f"{path.name}: its up axis {file.assetInfo.upaxis} is not applied, as in RViz")
-    for error in file.errors:
-        notes.append(f"{path.name}: {type(error).__name__}: {str(error).strip() or 'malformed'}")
-    if file.scene is None:
-        raise RefusedError(f"{path}: has no scene to show; export it again")
-    unit, pieces = float(file.assetInfo.unitmeter or 1.0), []
-    shown = set()
-    for geometry in file.scene.objects("geometry"):
-        shown.add(geometry.original.id)
-        for primitive in geometry.primitives():
-            pieces += _collada_piece(primitive, unit, path, notes)
-    for geometry in file.geometries:
-        if geometry.id not in shown:
-            notes.append(f"{path.name}: geometry {geometry.id!r} is not in the file's scene and is left out")
-    return pieces
+    words = np.ascontiguousarray(rows + np.float32(0), np.float32).view(np.uint32)  # + 0 makes -0 into 0
+    hashed = np.zeros(len(words), np.uint64)
+    for column in words.T:
+        hashed = (hashed ^ column) * np.uint64(0x9E3779B97F4A7C15)
+        hashed ^= hashed >> np.uint64(32)
+    _, first, kind = np.unique(hashed, return_index=True, return_inverse=True)
+    if not np.array_equal(words[first][kind], words):
+        _, first, kind = np.unique(words, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return first[order], rank[kind.reshape(-1)]
 
 
-def _collada_piece(
-    primitive: Any, unit: float, path: Path, notes: list[str]
-) -> list[tuple[NDArray, NDArray, Rgba | None]]:
-    """Triangles of one bound primitive; lines and points have none."""
-    kind = type(primitive).__name__
-    if hasattr(primitive, "triangleset"):
-        primitive = primitive.triangleset()
-    if not hasattr(primitive, "vertex_index") or np.shape(primitive.vertex_index)[-1] != 3:
-        notes.append(f"{path.name}: a {kind} holds no triangles and is left out")
-        return []
-    if primitive.vertex_index is None or not len(primitive.vertex_index):
-        return []
-    effect = getattr(primitive.material, "effect", None)
-    diffuse = getattr(effect, "diffuse", None)
-    colour: Rgba | None = None
-    if isinstance(diffuse, tuple):
-        r, g, b, a = (float(np.clip(c, 0, 1)) for c in (*diffuse, 1.0)[:4])
-        colour = (r, g, b, a)
-    elif diffuse is not None:
-        notes.append(f"{path.name}: a texture is not converted")
-    return [(np.asarray(primitive.vertex, float) * unit, np.asarray(primitive.vertex_index, int), colour)]
+def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float32]:
+    """Unit normals of each triangle's corners: smooth across shallow edges, sharp across creases.
 
+    A corner's normal is the mean, weighted by area, of the faces around its point that turn from its
+    own by less than CREASE; where more than FAN faces meet it is its own face's.
 
-def _mend_colours(text: str) -> tuple[str, list[str]]:
-    """`<color>` elements of effects with four numbers again: fused numbers parted, opacity added."""
-    mended: list[str] = []
+    Args:
+        points: Vertices [m], shape (V, 3).
+        faces: Corners of the triangles, counter-clockwise from outside, shape (F, 3).
 
-    def mend(match: re.Match[str]) -> str:
-        tokens = match[2].split()
-        parted = [piece for token in tokens for piece in _part(token)]
-        try:
-            numbers = [float(piece) for piece in parted]
-        except ValueError:
-            numbers = []
-        if len(tokens) == 4 and numbers and len(numbers) == 4:
-            return match[0]
-        numbers = [*numbers, 1.0] if len(numbers) == 3 else numbers
-        numbers = numbers if len(numbers) == 4 else [0.5, 0.5, 0.5, 1.0]
-        new = " ".join(f"{n:g}" for n in numbers)
-        mended.append(f"malformed colour {match[2].strip()!r} read as {new!r}")
-        return f"{match[1]}{new}{match[3]}"
-
-    start = text.find("<library_effects")
-    end = text.find("</library_effects>")
-    if start < 0 or end < 0:  # colours of lights have three numbers and matter to nobody here
-        return text, mended
-    effects = re.sub(r"(<color[^>]*>)([^<]*)(</color>)", mend, text[start:end])
-    return text[:start] + effects + text[end:], mended
-
-
-def _part(token: str) -> list[str]:
-    """Two numbers that were written without a space: "0.01.0" is 0.0 and 1.0."""
-    fused = re.fullmatch(r"(\d+\.\d+?)(\d\.\d+)", token)
-    return [fused[1], fused[2]] if fused else [token]
-
-
-def _clean(vertices: NDArray, faces: NDArray, colour: Rgba | None) -> tuple[MeshPart, int]:
-    """Like vertices made one, triangles without an area and unused vertices left out; and how many went."""
-    points, index = np.unique(np.asarray(vertices, np.float32), axis=0, return_inverse=True)
-    faces = index.reshape(-1)[faces]
-    a, b, c = np.moveaxis(points[faces].astype(float), 1, 0)
-    flat = np.linalg.norm(np.cross(b - a, c - a), axis=1) <= 1e-14
-    used, kept = np.unique(faces[~flat], return_inverse=True)
-    part = MeshPart(points[used].astype(float), kept.reshape(-1, 3), colour)
-    return part, int(flat.sum())
+    Returns:
+        Normals, shape (F, 3, 3).
+    """
+    a, b, c = (points[faces[:, i]].astype(float) for i in range(3))
+    area = np.cross(b - a, c - a)
+    size = np.linalg.norm(area, axis=1, keepdims=True)
+    area = (area / size.mean()).astype(np.float32)
+    unit = area / np.linalg.norm(area, axis=1, keepdims=True)
+    flat = faces.ravel()
+    corner = np.argsort(flat, kind="stable")  # corners of one point stand together
+    count = np.bincount(flat, minlength=len(points))
+    first = np.cumsum(count) - count
+    corner = corner[count[flat[corner]] <= FAN]
+    around = count[flat[corner]]  # each corner is paired with each corner of its point
+    mine = np.repeat(np.arange(len(corner)), around)
+    step = np.arange(len(mine)) - np.repeat(np.cumsum(around) - around, around)
+    by_point = np.argsort(flat, kind="stable") // 3
+    theirs = by_point[np.repeat(first[flat[corner]], around) + step]
+    near = np.einsum("ij,ij->i", unit[(corner // 3)[mine]], unit[theirs]) >= np.cos(CREASE)
+    mine, theirs = mine[near], theirs[near]
+    normals = np.repeat(unit, 3, axis=0)
+    for axis in range(3):
+        normals[corner, axis] = np.bincount(mine, area[theirs, axis], len(corner))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return (normals / length).reshape(-1, 3, 3)

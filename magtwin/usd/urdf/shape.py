@@ -1,24 +1,33 @@
-"""Shape: visuals and colliders of a link, as gprims in its frame."""
+"""Shape: visuals and colliders of a link, as gprims in its frame.
+
+A mesh looks as in RViz (robot_link.cpp): its file's own materials win, part by part; the visual's URDF
+material is worn by the parts to which the file gives none, which is all of an STL. GREY is what neither
+dresses.
+"""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
+from magtwin.names import RefusedError
 from magtwin.usd.sensors import write_pose
 from magtwin.usd.urdf.description import Description, origin_of
 from magtwin.usd.urdf.gazebo import Surface
 from magtwin.usd.urdf.inertia import quaternion
-from magtwin.usd.urdf.material import GREY, define_grip, define_look, wear
-from magtwin.usd.urdf.mesh import Rgba
-from magtwin.usd.urdf.mesh_layer import Form, MeshLayer
+from magtwin.usd.urdf.material import Look, define_grip, define_look, wear
+from magtwin.usd.urdf.mesh import Paint
+from magtwin.usd.urdf.mesh_layer import MESH, Entry, MeshLayer, free_name
+from magtwin.usd.urdf.reading import Reading
+from magtwin.usd.urdf.source import MissingFileError
+from magtwin.usd.urdf.texture import Image, read_image
 
 VISUALS, COLLISIONS = "visuals", "collisions"
 """Xforms below a link's prim."""
 
-COLLIDER_FORM: Form = "hull"
-"""What of a mesh collides."""
+APPROXIMATIONS = {"hull": "convexHull", "decomposition": "convexHull", "mesh": "none"}
+"""What engines are to make of a mesh collider's triangles, by `Options.collision`."""
 
 NEWTON_MESH_API = "NewtonMeshCollisionAPI"
 """Newton's applied schema, by name: its plugin lives elsewhere."""
@@ -27,7 +36,7 @@ NEWTON_MESH_API = "NewtonMeshCollisionAPI"
 def define_visual(
     body: Usd.Prim, visual: Any, description: Description, meshes: MeshLayer, layer: str
 ) -> list[Usd.Prim]:
-    """The gprims of a URDF `<visual>`: one, or one a colour of its mesh, each with its look.
+    """The prim of a URDF `<visual>`: a gprim with its look, or an Xform over the mesh that it shares.
 
     Args:
         body: Prim of the link, a child of the robot's.
@@ -35,94 +44,170 @@ def define_visual(
         description: Where the robot's materials stand.
         meshes: Where the mesh's triangles stand.
         layer: Asset path of the exported mesh layer.
+
+    Returns:
+        The prim, or nothing where its mesh is missing and that was allowed.
     """
-    name, given = _material(visual, description)
-    made = []
-    for gprim, colour in _define(body, VISUALS, visual, meshes, layer, form_of(visual, description)):
-        wear(gprim, define_look(body.GetParent(), given or colour or GREY, name))
-        made.append(gprim)
-    return made
+    paint = _paint_of(visual, description)
+    if visual.geometry.mesh is None:
+        prim = _define_primitive(body, VISUALS, visual)
+        wear(prim, body.GetParent(), _look(_plain(paint, "a primitive", description), meshes))
+        return [prim]
+    entry = meshes.try_add(visual.geometry.mesh, meshes.visual)
+    if entry is None:
+        return []
+    if not entry.textured:
+        paint = _plain(
+            paint, f"mesh {visual.geometry.mesh.filename!r} without texture coordinates", description
+        )
+    return [_define_mesh(body, visual, entry, paint, meshes, layer)]
 
 
 def define_collider(
     body: Usd.Prim, collision: Any, surface: Surface, meshes: MeshLayer, layer: str
 ) -> list[Usd.Prim]:
-    """The collider of a URDF `<collision>`: its primitive, or the convex hull of its mesh.
+    """The colliders of a URDF `<collision>`: its primitive, or the solids that its mesh collides as.
 
-    It is of purpose guide, so that no viewer shows it unasked. Other args as for `define_visual`.
+    They are of purpose guide, so that no viewer shows them unasked. Other args as for `define_visual`.
     """
-    made = []
-    for gprim, _ in _define(body, COLLISIONS, collision, meshes, layer, COLLIDER_FORM):
-        UsdGeom.Imageable(gprim).CreatePurposeAttr(UsdGeom.Tokens.guide)
-        UsdPhysics.CollisionAPI.Apply(gprim).CreateCollisionEnabledAttr(True)
-        if gprim.IsA(UsdGeom.Mesh):
-            UsdPhysics.MeshCollisionAPI.Apply(gprim).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
-            gprim.AddAppliedSchema(NEWTON_MESH_API)
-        wear(gprim, define_look(body.GetParent(), GREY), define_grip(body.GetParent(), surface))
-        made.append(gprim)
+    if collision.geometry.mesh is None:
+        made = [_define_primitive(body, COLLISIONS, collision)]
+    else:
+        made = []
+        for path in meshes.try_add(collision.geometry.mesh, meshes.collider) or ():
+            prim = body.GetStage().DefinePrim(_path(body, COLLISIONS, collision.name or path.name), "Mesh")
+            prim.GetReferences().AddReference(layer, path)
+            _place(prim, origin_of(collision))
+            made.append(prim)
+    robot = body.GetParent()
+    for prim in made:
+        UsdGeom.Imageable(prim).CreatePurposeAttr(UsdGeom.Tokens.guide)
+        UsdPhysics.CollisionAPI.Apply(prim).CreateCollisionEnabledAttr(True)
+        if prim.IsA(UsdGeom.Mesh):
+            UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(APPROXIMATIONS[meshes.collision])
+            prim.AddAppliedSchema(NEWTON_MESH_API)
+        wear(prim, robot, Look(), define_grip(robot, surface))
     return made
 
 
-def form_of(visual: Any, description: Description) -> Form:
-    """Whether a visual's mesh comes in its own colours, or whole because the URDF's material covers it."""
-    return "parts" if _material(visual, description)[1] is None else "whole"
+def _define_mesh(
+    body: Usd.Prim, visual: Any, entry: Entry, given: Paint | None, meshes: MeshLayer, layer: str
+) -> Usd.Prim:
+    """An Xform that refers to a mesh, as an instance where one look covers it.
+
+    Looks stand in the robot's own scope, which nothing below an instance can see: the one of an instance
+    is bound over it, and a mesh of several is no instance. Its arrays are shared either way.
+    """
+    stage, robot = body.GetStage(), body.GetParent()
+    prim = UsdGeom.Xform.Define(stage, _path(body, VISUALS, visual.name or entry.path.name)).GetPrim()
+    prim.GetReferences().AddReference(layer, entry.path)
+    _place(prim, origin_of(visual))
+    looks = [_look(paint or given, meshes) for paint in entry.paints]
+    if not entry.subsets:
+        wear(prim, robot, looks[0])
+        prim.SetInstanceable(True)
+        return prim
+    mesh = prim.GetPrimAtPath(MESH)
+    for name, look in zip(entry.subsets, looks, strict=True):
+        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrimAtPath(name)).Bind(define_look(robot, look))
+    colours = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displayColor")
+    if given is not None and None in entry.paints and colours.GetInterpolation() == UsdGeom.Tokens.uniform:
+        colours.GetAttr().Set(Vt.Vec3fArray([Gf.Vec3f(*look.display_colour) for look in looks]))
+    return prim
 
 
-def _material(visual: Any, description: Description) -> tuple[str, Rgba | None]:
-    """Name and colour of a visual's material: its own, or the robot's of that name."""
+def _look(paint: Paint | None, meshes: MeshLayer) -> Look:
+    """The look of a paint, its texture among the robot's; that of what has none if it is none."""
+    if paint is None:
+        return Look()
+    return Look(
+        rgba=paint.rgba,
+        name=paint.name,
+        texture="" if paint.image is None else meshes.textures.add(paint.image),
+        mean=(1.0, 1.0, 1.0) if paint.image is None else paint.image.mean,
+        roughness=paint.roughness,
+        metallic=paint.metallic,
+        see_through=paint.see_through and paint.image is not None,
+        cutoff=paint.cutoff,
+        by_vertex=paint.by_vertex,
+    )
+
+
+def _paint_of(visual: Any, description: Description) -> Paint | None:
+    """A visual's URDF material: its own, or the robot's of that name; none if it has none.
+
+    A texture is the colour alone, as in RViz; where it is missing, the material's colour is.
+    """
     material = visual.material
     if material is None:
-        return "", None
-    shared = description.materials.get(material.name)
+        return None
+    shared, name = description.materials.get(material.name), material.name or ""
     colour = material.color or (shared.color if shared else None)
-    if material.texture is not None or (shared is not None and shared.texture is not None):
-        description.note(f"material {material.name!r}: its texture is not converted")
-    if colour is None:
-        return "", None
-    r, g, b, a = (float(c) for c in colour.rgba)
-    return material.name or "", (r, g, b, a)
+    texture = material.texture or (shared.texture if shared else None)
+    image = None if texture is None else _image(texture.filename, name, description)
+    if image is None and colour is None:
+        return None
+    r, g, b, a = (1.0, 1.0, 1.0, 1.0) if colour is None else (float(c) for c in colour.rgba)
+    return Paint(name, (r, g, b, a)) if image is None else Paint(name, (1.0, 1.0, 1.0, a), image)
 
 
-def _define(
-    body: Usd.Prim, scope: str, shape: Any, meshes: MeshLayer, layer: str, form: Form
-) -> list[tuple[Usd.Prim, Rgba | None]]:
-    """Prims of a geometry, with the colours that its file gives."""
+def _image(filename: str, material: str, description: Description) -> Image | None:
+    """The picture of a URDF `<texture>`; none, with a note, where it is missing or none."""
+    reading = Reading(description.path, description.source.packages.holds)
+    try:
+        image = read_image(str(description.find_file(filename, "texture")), reading)
+    except MissingFileError:
+        reading.lose(f"texture {filename!r} of material {material!r} is missing and is left out")
+        image = None
+    for note in reading.notes:
+        description.note(note.text, lost=note.lost)
+    return image
+
+
+def _plain(paint: Paint | None, what: str, description: Description) -> Paint | None:
+    """A paint for what no texture can lie on: its mean colour."""
+    if paint is None or paint.image is None:
+        return paint
+    description.note(f"material {paint.name!r}: {what} shows the mean colour of its texture", lost=True)
+    return Paint(f"{paint.name}_mean", (*paint.image.mean, paint.rgba[3]))
+
+
+def _define_primitive(body: Usd.Prim, scope: str, shape: Any) -> Usd.Prim:
+    """The gprim of a box, capsule, cylinder or sphere."""
     stage, geometry = body.GetStage(), shape.geometry
-    parent = UsdGeom.Xform.Define(stage, body.GetPath().AppendChild(scope)).GetPrim()
-    pose = origin_of(shape)
-    if geometry.mesh is not None:
-        made = []
-        for entry in meshes.add(geometry.mesh, form):
-            prim = stage.DefinePrim(_free(parent, shape.name or entry.path.name), "Mesh")
-            prim.GetReferences().AddReference(layer, entry.path)
-            _place(prim, pose)
-            made.append((prim, entry.colour))
-        return made
-    if geometry.box is not None:
-        prim = UsdGeom.Cube.Define(stage, _free(parent, shape.name or "box")).GetPrim()
+    kind = next(k for k in ("box", "capsule", "cylinder", "sphere") if getattr(geometry, k, None) is not None)
+    solid, path, scale = getattr(geometry, kind), _path(body, scope, shape.name or kind), None
+    sizes = np.atleast_1d(
+        [getattr(solid, name) for name in ("size", "radius", "length") if hasattr(solid, name)]
+    )
+    if not (np.isfinite(sizes).all() and (sizes > 0).all()):
+        raise RefusedError(
+            f"link {body.GetName()!r}: a {kind} has sizes {sizes.ravel().tolist()}; all must be above 0"
+        )
+    if kind == "box":
+        prim = UsdGeom.Cube.Define(stage, path).GetPrim()
         UsdGeom.Cube(prim).CreateSizeAttr(1.0)
-        _place(prim, pose, scale=np.asarray(geometry.box.size, float))
-    elif geometry.cylinder is not None:
-        prim = UsdGeom.Cylinder.Define(stage, _free(parent, shape.name or "cylinder")).GetPrim()
-        UsdGeom.Cylinder(prim).CreateRadiusAttr(geometry.cylinder.radius)
-        UsdGeom.Cylinder(prim).CreateHeightAttr(geometry.cylinder.length)
-        UsdGeom.Cylinder(prim).CreateAxisAttr(UsdGeom.Tokens.z)
-        _place(prim, pose)
+        scale = np.asarray(solid.size, float)
+    elif kind == "sphere":
+        prim = UsdGeom.Sphere.Define(stage, path).GetPrim()
+        UsdGeom.Sphere(prim).CreateRadiusAttr(solid.radius)
     else:
-        prim = UsdGeom.Sphere.Define(stage, _free(parent, shape.name or "sphere")).GetPrim()
-        UsdGeom.Sphere(prim).CreateRadiusAttr(geometry.sphere.radius)
-        _place(prim, pose)
+        schema = UsdGeom.Capsule if kind == "capsule" else UsdGeom.Cylinder
+        prim = schema.Define(stage, path).GetPrim()
+        schema(prim).CreateRadiusAttr(solid.radius)
+        schema(prim).CreateHeightAttr(solid.length)  # of a capsule without its ends, in URDF and in USD
+        schema(prim).CreateAxisAttr(UsdGeom.Tokens.z)
+    _place(prim, origin_of(shape), scale)
     extent = UsdGeom.Boundable.ComputeExtentFromPlugins(UsdGeom.Boundable(prim), Usd.TimeCode.Default())
     UsdGeom.Boundable(prim).CreateExtentAttr(extent)
-    return [(prim, None)]
+    return prim
 
 
-def _free(parent: Usd.Prim, name: str) -> Sdf.Path:
-    """Path of a child that is not there yet, called `name` if that is free."""
-    name = Tf.MakeValidIdentifier(name)
+def _path(body: Usd.Prim, scope: str, name: str) -> Sdf.Path:
+    """Path of a prim that is not there yet, in a scope of a link, called `name` if that is free."""
+    parent = UsdGeom.Xform.Define(body.GetStage(), body.GetPath().AppendChild(scope)).GetPrim()
     taken = {child.GetName() for child in parent.GetChildren()}
-    unique = next(n for n in [name, *(f"{name}_{i}" for i in range(2, 10_000))] if n not in taken)
-    return parent.GetPath().AppendChild(unique)
+    return parent.GetPath().AppendChild(free_name(Tf.MakeValidIdentifier(name), taken))
 
 
 def _place(prim: Usd.Prim, pose: NDArray, scale: NDArray | None = None) -> None:
