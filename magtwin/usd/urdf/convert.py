@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
@@ -12,7 +12,7 @@ from magtwin.names import RefusedError
 from magtwin.usd.layers import describe_stage, open_stage
 from magtwin.usd.sensors import write_pose
 from magtwin.usd.urdf.description import Description, origin_of, read_description
-from magtwin.usd.urdf.drive import check_rules
+from magtwin.usd.urdf.drive import NO_WHEELS, check_rules
 from magtwin.usd.urdf.gazebo import Surface, read_surfaces
 from magtwin.usd.urdf.joint import define_joint, define_mimic, define_root_joint
 from magtwin.usd.urdf.layout import GEOMETRIES, PAYLOADS, check_payloads, write_layers
@@ -205,7 +205,7 @@ def _author(
     names = _prim_names(description)
     mechanism = read_mechanism(description, options)
     check_rules(mechanism, options)
-    surfaces, wheels = read_surfaces(description), ()
+    surfaces, wheels = read_surfaces(description), NO_WHEELS
     if options.profile == "diff-drive":
         wheels = find_wheels(mechanism)
         surfaces = grip(mechanism, wheels, surfaces)
@@ -251,7 +251,7 @@ def _define_joints(
     scope: Sdf.Path,
     mechanism: Mechanism,
     options: Options,
-    wheels: tuple[str, ...],
+    wheels: Mapping[str, float],
     places: dict[str, Place],
     paths: dict[str, Sdf.Path],
     ledger: Ledger,

@@ -3,9 +3,10 @@
 UsdPhysics has gains of joints that turn per degree, URDF and we per radian.
 """
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -25,6 +26,9 @@ POSITION_STIFFNESS = 100.0
 
 DEFAULT_EFFORT = 10.0
 """Largest effort of a drive where the URDF gives none [N m, N]."""
+
+
+NO_WHEELS: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,7 @@ def check_rules(mechanism: Mechanism, options: Options) -> None:
 
 
 def choose_drive(
-    joint: Any, mechanism: Mechanism, options: Options, wheels: Iterable[str] = ()
+    joint: Any, mechanism: Mechanism, options: Options, wheels: Mapping[str, float] = NO_WHEELS
 ) -> Drive | None:
     """The drive of a joint that moves; None if it has none: it follows another, or has several axes.
 
@@ -80,7 +84,7 @@ def choose_drive(
         joint: yourdfpy's joint.
         mechanism: Joints of the description; its description takes notes of what was guessed.
         options: Rules and profile.
-        wheels: Names of the joints of driven wheels.
+        wheels: Joints of driven wheels by name, with the torque of those that the URDF gives none [N m].
 
     Raises:
         RefusedError: The URDF's effort is below 0 or not a number; the text gives the line.
@@ -108,7 +112,7 @@ def choose_drive(
     else:
         rule, force = DriveRule(joints=joint.name, type="velocity", damping=WHEEL_DAMPING), None
     if force is None:
-        force = _effort(joint, mechanism.description)
+        force = _effort(joint, wheels.get(joint.name, DEFAULT_EFFORT), mechanism.description)
     return Drive(rule.type, rule.stiffness, rule.damping, force, _target(joint))
 
 
@@ -132,15 +136,15 @@ def define_drive(prim: Usd.Prim, axis: str, drive: Drive) -> None:
         made.CreateTargetVelocityAttr(0.0)
 
 
-def _effort(joint: Any, description: Description) -> float:
-    """The URDF's effort, or a guess with a note."""
+def _effort(joint: Any, guess: float, description: Description) -> float:
+    """The URDF's effort, or the guess with a note."""
     effort = None if joint.limit is None else joint.limit.effort
     if not effort:
         description.note(
             f"joint {joint.name!r} gives {'no effort' if effort is None else 'an effort of 0'}: "
-            f"its drive may use {DEFAULT_EFFORT:g} {'N' if joint.type == 'prismatic' else 'N m'}"
+            f"its drive may use {guess:g} {'N' if joint.type == 'prismatic' else 'N m'}"
         )
-        return DEFAULT_EFFORT
+        return guess
     if effort < 0 or not np.isfinite(effort):
         raise description.refused("joint", joint.name, f"has an effort of {effort:g}; give one above 0")
     return float(effort)

@@ -4,7 +4,7 @@ URDF's joint frame is the child link's; UsdPhysics wants an axis X, Y or Z of a 
 an oblique axis turns both frames. URDF's radians are degrees in UsdPhysics.
 """
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from pxr import Gf, Sdf, Usd, UsdPhysics
 
 from magtwin.frames import wxyz_from_xyzw
 from magtwin.usd.urdf.description import Description
-from magtwin.usd.urdf.drive import choose_drive, define_drive
+from magtwin.usd.urdf.drive import NO_WHEELS, choose_drive, define_drive
 from magtwin.usd.urdf.inertia import quaternion
 from magtwin.usd.urdf.mechanism import Mechanism
 from magtwin.usd.urdf.options import DEFAULTS, Options
@@ -33,6 +33,9 @@ KINDS = {
 LOCKED = (1.0, -1.0)
 """Limits of an axis that cannot move: UsdPhysics has the lower one above the upper."""
 
+WHEEL_SPEED = 30.0
+"""Highest speed of a driven wheel where the URDF gives none [rad/s]: some 1 m/s at the rim of a small one."""
+
 MIMIC_FREQUENCY = 100.0
 """Natural frequency of PhysX's mimic [1/s]; with a damping ratio of 0 the coupling is hard whatever it is."""
 
@@ -45,7 +48,7 @@ def define_joint(
     T: NDArray,
     mechanism: Mechanism,
     options: Options = DEFAULTS,
-    wheels: Iterable[str] = (),
+    wheels: Mapping[str, float] = NO_WHEELS,
 ) -> Usd.Prim:
     """Author a joint between two bodies; its mimic comes later, see `define_mimic`.
 
@@ -61,26 +64,27 @@ def define_joint(
         T: Pose in the parent's body of the joint at 0, or at rest if it is welded, shape (4, 4).
         mechanism: Joints of the description; its description takes notes of what was guessed.
         options: Drives and profile.
-        wheels: Names of the joints of driven wheels.
+        wheels: Joints of driven wheels by name, see `choose_drive`.
 
     Raises:
         RefusedError: A limit is missing, upside down, or not above 0; the text gives the line.
     """
     description, reason = mechanism.description, mechanism.welded.get(joint.name)
     made = (UsdPhysics.FixedJoint if reason is not None else KINDS[joint.type]).Define(stage, path)
-    if reason:
-        description.note(f"joint {joint.name!r} ({joint.type}) {reason}: welded")
     made.CreateBody0Rel().SetTargets([ends[0]])
     made.CreateBody1Rel().SetTargets([ends[1]])
     turn = np.eye(3)
     if reason is None:
         token, turn = _axis(joint.axis)
+        length = float(np.linalg.norm(joint.axis))
+        if abs(length - 1) > 1e-3:
+            description.note(f"joint {joint.name!r} has an axis of length {length:.3g}: taken as a direction")
         axes = _free_axes(made, joint, token, description)
         drive = choose_drive(joint, mechanism, options, wheels)
         if drive is not None:
             for axis in axes:
                 define_drive(made.GetPrim(), axis, drive)
-        _tune(made.GetPrim(), joint, axes, options, description)
+        _tune(made.GetPrim(), joint, axes, joint.name in wheels, description)
     made.CreateLocalPos0Attr(Gf.Vec3f(*(round(float(v), 12) + 0.0 for v in T[:3, 3])))
     made.CreateLocalRot0Attr(_quatf(T[:3, :3] @ turn))
     made.CreateLocalPos1Attr(Gf.Vec3f(0))
@@ -209,11 +213,11 @@ def _limit(made: Any, joint: Any, description: Description) -> None:
     made.CreateUpperLimitAttr(limit.upper * _unit(joint))
 
 
-def _tune(prim: Usd.Prim, joint: Any, axes: list[str], options: Options, description: Description) -> None:
+def _tune(prim: Usd.Prim, joint: Any, axes: list[str], wheel: bool, description: Description) -> None:
     """Highest speed, damping and friction of a joint, as Newton and PhysX read them."""
     names, unit = Sdf.ValueTypeNames.Float, _unit(joint)
     damping, friction = (_passive(joint, name, description) for name in ("damping", "friction"))
-    speed = _speed(joint, options, description)
+    speed = _speed(joint, wheel, description)
     prim.AddAppliedSchema(NEWTON_API)
     if speed is not None and joint.type != "planar":
         _write(prim, "newton:velocityLimit", names, speed * unit)
@@ -233,12 +237,17 @@ def _tune(prim: Usd.Prim, joint: Any, axes: list[str], options: Options, descrip
             _write(prim, f"physxJointAxis:{axis}:maxJointVelocity", names, speed * unit)
 
 
-def _speed(joint: Any, options: Options, description: Description) -> float | None:
-    """The URDF's highest speed [rad/s or m/s]; None if it gives none."""
+def _speed(joint: Any, wheel: bool, description: Description) -> float | None:
+    """The URDF's highest speed [rad/s or m/s]; None if it gives none, but for a driven wheel."""
     speed = None if joint.limit is None else joint.limit.velocity
-    if speed is not None and (speed < 0 or np.isnan(speed)):
+    if speed is not None and not speed >= 0:
         raise description.refused("joint", joint.name, f"has a velocity of {speed:g}; give one above 0")
-    return speed if speed and np.isfinite(speed) else None
+    if speed and np.isfinite(speed):
+        return float(speed)
+    if wheel:
+        description.note(f"joint {joint.name!r} gives no velocity: it may turn at {WHEEL_SPEED:g} rad/s")
+        return WHEEL_SPEED
+    return None
 
 
 def _passive(joint: Any, name: str, description: Description) -> float:

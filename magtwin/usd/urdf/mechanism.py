@@ -74,18 +74,25 @@ def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mec
         reason = _welded(joint, options)
         if reason is not None:
             welded[joint.name] = reason
+            if reason:
+                description.note(f"joint {joint.name!r} ({joint.type}) {reason}: welded")
     mimics, rests = {}, {}
     for name, joint in joints.items():
         if name in welded:
             limit = joint.limit
             if welded[name] and limit.lower is not None and limit.lower == limit.upper != 0:
                 rests[name] = float(limit.lower)
+            if joint.mimic is not None:
+                description.note(
+                    f"joint {name!r} cannot move: that it mimics {joint.mimic.joint!r} is left out"
+                )
             continue
         if joint.mimic is None:
             continue
         mimic = _resolved(joint, joints, description)
         if mimic.leader in welded:
             welded[name] = f"follows {mimic.leader!r}, which cannot move"
+            description.note(f"joint {name!r} {welded[name]}: welded")
         else:
             mimics[name] = mimic
         start = mimic.multiplier * _rest_of(joints[mimic.leader], welded) + mimic.offset

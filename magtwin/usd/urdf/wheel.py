@@ -9,11 +9,15 @@ from numpy.typing import NDArray
 
 from magtwin.names import RefusedError
 from magtwin.usd.urdf.description import Description, origin_of
+from magtwin.usd.urdf.drive import DEFAULT_EFFORT
 from magtwin.usd.urdf.gazebo import Surface
 from magtwin.usd.urdf.mechanism import Mechanism
 
 WHEEL_FRICTION, CASTER_FRICTION = 1.0, 0.05
 """Friction of driven wheels and of what slides, where the URDF gives none: rubber, and a polished ball."""
+
+GRAVITY = 9.81
+"""[m/s2]."""
 
 CASTER_NAMES = ("caster", "castor")
 """What links that slide are called."""
@@ -22,8 +26,8 @@ FLOOR = 0.002
 """Distance from the lowest point of the wheels within which something else touches the floor too [m]."""
 
 
-def find_wheels(mechanism: Mechanism, named: Iterable[str] = ()) -> tuple[str, ...]:
-    """Names of the joints of a robot's driven wheels.
+def find_wheels(mechanism: Mechanism, named: Iterable[str] = ()) -> dict[str, float]:
+    """The joints of a robot's driven wheels by name, with the torque that each gets if the URDF gives none.
 
     Those that a drive plugin names, or else the continuous joints about a level axis, but those of
     casters: called so, or below a joint that swivels about the vertical.
@@ -35,13 +39,12 @@ def find_wheels(mechanism: Mechanism, named: Iterable[str] = ()) -> tuple[str, .
     Raises:
         RefusedError: There are fewer than two.
     """
-    description = mechanism.description
+    description, poses = mechanism.description, mechanism.poses()
     joints = {joint.name: joint for joint in description.joints.values()}
     wheels = tuple(
         name for name in named if name in joints and joints[name].type in ("continuous", "revolute")
     )
     if not wheels:
-        poses = mechanism.poses()
         wheels = tuple(
             name
             for name, joint in joints.items()
@@ -54,7 +57,8 @@ def find_wheels(mechanism: Mechanism, named: Iterable[str] = ()) -> tuple[str, .
             f"{description.path}: profile diff-drive wants two wheels, continuous joints about a level axis; "
             f"found {', '.join(wheels) or 'none'}; convert with the profile general"
         )
-    return wheels
+    mass = sum(link.inertial.mass or 0.0 for link in description.links.values() if link.inertial is not None)
+    return {name: _torque(description.links[joints[name].child], mass / len(wheels)) for name in wheels}
 
 
 def grip(mechanism: Mechanism, wheels: Iterable[str], surfaces: Mapping[str, Surface]) -> dict[str, Surface]:
@@ -84,6 +88,21 @@ def grip(mechanism: Mechanism, wheels: Iterable[str], surfaces: Mapping[str, Sur
         given[name] = replace(Surface(), friction=friction)
         description.note(f"link {name!r} is {what} and gives no friction: {friction:g}")
     return given
+
+
+def _torque(link: Any, mass: float) -> float:
+    """Half of what a wheel's rim can pass on to the floor: mu m g r / 2 [N m].
+
+    More would throw the robot back at each step of its command, which no base of this kind can do.
+
+    Args:
+        link: yourdfpy's link of the wheel; its radius is that of its round collider or visual.
+        mass: The wheel's share of the robot's [kg].
+    """
+    shapes = [shape.geometry for shape in (*link.collisions, *link.visuals)]
+    round_ones = [geometry.cylinder or geometry.sphere for geometry in shapes]
+    radius = max((float(one.radius) for one in round_ones if one is not None), default=0.0)
+    return float(f"{WHEEL_FRICTION * mass * GRAVITY * radius / 2:.3g}") or DEFAULT_EFFORT
 
 
 def _rolls(joint: Any, poses: Mapping[str, NDArray]) -> bool:
