@@ -162,14 +162,15 @@ def test_a_wheel_without_effort_is_noted_and_a_dead_suspension_is_welded(tmp_pat
 
 def test_friction_of_gazebo_tags_reaches_the_collider(tmp_path):
     path = arm(tmp_path, "fixed|")
-    tag = '<gazebo reference="hand"><mu1>0.05</mu1><kp>1</kp></gazebo></robot>'
+    tag = '<gazebo reference="hand"><mu1>0.05</mu1><maxVel>1</maxVel></gazebo></robot>'
     path.write_text(path.read_text().replace("</robot>", tag))
     _, robot = convert(path)
     collider = robot.GetPrimAtPath("hand/collisions").GetChildren()[0]
     grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0]
     assert_allclose(UsdPhysics.MaterialAPI(grip).GetDynamicFrictionAttr().Get(), 0.05, rtol=1e-6)
     assert collider.GetAttribute("purpose").Get() == "guide"
-    assert "1 elements in <gazebo> tags are not converted; only mu1 is" in read_notes(tmp_path / "arm.usda")
+    (note,) = read_notes(tmp_path / "arm.usda")
+    assert note == "1 tags without a meaning here are kept as text, such as gazebo/maxVel"
 
 
 def test_colours_of_materials_arrive_linear_and_one_name_with_two_colours_stays_two(tmp_path):
@@ -351,11 +352,14 @@ REFUSED = {
     "mesh absolute": (mesh_link("/etc/x.stl"), r"mesh '/etc/x\.stl' lies outside"),
     "mesh format": (mesh_link("a.blend"), r"mesh 'a\.blend' is of no known format \(\.dae, \.glb"),
     "mesh scale": (mesh_link('t.stl" scale="1 0 1'), r"mesh 't\.stl' has scale \[1\.0, 0\.0, 1\.0\]; give"),
-    "package": (mesh_link("package://nowhere/a.stl"), "is in a package: no package 'nowhere' around it; give"),
+    "package": (
+        mesh_link("package://nowhere/a.stl"),
+        "is in a package: no package 'nowhere' around it; give",
+    ),
     "package above": (mesh_link("package://arms/../../a.stl"), r"mesh .* lies outside .*arms"),
     "no mass": (NO_MASS, r":3: link 'b' has a mass of 0"),
     "inertia": (f'<link name="b">{FLAT}</link>', r":3: link 'b' has an impossible inertia: no body has"),
-    "friction": (LINK + NEGATIVE, r"arm\.urdf:3: mu1 of 'base_link' must be a number not below 0, got '-1'"),
+    "friction": (LINK + NEGATIVE, r"arm\.urdf:3: mu1 must be a finite number not below 0, got '-1'"),
     "reserved": (LINK.replace("base_link", "joints"), "'joints' would become prim 'joints', which is taken"),
     "no number": (NO_NUMBER, r":3: link 'b': radius of <sphere> must be a finite number, got 'big'"),
 }

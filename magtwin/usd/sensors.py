@@ -83,10 +83,16 @@ def define_imu(stage: Usd.Stage, path: str | Sdf.Path, spec: ImuSpec) -> Usd.Pri
     """
     prim = _define_mounted(stage, path, spec)
     write_figures(apply_api(prim, "imu"), "imu", spec, skip=POSE_FIELDS)
-    sensor = stage.DefinePrim(prim.GetPath().AppendChild("imu_sensor"), IMU_TYPE)
-    _write_foreign(sensor, "enabled", Sdf.ValueTypeNames.Bool, True)
-    _write_foreign(sensor, "sensorPeriod", Sdf.ValueTypeNames.Float, 1 / spec.rate_hz)
+    define_isaac_imu(prim, spec.rate_hz)
     return prim
+
+
+def define_isaac_imu(mount: Usd.Prim, rate_hz: float) -> Usd.Prim:
+    """Author NVIDIA's inertial unit as a child of an Xform; returns the sensor's prim."""
+    sensor = mount.GetStage().DefinePrim(mount.GetPath().AppendChild("imu_sensor"), IMU_TYPE)
+    _write_foreign(sensor, "enabled", Sdf.ValueTypeNames.Bool, True)
+    _write_foreign(sensor, "sensorPeriod", Sdf.ValueTypeNames.Float, 1 / rate_hz)
+    return sensor
 
 
 def read_imu(prim: Usd.Prim) -> ImuSpec:
@@ -101,16 +107,31 @@ def define_lidar(stage: Usd.Stage, path: str | Sdf.Path, spec: LidarSpec) -> Usd
     """
     prim = _define_mounted(stage, path, spec)
     write_figures(apply_api(prim, "lidar"), "lidar", spec, skip=POSE_FIELDS)
-    sensor = stage.DefinePrim(prim.GetPath().AppendChild("omni_lidar"), LIDAR_TYPE)
+    define_omni_lidar(prim, spec.scan_rate_hz, (spec.range_min_m, spec.range_max_m))
+    return prim
+
+
+def define_omni_lidar(
+    mount: Usd.Prim, scan_rate_hz: float, ranges_m: tuple[float, float], *, rotary: bool = True
+) -> Usd.Prim:
+    """Author NVIDIA's LiDAR as a child of an Xform; returns the sensor's prim.
+
+    Args:
+        mount: Its pose.
+        scan_rate_hz: Scans a second [Hz]; NVIDIA's is a whole number, from 1.
+        ranges_m: Nearest and farthest range [m].
+        rotary: Whether it turns, or fires one fixed pattern.
+    """
+    sensor = mount.GetStage().DefinePrim(mount.GetPath().AppendChild("omni_lidar"), LIDAR_TYPE)
     if LIDAR_API not in sensor.GetPrimTypeInfo().GetAppliedAPISchemas():
         sensor.AddAppliedSchema(LIDAR_API)
     names, core = Sdf.ValueTypeNames, "omni:sensor:Core:"
-    turns = round(np.clip(spec.scan_rate_hz, 1, 1e6))  # NVIDIA's is a whole number
-    _write_foreign(sensor, core + "scanType", names.Token, "ROTARY")
+    turns = round(np.clip(scan_rate_hz, 1, 1e6))
+    _write_foreign(sensor, core + "scanType", names.Token, "ROTARY" if rotary else "SOLID_STATE")
     _write_foreign(sensor, core + "scanRateBaseHz", names.UInt, turns)
-    _write_foreign(sensor, core + "nearRangeM", names.Float, spec.range_min_m)
-    _write_foreign(sensor, core + "farRangeM", names.Float, spec.range_max_m)
-    return prim
+    _write_foreign(sensor, core + "nearRangeM", names.Float, ranges_m[0])
+    _write_foreign(sensor, core + "farRangeM", names.Float, ranges_m[1])
+    return sensor
 
 
 def read_lidar(prim: Usd.Prim) -> LidarSpec:

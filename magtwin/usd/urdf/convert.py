@@ -3,17 +3,26 @@
 import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 
 from magtwin.files import check_free, output, sha256
 from magtwin.names import RefusedError
+from magtwin.spec import DriveSpec
 from magtwin.usd.layers import describe_stage, open_stage
 from magtwin.usd.sensors import write_pose
+from magtwin.usd.urdf.control import define_differential, define_safety, read_commands, read_drive
 from magtwin.usd.urdf.description import Description, origin_of, read_description
 from magtwin.usd.urdf.drive import NO_WHEELS, check_rules
-from magtwin.usd.urdf.gazebo import Surface, read_surfaces
+from magtwin.usd.urdf.gazebo import (
+    Surface,
+    define_springs,
+    define_weightless,
+    read_surfaces,
+    self_collides,
+)
 from magtwin.usd.urdf.joint import define_joint, define_mimic, define_root_joint
 from magtwin.usd.urdf.layout import GEOMETRIES, PAYLOADS, check_payloads, write_layers
 from magtwin.usd.urdf.link import Rider, define_body, define_frame, is_marker
@@ -24,8 +33,10 @@ from magtwin.usd.urdf.merge import WORLD, Place, carried, place_links, riders
 from magtwin.usd.urdf.mesh_layer import MeshLayer, gather
 from magtwin.usd.urdf.options import DEFAULTS, Options
 from magtwin.usd.urdf.report import ConversionReport, Ledger, make_report
+from magtwin.usd.urdf.sensor import define_sensors
 from magtwin.usd.urdf.shape import define_collider, define_visual, pose_of
 from magtwin.usd.urdf.source import read_source
+from magtwin.usd.urdf.tag import Tags
 from magtwin.usd.urdf.texture import TEXTURES
 from magtwin.usd.urdf.wheel import find_wheels, grip
 
@@ -203,11 +214,14 @@ def _author(
     """The robot's prim with all that hangs from it."""
     describe_stage(stage, f"{description.name}: converted from {description.path.name}.")
     names = _prim_names(description)
-    mechanism = read_mechanism(description, options)
+    mechanism, tags = read_mechanism(description, options), Tags(description)
     check_rules(mechanism, options)
-    surfaces, wheels = read_surfaces(description), NO_WHEELS
+    drive, commands = read_drive(tags, mechanism), read_commands(tags, mechanism)
+    options = replace(options, drives=(*options.drives, *commands))
+    surfaces, wheels = read_surfaces(tags), NO_WHEELS
     if options.profile == "diff-drive":
-        wheels = find_wheels(mechanism)
+        named = () if drive is None else (drive.left_wheel_joint, drive.right_wheel_joint)
+        wheels = find_wheels(mechanism, named)
         surfaces = grip(mechanism, wheels, surfaces)
     places, poses = place_links(mechanism, merge=options.merge_fixed), mechanism.poses()
     robot = UsdGeom.Xform.Define(stage, Sdf.Path.absoluteRootPath.AppendChild(names[""])).GetPrim()
@@ -242,8 +256,37 @@ def _author(
             ledger.link(name, "frame" if is_marker(description.links[name]) else "merged", frame)
     scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(JOINTS)).GetPath()
     joints = _define_joints(stage, scope, mechanism, options, wheels, places, paths, ledger)
-    _articulate(robot, [path for name, path in paths.items() if name != WORLD], joints)
+    links = [path for name, path in paths.items() if name != WORLD]
+    _articulate(robot, links, joints, self_collision=self_collides(tags))
+    _equip(robot, tags, options, drive, ledger)
     return robot
+
+
+def _equip(robot: Usd.Prim, tags: Tags, options: Options, drive: DriveSpec | None, ledger: Ledger) -> None:
+    """Author what the tags beyond URDF tell of; what is left of them is kept as text."""
+    stage = robot.GetStage()
+
+    def link_of(name: str) -> Usd.Prim:
+        return stage.GetPrimAtPath(ledger.bodies[name][1])
+
+    def joint_of(name: str) -> Usd.Prim | None:
+        return stage.GetPrimAtPath(ledger.joints[name]) if name in ledger.joints else None
+
+    define_springs(tags, joint_of, options)
+    define_weightless(tags, link_of)
+    define_safety(tags, joint_of)
+    if drive is not None:
+        define_differential(robot, drive, {name: path.name for name, path in ledger.joints.items()})
+    define_sensors(tags, robot, link_of)
+    ledger.unknown_tags = tags.keep(
+        lambda name: link_of(name) if name in ledger.bodies else joint_of(name) or robot
+    )
+    count = sum(ledger.unknown_tags.values())
+    if count:
+        most = sorted(ledger.unknown_tags, key=lambda tag: -ledger.unknown_tags[tag])[:4]
+        tags.description.note(
+            f"{count} tags without a meaning here are kept as text, such as {', '.join(most)}"
+        )
 
 
 def _define_joints(
@@ -284,14 +327,17 @@ def _define_joints(
     return [prim.GetPath() for prim in made.values()]
 
 
-def _articulate(robot: Usd.Prim, links: list[Sdf.Path], joints: list[Sdf.Path]) -> None:
-    """Make the robot's prim one articulation that floats and does not collide with itself."""
+def _articulate(
+    robot: Usd.Prim, links: list[Sdf.Path], joints: list[Sdf.Path], *, self_collision: bool
+) -> None:
+    """Make the robot's prim one articulation, that says whether it collides with itself."""
     UsdPhysics.ArticulationRootAPI.Apply(robot)
     robot.AddAppliedSchema(ROBOT_API)
     robot.AddAppliedSchema(ARTICULATION_API)
     kinds = Sdf.ValueTypeNames
-    robot.CreateAttribute("newton:selfCollisionEnabled", kinds.Bool, custom=False).Set(False)
-    robot.CreateAttribute("physxArticulation:enabledSelfCollisions", kinds.Bool, custom=False).Set(False)
+    robot.CreateAttribute("newton:selfCollisionEnabled", kinds.Bool, custom=False).Set(self_collision)
+    physx = robot.CreateAttribute("physxArticulation:enabledSelfCollisions", kinds.Bool, custom=False)
+    physx.Set(self_collision)
     robot.CreateRelationship("isaac:physics:robotLinks", custom=False).SetTargets(links)
     robot.CreateRelationship("isaac:physics:robotJoints", custom=False).SetTargets(joints)
 

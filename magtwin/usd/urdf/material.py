@@ -13,6 +13,9 @@ Rgba = tuple[float, float, float, float]
 GREY: Rgba = (0.5, 0.5, 0.5, 1.0)
 """Look of what has none."""
 
+PHYSX_API = "PhysxMaterialAPI"
+"""PhysX's applied schema, by name: its plugin lives elsewhere."""
+
 LOOKS = "Looks"
 """Scope of all materials below the robot's prim."""
 
@@ -155,11 +158,18 @@ def define_grip(robot: Usd.Prim, surface: Surface) -> UsdShade.Material:
 
     Args:
         robot: Root prim; physics materials lie among its looks.
-        surface: Coefficients of friction [-] and restitution [-].
+        surface: How it grips and bounces; how it gives way is PhysX's own, a compliant contact.
     """
     stage = robot.GetStage()
     scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(LOOKS)).GetPath()
-    path = scope.AppendChild(Tf.MakeValidIdentifier(f"friction_{surface.friction:g}"))
+    name = f"friction_{surface.friction:g}"
+    for label, value in (
+        ("bounce", surface.restitution or None),
+        ("stiffness", surface.stiffness),
+        ("damping", surface.damping),
+    ):
+        name += "" if value is None else f"_{label}_{value:g}"
+    path = scope.AppendChild(Tf.MakeValidIdentifier(name))
     if stage.GetPrimAtPath(path):
         return UsdShade.Material(stage.GetPrimAtPath(path))
     material = UsdShade.Material.Define(stage, path)
@@ -167,6 +177,12 @@ def define_grip(robot: Usd.Prim, surface: Surface) -> UsdShade.Material:
     api.CreateStaticFrictionAttr(surface.friction)
     api.CreateDynamicFrictionAttr(surface.friction)
     api.CreateRestitutionAttr(surface.restitution)
+    for what, value in (("Stiffness", surface.stiffness), ("Damping", surface.damping)):
+        if value is not None:
+            if PHYSX_API not in material.GetPrim().GetPrimTypeInfo().GetAppliedAPISchemas():
+                material.GetPrim().AddAppliedSchema(PHYSX_API)
+            attribute = f"physxMaterial:compliantContact{what}"
+            material.GetPrim().CreateAttribute(attribute, Sdf.ValueTypeNames.Float, custom=False).Set(value)
     return material
 
 

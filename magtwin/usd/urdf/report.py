@@ -173,6 +173,9 @@ class Ledger:
     shapes: dict[tuple[str, str, int], list[Sdf.Path]] = field(default_factory=dict)
     """Prims of each geometry, by link, role and index."""
 
+    unknown_tags: dict[str, int] = field(default_factory=dict)
+    """How often each tag was met that has no meaning here."""
+
     def link(self, name: str, became: str, prim: Usd.Prim) -> None:
         """Put down a link's prim."""
         self.bodies[name] = (became, prim.GetPath())
@@ -195,7 +198,6 @@ def make_report(
     name: str,
     sha256: str,
     lint: tuple[str, ...] = (),
-    unknown_tags: Mapping[str, int] | None = None,
 ) -> ConversionReport:
     """Compare a description with the stage that was made of it.
 
@@ -210,7 +212,6 @@ def make_report(
         name: Name of the root layer.
         sha256: Checksum of the description's file.
         lint: Lines of `lint.lint`.
-        unknown_tags: Tags without a meaning here, with their number.
     """
     lines = _geometries(description, meshes, stage, ledger)
     links = tuple(_link(name_, link, stage, ledger) for name_, link in description.links.items())
@@ -245,7 +246,7 @@ def make_report(
         notes=tuple(description.notes),
         losses=tuple(dict.fromkeys(losses)),
         lint=tuple(lint),
-        unknown_tags=dict(sorted((unknown_tags or {}).items())),
+        unknown_tags=dict(sorted(ledger.unknown_tags.items())),
     )
 
 
