@@ -246,7 +246,8 @@ def _parse(path: Path) -> tuple[dict[str, Any], bytes]:
         return json.loads(data), b""
     if len(data) < 20 or struct.unpack_from("<I", data, 8)[0] > len(data):
         raise RefusedError(f"{path}: is cut short; export it again")
-    found, at = {}, 12
+    found: dict[int, bytes] = {}
+    at = 12
     while at + 8 <= len(data):
         length, kind = struct.unpack_from("<II", data, at)
         found.setdefault(kind, data[at + 8 : at + 8 + length])

@@ -1,6 +1,7 @@
 """Material: how a surface looks (UsdPreviewSurface) and how it grips (UsdPhysics)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
@@ -95,7 +96,7 @@ def define_look(robot: Usd.Prim, look: Look) -> UsdShade.Material:
     return material
 
 
-def _inputs(look: Look) -> list[tuple[str, Sdf.ValueTypeName, object]]:
+def _inputs(look: Look) -> list[tuple[str, Sdf.ValueTypeName, Any]]:
     """Inputs of a look's UsdPreviewSurface: name, type and value."""
     kinds = Sdf.ValueTypeNames
     colour = look.display_colour if look.texture else linear_from_srgb(look.rgba[:3])

@@ -93,11 +93,10 @@ class Piece:
 
     def flipped(self) -> "Piece":
         """The piece with its faces wound the other way, their normals as they are."""
-        corners = {
-            name: None if (values := getattr(self, name)) is None else values[:, ::-1]
-            for name in ("normals", "uvs", "colours")
-        }
-        return replace(self, faces=self.faces[:, ::-1], **corners)
+        normals, uvs, colours = (
+            None if values is None else values[:, ::-1] for values in (self.normals, self.uvs, self.colours)
+        )
+        return replace(self, faces=self.faces[:, ::-1], normals=normals, uvs=uvs, colours=colours)
 
 
 @dataclass(frozen=True)

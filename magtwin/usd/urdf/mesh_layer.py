@@ -278,7 +278,9 @@ def _primvar(mesh: UsdGeom.Mesh, name: str, kind: Sdf.ValueTypeName, values: NDA
 
 def _subsets(mesh: UsdGeom.Mesh, file: Mesh) -> list[str]:
     """A GeomSubset a paint, named after it."""
-    api, taken, names = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()), set(), []
+    api = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
+    taken: set[str] = set()
+    names: list[str] = []
     for i, paint in enumerate(file.paints):
         name = free_name(Tf.MakeValidIdentifier((paint.name if paint else "") or "plain"), taken)
         faces = Vt.IntArray.FromNumpy(np.flatnonzero(file.paint == i).astype(np.int32))

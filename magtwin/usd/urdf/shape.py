@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
-from magtwin.names import RefusedError
 from magtwin.usd.sensors import write_pose
 from magtwin.usd.urdf.description import Description, origin_of
 from magtwin.usd.urdf.gazebo import Surface
@@ -177,13 +176,6 @@ def _define_primitive(body: Usd.Prim, scope: str, shape: Any) -> Usd.Prim:
     stage, geometry = body.GetStage(), shape.geometry
     kind = next(k for k in ("box", "capsule", "cylinder", "sphere") if getattr(geometry, k, None) is not None)
     solid, path, scale = getattr(geometry, kind), _path(body, scope, shape.name or kind), None
-    sizes = np.atleast_1d(
-        [getattr(solid, name) for name in ("size", "radius", "length") if hasattr(solid, name)]
-    )
-    if not (np.isfinite(sizes).all() and (sizes > 0).all()):
-        raise RefusedError(
-            f"link {body.GetName()!r}: a {kind} has sizes {sizes.ravel().tolist()}; all must be above 0"
-        )
     if kind == "box":
         prim = UsdGeom.Cube.Define(stage, path).GetPrim()
         UsdGeom.Cube(prim).CreateSizeAttr(1.0)

@@ -76,7 +76,7 @@ def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
     except (OSError, RefusedError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
         reading.lose(f"texture {name!r} is no picture that can be read and is left out ({error})")
         return None
-    r, g, b = (c / 255 for c in rgba.convert("RGB").resize((1, 1), Pillow.Resampling.BOX).getpixel((0, 0)))
+    r, g, b = (c / 255 for c in rgba.convert("RGB").resize((1, 1), Pillow.Resampling.BOX).tobytes())
     if kind not in KEPT:
         reading.note(f"texture {name!r} is {kind}, which not every USD viewer reads; written as PNG")
         buffer = io.BytesIO()

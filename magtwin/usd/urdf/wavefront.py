@@ -37,8 +37,10 @@ def read_wavefront(reading: Reading) -> list[Piece]:
     """
     path = reading.path
     rows: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}
-    groups, paints, group, unread = [_Group("")], {}, None, set()
-    group = groups[0]
+    paints: dict[str, Paint] = {}
+    unread: set[str] = set()
+    group = _Group("")
+    groups = [group]
     for number, words in _statements(path):
         kind = words[0]
         if kind in rows:
