@@ -74,16 +74,31 @@ def output(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Pat
         RefusedError: It exists and `force` was not given, or its folder cannot be written.
     """
     path = check_free(path, force=force)
+    place = Path.cwd() / path  # the working folder may itself be renamed
+    if place.resolve() in (Path.cwd(), *Path.cwd().parents):
+        raise RefusedError(f"{path}: is the working folder or holds it; name a folder inside it")
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise RefusedError(f"{path}: a device or pipe, which cannot be replaced; name a file")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        place.parent.mkdir(parents=True, exist_ok=True)
+        aside = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
     except OSError as error:
         raise RefusedError(f"{path}: cannot be written ({error.strerror})") from error
+    new, old = aside / place.name, aside / ".old"
     try:
-        yield aside / path.name
-        if path.is_dir():
-            path.rename(aside / ".old")
-        (aside / path.name).replace(path)
+        yield new
+        if place.exists() and place.is_dir() != new.is_dir():
+            kind = "folder" if place.is_dir() else "file"
+            raise RefusedError(f"{path}: is a {kind}, which this output will not replace; remove it first")
+        if place.is_dir():
+            place.rename(old)
+            try:
+                new.rename(place)
+            except BaseException:
+                old.rename(place)
+                raise
+        else:
+            new.replace(place)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
 
@@ -101,6 +116,8 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
         RefusedError: The file is missing, or is not TOML; the text gives the line.
     """
     path = existing(path, "TOML file")
+    if path.is_dir():
+        raise RefusedError(f"{path}: a folder; give a TOML file")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -189,6 +206,8 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
         if len(args) != len(value):
             raise wrong
         if any(dataclasses.is_dataclass(a) for a in args):
+            if not all(isinstance(v, dict) for v in value):
+                raise wrong
             return tuple(from_table(a, v, where.path, section) for a, v in zip(args, value, strict=True))
         return tuple(_value(a, v, where, key) for a, v in zip(args, value, strict=True))
     if origin is typing.Literal:
@@ -200,6 +219,8 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
             raise wrong
         return {name: _value(args[1], entry, where, name) for name, entry in value.items()}
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        if not abs(value) < 1e300:  # nan, inf, and whole numbers that no float holds
+            raise wrong
         return float(value)
     if kind is Path and isinstance(value, str):
         return (where.path.parent / value).resolve()

@@ -134,12 +134,19 @@ class Run(Mapping[str, NDArray[Any]]):
             if len(values):
                 note = f"{values.min():.0f} to {values.max():.0f}"
                 figures.append(Figure(name, float(values.mean()), "nT", float(values.std()), note))
-        error = self.columns.get("b_total_nt", np.array([])) - self.columns.get("b_truth_nt", np.array([]))
+        error = (
+            self["b_total_nt"] - self["b_truth_nt"]
+            if {"b_total_nt", "b_truth_nt"} <= set(self)
+            else np.array([])
+        )
         if np.nanmax(np.abs(error), initial=0.0) > 0:
             note = "mean absolute difference of b_total_nt from b_truth_nt"
             figures.append(Figure("error", float(np.nanmean(np.abs(error))), "nT", None, note))
         raised = [name for name in self if name.startswith("flag_") and self[name].any()]
-        figures += [Figure(n, int(self[n].sum()), "readings", None, COLUMNS[n].doc) for n in raised]
+        figures += [
+            Figure(n, int(self[n].sum()), "readings", None, COLUMNS[n].doc if n in COLUMNS else "")
+            for n in raised
+        ]
         return Report(title, tuple(figures), dict(self.facts))
 
 

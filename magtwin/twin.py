@@ -116,6 +116,8 @@ def simulate(
         twin = open_twin(twin, net=net)
     elif net is not None:
         raise RefusedError("net goes to open_twin where a Twin is given to simulate")
+    if not isinstance(seed, int) or seed < 0:
+        raise RefusedError(f"seed must be a whole number from 0 up, got {seed!r}")
     magnetometer = twin.magnetometer
     run = run_scene(
         twin.scene,

@@ -289,6 +289,9 @@ def _copied_asset(asset: Path, folder: Path) -> Path:
     if unresolved:
         raise RefusedError(f"{asset}: names {unresolved[0]}, which is not there")
     files = sorted({asset, *(Path(layer.realPath).resolve() for layer in layers), *map(Path, assets)})
+    outside = [file for file in files if not file.is_relative_to(asset.parent)]
+    if outside:
+        raise RefusedError(f"{asset}: names {outside[0]}, outside its folder; copy it into {asset.parent}")
     common = Path(os.path.commonpath([file.parent for file in files]))
     for file in files:
         _copied(file, (folder / file.relative_to(common)).parent)
