@@ -1,8 +1,9 @@
 """The command line: one typed function a subcommand, nothing else."""
 
+import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -29,12 +30,19 @@ net_app = App(name="net", help="Work with networks.")
 app.command(map_app)
 app.command(net_app)
 
+
+def _whole(kind: type, tokens: Any) -> int:
+    """A whole number; cyclopts itself would round 1.5 to 2."""
+    return int(tokens[0].value)
+
+
+Seed = Annotated[int, Parameter(converter=_whole)]
 Force = Annotated[bool, Parameter(name="--force", negative="")]
 Json = Annotated[bool, Parameter(name="--json", negative="")]
 
 
 @app.command
-def demo(*, out: Path = Path("demo"), seed: int = 0, force: Force = False, json: Json = False) -> None:
+def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json: Json = False) -> None:
     """Author a lab and a TurtleBot 4, drive a figure of eight, log what the magnetometer reads.
 
     Writes the stages, run.rrd (opens in Rerun), run.parquet and pictures. Takes under a minute.
@@ -304,7 +312,7 @@ def run(
     *,
     path: str = "figure8",
     net: Path | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     speed: float = 0.2,
     duration: float | None = None,
     rate_hz: float | None = None,
@@ -356,9 +364,10 @@ def run(
     existing(scene, "scene")
     if out is rrd is parquet is None:
         out = Path("run")
-    for target in (out, rrd, parquet):
-        if target is not None:
-            check_free(target, force=force)
+    targets = [None if target is None else check_free(target, force=force) for target in (out, rrd, parquet)]
+    places = [target.resolve() for target in targets if target is not None]
+    if len(set(places)) < len(places):
+        raise RefusedError("two outputs have one name; give each its own")
     options: dict[str, Any] = {
         "steps": _steps(quiet=json),
         "net": net,
@@ -368,17 +377,13 @@ def run(
         "rate_hz": rate_hz,
         "lidar": lidar,
         "outside": outside,
-        "rrd": rrd,
-        "parquet": parquet,
-        "force": force,
         "title": f"{path} in {scene}",
     }
-    if out is None:
-        report = _run(scene, path, None, **options)
-    else:
-        with output(out, force=force) as folder:
-            folder.mkdir()
-            report = _run(scene, path, folder, **options)
+    with ExitStack() as stack:  # all are written, or none
+        asides = [t if t is None else stack.enter_context(output(t, force=force)) for t in targets]
+        if asides[0] is not None:
+            asides[0].mkdir()
+        report = _run(scene, path, asides[0], rrd=asides[1], parquet=asides[2], **options)
     _print_report(report, json)
     if not json:
         _say("Wrote " + ", ".join(str(target) for target in (out, rrd, parquet) if target is not None))
@@ -429,17 +434,19 @@ def info(file: Path, *, json: Json = False) -> None:
         ".safetensors": _info_of_net,
         ".pth": _info_of_net,
     }
+    if file.is_dir():
+        raise RefusedError(f"{file}: a folder; name a file in it, or use `magtwin map info` for a survey")
     _print_report(find("kind of file", file.suffix, suffixes)(file), json)
 
 
 @app.command
 def view(file: Path) -> None:
-    """Open a recording, or the recording of a run, in the Rerun viewer.
+    """Open a recording, or the series of a run, in the Rerun viewer.
 
     Parameters
     ----------
     file
-        A .rrd file.
+        A .rrd file, or a .parquet file of a run.
     """
     from magtwin.io.rerun import view as view_rrd
 
@@ -480,12 +487,16 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `magtwin` command; `arguments` are those of the command line unless given."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what is half-written goes
     try:
         app([a for a in arguments if a != "--debug"], exit_on_error=False, result_action="return_value")
     except CycloptsError:
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
+    except BrokenPipeError:  # `magtwin info ... | head`
+        sys.stderr.close()
+        sys.exit(141)
     except Exception as error:
         if debug:
             raise
@@ -560,18 +571,19 @@ def _print_report(report: Any, as_json: bool) -> None:
     for figure in report.figures:
         if isinstance(figure.value, str):
             note = f"  ({figure.note})" if figure.note else ""
-            words.add_row(figure.name, Text(f"{figure.value} {figure.unit}{note}".strip()))
+            words.add_row(Text(figure.name), Text(f"{figure.value} {figure.unit}{note}".strip()))
         else:
             value = f"{figure.value:,.6g}" if isinstance(figure.value, float) else f"{figure.value:,}"
             spread = f"± {figure.spread:,.3g}" if figure.spread is not None else ""
-            numbers.add_row(figure.name, value, spread, figure.unit, Text(figure.note, style="dim"))
+            cells = (figure.name, value, spread, figure.unit)
+            numbers.add_row(*map(Text, cells), Text(figure.note, style="dim"))
     for name, fact in report.facts.items():
         if isinstance(fact, dict):
             entries = list(fact.items())
         else:
             entries = [("", entry) for entry in (fact if isinstance(fact, list) else [fact])]
         for key, entry in entries:
-            words.add_row(f"{name} {key}".strip(), Text(str(entry)))
+            words.add_row(Text(f"{name} {key}".strip()), Text(str(entry)))
     console.print(Text(report.title, style="bold"))
     for table in (numbers, words):
         if table.row_count:
@@ -598,7 +610,6 @@ def _run(
     title: str,
     rrd: Path | None = None,
     parquet: Path | None = None,
-    force: bool = False,
     net: Path | None = None,
     **options: Any,
 ) -> Any:
@@ -615,7 +626,7 @@ def _run(
     steps("Writing the run")
     for target in (folder / "run.parquet" if folder else None, parquet):
         if target is not None:
-            write_parquet(result, target, force=force)
+            write_parquet(result, target)
     for target in (folder / "run.rrd" if folder else None, rrd):
         if target is not None:
             write_rrd(
@@ -625,7 +636,6 @@ def _run(
                 scene_file=twin.scene_file,
                 field=twin.field,
                 planned=planned,
-                force=force,
             )
     if folder:
         from magtwin.io.plots import plot_run

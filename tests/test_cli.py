@@ -237,3 +237,68 @@ def test_info_tells_of_stages_runs_and_networks(lab_scene, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["figures"]["duration"]["unit"] == "s"
     (tmp_path / "a.txt").touch()
     assert "no kind of file '.txt'" in refused(capsys, "info", tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize("seed", ["-1", "1.5"])
+def test_a_seed_that_is_no_whole_number_from_0_up_is_refused(lab_scene, tmp_path, capsys, seed):
+    with pytest.raises(SystemExit) as stop:
+        main(["run", str(lab_scene), "--seed", seed, "--parquet", str(tmp_path / "a.parquet")])
+    assert stop.value.code in (1, 2)
+    assert "seed" in capsys.readouterr().err.lower()
+    assert not list(tmp_path.iterdir())
+
+
+def test_of_several_outputs_all_are_written_or_none(lab_scene, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    arguments = ("run", lab_scene, "--duration", "1", "--parquet", tmp_path / "a.parquet")
+    assert "cannot be written" in refused(capsys, *arguments, "--rrd", tmp_path / "file" / "a.rrd")
+    assert "two outputs have one name" in refused(capsys, *arguments, "--rrd", tmp_path / "a.parquet")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_run_that_is_told_to_end_leaves_nothing(lab_scene, tmp_path):
+    import signal
+    import time
+
+    command = [sys.executable, "-c", "from magtwin.cli import main; main()", "run", str(lab_scene)]
+    process = subprocess.Popen(
+        [*command, "--duration", "20000", "--out", str(tmp_path / "run")], stderr=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + 30
+    while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert list(tmp_path.iterdir())
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 143
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_are_not_markup(lab_scene, tmp_path, capsys):
+    import shutil
+
+    folder = shutil.copytree(lab_scene.parent, tmp_path / "br[red]x[")
+    main(["info", str(folder / lab_scene.name)])
+    assert "br[red]x[" in "".join(capsys.readouterr().out.split())
+
+
+def test_a_folder_is_not_put_in_place_of_a_file_nor_a_file_of_a_folder(lab_scene, tmp_path, capsys):
+    (tmp_path / "a.png").mkdir()
+    (tmp_path / "a.png" / "mine").touch()
+    from magtwin.files import shipped
+
+    layer = shipped("maps", "lab", "lab.usdc")
+    assert "is a folder" in refused(capsys, "map", "plot", layer, "--out", tmp_path / "a.png", "--force")
+    (tmp_path / "b").write_text("mine")
+    assert "is a file" in refused(capsys, "scene", "lab", "--out", tmp_path / "b", "--force")
+    assert (tmp_path / "a.png" / "mine").is_file()
+    assert (tmp_path / "b").read_text() == "mine"
+
+
+def test_the_working_folder_and_devices_are_not_replaced(tmp_path, monkeypatch, capsys, lab_scene):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert "working folder" in refused(capsys, "scene", "lab", "--out", ".", "--force")
+    assert "working folder" in refused(capsys, "scene", "lab", "--out", "../here", "--force")
+    line = refused(capsys, "run", lab_scene, "--duration", "1", "--parquet", "/dev/null", "--force")
+    assert "a device or pipe" in line
+    assert (tmp_path / "here").is_dir()
