@@ -219,6 +219,11 @@ def test_thinning_keeps_the_ends_and_the_corners_of_a_coarse_path():
         ({"speed": 0.0}, r"speed must be above 0 and at most 0\.306 m/s"),
         ({"speed": 0.4}, r"speed must be above 0 and at most 0\.306 m/s, the drive's v_max; got 0\.4"),
         ({"speed": float("nan")}, "speed must be above 0"),
+        (
+            {"speed": 1e-9},
+            r"path sine: its \d+\.?\d* m take 1.12e\+10 s at 1e-09 m/s, more than 86400 s, a day",
+        ),
+        ({"speed": 5e-324}, "more than 86400 s, a day; drive faster than"),
         ({"speed": 0.2, "duration_s": 0.0}, "duration_s must be above 0 s"),
         ({"speed": 0.2, "duration_s": float("inf")}, "duration_s must be above 0 s and finite"),
         ({"speed": 0.2, "rate_hz": 0.0}, "rate_hz of a controller must be above 0 Hz"),

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.field import sources
-from magtwin.field.sources import dipole_field_nt
+from magtwin.field.sources import dipole_field_and_rate_nt, dipole_field_nt
 from magtwin.names import RefusedError
 
 ORIGIN = np.zeros((1, 3))
@@ -46,6 +46,33 @@ def gradient(p, place, moment, step=1e-3):
     near = dipole_field_nt(p + move, place, moment) - dipole_field_nt(p - move, place, moment)
     far = dipole_field_nt(p + 2 * move, place, moment) - dipole_field_nt(p - 2 * move, place, moment)
     return np.moveaxis((8 * near - far) / (12 * step), 0, 1)
+
+
+def test_the_rate_at_a_moving_point_is_the_gradient_along_its_velocity():
+    p, dipoles = some_points(400), some_dipoles(80)
+    v = np.random.default_rng(3).normal(size=(400, 3))
+    field, rate = dipole_field_and_rate_nt(p, v, *dipoles)
+    assert_array_equal(field, dipole_field_nt(p, *dipoles))
+    slope = gradient(p, *dipoles)
+    assert_allclose(rate, np.einsum("ni,nij->nj", v, slope), rtol=0, atol=1e-8 * np.abs(rate).max())
+
+
+def test_the_rate_on_a_dipoles_axis_is_minus_three_times_the_field_over_the_distance():
+    # B = 200 nT / z^3 along the axis, so dB/dz = -3 B / z
+    field, rate = dipole_field_and_rate_nt([0, 0, 2.0], [0, 0, 0.5], ORIGIN, [[0, 0, 1]])
+    assert_allclose(field, [0, 0, 25], rtol=1e-9)
+    assert_allclose(rate, [0, 0, -3 * 25 / 2 * 0.5], rtol=1e-9)
+
+
+def test_a_standing_point_sees_no_rate_and_no_dipoles_make_none():
+    p, dipoles = some_points(5), some_dipoles(3)
+    assert_array_equal(dipole_field_and_rate_nt(p, 0 * p, *dipoles)[1], 0 * p)
+    assert_array_equal(dipole_field_and_rate_nt(p, p, ORIGIN[:0], ORIGIN[:0])[1], 0 * p)
+
+
+def test_velocities_of_another_shape_are_refused():
+    with pytest.raises(RefusedError, match=r"v_world must have the shape of p_world, \(3,\), got \(2, 3\)"):
+        dipole_field_and_rate_nt(np.zeros(3), np.zeros((2, 3)), ORIGIN, ORIGIN)
 
 
 def test_the_field_has_neither_divergence_nor_curl():

@@ -1,5 +1,7 @@
 """Magnetised things, seen as point dipoles."""
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -32,6 +34,49 @@ def dipole_field_nt(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: Arra
     Raises:
         RefusedError: A shape is not as above.
     """
+    p, place, moment = _checked(p_world, p_world_dipole, m_world)
+    points = p.reshape(-1, 3)
+    field = np.zeros(points.shape)
+    for rows in _blocks(len(points), len(place)):
+        field[rows], _ = _dipoles(points[rows], None, place, moment)
+    return field.reshape(p.shape)
+
+
+def dipole_field_and_rate_nt(
+    p_world: ArrayLike, v_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike
+) -> tuple[Array, Array]:
+    """Field of point dipoles at points that move, and how fast it changes there.
+
+    dB/dt = (v . grad) B = mu_0 / 4 pi * sum_d 3 / |r|^5 *
+            ((m_d . v) r + (m_d . r) v + (v . r) m_d - 5 (m_d . r) (v . r) r / |r|^2),  r = p - p_d
+
+    which is the derivative of `dipole_field_nt`'s sum along v.
+
+    Args:
+        p_world: Observation points [m], shape (..., 3).
+        v_world: Their velocities [m/s], shape (..., 3).
+        p_world_dipole: Dipole positions [m], shape (D, 3).
+        m_world: Dipole moments [A m^2], shape (D, 3).
+
+    Returns:
+        Field in world axes [nT], the same bytes as `dipole_field_nt` gives, and its rate of change at
+        the moving point [nT/s], each of shape (..., 3).
+
+    Raises:
+        RefusedError: A shape is not as above.
+    """
+    p, place, moment = _checked(p_world, p_world_dipole, m_world)
+    v = np.asarray(v_world, float)
+    if v.shape != p.shape:
+        raise RefusedError(f"v_world must have the shape of p_world, {p.shape}, got {v.shape}")
+    points, velocities = p.reshape(-1, 3), v.reshape(-1, 3)
+    field, rate = np.zeros(points.shape), np.zeros(points.shape)
+    for rows in _blocks(len(points), len(place)):
+        field[rows], rate[rows] = _dipoles(points[rows], velocities[rows], place, moment)
+    return field.reshape(p.shape), rate.reshape(p.shape)
+
+
+def _checked(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike) -> tuple[Array, Array, Array]:
     p = np.asarray(p_world, float)
     place, moment = np.asarray(p_world_dipole, float), np.asarray(m_world, float)
     if p.ndim == 0 or p.shape[-1] != 3:
@@ -40,20 +85,39 @@ def dipole_field_nt(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: Arra
         raise RefusedError(
             f"p_world_dipole and m_world must have one shape (D, 3), got {place.shape} and {moment.shape}"
         )
-    points = p.reshape(-1, 3)
-    field = np.zeros(points.shape)
-    block = max(1, PAIRS // max(1, len(place)))
-    for start in range(0, len(points), block):
-        field[start : start + block] = _dipoles(points[start : start + block], place, moment)
-    return field.reshape(p.shape)
+    return p, place, moment
 
 
-def _dipoles(p: Array, place: Array, moment: Array) -> Array:
-    """Field [nT] at p (N, 3), with arrays of shape (N, D)."""
-    rx, ry, rz = (p[:, axis, None] - place[:, axis] for axis in range(3))
+def _blocks(points: int, dipoles: int) -> Iterator[slice]:
+    """Rows worked on at a time."""
+    block = max(1, PAIRS // max(1, dipoles))
+    for start in range(0, points, block):
+        yield slice(start, start + block)
+
+
+def _dipoles(p: Array, v: Array | None, place: Array, moment: Array) -> tuple[Array, Array]:
+    """Field [nT] at p (N, 3), with arrays of shape (N, D), and its rate [nT/s] for velocities v (N, 3)."""
+    r = [p[:, axis, None] - place[:, axis] for axis in range(3)]
+    scale = MU_0_OVER_4_PI * NT_PER_T
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / (rx * rx + ry * ry + rz * rz)
+        inverse = 1 / _dot(r, r)
         cubed = inverse * np.sqrt(inverse)
-        along = 3 * inverse * (moment[:, 0] * rx + moment[:, 1] * ry + moment[:, 2] * rz)
-        parts = [((along * r - moment[:, axis]) * cubed).sum(axis=1) for axis, r in enumerate((rx, ry, rz))]
-    return MU_0_OVER_4_PI * NT_PER_T * np.stack(parts, axis=-1)
+        along = 3 * inverse * _dot(moment.T, r)
+        field = [((along * r[axis] - moment[:, axis]) * cubed).sum(axis=1) for axis in range(3)]
+        if v is None:
+            return scale * np.stack(field, axis=-1), np.empty((0, 3))
+        towards = _dot(v.T[:, :, None], r)
+        radial = _dot(v.T[:, :, None], moment.T) - 5 / 3 * along * towards
+        fifth = 3 * inverse * cubed
+        radial, towards = radial * fifth, towards * fifth
+        turned = [
+            np.einsum("nd,nd->n", radial, r[axis]) + np.einsum("nd,d->n", towards, moment[:, axis])
+            for axis in range(3)
+        ]
+        rate = np.array(turned) + np.einsum("nd,nd->n", along, cubed) * v.T
+    return scale * np.stack(field, axis=-1), scale * np.stack(rate, axis=-1)
+
+
+def _dot(a: Sequence[Array] | Array, b: Sequence[Array] | Array) -> Array:
+    """Scalar products of vectors given axis by axis."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -342,9 +342,16 @@ def follow(
         way = way.prolonged(speed * duration_s)
     if start is not None:
         way = Path(way.name, np.vstack([start[:2], way.p_xy]))
+    if duration_s is None and way.length > speed * LONGEST_S > 0:
+        raise RefusedError(
+            f"path {path.name}: its {way.length:.4g} m take {way.length / speed:.3g} s at {speed:g} m/s, "
+            f"more than {LONGEST_S:g} s, a day; drive faster than {way.length / LONGEST_S:.2g} m/s, or "
+            "give duration_s"
+        )
     pieces = plan(way, drive, speed=speed)
     if duration_s is None:
-        steps = math.ceil((60 + 10 * len(pieces) + 4 * way.length / min(_SLOWEST, speed)) / dt)
+        patience_s = 60 + 10 * len(pieces) + 4 * way.length / min(_SLOWEST, speed)
+        steps = math.ceil(min(patience_s, LONGEST_S) / dt)
     else:
         steps = math.ceil(duration_s / dt - 1e-9)
     x, y, yaw = start if start is not None else (pieces[0].x[0], pieces[0].y[0], pieces[0].heading[0])

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.field.sources import dipole_field_nt
+from magtwin.field.sources import dipole_field_and_rate_nt, dipole_field_nt
 from magtwin.names import RefusedError
 from magtwin.spec import BatterySpec, PlatformFieldSpec, Scene
 
@@ -23,6 +23,31 @@ def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
     Raises:
         RefusedError: The scene has no Earth's field, so only its map is known.
     """
+    earth, place, moment = _known(scene)
+    return dipole_field_nt(p_world, place, moment) + earth
+
+
+def ambient_field_and_rate_nt(scene: Scene, p_world: ArrayLike, v_world: ArrayLike) -> tuple[Array, Array]:
+    """`ambient_field_nt` at points that move, and how fast it changes there.
+
+    Args:
+        scene: A scene whose Earth's field is known.
+        p_world: Points [m], shape (..., 3).
+        v_world: Their velocities [m/s], shape (..., 3).
+
+    Returns:
+        Field [nT] and its rate of change [nT/s], both in world axes, each of shape (..., 3).
+
+    Raises:
+        RefusedError: As for `ambient_field_nt`.
+    """
+    earth, place, moment = _known(scene)
+    field, rate = dipole_field_and_rate_nt(p_world, v_world, place, moment)
+    return field + earth, rate
+
+
+def _known(scene: Scene) -> tuple[Array, Array, Array]:
+    """The Earth's field [nT] (3,), positions [m] and moments [A m2] of the sources (D, 3)."""
     if scene.earth is None:
         raise RefusedError(
             f"scene {scene.name!r} has no Earth's field, so its exact field is not known; "
@@ -30,7 +55,7 @@ def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
         )
     place = np.array([s.p_world for s in scene.sources], float).reshape(-1, 3)
     moment = np.array([s.m_world for s in scene.sources], float).reshape(-1, 3)
-    return dipole_field_nt(p_world, place, moment) + scene.earth.b_world_nt
+    return np.array(scene.earth.b_world_nt), place, moment
 
 
 def platform_field_nt(

@@ -14,7 +14,7 @@ from magtwin.path import Path, check_on_floor
 from magtwin.run import COLUMNS, Run
 from magtwin.sim.drive import Moment, wheel_rates
 from magtwin.sim.follow import follow
-from magtwin.sim.interference import ambient_field_nt, excess_current_a, platform_field_nt
+from magtwin.sim.interference import ambient_field_and_rate_nt, excess_current_a, platform_field_nt
 from magtwin.sim.sensors import (
     charge,
     into_sensor,
@@ -28,6 +28,9 @@ from magtwin.sim.sensors import (
 from magtwin.spec import Scene
 
 Array = NDArray[np.float64]
+
+MOST_READINGS = 20_000_000
+"""Most readings of a run: about 8 GB of columns."""
 
 _STREAMS = ("odometry", "imu", "battery", "magnetometer")
 """Who draws random numbers, each from a child generator of its own; append only: the order is the seed."""
@@ -86,9 +89,12 @@ def simulate(
         )
     lidar_on(robot.lidar, 0.0, lidar)  # refuses an unknown mode before anything is computed
     check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
+    if duration_s is not None:
+        _check_readings(duration_s, rate)
 
     motion = follow(path, robot.drive, speed=speed, duration_s=duration_s)
     end = motion.duration_s if duration_s is None else duration_s
+    _check_readings(end, rate)
     t = np.arange(max(1, math.ceil(end * rate - 1e-9))) / rate
     streams = dict(zip(_STREAMS, rng.spawn(len(_STREAMS)), strict=True))
     true = motion.at(t)
@@ -122,6 +128,16 @@ def simulate(
     return Run({name: columns[name] for name in COLUMNS}, facts)
 
 
+def _check_readings(duration_s: float, rate_hz: float) -> None:
+    """Refuse a run of which no memory could hold the columns."""
+    if duration_s * rate_hz > MOST_READINGS:
+        raise RefusedError(
+            f"{duration_s:g} s at {rate_hz:g} Hz make {duration_s * rate_hz:.3g} readings, more than "
+            f"{MOST_READINGS:,}; lower rate_hz to {MOST_READINGS / duration_s:.4g} Hz, or duration_s "
+            f"to {MOST_READINGS / rate_hz:.4g} s"
+        )
+
+
 def _truth(true: Moment, t: Array, height_m: float) -> dict[str, NDArray[Any]]:
     """The columns of what the robot did and was told: a kinematic drive does what it is told."""
     zero, yaw = np.zeros(len(t)), wrap_angle(true.pose[:, 2])
@@ -152,8 +168,8 @@ def _map(
 def _exact_field(scene: Scene, true: Moment, on: NDArray[np.bool_], t: Array) -> dict[str, NDArray[Any]]:
     """Field at the magnetometer, vector in its axes and magnitude; nan where the Earth's is not known.
 
-    The rate in base_link axes is d/dt (R^T B) = R^T dB/dt - w x R^T B, with dB/dt by central
-    differences along the way of the magnetometer.
+    The rate in base_link axes is d/dt (R^T B) = R^T dB/dt - w x R^T B, with dB/dt = (u . grad) B for
+    the magnetometer's velocity u: that of the twist which holds from t on, whatever other times are asked.
     """
     robot = scene.robot
     if scene.earth is None:
@@ -164,8 +180,14 @@ def _exact_field(scene: Scene, true: Moment, on: NDArray[np.bool_], t: Array) ->
     p_world = np.column_stack(
         [x + px * cos - py * sin, y + px * sin + py * cos, np.full(len(t), robot.base_height_m + pz)]
     )
-    b_world = ambient_field_nt(scene, p_world)
-    change = np.gradient(b_world, t, axis=0) if len(t) > 1 else np.zeros_like(b_world)
+    v_world = np.column_stack(
+        [
+            true.v * cos - true.w * (p_world[:, 1] - y),
+            true.v * sin + true.w * (p_world[:, 0] - x),
+            np.zeros(len(t)),
+        ]
+    )
+    b_world, change = ambient_field_and_rate_nt(scene, p_world, v_world)
     b_base = _into_base(b_world, cos, sin)
     b_rate = _into_base(change, cos, sin)
     b_rate[:, 0] += true.w * b_base[:, 1]
