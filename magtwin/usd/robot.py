@@ -1,6 +1,7 @@
 """Robot: an asset with drive, battery and sensors, from a URDF and what a URDF cannot say."""
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -70,6 +71,7 @@ def build_robot(
     *,
     options: Options | None = None,
     force: bool = False,
+    thumbnail: Callable[[Path, Path], object] | None = None,
 ) -> ConversionReport:
     """Convert a URDF and author its drive, battery, own magnetic field and sensors.
 
@@ -79,6 +81,7 @@ def build_robot(
         out: Root layer to write, `.usda`; `read_robot` gives its spec.
         options: How the URDF is converted, in place of what the settings say.
         force: Whether files that are there are replaced.
+        thumbnail: Draws the asset, see `convert_with_report`.
 
     Returns:
         What became of the URDF.
@@ -98,7 +101,14 @@ def build_robot(
         except RefusedError as error:
             raise RefusedError(f"{where}{error}") from error
 
-    return convert_with_report(urdf, out, options=options or given.conversion, force=force, finish=finish)
+    return convert_with_report(
+        urdf,
+        out,
+        options=options or given.conversion,
+        force=force,
+        finish=finish,
+        thumbnail=thumbnail,
+    )
 
 
 def read_settings(settings: str | os.PathLike[str]) -> RobotSettings:

@@ -532,7 +532,14 @@ def write(folder):
 
 
 if __name__ == "__main__":
+    from magtwin.io.pictures import picture_of_stage
     from magtwin.usd.robot import build_robot
 
-    report = build_robot(write(HERE), HERE / "robot.toml", HERE / "turtlebot4.usda", force=True)
+    report = build_robot(
+        write(HERE),
+        HERE / "robot.toml",
+        HERE / "turtlebot4.usda",
+        force=True,
+        thumbnail=lambda asset, png: picture_of_stage(asset, png, size=(256, 256)),
+    )
     sys.stdout.write(f"{report.summary().title}\n")

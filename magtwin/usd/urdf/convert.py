@@ -35,6 +35,7 @@ from magtwin.usd.urdf.options import DEFAULTS, Options
 from magtwin.usd.urdf.report import ConversionReport, Ledger, make_report
 from magtwin.usd.urdf.sensor import define_sensors
 from magtwin.usd.urdf.shape import define_collider, define_visual, pose_of
+from magtwin.usd.urdf.simready import check_metadata, metadata
 from magtwin.usd.urdf.source import read_source
 from magtwin.usd.urdf.tag import Tags
 from magtwin.usd.urdf.texture import TEXTURES
@@ -42,6 +43,9 @@ from magtwin.usd.urdf.wheel import find_wheels, grip
 
 JOINTS = "joints"
 """Scope of the joints below the robot's prim."""
+
+THUMBNAILS = Path(".thumbs", "256x256")
+"""Folder of an asset's picture beside it."""
 
 ROBOT_API, ARTICULATION_API = "IsaacRobotAPI", "NewtonArticulationRootAPI"
 """Applied schemas of Isaac Sim and Newton, by name: their plugins live elsewhere."""
@@ -73,6 +77,7 @@ def convert_with_report(
     options: Options = DEFAULTS,
     force: bool = False,
     finish: Callable[[Usd.Prim], Iterable[str]] | None = None,
+    thumbnail: Callable[[Path, Path], object] | None = None,
 ) -> ConversionReport:
     """Convert a URDF to a USD articulation with a floating base, and say what became of it.
 
@@ -87,6 +92,8 @@ def convert_with_report(
         options: What is done where the URDF leaves a choice.
         force: Whether files that are there are replaced.
         finish: Called with the robot's prim before anything is written, to author more; gives notes.
+        thumbnail: Called with `out` and the name of a PNG to draw of it, 256 pixels square; it lies
+            where asset browsers look for it, `.thumbs/256x256/`.
 
     Returns:
         Every link, joint and geometry, in and out, with what was repaired, guessed or left out.
@@ -98,6 +105,22 @@ def convert_with_report(
     out = Path(out)
     if out.suffix != ".usda":
         raise RefusedError(f"{out}: the robot's root layer is text; give it the suffix .usda")
+    check_metadata(options.metadata)
+    report = _convert(urdf, out, options, force, finish)
+    if thumbnail is not None:
+        with output(out.parent / THUMBNAILS / f"{out.name}.png", force=True) as aside:
+            thumbnail(out, aside)
+    return report
+
+
+def _convert(
+    urdf: str | os.PathLike[str],
+    out: Path,
+    options: Options,
+    force: bool,
+    finish: Callable[[Usd.Prim], Iterable[str]] | None,
+) -> ConversionReport:
+    """Read, author and write, see `convert_with_report`."""
     source = read_source(urdf, packages=options.packages, arguments=options.arguments)
     description = read_description(source)
     beside, pictures = (out.with_name(f"{out.stem}_{what}") for what in ("meshes.usdc", "textures"))
@@ -194,6 +217,7 @@ def _author_all(
         report.refuse_losses()
     stage.GetRootLayer().customLayerData = {
         **stage.GetRootLayer().customLayerData,
+        **metadata(stage, description, report, options.metadata),
         "magtwin": {
             "source": description.path.name,
             "sourceSha256": checksum,
@@ -275,6 +299,8 @@ def _equip(robot: Usd.Prim, tags: Tags, options: Options, drive: DriveSpec | Non
     define_springs(tags, joint_of, options)
     define_weightless(tags, link_of)
     define_safety(tags, joint_of)
+    if not options.fix_base and (drive is not None or options.profile == "diff-drive"):
+        robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set("Wheeled")
     if drive is not None:
         define_differential(robot, drive, {name: path.name for name, path in ledger.joints.items()})
     define_sensors(tags, robot, link_of)

@@ -137,6 +137,7 @@ def split(flat: Sdf.Layer) -> dict[str, Sdf.Layer]:
     splitter = _Splitter(flat, parts)
     splitter.route(robot)
     for name, layer in parts.items():
+        layer.RemoveInertSceneDescription()
         _describe(layer, flat, name, robot.name)
     _compose(parts, robot)
     return parts

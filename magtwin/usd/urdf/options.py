@@ -91,6 +91,9 @@ class Options:
     mass: float | None = None
     """Mass of a data sheet to hold the robot's against [kg]."""
 
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    """What the asset says of itself (author, asset_license, category, ...), before what its package says."""
+
     def __post_init__(self) -> None:
         for name in ("density", "mass"):
             value = getattr(self, name)
