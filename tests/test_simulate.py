@@ -186,12 +186,12 @@ def test_eddy_currents_see_the_fields_change_along_the_way():
         drive(with_robot(KNOWN, platform=p))["b_vector_nt"] for p in (PlatformFieldSpec(), platform)
     )
     run = drive()
-    cruising = np.flatnonzero(run["v_cmd"] == 0.2)[2:-2]  # the speed does not change around it
+    cruising = (run["t"] > 1) & (run["t"] < 4)
+    assert_allclose(run["v_cmd"][cruising], 0.2, rtol=1e-6)
     # On a straight line base_link does not turn: the eddy part is the derivative of the rest.
     slope = np.gradient(still, run["t"], axis=0)
     assert_allclose((moving - still)[cruising], slope[cruising], rtol=0, atol=1e-5 * np.abs(slope).max())
     assert np.abs((moving - still)[cruising]).max() > 10
-    assert len(cruising) > 200
 
 
 def test_the_truth_at_a_time_does_not_depend_on_how_often_it_is_read():
