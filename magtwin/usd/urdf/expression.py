@@ -169,6 +169,8 @@ def evaluate(text: str, names: Mapping[str, Any], budget: Budget) -> Any:
         tree = ast.parse(text, mode="eval")
         return _Interpreter(names, budget).value(tree.body)
     except ExpressionError as error:
+        if "(in expression" in str(error):  # that of a property which this one reads
+            raise
         raise ExpressionError(f"{error} (in expression {text!r})") from error
     except SyntaxError as error:
         raise ExpressionError(f"not an expression: {text!r}") from error
@@ -241,7 +243,7 @@ class _Interpreter:
                 raise ExpressionError(
                     f"no {node.attr!r} in it; {hint(node.attr, map(str, holder))}"
                 ) from None
-        raise ExpressionError(f"attribute {node.attr!r} of a {type(holder).__name__} is not allowed")
+        raise ExpressionError(f"attribute {node.attr!r} of type {type(holder).__name__} is not allowed")
 
     def _call(self, node: ast.Call) -> Any:
         method = self._method(node.func)
@@ -274,7 +276,7 @@ class _Interpreter:
         if isinstance(holder, dict):
             return None
         raise ExpressionError(
-            f"method {function.attr!r} of a {type(holder).__name__} is not allowed"
+            f"method {function.attr!r} of type {type(holder).__name__} is not allowed"
             + (f"; allowed: {', '.join(sorted(allowed))}" if allowed else "")
         )
 

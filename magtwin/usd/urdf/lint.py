@@ -108,7 +108,7 @@ def _swapped_sides(description: Description) -> Iterator[str]:
         if left < -ASIDE and right > ASIDE:
             yield (
                 f"link {name!r} is at y = {left:.4g} m and {twin!r} at {right:.4g} m: "
-                "left is +y (REP-103), they seem to be swapped"
+                "swapped? left is +y (REP-103)"
             )
 
 

@@ -25,8 +25,8 @@ from magtwin.usd.urdf.expression import GLOBALS, LARGEST, Budget, ExpressionErro
 from magtwin.usd.urdf.markup import parse_markup
 from magtwin.usd.urdf.package import Packages
 
-UNITS = 20_000_000
-"""What an expansion may cost, see `Budget`; a TurtleBot4 costs a fiftieth."""
+UNITS, ELEMENT = 20_000_000, 100
+"""What an expansion may cost, see `Budget`, and the part of it that each element costs."""
 
 PLACE = "magtwin.place"
 """Key of the file and line that a node carries, through copies too."""
@@ -84,7 +84,7 @@ class _Expansion:
         except ExpressionError as error:
             raise self._refused(str(error)) from error
         except library.XacroException as error:
-            raise self._refused(" ".join(str(error).split())) from error
+            raise self._refused(" ".join(str(error.args[0] or error).split())) from error
         unknown = [name for name in self._arguments if name not in self._asked]
         if unknown:
             known = hint(unknown[0], self._asked) if self._asked else "it has none"
@@ -136,7 +136,7 @@ class _Expansion:
         """The library's function, with the node that it works on kept in mind and paid for."""
 
         def follow(node: minidom.Element, *arguments: Any) -> Any:
-            self._budget.spend()
+            self._budget.spend(ELEMENT)
             self._at = node.getUserData(PLACE) or self._at
             if node.tagName == "xacro:arg":
                 self._asked.add(node.getAttribute("name"))
@@ -252,7 +252,7 @@ class _Expansion:
         elements = document.getElementsByTagName("*")
         for element, line in zip(elements, markup.lines.values(), strict=True):
             element.setUserData(PLACE, (path, line), _KEEP)
-        self._budget.spend(len(elements))
+        self._budget.spend(ELEMENT * len(elements))
         return document
 
     def _yaml(self, filename: str) -> Any:
