@@ -738,7 +738,10 @@ DAMAGED = {
         lambda p: p.write_text("v 0 0 0\nf 1 x 3\n"),
         r"word\.obj:2: face '1 x 3' is malformed; export",
     ),
-    "rows.obj": (lambda p: p.write_text("v 0 0\nf 1 1 1\n"), r"rows\.obj: its v have 2 numbers each; export"),
+    "rows.obj": (
+        lambda p: p.write_text("v 0 0\nf 1 1 1\n"),
+        r"rows\.obj: its v are not 3 numbers each; export",
+    ),
     "cut.glb": (lambda p: cut(p, gltf), r"cut\.glb: is cut short; export it again"),
     "old.glb": (lambda p: gltf(p, asset={"version": "1.0"}), r"old\.glb: is glTF of version 1\.0; only 2\.0"),
     "small.glb": (

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.names import RefusedError
-from magtwin.usd.urdf.mesh import Mesh
+from magtwin.usd.urdf.mesh import Mesh, has_area
 from magtwin.usd.urdf.options import Collision
 
 EXTRA = 'pip install "magtwin[decomposition]"'
@@ -77,6 +77,7 @@ def _decomposition(mesh: Mesh) -> tuple[Solid, ...]:
 
 
 def _used(points: NDArray, faces: NDArray) -> Solid:
-    """The points that faces name."""
+    """The faces that have an area, and the points that they name."""
+    faces = faces[has_area(points, faces)]
     used, index = np.unique(faces, return_inverse=True)
     return Solid(points[used], index.reshape(-1, 3))

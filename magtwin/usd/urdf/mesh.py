@@ -211,7 +211,7 @@ def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
     paint = np.repeat([paints.index(p.paint) for p in pieces], [len(p.faces) for p in pieces])
     kept, index = distinct(points)
     points, faces = points[kept], index[faces]
-    solid = _has_area(points, faces)
+    solid = has_area(points, faces)
     if not solid.any():
         raise RefusedError(f"{path}: holds no triangle with an area; export it again, or use a primitive")
     lost = int(len(faces) - solid.sum())
@@ -266,7 +266,7 @@ def _unit(normals: NDArray | None) -> NDArray | None:
         return np.where(length > 1e-12, normals / length, np.nan).astype(np.float32)
 
 
-def _has_area(points: NDArray, faces: NDArray) -> NDArray[np.bool_]:
+def has_area(points: NDArray, faces: NDArray) -> NDArray[np.bool_]:
     """Whether each triangle has an area, against the square of its longest edge."""
     a, b, c = (points[faces[:, i]].astype(float) for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -300,6 +300,13 @@ def distinct(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return first[order], rank[kind.reshape(-1)]
 
 
+def face_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
+    """Unit normals of triangles, shape (F, 3); args as for `corner_normals`."""
+    a, b, c = (points[faces[:, i]].astype(float) for i in range(3))
+    area = np.cross(b - a, c - a)
+    return area / np.linalg.norm(area, axis=1, keepdims=True)
+
+
 def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float32]:
     """Unit normals of each triangle's corners: smooth across shallow edges, sharp across creases.
 
@@ -318,17 +325,16 @@ def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float32]:
     size = np.linalg.norm(area, axis=1, keepdims=True)
     area = (area / size.mean()).astype(np.float32)
     unit = area / np.linalg.norm(area, axis=1, keepdims=True)
-    flat = faces.ravel()
-    corner = np.argsort(flat, kind="stable")  # corners of one point stand together
+    flat = faces.ravel().astype(np.int32)
+    by_point = np.argsort(flat, kind="stable")  # corners of one point stand together
     count = np.bincount(flat, minlength=len(points))
     first = np.cumsum(count) - count
-    corner = corner[count[flat[corner]] <= FAN]
+    corner = by_point[count[flat[by_point]] <= FAN]
     around = count[flat[corner]]  # each corner is paired with each corner of its point
     mine = np.repeat(np.arange(len(corner)), around)
-    step = np.arange(len(mine)) - np.repeat(np.cumsum(around) - around, around)
-    by_point = np.argsort(flat, kind="stable") // 3
-    theirs = by_point[np.repeat(first[flat[corner]], around) + step]
-    near = np.einsum("ij,ij->i", unit[(corner // 3)[mine]], unit[theirs]) >= np.cos(CREASE)
+    start = np.repeat(first[flat[corner]] - np.cumsum(around) + around, around)
+    theirs = (by_point // 3)[start + np.arange(len(mine))]
+    near = np.einsum("ij,ij->i", np.repeat(unit[corner // 3], around, axis=0), unit[theirs]) >= np.cos(CREASE)
     mine, theirs = mine[near], theirs[near]
     normals = np.repeat(unit, 3, axis=0)
     for axis in range(3):

@@ -18,7 +18,7 @@ from magtwin.usd.layers import describe_stage
 from magtwin.usd.urdf.collider import Solid, solids_of
 from magtwin.usd.urdf.description import Description
 from magtwin.usd.urdf.material import GREY
-from magtwin.usd.urdf.mesh import SUFFIXES, Mesh, Paint, corner_normals, distinct, read_mesh
+from magtwin.usd.urdf.mesh import SUFFIXES, Mesh, Paint, distinct, face_normals, read_mesh
 from magtwin.usd.urdf.options import DEFAULTS, Collision, Options
 from magtwin.usd.urdf.source import MissingFileError
 from magtwin.usd.urdf.texture import Textures
@@ -166,7 +166,8 @@ class MeshLayer:
         corners = slice(None, None, -1) if np.prod(scale) < 0 else slice(None)
         normals = file.shaded()[:, corners] / scale
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        mesh = self._define_mesh(xform.GetPath().AppendChild(MESH), points, faces, normals)
+        mesh = self._define_mesh(xform.GetPath().AppendChild(MESH), points, faces)
+        _primvar(mesh, "normals", Sdf.ValueTypeNames.Normal3fArray, np.round(normals, 4))
         if any(paint is not None and paint.double_sided for paint in file.paints):
             mesh.CreateDoubleSidedAttr(True)
         if file.uvs is not None:
@@ -194,16 +195,18 @@ class MeshLayer:
 
     def _define_solid(self, solid: Solid, scale: NDArray, name: str) -> Sdf.Path:
         points, faces = _scaled(solid.points, solid.faces, scale)
-        return self._define_mesh(self._free(name), points, faces, corner_normals(points, faces)).GetPath()
+        mesh = self._define_mesh(self._free(name), points, faces)
+        normals = np.round(face_normals(points, faces), 4)
+        _primvar(mesh, "normals", Sdf.ValueTypeNames.Normal3fArray, normals, UsdGeom.Tokens.uniform)
+        return mesh.GetPath()
 
-    def _define_mesh(self, path: Sdf.Path, points: NDArray, faces: NDArray, normals: NDArray) -> UsdGeom.Mesh:
+    def _define_mesh(self, path: Sdf.Path, points: NDArray, faces: NDArray) -> UsdGeom.Mesh:
         mesh = UsdGeom.Mesh.Define(self._stage, path)
         mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
         mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
         mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.ravel().astype(np.int32)))
         mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.array([points.min(0), points.max(0)])))
-        _primvar(mesh, "normals", Sdf.ValueTypeNames.Normal3fArray, np.round(normals, 4))
         return mesh
 
     def _free(self, name: str) -> Sdf.Path:
@@ -266,12 +269,18 @@ def _scaled(points: NDArray, faces: NDArray, scale: NDArray) -> tuple[NDArray[np
     return scaled, faces[:, ::-1] if np.prod(scale) < 0 else faces
 
 
-def _primvar(mesh: UsdGeom.Mesh, name: str, kind: Sdf.ValueTypeName, values: NDArray) -> None:
-    """A primvar of values at corners, shape (F, 3, K), each value once."""
+def _primvar(
+    mesh: UsdGeom.Mesh,
+    name: str,
+    kind: Sdf.ValueTypeName,
+    values: NDArray,
+    interpolation: str = UsdGeom.Tokens.faceVarying,
+) -> None:
+    """A primvar of values at corners, shape (F, 3, K), or of another interpolation; each value once."""
     rows = values.reshape(-1, values.shape[-1]).astype(np.float32) + np.float32(0)
     first, index = distinct(rows)
     arrays = {2: Vt.Vec2fArray, 3: Vt.Vec3fArray}
-    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(name, kind, UsdGeom.Tokens.faceVarying)
+    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(name, kind, interpolation)
     primvar.Set(arrays[rows.shape[1]].FromNumpy(np.ascontiguousarray(rows[first])))
     primvar.SetIndices(Vt.IntArray.FromNumpy(index.astype(np.int32)))
 

@@ -1,6 +1,7 @@
 """Wavefront: triangles of an .obj with the materials of its .mtl."""
 
 import re
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,11 +24,15 @@ MAP_ARGUMENTS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
 
 @dataclass
 class _Group:
-    """Polygons of one material, as corners (vertex, texture coordinate, normal; 0 is none), 1-based."""
+    """Polygons of one material."""
 
     material: str
-    corners: list[tuple[int, int, int]] = field(default_factory=list)
+    words: list[str] = field(default_factory=list)
+    """Corners of all polygons as the file has them: `v`, `v/vt`, `v//vn` or `v/vt/vn`, from 1."""
     counts: list[int] = field(default_factory=list)
+    """Number of corners of each polygon."""
+    lines: list[int] = field(default_factory=list)
+    """Line of each polygon."""
 
 
 def read_wavefront(reading: Reading) -> list[Piece]:
@@ -41,85 +46,111 @@ def read_wavefront(reading: Reading) -> list[Piece]:
     unread: set[str] = set()
     group = _Group("")
     groups = [group]
-    for number, words in _statements(path):
-        kind = words[0]
+    for number, kind, rest in _statements(path):
         if kind in rows:
-            rows[kind].append(" ".join(words[1:]))
+            rows[kind].append(rest)
         elif kind == "f":
-            try:
-                corners = [_corner(word, rows) for word in words[1:]]
-            except ValueError as error:
-                raise RefusedError(
-                    f"{path}:{number}: face {' '.join(words[1:])!r} is malformed; export it again"
-                ) from error
-            if len(corners) >= 3:
-                group.corners += corners
-                group.counts.append(len(corners))
+            words = rest.split()
+            if "-" in rest:
+                words = [_absolute(word, rows) for word in words]
+            if len(words) >= 3:
+                group.words += words
+                group.counts.append(len(words))
+                group.lines.append(number)
         elif kind == "usemtl":
-            group = _Group(" ".join(words[1:]))
+            group = _Group(rest)
             groups.append(group)
         elif kind == "mtllib":
-            paints |= _read_library(" ".join(words[1:]), reading)
+            paints |= _read_library(rest, reading)
         elif kind in UNREAD:
             unread.add(kind)
     if unread:
         reading.lose(f"lines, points and curves ({', '.join(sorted(unread))}) are left out")
-    v, vt, vn = (_table(rows[kind], kind, path) for kind in ("v", "vt", "vn"))
-    for missing in dict.fromkeys(
-        g.material for g in groups if g.counts and g.material and g.material not in paints
-    ):
+    v, vt, vn = (_table(rows[kind], kind, least, path) for kind, least in (("v", 3), ("vt", 2), ("vn", 3)))
+    groups = [g for g in groups if g.counts]
+    for missing in dict.fromkeys(g.material for g in groups if g.material and g.material not in paints):
         reading.lose(f"material {missing!r} is in none of its libraries; shown without it")
-    return [_piece(g, paints.get(g.material), v, vt, vn, path) for g in groups if g.counts]
+    return [_piece(g, paints.get(g.material), v, vt, vn, path) for g in groups]
 
 
-def _statements(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Number and words of each line that says something; a backslash at its end joins the next."""
+def _statements(path: Path) -> Iterator[tuple[int, str, str]]:
+    """Line, keyword and the rest of each statement; a backslash at the end of a line joins the next."""
     held = ""
     with path.open(encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file, 1):
-            line = held + line
+        for number, text in enumerate(file, 1):
+            line = held + text if held else text
             if line.endswith("\\\n"):
                 held = line[:-2] + " "
                 continue
             held = ""
-            words = line.partition("#")[0].split() if "#" in line else line.split()
-            if words:
-                yield number, words
+            parts = (line.partition("#")[0] if "#" in line else line).split(None, 1)
+            if len(parts) == 2:
+                yield number, parts[0], parts[1].rstrip()
 
 
-def _corner(word: str, rows: dict[str, list[str]]) -> tuple[int, int, int]:
-    """`v`, `v/vt`, `v//vn` or `v/vt/vn`; negative ones count back from the newest."""
+def _absolute(word: str, rows: dict[str, list[str]]) -> str:
+    """A corner whose negative numbers, which count back from the newest, count from the first."""
     parts = word.split("/")
-    v = int(parts[0])
-    vt = int(parts[1]) if len(parts) > 1 and parts[1] else 0
-    vn = int(parts[2]) if len(parts) > 2 and parts[2] else 0
-    if v < 0 or vt < 0 or vn < 0:
-        v = v if v >= 0 else len(rows["v"]) + 1 + v
-        vt = vt if vt >= 0 else len(rows["vt"]) + 1 + vt
-        vn = vn if vn >= 0 else len(rows["vn"]) + 1 + vn
-    if v < 1:
-        raise ValueError("a corner without a vertex")
-    return v, vt, vn
+    for i, (part, kind) in enumerate(zip(parts, ("v", "vt", "vn"), strict=False)):
+        if part.startswith("-") and part[1:].isdecimal():
+            parts[i] = str(len(rows[kind]) + 1 - int(part[1:]))
+    return "/".join(parts)
 
 
-def _table(rows: list[str], kind: str, path: Path) -> NDArray:
-    """Numbers of all `v`, `vt` or `vn`, one row each."""
+def _numbers(text: str, dtype: type) -> NDArray:
+    """Numbers apart by blanks, as far as they are numbers: quicker than one by one."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # said where a word is none
+        try:
+            return np.fromstring(text, dtype, sep=" ")
+        except ValueError:
+            return np.empty(0, dtype)
+
+
+def _corners(group: _Group, path: Path) -> NDArray[np.int64]:
+    """Vertex, texture coordinate and normal of each corner, from 0; -1 is none; shape (N, 3)."""
+    words = group.words
+    corners = np.zeros((len(words), 3), np.int64)
+    slashes = {word.count("/") for word in words}
+    doubled = sum("//" in word for word in words)
+    if slashes in ({0}, {1}, {2}) and doubled in (0, len(words)):
+        columns = [0, 2] if doubled else list(range(max(slashes) + 1))
+        numbers = _numbers(" ".join(words).replace("/", " "), np.int64)
+        if len(numbers) == len(words) * len(columns):
+            corners[:, columns] = numbers.reshape(len(words), len(columns))
+            if (corners[:, columns] > 0).all():
+                return corners - 1
+    first = 0  # corners of several kinds, or malformed ones: one by one
+    for number, count in zip(group.lines, group.counts, strict=True):
+        for i in range(first, first + count):
+            parts = words[i].split("/")
+            try:
+                corners[i, : len(parts)] = [int(part or 0) for part in parts]
+            except ValueError:
+                corners[i, 0] = 0
+            if corners[i, 0] < 1 or corners[i].min() < 0:
+                polygon = " ".join(words[first : first + count])
+                raise RefusedError(f"{path}:{number}: face {polygon!r} is malformed; export it again")
+        first += count
+    return corners - 1
+
+
+def _table(rows: list[str], kind: str, least: int, path: Path) -> NDArray:
+    """Numbers of all `v`, `vt` or `vn`, one row each: as many as the first has, or the least."""
     if not rows:
-        return np.empty((0, 3))
+        return np.empty((0, least))
     width = len(rows[0].split())
+    values = _numbers(" ".join(rows), float)
+    if width >= least and len(values) == len(rows) * width:
+        return values.reshape(len(rows), width)
     try:
-        values = np.array(" ".join(rows).split(), float).reshape(len(rows), width)
+        return np.array([row.split()[:least] for row in rows], float).reshape(len(rows), least)
     except ValueError as error:
-        raise RefusedError(
-            f"{path}: its {kind} are not {width} numbers each, as the first one is; export it again"
-        ) from error
-    if width < (2 if kind == "vt" else 3):
-        raise RefusedError(f"{path}: its {kind} have {width} numbers each; export it again")
-    return values
+        raise RefusedError(f"{path}: its {kind} are not {least} numbers each; export it again") from error
 
 
 def _piece(group: _Group, paint: Paint | None, v: NDArray, vt: NDArray, vn: NDArray, path: Path) -> Piece:
-    corners, counts = np.array(group.corners, np.int64) - 1, np.array(group.counts)
+    corners, counts = _corners(group, path), np.array(group.counts)
     for column, table, name in ((0, v, "vertex"), (1, vt, "texture coordinate"), (2, vn, "normal")):
         if corners[:, column].max() >= len(table):
             raise RefusedError(
@@ -162,11 +193,11 @@ def _read_library(name: str, reading: Reading) -> dict[str, Paint]:
         return {}
     tables: dict[str, dict[str, list[str]]] = {}
     table: dict[str, list[str]] = {}
-    for _, words in _statements(library):
-        if words[0] == "newmtl":
-            table = tables.setdefault(" ".join(words[1:]), {})
+    for _, kind, rest in _statements(library):
+        if kind == "newmtl":
+            table = tables.setdefault(rest, {})
         else:
-            table[words[0].lower()] = words[1:]
+            table[kind.lower()] = rest.split()
     return {material: _paint(material, table, library.parent, reading) for material, table in tables.items()}
 
 
