@@ -212,15 +212,15 @@ def map_import(
     json
         Print the summary as JSON.
     """
-    from magtwin.field.survey import import_survey, survey_report
+    from magtwin.field.survey import read_survey
     from magtwin.files import check_free
     from magtwin.usd.maps import save_map
 
     _check_suffix(out, (".usdc", ".usd"), "a map layer")
     check_free(out, force=force)
-    field = import_survey(folder, name=name or out.stem, licence=licence)
+    field, report = read_survey(folder, name=name or out.stem, licence=licence)
     save_map(field, out, force=force)
-    _print_report(survey_report(folder), json)
+    _print_report(report, json)
     if not json:
         _say(f"Wrote {out}")
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from magtwin.field.survey import import_survey, survey_report
+from magtwin.field import survey
+from magtwin.field.survey import import_survey, read_survey
 from magtwin.files import sha256
 from magtwin.names import RefusedError
 
@@ -79,29 +80,40 @@ def test_the_report_tells_the_worst_heading_and_repeated_readings(tmp_path):
     latched = layer_text(90, (35_600, 35_600, 40_000, 41_000))
     lines = latched.splitlines(keepends=True)
     lines[3] = f"0.0,0.5,{np.radians(90 - 20)},40000\n"
-    got = figures(survey_report(write_survey(tmp_path, h90="".join(lines))))
+    got = figures(read_survey(write_survey(tmp_path, h90="".join(lines)))[1])
     assert got["largest heading deviation"].value == pytest.approx(20, abs=1e-3)
     assert got["largest heading deviation"].note == "90_map.csv:4, at (0, 0.5) m"
     assert got["median heading deviation"].value == 0
     assert got["repeated readings"].value == 1
 
 
+def test_map_and_report_come_from_one_reading_of_the_files(tmp_path, monkeypatch):
+    read = []
+    monkeypatch.setattr(survey, "_read_layer", lambda *a, of=survey._read_layer: read.append(a) or of(*a))
+    folder = write_survey(tmp_path)
+    field, report = read_survey(folder, name="a")
+    assert len(read) == 4
+    assert report.title == f"survey {folder}"
+    assert figures(report).items() >= figures(field.report()).items()
+    assert_array_equal(import_survey(folder, name="a").values_nt, field.values_nt)
+
+
 def test_recorded_headings_are_compared_on_the_circle(tmp_path):
     turned = layer_text(180).replace(str(np.pi), str(np.radians(-179)))
-    got = figures(survey_report(write_survey(tmp_path, h180=turned)))
+    got = figures(read_survey(write_survey(tmp_path, h180=turned))[1])
     assert got["largest heading deviation"].value == pytest.approx(1, abs=1e-3)
 
 
 def test_the_real_survey_has_the_published_figures(real_data):
     folder = real_data / "aprilab/maps"
-    field = import_survey(folder, name="aprilab", licence="MIT")
+    field, report = read_survey(folder, name="aprilab", licence="MIT")
     assert field.values_nt.shape == (4, 15, 25)
     assert field.extent == (-3.0, 3.0, -1.75, 1.75)
     table = np.loadtxt(folder / "270_map.csv", delimiter=",")
     assert_array_equal(field.values_nt[3].ravel(), table[:, 3])  # x fastest
     assert "05d12029c4703c9aa83eb0b25b394356c9f64c08ebf513a07a99e847ec969b56" in field.source
 
-    got = figures(survey_report(folder))
+    got = figures(report)
     assert got["mean"].value == pytest.approx(40_943, abs=1)
     assert got["heading amplitude"].value == pytest.approx(482, abs=1)
     assert 4.1 < got["median gradient"].value < 4.4
@@ -214,13 +226,12 @@ def write_refused(folder, case):
 def test_a_survey_is_refused_in_one_line_that_says_where(tmp_path, case):
     folder = tmp_path / "maps"
     write_refused(folder, case)
-    for read in (import_survey, survey_report):
-        with pytest.raises(RefusedError) as refusal:
-            read(folder)
-        text = str(refusal.value)
-        assert re.search(REFUSALS[case][-1], text), text
-        assert text.startswith(str(folder))
-        assert "\n" not in text
+    with pytest.raises(RefusedError) as refusal:
+        read_survey(folder)
+    text = str(refusal.value)
+    assert re.search(REFUSALS[case][-1], text), text
+    assert text.startswith(str(folder))
+    assert "\n" not in text
 
 
 def test_a_heading_that_was_not_asked_for_is_refused(tmp_path):

@@ -32,18 +32,18 @@ GRAIN_M = 1e-6
 """Coordinates closer than this are one."""
 
 
-def import_survey(
+def read_survey(
     folder: str | os.PathLike[str],
     *,
     name: str | None = None,
     licence: str = "",
     headings_deg: tuple[float, ...] | None = None,
-) -> AnomalyMap:
-    """The map of a survey folder: `0_map.csv`, `90_map.csv`, `180_map.csv`, `270_map.csv`.
+) -> tuple[AnomalyMap, Report]:
+    """The map of a survey folder, `0_map.csv`, `90_map.csv`, `180_map.csv`, `270_map.csv`, and its report.
 
     Each file begins with the line `# x,y,theta,scalar_mag` and has one row a node, in any order:
     x and y in world [m], the recorded heading [rad], the total field [nT]. The layer's heading is the
-    nominal one of the file's name; `survey_report` says how far the recorded ones are from it.
+    nominal one of the file's name; the report says how far the recorded ones are from it.
 
     Args:
         folder: Folder that holds the files. Other files in it are left alone.
@@ -53,52 +53,29 @@ def import_survey(
             spaced on the circle and at most 90 deg apart, so that a lost file is noticed.
 
     Returns:
-        The map; every node is valid, and nothing is known of its variance.
+        The map; every node is valid, and nothing is known of its variance. And the report: the map's
+        figures; the median and the largest deviation of a recorded heading from the nominal one, with
+        the worst row; how many readings repeat the one before in their row to the last digit, which a
+        sensor that lost lock does and a field does not.
 
     Raises:
         RefusedError: A file or a heading is missing, a row or a value is none, the grid has a hole or
             a node two values, the headings' grids differ, or the unit is not nT; with file and line.
     """
-    return _assemble(_read(folder, headings_deg), Path(folder), name, licence)
-
-
-def survey_report(folder: str | os.PathLike[str], *, headings_deg: tuple[float, ...] | None = None) -> Report:
-    """What a survey holds, and how well its headings were kept.
-
-    Args:
-        folder: As in `import_survey`, with the same refusals.
-        headings_deg: As in `import_survey`.
-
-    Returns:
-        The map's figures; the median and the largest deviation of a recorded heading from the nominal
-        one, with the worst row; how many readings repeat the one before in their row to the last
-        digit, which a sensor that lost lock does and a field does not.
-    """
     layers = _read(folder, headings_deg)
-    field = _assemble(layers, Path(folder), None, "")
-    deviation = [np.degrees(np.abs(wrap_angle(s.theta - np.radians(s.heading_deg)))) for s in layers]
-    worst = max(range(len(layers)), key=lambda k: deviation[k].max())
-    row = int(deviation[worst].argmax())
-    layer = layers[worst]
-    repeated = int(np.count_nonzero(np.diff(field.values_nt, axis=2) == 0))
-    every = np.concatenate(deviation)
-    return Report(
-        f"survey {folder}",
-        (
-            *field.report().figures,
-            Figure("median heading deviation", round(float(np.median(every)), 3), "deg"),
-            Figure(
-                "largest heading deviation",
-                round(float(every.max()), 3),
-                "deg",
-                note=f"{layer.path.name}:{layer.lines[row]}, at ({layer.x[row]:g}, {layer.y[row]:g}) m",
-            ),
-            Figure(
-                "repeated readings", repeated, note="equal to the one before in the row to the last digit"
-            ),
-        ),
-        {"files": {s.path.name: s.sha256 for s in layers}},
-    )
+    field = _assemble(layers, Path(folder), name, licence)
+    return field, _report(layers, field, folder)
+
+
+def import_survey(
+    folder: str | os.PathLike[str],
+    *,
+    name: str | None = None,
+    licence: str = "",
+    headings_deg: tuple[float, ...] | None = None,
+) -> AnomalyMap:
+    """The map alone of `read_survey`, with its arguments and refusals."""
+    return read_survey(folder, name=name, licence=licence, headings_deg=headings_deg)[0]
 
 
 @dataclass(frozen=True)
@@ -249,6 +226,33 @@ def _assemble(layers: list[_Layer], folder: Path, name: str | None, licence: str
         method="survey, one reading a node and heading, the robot at rest",
         source="; ".join(f"{s.path.name} sha256:{s.sha256}" for s in layers),
         licence=licence,
+    )
+
+
+def _report(layers: list[_Layer], field: AnomalyMap, folder: str | os.PathLike[str]) -> Report:
+    """What the survey holds, and how well its headings were kept."""
+    deviation = [np.degrees(np.abs(wrap_angle(s.theta - np.radians(s.heading_deg)))) for s in layers]
+    worst = max(range(len(layers)), key=lambda k: deviation[k].max())
+    row = int(deviation[worst].argmax())
+    layer = layers[worst]
+    repeated = int(np.count_nonzero(np.diff(field.values_nt, axis=2) == 0))
+    every = np.concatenate(deviation)
+    return Report(
+        f"survey {folder}",
+        (
+            *field.report().figures,
+            Figure("median heading deviation", round(float(np.median(every)), 3), "deg"),
+            Figure(
+                "largest heading deviation",
+                round(float(every.max()), 3),
+                "deg",
+                note=f"{layer.path.name}:{layer.lines[row]}, at ({layer.x[row]:g}, {layer.y[row]:g}) m",
+            ),
+            Figure(
+                "repeated readings", repeated, note="equal to the one before in the row to the last digit"
+            ),
+        ),
+        {"files": {s.path.name: s.sha256 for s in layers}},
     )
 
 
