@@ -13,7 +13,6 @@ import itertools
 import statistics
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +25,7 @@ from magtwin.files import shipped
 from magtwin.io.rerun import write_rrd
 from magtwin.io.tables import write_parquet
 from magtwin.learn.features import features
+from magtwin.learn.magnetometer import in_threads
 from magtwin.learn.model import FieldNet
 from magtwin.path import path_named
 from magtwin.twin import Twin, open_twin, simulate
@@ -62,31 +62,18 @@ class Products:
 
     def chunked(self, chunk: int, threads: int) -> None:
         """Chunks of rows, each taken through every layer by one thread; nothing allocated between."""
-        starts = iter(range(0, len(self.x), chunk))
-        lock = threading.Lock()
+        starts = itertools.count(0, chunk)  # next() on it is atomic
 
         def work() -> None:
             blocks = [torch.empty(chunk, weight.shape[1]) for weight in self.weights]
-            while True:
-                with lock:
-                    start = next(starts, None)
-                if start is None:
-                    return
+            for start in starts:
                 x = self.x[start : start + chunk]
+                if not len(x):
+                    return
                 for weight, block in zip(self.weights, blocks, strict=True):
                     x = torch.mm(x, weight, out=block[: len(x)])
 
-        before = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            others = [threading.Thread(target=work) for _ in range(threads - 1)]
-            for thread in others:
-                thread.start()
-            work()
-            for thread in others:
-                thread.join()
-        finally:
-            torch.set_num_threads(before)
+        in_threads(work, threads)
 
     def fastest(self, threads: int) -> tuple[int, Callable[[], None]]:
         """The chunk size that is fastest here, 0 for none, and the work in it."""

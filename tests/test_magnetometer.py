@@ -10,7 +10,7 @@ from test_model import RELEASED, a_net
 
 from magtwin.files import sha256, shipped
 from magtwin.learn.features import FULL, features
-from magtwin.learn.magnetometer import NeuralMagnetometer
+from magtwin.learn.magnetometer import NeuralMagnetometer, in_threads
 from magtwin.names import RefusedError
 from magtwin.path import path_named
 
@@ -188,3 +188,18 @@ def test_the_shipped_network_more_than_halves_the_error_on_a_new_run_of_a_kind_i
     naive = np.abs(new.y - float(shipped_network.net.y_mean)).mean()
     assert np.abs(shipped_network.predict(new.x) - new.y).mean() < naive / 2  # the card: 0.31 and 0.38
     assert shipped_network.outside(new.x).mean() < 0.01
+
+
+def test_work_is_done_in_each_thread_and_the_first_failure_is_raised_after_all_ended():
+    before, done = torch.get_num_threads(), []
+    in_threads(lambda: done.append(torch.get_num_threads()), 3)
+    assert done == [1, 1, 1]
+
+    def fails():
+        done.append(0)
+        raise ArithmeticError("no")
+
+    with pytest.raises(ArithmeticError, match="no"):
+        in_threads(fails, 2)
+    assert done == [1, 1, 1, 0, 0]
+    assert torch.get_num_threads() == before

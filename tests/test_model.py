@@ -197,7 +197,24 @@ F8 = torch.float64
             "reads yaw_deg in 'rad', magtwin gives it in 'deg'",
         ),
         ({"about": {"dropout": "much"}}, "'dropout' of its metadata is missing or of the wrong type"),
-        ({"about": {"features": [1, 2]}}, "'features' of its metadata must be names"),
+        ({"about": {"features": [1, 2]}}, "'features' of its metadata must be names, one at least"),
+        ({"about": {"features": []}}, "'features' of its metadata must be names, one at least"),
+        ({"about": {"features": 5}}, "'features' of its metadata is missing or of the wrong type"),
+        ({"metadata": {"magtwin": '{"a": 5}'}}, "format version None, this magtwin reads 1; update magtwin"),
+        ({"metadata": {"magtwin": "5"}}, "format version None, this magtwin reads 1; update magtwin"),
+        (
+            {"about": {"residual_sd_nt": math.inf}},
+            "'residual_sd_nt' of its metadata must be from 0 nT up and finite, got inf",
+        ),
+        ({"about": {"facts": {"a": [1]}}}, "fact 'a' of its metadata must be text, a number, true or false"),
+        (
+            {"layers__0__weight": torch.tensor(1.0)},
+            "tensor 'layers.0.weight' is float32 (); a layer's have shape (out, in)",
+        ),
+        (
+            {"layers__2__weight": torch.ones(4)},
+            "tensor 'layers.2.weight' is float32 (4,); a layer's have shape (out, in)",
+        ),
         ({"about": {"format_version": 2}}, "format version 2, this magtwin reads 1; update magtwin"),
         ({"metadata": {"magtwin": "{"}}, "its metadata is not JSON (Expecting property name enclosed in "
                                          "double quotes: line 1 column 2 (char 1))"),

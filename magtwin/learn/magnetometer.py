@@ -4,13 +4,13 @@ import itertools
 import math
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.files import existing, sha256
+from magtwin import files
 from magtwin.learn.features import features
 from magtwin.learn.model import Fact, FieldNet, load_net
 from magtwin.names import RefusedError
@@ -27,6 +27,44 @@ matrix kernels take at once, so that a row's bytes do not depend on its neighbou
 
 _FAR = 5.0
 """Scales from the mean beyond which an input is outside, where the training range is unknown."""
+
+
+def in_threads(work: Callable[[], None], threads: int) -> None:
+    """Do `work` once in each of some threads, with torch's products in one thread each.
+
+    Both cores are then busy between products too, which torch's own threads leave idle.
+
+    Args:
+        work: What each thread does; it takes its share of a common supply until none is left.
+        threads: How many; for one at most, it is done here, with torch as it is.
+
+    Raises:
+        BaseException: The first that a thread raised, after all have ended.
+    """
+    if threads <= 1:
+        work()
+        return
+    failures: list[BaseException] = []
+
+    def guarded() -> None:
+        try:
+            work()
+        except BaseException as error:
+            failures.append(error)
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        others = [threading.Thread(target=guarded) for _ in range(threads - 1)]
+        for thread in others:
+            thread.start()
+        guarded()
+        for thread in others:
+            thread.join()
+    finally:
+        torch.set_num_threads(before)
+    if failures:
+        raise failures[0]
 
 
 class NeuralMagnetometer:
@@ -62,8 +100,8 @@ class NeuralMagnetometer:
         Raises:
             RefusedError: No such file, another checksum, or not a network.
         """
-        path = existing(path, "weights file")
-        found = _checksum(path)
+        path = files.existing(path, "weights file")
+        found = files.sha256(path)
         if sha256 and found != sha256.lower():
             raise RefusedError(
                 f"{path}: its sha256 is {found}, expected {sha256}; get the file again or change the checksum"
@@ -129,30 +167,7 @@ class NeuralMagnetometer:
         y = np.empty(len(x))
         starts = itertools.count(0, _CHUNK)  # next() on it is atomic
         threads = min(torch.get_num_threads(), math.ceil(len(x) / _CHUNK))
-        if threads <= 1:
-            self._work(x, y, starts)
-            return y
-        before = torch.get_num_threads()
-        failures: list[BaseException] = []
-
-        def work() -> None:
-            try:
-                self._work(x, y, starts)
-            except BaseException as error:
-                failures.append(error)
-
-        torch.set_num_threads(1)  # a product a thread: both cores are then busy between products too
-        try:
-            others = [threading.Thread(target=work) for _ in range(threads - 1)]
-            for thread in others:
-                thread.start()
-            work()
-            for thread in others:
-                thread.join()
-        finally:
-            torch.set_num_threads(before)
-        if failures:
-            raise failures[0]
+        in_threads(lambda: self._work(x, y, starts), threads)
         return y
 
     def _work(self, x: Array, y: Array, starts: "itertools.count[int]") -> None:
@@ -184,6 +199,3 @@ class NeuralMagnetometer:
                 f"got {x.shape}"
             )
         return x
-
-
-_checksum = sha256

@@ -254,6 +254,11 @@ def _from_safetensors(path: Path) -> FieldNet:
     if missing:
         raise RefusedError(f"{path}: tensor {missing[0]!r} is missing; train or convert the network again")
     weights = [tensors[f"layers.{i}.weight"] for i in range(layers)]
+    for i, weight in enumerate(weights):
+        if weight.ndim != 2:
+            raise RefusedError(
+                f"{path}: tensor 'layers.{i}.weight' is {_say(weight)}; a layer's have shape (out, in)"
+            )
     try:
         net = FieldNet(
             about["features"],
@@ -298,8 +303,16 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     for key, kind in types.items():
         if key not in about or not isinstance(about[key], kind):
             raise RefusedError(f"{path}: {key!r} of its metadata is missing or of the wrong type")
-    if not all(isinstance(name, str) for name in about["features"]):
-        raise RefusedError(f"{path}: 'features' of its metadata must be names")
+    if not about["features"] or not all(isinstance(name, str) for name in about["features"]):
+        raise RefusedError(f"{path}: 'features' of its metadata must be names, one at least")
+    sd = about["residual_sd_nt"]
+    if sd is not None and not 0 <= sd < math.inf:
+        raise RefusedError(
+            f"{path}: 'residual_sd_nt' of its metadata must be from 0 nT up and finite, got {sd}"
+        )
+    for key, value in about["facts"].items():
+        if not isinstance(value, Fact):
+            raise RefusedError(f"{path}: fact {key!r} of its metadata must be text, a number, true or false")
     for name, unit in zip(about["features"], about["units"], strict=False):
         if name in FEATURES and FEATURES[name].unit != unit:
             raise RefusedError(
