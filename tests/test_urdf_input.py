@@ -201,6 +201,38 @@ def test_an_expression_cannot_take_time_or_memory_without_bound(text):
     assert time.process_time() - start < 1
 
 
+SLIPS = {
+    "<xacro:property/>": "cannot be expanded: xacro:property: missing attribute 'name'",
+    '<xacro:property name="p" value="1" scope="parent"/>': "cannot be expanded: ",
+    '<xacro:element xacro:name=""/>': "xacro:element: empty name",
+    '<xacro:if value="maybe"><a/></xacro:if>': 'conditional "maybe" evaluated to "maybe", which is not a boo',
+    '<xacro:macro name="m" params="a"/><xacro:m/>': r"Undefined parameters \[a\]",
+    '<xacro:macro name="m" params="*b"/><xacro:m/>': "Not enough blocks",
+    '<xacro:insert_block name="x"/>': 'Undefined block "x"',
+    '<xacro:property name="a" value="${b}"/><xacro:property name="b" value="${a}"/><l x="${a}"/>': "circ",
+    '<l x="${1 / 0}"/>': r"ZeroDivisionError: division by zero \(in expression '1 / 0'\)",
+    '<l x="${xacro.fatal(1, 2)}"/>': "1 2",
+    '<l x="${xacro}"/>': "a method is no value",
+    '<l x="$(cwd)"/>': r"\$\(cwd\) is not known; known: arg, dirname, env, eval, find, optenv",
+}
+
+
+@pytest.mark.parametrize("slip", SLIPS)
+def test_a_slip_in_a_xacro_is_told_with_its_line(tmp_path, slip):
+    with pytest.raises(RefusedError, match=r"arm\.xacro:2: .*" + SLIPS[slip]):
+        read_source(write_xacro(tmp_path, slip))
+
+
+def test_what_a_xacro_says_and_what_it_hides_is_noted(tmp_path):
+    body = '<l x="${xacro.warning(\'careful\')}"/><xacro:property name="e" value="2"/>'
+    body += '<xacro:include filename="none*.xacro"/>'
+    assert read_source(write_xacro(tmp_path, body)).notes == (
+        "arm.xacro:2: careful",
+        "arm.xacro:2: redefining global symbol: e",
+        "arm.xacro:2: include 'none*.xacro' names no file that is there",
+    )
+
+
 def test_the_environment_has_no_part_in_a_xacro(tmp_path, monkeypatch):
     monkeypatch.setenv("ARM_MODE", "secret")
     path = write_xacro(tmp_path, '<link name="$(optenv ARM_MODE quiet)"/>')

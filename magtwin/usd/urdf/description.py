@@ -79,11 +79,6 @@ class Description:
         """The whole `<robot>`, for what yourdfpy does not read."""
         return self.source.xml
 
-    @property
-    def lines(self) -> Mapping[ElementTree.Element, int]:
-        """Line of each element's start, in its own file: `where` gives both."""
-        return {element: line for element, (_, line) in self.source.places.items()}
-
     def where(self, element: ElementTree.Element | None) -> str:
         """`file:line` of an element of `xml`."""
         return self.source.where(element)

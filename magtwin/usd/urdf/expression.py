@@ -180,11 +180,16 @@ def evaluate(text: str, names: Mapping[str, Any], budget: Budget) -> Any:
         raise ExpressionError(f"{type(error).__name__}: {error} (in expression {text!r})") from error
 
 
-def check_size(value: Any, budget: Budget) -> Any:
+def check_size(value: Any, budget: Budget, *, plain: bool = False) -> Any:
     """`value`, if it is not too large with all that it holds.
 
+    Args:
+        value: Of any type.
+        budget: Pays for its size.
+        plain: Whether functions and the like are refused, which no text stands for.
+
     Raises:
-        ExpressionError: It is.
+        ExpressionError: It is too large, or not plain.
     """
     pending, size = [value], 0
     while pending:
@@ -199,6 +204,8 @@ def check_size(value: Any, budget: Budget) -> Any:
         elif isinstance(entry, list | tuple):
             size += len(entry)
             pending += entry if size <= LARGEST else []
+        elif plain and not isinstance(entry, int | float | None):
+            raise ExpressionError(f"a {type(entry).__name__} is no value")
         if size > LARGEST:
             raise ExpressionError(f"a value of over {LARGEST} characters or entries")
     budget.spend(1 + size)

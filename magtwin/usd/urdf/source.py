@@ -88,9 +88,10 @@ class Source:
         if not path.is_file():
             siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
             near = difflib.get_close_matches(path.name, siblings, n=1)
-            raise MissingFileError(
-                f"{start} is missing; looked for {path}" + (f"; did you mean {near[0]!r}?" if near else "")
-            )
+            advice = f"; did you mean {near[0]!r}?" if near else ""
+            if what == "mesh":
+                advice += "; --missing-meshes note does without it"
+            raise MissingFileError(f"{start} is missing; looked for {path}{advice}")
         return path
 
 

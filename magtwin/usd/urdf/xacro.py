@@ -85,6 +85,10 @@ class _Expansion:
             raise self._refused(str(error)) from error
         except library.XacroException as error:
             raise self._refused(" ".join(str(error.args[0] or error).split())) from error
+        except RefusedError:
+            raise
+        except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+            raise self._refused(f"cannot be expanded: {error}") from error  # the library's way to say no
         unknown = [name for name in self._arguments if name not in self._asked]
         if unknown:
             known = hint(unknown[0], self._asked) if self._asked else "it has none"
@@ -112,7 +116,7 @@ class _Expansion:
             "message": self._note,
             "error": self._note,
         }
-        for name in ("check_attrs", "eval_all", "handle_macro_call"):
+        for name in ("check_attrs", "eval_all", "handle_macro_call", "reqd_attrs"):
             ours[name] = self._followed(getattr(library, name))
         for name, replacement in ours.items():
             if not hasattr(library, name):
@@ -144,7 +148,7 @@ class _Expansion:
 
         return follow
 
-    def _text(self, text: str, names: Mapping[str, Any]) -> Any:
+    def _text(self, text: str, symbols: Mapping[str, Any]) -> Any:
         """The value of a text: that of its one expression, or all joined to a text."""
         values: list[Any] = []
         end = size = 0
@@ -157,9 +161,10 @@ class _Expansion:
             if kind == "escaped":
                 content = content[1:]
             elif kind == "expression":
-                content = evaluate(str(self._text(content, names)), names, self._budget)
+                value = evaluate(str(self._text(content, symbols)), symbols, self._budget)
+                content = check_size(value, self._budget, plain=True)
             elif kind == "command":
-                content = self._command(str(self._text(content, names)))
+                content = self._command(str(self._text(content, symbols)))
             values.append(content)
         if end != len(text):
             raise ExpressionError(f"not closed: {text[end : end + 40]!r}")
