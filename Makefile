@@ -5,7 +5,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q install -c constraints.txt
 
-.PHONY: demo test lint bench wheel-test schema assets clean help
+.PHONY: demo test simready lint bench wheel-test schema assets clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -15,6 +15,11 @@ demo: $(VENV)/.installed  ## Author a lab and a robot, drive it, log the run to 
 
 test: $(VENV)/.dev  ## Run all tests
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+simready: $(VENV)/.dev  ## Hold robots against NVIDIA's SimReady profiles, in an environment of its own
+	test -x build/simready/bin/simready-validate || $(PYTHON) -m venv build/simready
+	build/simready/bin/python -m pip --disable-pip-version-check -q install 'simready-validate>=2026.8' 'simready-foundation-tier-core>=2026.8' 'simready-foundation-tier-sensors>=2026.8'
+	MAGTWIN_SIMREADY=$(CURDIR)/build/simready/bin/simready-validate $(BIN)/python -m pytest tests/test_urdf_layout.py
 
 lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies
 	$(BIN)/ruff format --check .

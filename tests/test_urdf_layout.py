@@ -20,9 +20,8 @@ from magtwin.usd.urdf.layout import VARIANTS
 from magtwin.usd.urdf.options import Options
 
 SIMREADY = "MAGTWIN_SIMREADY"
-"""Variable that names the `simready-validate` of an environment of its own: its rules would join those of
-`nvidia_usd_validate` in ours. To make one: `pip install simready-validate simready-foundation-tier-core
-simready-foundation-tier-sensors` in a fresh venv."""
+"""Variable that names the `simready-validate` of an environment of its own, as `make simready` makes it: its
+rules would join those of `nvidia_usd_validate` in ours."""
 
 TAGS = """<gazebo reference="hand"><mu1>0.3</mu1><kp>1e6</kp><sensor name="imu" type="imu"><imu/></sensor>
 <maxVel>1</maxVel></gazebo>"""
