@@ -4,11 +4,13 @@ Plain data between `usd/`, which authors and reads it, and `sim/`, which runs it
 for one attribute of a prim. Lengths are metres, angles radians, fields nT. A spec is checked at birth.
 """
 
-from dataclasses import dataclass, field
+import datetime
+import math
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from magtwin.frames import IDENTITY_XYZW
+from magtwin.frames import IDENTITY_XYZW, quat_multiply
 from magtwin.names import RefusedError
 
 Vec3 = tuple[float, float, float]
@@ -20,24 +22,46 @@ ZERO3: Vec3 = (0.0, 0.0, 0.0)
 ZERO9: Matrix3 = (0.0,) * 9  # type: ignore[assignment]
 
 
-def _above_zero(spec: Any, *names: str) -> None:
-    for name in names:
-        if not getattr(spec, name) > 0:
-            raise RefusedError(
-                f"{name} of {type(spec).__name__} must be above 0, got {getattr(spec, name)!r}"
-            )
+UNIT_TOLERANCE = 1e-6
+"""How far the square of a unit quaternion's length may be from 1: single precision passes."""
 
 
-def _not_negative(spec: Any, *names: str) -> None:
-    for name in names:
-        if not getattr(spec, name) >= 0:
-            raise RefusedError(
-                f"{name} of {type(spec).__name__} must not be below 0, got {getattr(spec, name)!r}"
-            )
+class Spec:
+    """What every spec has: all of its numbers are finite."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, f.name)
+            numbers = value if isinstance(value, tuple) else (value,)
+            finite = all(abs(x) < math.inf for x in numbers if isinstance(x, int | float))
+            self._require(f.name, finite, "be finite", value)
+
+    def _require(self, name: str, holds: bool, what: str, seen: Any) -> None:
+        if not holds:
+            kind = type(self).__name__.lstrip("_")
+            raise RefusedError(f"{name} of {kind} must {what}, got {seen!r}")
+
+    def _above_zero(self, *names: str) -> None:
+        for name in names:
+            self._require(name, getattr(self, name) > 0, "be above 0", getattr(self, name))
+
+    def _not_negative(self, *names: str) -> None:
+        for name in names:
+            self._require(name, getattr(self, name) >= 0, "not be below 0", getattr(self, name))
+
+    def _within(self, name: str, least: float, most: float) -> None:
+        value = getattr(self, name)
+        self._require(name, least <= value <= most, f"lie in {least:g}..{most:g}", value)
+
+    def _unit(self, *names: str) -> None:
+        for name in names:
+            q = getattr(self, name)
+            off = abs(sum(c * c for c in q) - 1)
+            self._require(name, off <= UNIT_TOLERANCE, "be a unit quaternion", q)
 
 
 @dataclass(frozen=True, kw_only=True)
-class MountSpec:
+class MountSpec(Spec):
     """Where a sensor sits: a pose on a link of the robot."""
 
     link: str
@@ -48,6 +72,10 @@ class MountSpec:
 
     q_link_sensor_xyzw: Quat = IDENTITY_XYZW
     """Sensor's axes in the link."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._unit("q_link_sensor_xyzw")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,8 +103,9 @@ class MagnetometerSpec(MountSpec):
     """Names of the network's inputs, in order."""
 
     def __post_init__(self) -> None:
-        _above_zero(self, "rate_hz")
-        _not_negative(self, "noise_std_nt", "resolution_nt")
+        super().__post_init__()
+        self._above_zero("rate_hz")
+        self._not_negative("noise_std_nt", "resolution_nt")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,8 +127,9 @@ class ImuSpec(MountSpec):
     """Standard deviation of an acceleration sample, each axis [m/s2]."""
 
     def __post_init__(self) -> None:
-        _above_zero(self, "rate_hz")
-        _not_negative(self, "orientation_noise_std", "gyro_noise_std", "accel_noise_std")
+        super().__post_init__()
+        self._above_zero("rate_hz")
+        self._not_negative("orientation_noise_std", "gyro_noise_std", "accel_noise_std")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,12 +154,15 @@ class LidarSpec(MountSpec):
     """Time off in each cycle of the schedule [s]; 0 means always on."""
 
     def __post_init__(self) -> None:
-        _above_zero(self, "scan_rate_hz", "range_max_m")
-        _not_negative(self, "range_min_m", "on_s", "off_s")
+        super().__post_init__()
+        self._above_zero("scan_rate_hz", "range_max_m")
+        self._not_negative("range_min_m", "on_s", "off_s")
+        low, high = self.range_min_m, self.range_max_m
+        self._require("range_min_m", low < high, f"be below range_max_m {high!r}", low)
 
 
 @dataclass(frozen=True, kw_only=True)
-class BatterySpec:
+class BatterySpec(Spec):
     """A battery: its charge falls linearly, its voltage follows the charge, with Gaussian noise."""
 
     capacity_wh: float = 26.0
@@ -154,16 +187,16 @@ class BatterySpec:
     """Samples a second [Hz]."""
 
     def __post_init__(self) -> None:
-        _above_zero(self, "capacity_wh", "voltage_empty_v", "voltage_full_v", "rate_hz")
-        _not_negative(self, "load_w", "voltage_noise_std_v")
-        if not 0 <= self.initial_fraction <= 1:
-            raise RefusedError(
-                f"initial_fraction of BatterySpec must lie in 0..1, got {self.initial_fraction!r}"
-            )
+        super().__post_init__()
+        self._above_zero("capacity_wh", "voltage_empty_v", "voltage_full_v", "rate_hz")
+        self._not_negative("load_w", "voltage_noise_std_v")
+        self._within("initial_fraction", 0, 1)
+        low, high = self.voltage_empty_v, self.voltage_full_v
+        self._require("voltage_full_v", high >= low, f"not be below voltage_empty_v {low!r}", high)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveSpec:
+class DriveSpec(Spec):
     """A differential drive: its size, its limits and its odometry."""
 
     left_wheel_joint: str = "left_wheel_joint"
@@ -197,8 +230,8 @@ class DriveSpec:
     """Relative standard deviation of the wheels' scale, drawn once a run: what makes odometry drift."""
 
     def __post_init__(self) -> None:
-        _above_zero(
-            self,
+        super().__post_init__()
+        self._above_zero(
             "wheel_separation_m",
             "wheel_radius_m",
             "v_max",
@@ -208,11 +241,13 @@ class DriveSpec:
             "command_timeout_s",
             "odometry_rate_hz",
         )
-        _not_negative(self, "odometry_noise_std")
+        self._not_negative("odometry_noise_std")
+        left, right = self.left_wheel_joint, self.right_wheel_joint
+        self._require("right_wheel_joint", left != right, "be another joint than the left wheel's", right)
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlatformFieldSpec:
+class PlatformFieldSpec(Spec):
     """The robot's own magnetic field at its magnetometer, in base_link axes.
 
     B = (1 + S) b + h + E db/dt + (terms of motors, LiDAR and electronics), b the ambient field in
@@ -243,7 +278,7 @@ class PlatformFieldSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobotSpec:
+class RobotSpec(Spec):
     """A robot: the USD asset that shows it, and what the simulator needs to drive it."""
 
     name: str
@@ -261,6 +296,12 @@ class RobotSpec:
     p_base_magnetometer: Vec3 = ZERO3
     """Magnetometer's origin in base_link at rest, through the links between [m]; read from the asset."""
 
+    q_base_magnetometer_link_xyzw: Quat = IDENTITY_XYZW
+    """Axes of the link that carries the magnetometer, in base_link; read from the asset."""
+
+    q_base_imu_link_xyzw: Quat = IDENTITY_XYZW
+    """Axes of the link that carries the IMU, in base_link; read from the asset."""
+
     drive: DriveSpec = field(default_factory=DriveSpec)
     battery: BatterySpec = field(default_factory=BatterySpec)
     platform: PlatformFieldSpec = field(default_factory=PlatformFieldSpec)
@@ -269,11 +310,28 @@ class RobotSpec:
     lidar: LidarSpec = field(default_factory=LidarSpec)
 
     def __post_init__(self) -> None:
-        _above_zero(self, "footprint_radius_m")
+        super().__post_init__()
+        self._above_zero("footprint_radius_m")
+        self._unit("q_base_magnetometer_link_xyzw", "q_base_imu_link_xyzw")
+
+    @property
+    def q_base_magnetometer_xyzw(self) -> Quat:
+        """Magnetometer's axes in base_link."""
+        return _product(self.q_base_magnetometer_link_xyzw, self.magnetometer.q_link_sensor_xyzw)
+
+    @property
+    def q_base_imu_xyzw(self) -> Quat:
+        """IMU's axes in base_link."""
+        return _product(self.q_base_imu_link_xyzw, self.imu.q_link_sensor_xyzw)
+
+
+def _product(a: Quat, b: Quat) -> Quat:
+    x, y, z, w = quat_multiply(a, b).tolist()
+    return (x, y, z, w)
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabSpec:
+class LabSpec(Spec):
     """A room: a floor centred on the world's origin, low walls, posts of a motion-capture frame."""
 
     floor_m: tuple[float, float] = (6.0, 3.5)
@@ -289,14 +347,14 @@ class LabSpec:
     """Height of the motion-capture posts, one at each corner and amid each long wall [m]; 0 for none."""
 
     def __post_init__(self) -> None:
-        if not (self.floor_m[0] > 0 and self.floor_m[1] > 0):
-            raise RefusedError(f"floor_m of LabSpec must be above 0 m each way, got {self.floor_m}")
-        _not_negative(self, "wall_height_m", "post_height_m")
-        _above_zero(self, "wall_thickness_m")
+        super().__post_init__()
+        self._require("floor_m", min(self.floor_m) > 0, "be above 0 m each way", self.floor_m)
+        self._not_negative("wall_height_m", "post_height_m")
+        self._above_zero("wall_thickness_m")
 
 
 @dataclass(frozen=True, kw_only=True)
-class EarthFieldSpec:
+class EarthFieldSpec(Spec):
     """The Earth's field in the lab, uniform over it; world x is east, y north, z up."""
 
     b_world_nt: Vec3
@@ -314,9 +372,22 @@ class EarthFieldSpec:
     date: str
     """Day for which the field holds, YYYY-MM-DD."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._within("latitude_deg", -90, 90)
+        self._within("longitude_deg", -180, 360)
+        self._require("date", _is_day(self.date), "be a day as YYYY-MM-DD", self.date)
+
+
+def _is_day(text: str) -> bool:
+    try:
+        return datetime.date.fromisoformat(text).isoformat() == text
+    except ValueError:
+        return False
+
 
 @dataclass(frozen=True, kw_only=True)
-class SourceSpec:
+class SourceSpec(Spec):
     """A magnetised thing, seen as a point dipole."""
 
     name: str
@@ -330,7 +401,7 @@ class SourceSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class Scene(Spec):
     """A lab, its magnetic map, and a robot in it."""
 
     name: str
@@ -338,6 +409,9 @@ class Scene:
 
     map_layer: Path
     """USD layer of the anomaly map."""
+
+    map_sha256: str = ""
+    """Checksum of the map layer's file, lower-case hex; "" means that any file will do."""
 
     robot: RobotSpec
     lab: LabSpec = field(default_factory=LabSpec)

@@ -50,7 +50,7 @@ def open_twin(scene_file: str | FilePath, *, net: str | FilePath | None = None) 
     from magtwin.usd.scene import read_scene
 
     scene_file = FilePath(scene_file)
-    scene = read_scene(scene_file)
+    scene = read_scene(scene_file, check_network=net is None)
     if net is not None:
         robot = scene.robot
         magnetometer = dataclasses.replace(

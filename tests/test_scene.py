@@ -18,6 +18,7 @@ from validators import assert_valid
 from magtwin.field.earth import earth_field_nt
 from magtwin.field.map import AnomalyMap
 from magtwin.files import sha256, shipped
+from magtwin.frames import IDENTITY_XYZW, quat_from_rpy, quat_multiply
 from magtwin.names import RefusedError
 from magtwin.spec import (
     BatterySpec,
@@ -49,7 +50,12 @@ SOURCES = (
     SourceSpec(name="beam", p_world=(1.0, 0.5, -0.4), m_world=(0.0, 3.0, -8.0)),
     SourceSpec(name="anchor", p_world=(-1.5, -0.25, -0.3), m_world=(0.5, 0.0, 2.0)),
 )
-LINKS = {"base_link": (0.0, 0.0, 0.05), "magnetometer_link": (0.03, 0.0, 0.35), "imu_link": (0.0, 0.0, 0.1)}
+LINKS = {
+    "base_link": (0.0, 0.0, 0.05),
+    "magnetometer_link": (0.03, 0.0, 0.35),
+    "imu_link": (0.0, 0.0, 0.1),
+    "rplidar_link": (0.0, 0.0, 0.2),
+}
 TOML = """
 name = "small"
 map = "map.usdc"
@@ -65,7 +71,7 @@ def define_robot_asset(path: Path) -> None:
         root = UsdGeom.Xform.Define(stage, "/bot").GetPrim()
         stage.SetDefaultPrim(root)
         stage.RemovePrim("/World")
-        for link, p in {**LINKS, "rplidar_link": (0.0, 0.0, 0.2)}.items():
+        for link, p in LINKS.items():
             write_pose(UsdGeom.Xform.Define(stage, f"/bot/{link}").GetPrim(), p)
         UsdPhysics.RigidBodyAPI.Apply(stage.GetPrimAtPath("/bot/base_link"))
         for joint in ("left_wheel_joint", "right_wheel_joint"):
@@ -178,6 +184,43 @@ def test_any_scene_of_that_robot_survives_its_layers(
 def test_the_magnetometers_place_in_the_base_is_read_through_the_links(parts):
     robot = scene_from_toml(parts / "scene.toml").robot
     assert robot.p_base_magnetometer == pytest.approx((0.03, 0.0, 0.31), abs=1e-15)  # .35 + .01 - .05
+
+
+def turned_links(parts: Path) -> None:
+    """Lean the robot's base, in it yaw imu_link by a quarter and lay magnetometer_link on its back."""
+    lean = tuple(quat_from_rpy([0.1, -0.2, 0.3]).tolist())
+    turns = {
+        "base_link": lean,
+        "imu_link": quat_multiply(lean, (0.0, 0.0, 0.5**0.5, 0.5**0.5)),
+        "magnetometer_link": quat_multiply(lean, (1.0, 0.0, 0.0, 0.0)),
+        "rplidar_link": lean,
+    }
+    stage = Usd.Stage.Open(str(parts / "robot" / "bot.usda"))
+    for link, q in turns.items():
+        write_pose(stage.GetPrimAtPath(f"/bot/{link}"), LINKS[link], tuple(map(float, q)))
+    stage.Save()
+
+
+def test_the_axes_of_the_sensors_links_in_the_base_are_read_from_the_stage(own_parts, tmp_path):
+    level = scene_from_toml(own_parts / "scene.toml").robot
+    assert level.q_base_magnetometer_link_xyzw == level.q_base_imu_link_xyzw == IDENTITY_XYZW
+    turned_links(own_parts)
+    scene = scene_from_toml(own_parts / "scene.toml")
+    assert scene.robot.q_base_imu_link_xyzw == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5), abs=1e-15)
+    assert np.abs(scene.robot.q_base_magnetometer_link_xyzw) == pytest.approx((1, 0, 0, 0), abs=1e-15)
+    placed = replace(scene, start=(1.0, -0.5, math.pi / 2))
+    assert read_scene(author_scene(placed, tmp_path / "s", by_reference=True)).robot == scene.robot
+
+
+def test_links_that_lean_with_their_base_are_parallel_to_the_bit(own_parts):
+    turned_links(own_parts)
+    stage = Usd.Stage.Open(str(own_parts / "robot" / "bot.usda"))
+    lean = stage.GetPrimAtPath("/bot/base_link").GetAttribute("xformOp:orient").Get()
+    for link in ("imu_link", "magnetometer_link"):
+        stage.GetPrimAtPath(f"/bot/{link}").GetAttribute("xformOp:orient").Set(lean)
+    stage.Save()
+    robot = scene_from_toml(own_parts / "scene.toml").robot
+    assert robot.q_base_magnetometer_link_xyzw == robot.q_base_imu_link_xyzw == IDENTITY_XYZW
 
 
 def test_a_scenes_folder_can_be_moved_and_needs_nothing_outside_of_it(own_parts, tmp_path):
@@ -396,6 +439,30 @@ def test_a_network_in_safetensors_brings_its_inputs_and_its_checksum(own_parts):
         ("[robot]", "[robot]\nnetwork = 'net'", r"net: no such weights file"),
         ("[robot]", "[sources]\nfile = 'gone.toml'\n[robot]", r"gone\.toml: no such TOML file"),
         ("small", "../small", r"scene '\.\./small' cannot name a file"),
+        ('"small"', '""', "scene '' cannot name a file; use letters, digits, - and _"),
+        ('"small"', '"."', r"scene '\.' cannot name a file"),
+        (
+            "[robot]",
+            "start = [0, inf, 0]\n[robot]",
+            r"scene\.toml:5: start must be a number, got inf",
+        ),
+        (
+            "[robot]",
+            "[earth]\nb_world_nt = [0, 2e4, -4e4]\nlatitude_deg = 95\nlongitude_deg = 0\nheight_m = 0\n"
+            'date = "2026-01-01"\n[robot]',
+            r"scene\.toml:7: \[earth\] latitude_deg of EarthFieldSpec must lie in -90\.\.90, got 95",
+        ),
+        (
+            "[robot]",
+            "[earth]\nb_world_nt = [0, 2e4, -4e4]\nlatitude_deg = 9\nlongitude_deg = 0\nheight_m = 0\n"
+            'date = "20260101"\n[robot]',
+            r"scene\.toml:10: \[earth\] date of EarthFieldSpec must be a day as YYYY-MM-DD, got '20260101'",
+        ),
+        (
+            'asset = "robot/bot.usda"',
+            'urdf = "bot.urdf"\nfootprint_radius_m = -1',
+            r"scene\.toml:7: \[robot\] footprint_radius_m of RobotTable must be above 0, got -1",
+        ),
     ],
 )
 def test_a_broken_toml_is_refused_by_line_with_nothing_written(own_parts, tmp_path, old, new, said):
@@ -563,6 +630,74 @@ def test_a_stage_that_is_no_scene_is_refused(parts):
         RefusedError, match=r"map\.usdc </>: needs one prim with MagtwinLabAPI below it, found none"
     ):
         read_scene(parts / "map.usdc")
+
+
+def test_another_map_in_the_place_of_the_scenes_own_is_refused_naming_both(parts, tmp_path):
+    scene = full_scene(parts)
+    assert scene.map_sha256 == sha256(parts / "map.usdc")
+    root = author_scene(scene, tmp_path / "s")
+    own = tmp_path / "s" / "map" / "map.usdc"
+    save_map(replace(small_map(), origin_m=(-2.5, -1.75)), own, force=True)
+    with pytest.raises(
+        RefusedError, match=r"small\.usda </World/bot/.*/magnetometer>: .*map\.usdc: has"
+    ) as e:
+        read_scene(root)
+    assert sha256(own) in str(e.value)
+    assert scene.map_sha256 in str(e.value)
+    root.write_text(root.read_text().replace(f'mapSha256 = "{scene.map_sha256}"', 'mapSha256 = ""'))
+    assert read_scene(root).map_sha256 == "", "any map will do where the scene says no checksum"
+
+
+def test_a_scene_is_not_authored_over_another_map_than_it_names(own_parts, tmp_path):
+    scene = full_scene(own_parts)
+    save_map(replace(small_map(), name="other"), own_parts / "map.usdc", force=True)
+    with pytest.raises(
+        RefusedError, match=r"map\.usdc: has SHA-256 .* but scene 'small' was made with a map"
+    ):
+        author_scene(scene, tmp_path / "s")
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_flattened_scene_is_read_though_it_is_its_own_map(parts, tmp_path):
+    scene = full_scene(parts)
+    stage = Usd.Stage.Open(str(author_scene(scene, tmp_path / "s")))
+    stage.Flatten().Export(str(tmp_path / "flat.usdc"))
+    flat = read_scene(tmp_path / "flat.usdc")
+    assert flat.map_layer == tmp_path / "flat.usdc"
+    assert (flat.earth, flat.sources, flat.robot.drive) == (scene.earth, scene.sources, scene.robot.drive)
+
+
+def test_a_scene_whose_weights_are_gone_is_read_when_they_are_not_wanted(parts, tmp_path):
+    root = author_scene(full_scene(parts), tmp_path / "s")
+    weights = tmp_path / "s" / "weights" / "net.pth"
+    weights.unlink()
+    with pytest.raises(RefusedError, match=r"magnetometer:network names .*net\.pth, which is not there"):
+        read_scene(root)
+    assert read_scene(root, check_network=False).robot.magnetometer.network == weights
+
+
+def test_a_robot_that_stands_nowhere_is_refused_by_prim(parts, tmp_path):
+    root = broken(parts, tmp_path, lambda text: text.replace("translate = (1,", "translate = (inf,"))
+    with pytest.raises(RefusedError, match=r"</World/bot>: start of Scene must be finite, got \(inf"):
+        read_scene(root)
+
+
+def test_a_folder_is_no_stage(tmp_path):
+    with pytest.raises(RefusedError, match=rf"^{re.escape(str(tmp_path))}: a folder; give a USD file in it$"):
+        read_scene(tmp_path)
+
+
+def test_a_truncated_crate_is_refused_in_words_without_where_usd_keeps_its_sources(parts, tmp_path):
+    whole = (parts / "map.usdc").read_bytes()
+    (tmp_path / "half.usdc").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(RefusedError, match=r"half\.usdc: cannot be opened as USD: .*truncated") as refused:
+        read_scene(tmp_path / "half.usdc")
+    assert "pxrInternal" not in str(refused.value)
+    assert "/pxr/" not in str(refused.value)
+    (tmp_path / "text.usda").write_text("#usda 1.0\n{{{")
+    with pytest.raises(RefusedError, match=r"text\.usda:2:1: parse error") as refused:
+        read_scene(tmp_path / "text.usda")
+    assert "pxrInternal" not in str(refused.value)
 
 
 def test_a_map_that_was_changed_is_refused(parts, tmp_path):

@@ -3,6 +3,7 @@
 from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -30,9 +31,16 @@ number = st.floats(allow_nan=False, allow_infinity=False)
 not_negative = st.floats(0, 1e300)
 above_zero = st.floats(1e-300, 1e300)
 vec3 = st.tuples(number, number, number)
-mount = {"link": st.just("some_link"), "p_link_sensor": vec3, "q_link_sensor_xyzw": st.tuples(*[number] * 4)}
+turns = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
+unit = turns.map(lambda q: tuple((np.array(q) / np.linalg.norm(q)).tolist()))
+mount = {"link": st.just("some_link"), "p_link_sensor": vec3, "q_link_sensor_xyzw": unit}
 text = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=12)
 name = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,12}", fullmatch=True)
+
+
+def ordered(values):
+    """Two of the values, the lesser first."""
+    return st.tuples(values, values).map(lambda pair: tuple(sorted(pair)))
 
 
 def stage_with_link() -> Usd.Stage:
@@ -85,17 +93,11 @@ def test_an_imu_survives_the_stage(spec):
 
 @unhurried
 @given(
-    st.builds(
-        LidarSpec,
-        **mount,
-        scan_rate_hz=above_zero,
-        range_min_m=not_negative,
-        range_max_m=above_zero,
-        on_s=not_negative,
-        off_s=not_negative,
-    )
+    st.fixed_dictionaries({**mount, "scan_rate_hz": above_zero, "on_s": not_negative, "off_s": not_negative}),
+    ordered(not_negative).filter(lambda ranges: ranges[0] < ranges[1]),
 )
-def test_a_lidar_survives_the_stage(spec):
+def test_a_lidar_survives_the_stage(figures, ranges):
+    spec = LidarSpec(**figures, range_min_m=ranges[0], range_max_m=ranges[1])
     stage = stage_with_link()
     assert sensors.read_lidar(sensors.define_lidar(stage, f"{LINK}/lidar", spec)) == spec
 
@@ -107,13 +109,14 @@ def test_a_lidar_survives_the_stage(spec):
         capacity_wh=above_zero,
         load_w=not_negative,
         initial_fraction=st.floats(0, 1),
-        voltage_empty_v=above_zero,
-        voltage_full_v=above_zero,
+        voltage_full_v=st.just(1e300),
         voltage_noise_std_v=not_negative,
         rate_hz=above_zero,
-    )
+    ),
+    ordered(above_zero),
 )
-def test_a_battery_survives_the_stage(spec):
+def test_a_battery_survives_the_stage(spec, voltages):
+    spec = replace(spec, voltage_empty_v=voltages[0], voltage_full_v=voltages[1])
     stage = stage_with_link()
     assert sensors.read_battery(sensors.define_battery(stage, "/robot/battery", spec)) == spec
 
@@ -121,7 +124,8 @@ def test_a_battery_survives_the_stage(spec):
 @unhurried
 @given(st.data())
 def test_a_drive_survives_the_stage(data):
-    joints = {f: data.draw(name) for f in sensors.JOINT_FIELDS}
+    names = data.draw(st.lists(name, min_size=2, max_size=2, unique=True))
+    joints = dict(zip(sensors.JOINT_FIELDS, names, strict=True))
     figures = {f.name: data.draw(above_zero) for f in fields(DriveSpec) if f.name not in joints}
     spec = DriveSpec(**joints, **figures)
     stage = stage_with_wheels(spec)
@@ -150,10 +154,10 @@ def test_a_source_survives_the_stage(spec):
     st.builds(
         EarthFieldSpec,
         b_world_nt=vec3,
-        latitude_deg=number,
-        longitude_deg=number,
+        latitude_deg=st.floats(-90, 90),
+        longitude_deg=st.floats(-180, 360),
         height_m=number,
-        date=text,
+        date=st.dates().map(str),
     )
 )
 def test_the_earths_field_survives_the_stage(spec):
@@ -187,12 +191,31 @@ def test_a_pose_that_others_wrote_as_a_matrix_is_read():
     assert q == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
 
 
-def test_defaults_author_nothing_and_a_change_authors_only_itself():
+def test_a_turn_that_others_wrote_in_single_or_half_precision_is_read_at_unit_length():
     stage = stage_with_link()
-    prim = sensors.define_battery(stage, "/robot/battery", BatterySpec())
-    assert [a.GetName() for a in prim.GetAuthoredAttributes()] == []
-    sensors.define_battery(stage, "/robot/battery", BatterySpec(load_w=20.0))
-    assert [a.GetName() for a in prim.GetAuthoredAttributes()] == ["magtwin:battery:loadW"]
+    for kind, quaternion in (("half", Gf.Quath), ("single", Gf.Quatf)):
+        prim = sensors.define_imu(stage, f"{LINK}/{kind}", ImuSpec(link="some_link"))
+        prim.RemoveProperty("xformOp:orient")
+        names = {"half": Sdf.ValueTypeNames.Quath, "single": Sdf.ValueTypeNames.Quatf}
+        prim.CreateAttribute("xformOp:orient", names[kind], custom=False).Set(quaternion(0.6, 0.8, 0, 0))
+        q = sensors.read_imu(prim).q_link_sensor_xyzw
+        assert np.linalg.norm(q) == pytest.approx(1, abs=1e-15)
+        assert q == pytest.approx((0.8, 0, 0, 0.6), abs=5e-4)
+
+
+def test_every_figure_is_authored_also_one_that_equals_the_schemas_fallback():
+    stage = stage_with_link()
+    battery = sensors.define_battery(stage, "/robot/battery", BatterySpec())
+    magnetometer = sensors.define_magnetometer(stage, f"{LINK}/mag", MagnetometerSpec(link="some_link"))
+    platform = sensors.define_platform(stage.GetPrimAtPath("/robot"), PlatformFieldSpec())
+    footprint = sensors.define_footprint(stage.GetPrimAtPath("/robot"), 0.171)
+    for prim, noun in ((battery, "battery"), (platform, "platform"), (footprint, "robot")):
+        assert all(
+            a.HasAuthoredValue() for a in prim.GetAttributes() if a.GetName().startswith(f"magtwin:{noun}:")
+        )
+    figures = [a for a in magnetometer.GetAttributes() if a.GetName().startswith("magtwin")]
+    unsaid = {a.GetName().split(":")[-1] for a in figures if not a.HasAuthoredValue()}
+    assert unsaid == {"network", "networkSha256", "inputs", "mapSha256"}, "what is empty says nothing"
 
 
 def test_a_layer_over_a_sensor_holds_only_what_it_changes():
@@ -241,15 +264,16 @@ def test_nvidias_imu_and_lidar_carry_what_they_can():
     assert omni.GetAttribute("omni:sensor:Core:farRangeM").Get() == 8.0
 
 
-def test_a_missing_network_is_refused_by_file_and_prim(tmp_path):
-    stage = Usd.Stage.CreateNew(str(tmp_path / "s.usda"))
+def test_a_missing_network_is_read_as_where_it_should_be(tmp_path):
+    (tmp_path / "a").mkdir()
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a" / "s.usda"))
     UsdGeom.Xform.Define(stage, LINK)
     spec = MagnetometerSpec(link="some_link", network=tmp_path / "gone.safetensors")
     prim = sensors.define_magnetometer(stage, f"{LINK}/mag", spec)
-    with pytest.raises(
-        RefusedError, match=r"s\.usda </robot/some_link/mag>: .*network names \./gone\.safetensors"
-    ):
-        sensors.read_magnetometer(prim)
+    assert sensors.read_magnetometer(prim) == spec
+    over = Usd.Stage.CreateNew(str(tmp_path / "over.usda"))
+    over.GetRootLayer().subLayerPaths.append("./a/s.usda")
+    assert sensors.read_magnetometer(over.GetPrimAtPath(f"{LINK}/mag")) == spec
 
 
 def test_a_figure_out_of_range_is_refused_by_prim():
@@ -260,14 +284,61 @@ def test_a_figure_out_of_range_is_refused_by_prim():
         sensors.read_battery(prim)
 
 
+@pytest.mark.parametrize(
+    ("noun", "attribute", "value", "said"),
+    [
+        ("battery", "loadW", float("nan"), "</robot/battery>: load_w of BatterySpec must be finite, got nan"),
+        ("battery", "voltageFullV", 5.0, "voltage_full_v of BatterySpec must not be below voltage_empty_v"),
+        ("earth", "date", "soon", "</robot/earth>: date of EarthFieldSpec must be a day as YYYY-MM-DD"),
+        ("earth", "latitudeDeg", 90.5, r"latitude_deg of EarthFieldSpec must lie in -90\.\.90, got 90\.5"),
+        ("imu", "gyroNoiseStd", float("inf"), "some_link/imu>: gyro_noise_std of ImuSpec must be finite"),
+        ("lidar", "rangeMinM", 12.0, r"some_link/lidar>: range_min_m of LidarSpec must be below range_max_m"),
+        ("source", "mWorld", (0, 0, float("nan")), "</robot/beam>: m_world of SourceSpec must be finite"),
+    ],
+)
+def test_a_figure_that_makes_no_sense_is_refused_by_prim(noun, attribute, value, said):
+    stage = stage_with_link()
+    earth = EarthFieldSpec(
+        b_world_nt=(0, 2e4, -4e4), latitude_deg=29, longitude_deg=-82, height_m=2, date="2026-01-01"
+    )
+    beam = SourceSpec(name="beam", p_world=(0, 0, 0), m_world=(0, 0, 1))
+    prim = {
+        "battery": lambda: sensors.define_battery(stage, "/robot/battery", BatterySpec()),
+        "earth": lambda: sensors.define_earth(stage, "/robot/earth", earth),
+        "imu": lambda: sensors.define_imu(stage, f"{LINK}/imu", ImuSpec(link="some_link")),
+        "lidar": lambda: sensors.define_lidar(stage, f"{LINK}/lidar", LidarSpec(link="some_link")),
+        "source": lambda: sensors.define_source(stage, "/robot", beam),
+    }[noun]()
+    prim.GetAttribute(f"magtwin:{noun}:{attribute}").Set(value)
+    with pytest.raises(RefusedError, match=said):
+        getattr(sensors, f"read_{noun}")(prim)
+
+
+def test_a_turn_that_is_none_is_refused_by_prim():
+    stage = stage_with_link()
+    prim = sensors.define_imu(stage, f"{LINK}/imu", ImuSpec(link="some_link"))
+    prim.GetAttribute("xformOp:orient").Set(Gf.Quatd(1, 1, 0, 0))
+    with pytest.raises(
+        RefusedError, match="some_link/imu>: q_link_sensor_xyzw of ImuSpec must be a unit quaternion"
+    ):
+        sensors.read_imu(prim)
+
+
+def test_a_drive_with_one_joint_for_both_wheels_is_refused_by_prim():
+    stage = stage_with_wheels(DriveSpec())
+    prim = sensors.define_drive(stage.GetPrimAtPath("/robot"), DriveSpec())
+    left = prim.GetRelationship("magtwin:drive:leftWheelJoint").GetTargets()
+    prim.GetRelationship("magtwin:drive:rightWheelJoint").SetTargets(left)
+    with pytest.raises(RefusedError, match="</robot>: right_wheel_joint of DriveSpec must be another joint"):
+        sensors.read_drive(prim)
+
+
 def test_a_figure_of_another_type_is_refused_by_prim():
     stage = stage_with_link()
     sensors.define_battery(stage, "/robot/battery", BatterySpec())
-    spec = Sdf.AttributeSpec(
-        stage.GetRootLayer().GetPrimAtPath("/robot/battery"),
-        "magtwin:battery:loadW",
-        Sdf.ValueTypeNames.String,
-    )
+    battery = stage.GetRootLayer().GetPrimAtPath("/robot/battery")
+    battery.RemoveProperty(battery.attributes["magtwin:battery:loadW"])
+    spec = Sdf.AttributeSpec(battery, "magtwin:battery:loadW", Sdf.ValueTypeNames.String)
     spec.default = "much"
     with pytest.raises(RefusedError, match=r"</robot/battery>: magtwin:battery:loadW must be a double, got"):
         sensors.read_battery(stage.GetPrimAtPath("/robot/battery"))

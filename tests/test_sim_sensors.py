@@ -8,7 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from magtwin.frames import quat_conjugate, quat_from_rpy, quat_from_yaw, quat_multiply, yaw_from_quat
+from magtwin.frames import (
+    IDENTITY_XYZW,
+    quat_conjugate,
+    quat_from_rpy,
+    quat_from_yaw,
+    quat_multiply,
+    rotate,
+    yaw_from_quat,
+)
 from magtwin.names import RefusedError
 from magtwin.sim.drive import Motion
 from magtwin.sim.sensors import (
@@ -32,6 +40,10 @@ def generator(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
+def imu_of(spec: ImuSpec, motion: Motion, t, rng, q_base_imu_xyzw=IDENTITY_XYZW):
+    return sense_imu(spec, q_base_imu_xyzw, motion, t, rng)
+
+
 @given(rate=st.floats(0.01, 500), reading=st.floats(1, 500), count=st.integers(1, 500))
 def test_a_held_sample_is_never_from_the_future_and_is_the_latest(rate, reading, count):
     t = np.arange(count) / reading
@@ -44,7 +56,7 @@ def test_a_held_sample_is_never_from_the_future_and_is_the_latest(rate, reading,
 
 def test_each_sensor_changes_at_its_own_rate():
     t = np.arange(10_000) / 1000.0
-    imu = sense_imu(ImuSpec(), CIRCLE, t, generator())
+    imu = imu_of(ImuSpec(), CIRCLE, t, generator())
     battery = sense_battery(BatterySpec(), t, generator())
     assert np.count_nonzero(np.diff(imu["imu_a"][:, 0])) == np.floor(9.999 * 62)
     assert np.count_nonzero(np.diff(battery["battery_v"])) == np.floor(9.999 * 0.5)
@@ -86,7 +98,7 @@ def test_odometry_errors_have_the_spread_of_the_spec():
 
 
 def test_an_imu_without_noise_reads_a_circles_rates_and_centripetal_acceleration():
-    imu = sense_imu(ImuSpec(**QUIET), CIRCLE, T[200:], generator())
+    imu = imu_of(ImuSpec(**QUIET), CIRCLE, T[200:], generator())
     assert_allclose(imu["imu_w"], [[0, 0, 0.5]] * len(T[200:]))
     assert_allclose(imu["imu_a"], [[0, 0.2 * 0.5, 0]] * len(T[200:]), atol=1e-12)
     stamps, latest = held(T[200:], 62.0)
@@ -96,20 +108,31 @@ def test_an_imu_without_noise_reads_a_circles_rates_and_centripetal_acceleration
 
 def test_forward_acceleration_is_the_change_of_speed():
     v = np.minimum(0.3, 0.4 * 0.02 * np.arange(1, 101))  # 0.4 m/s2 up to 0.3 m/s
-    imu = sense_imu(ImuSpec(**QUIET), Motion(DriveSpec(), 0.02, v, np.zeros(100)), T[:200], generator())
+    imu = imu_of(ImuSpec(**QUIET), Motion(DriveSpec(), 0.02, v, np.zeros(100)), T[:200], generator())
     assert_allclose(imu["imu_a"][:90, 0], 0.4, atol=1e-9)
     assert_allclose(imu["imu_a"][110:, 0], 0, atol=1e-9)
 
 
 def test_an_imu_mounted_askew_reads_in_its_own_axes():
-    upside_down = ImuSpec(q_link_sensor_xyzw=(1.0, 0.0, 0.0, 0.0), **QUIET)
-    imu = sense_imu(upside_down, CIRCLE, T[200:], generator())
+    upside_down = (1.0, 0.0, 0.0, 0.0)
+    imu = imu_of(ImuSpec(**QUIET), CIRCLE, T[200:], generator(), upside_down)
     assert_allclose(imu["imu_w"], [[0, 0, -0.5]] * len(T[200:]), atol=1e-12)
     assert_allclose(imu["imu_a"], [[0, -0.1, 0]] * len(T[200:]), atol=1e-12)
 
 
+def test_an_imus_noise_is_in_its_own_axes_however_it_is_mounted():
+    askew = tuple(quat_from_rpy([0.3, -0.2, 1.0]).tolist())
+    a, b = (imu_of(ImuSpec(), CIRCLE, T, generator(3), q) for q in (IDENTITY_XYZW, askew))
+    clean_a, clean_b = (imu_of(ImuSpec(**QUIET), CIRCLE, T, generator(3), q) for q in (IDENTITY_XYZW, askew))
+    for name in ("imu_w", "imu_a"):
+        assert_allclose(rotate(np.array(askew), clean_b[name]), clean_a[name], atol=1e-12)
+        assert_allclose(b[name] - clean_b[name], a[name] - clean_a[name], atol=1e-12)
+    turn = quat_multiply(quat_conjugate(clean_a["imu_q_xyzw"]), clean_b["imu_q_xyzw"])
+    assert_allclose(np.abs(turn @ np.array(askew)), 1, atol=1e-12)
+
+
 def test_the_imus_quaternion_is_of_unit_length_with_w_not_below_0():
-    q = sense_imu(ImuSpec(), CIRCLE, T, generator())["imu_q_xyzw"]
+    q = imu_of(ImuSpec(), CIRCLE, T, generator())["imu_q_xyzw"]
     assert_allclose(np.linalg.norm(q, axis=1), 1)
     assert q[:, 3].min() >= 0
     assert np.ptp(yaw_from_quat(q)) > 6  # it did turn all the way round
@@ -119,7 +142,7 @@ def test_the_imus_noise_has_the_spread_of_its_spec_on_every_axis():
     t = np.arange(62 * 200) / 62.0
     still = Motion(DriveSpec(), 0.02, np.zeros(10), np.zeros(10), (0.0, 0.0, 1.0))
     spec = ImuSpec(orientation_noise_std=0.003, gyro_noise_std=0.02, accel_noise_std=0.3)
-    imu = sense_imu(spec, still, t, generator())
+    imu = imu_of(spec, still, t, generator())
     off = quat_multiply(quat_conjugate(quat_from_yaw(1.0)), imu["imu_q_xyzw"])
     for noise, sd in ((2 * off[:, :3], 0.003), (imu["imu_w"], 0.02), (imu["imu_a"], 0.3)):
         assert_allclose(noise.std(axis=0), sd, rtol=0.04)  # 12,400 draws: 0.6 % is one sigma
@@ -129,7 +152,7 @@ def test_the_imus_noise_has_the_spread_of_its_spec_on_every_axis():
 def test_small_angles_of_the_orientation_are_roll_pitch_yaw_in_the_sensors_axes():
     spec = ImuSpec(orientation_noise_std=0.01)
     still = Motion(DriveSpec(), 0.02, np.zeros(10), np.zeros(10), (0.0, 0.0, -2.0))
-    q = sense_imu(spec, still, np.array([0.0]), generator(7))["imu_q_xyzw"][0]
+    q = imu_of(spec, still, np.array([0.0]), generator(7))["imu_q_xyzw"][0]
     angles = 0.01 * generator(7).standard_normal(9)[:3]
     wanted = quat_multiply(quat_from_yaw(-2.0), quat_from_rpy(angles))
     assert_allclose(np.abs(q @ wanted), 1, atol=1e-14)
@@ -189,7 +212,7 @@ def test_a_magnetometer_without_noise_or_steps_reads_the_field_and_nan_stays_nan
 
 def test_a_longer_run_begins_with_the_noise_of_a_shorter_one():
     for sense in (
-        lambda t: sense_imu(ImuSpec(), CIRCLE, t, generator(1)),
+        lambda t: imu_of(ImuSpec(), CIRCLE, t, generator(1)),
         lambda t: sense_odometry(CIRCLE, t, generator(1)),
         lambda t: sense_battery(BatterySpec(), t, generator(1)),
         lambda t: sense_magnetometer(MagnetometerSpec(), np.zeros(len(t)), generator(1)),

@@ -15,6 +15,7 @@ from magtwin.run import COLUMNS, Run
 from magtwin.sim.simulate import simulate
 from magtwin.spec import (
     EarthFieldSpec,
+    ImuSpec,
     LabSpec,
     MagnetometerSpec,
     PlatformFieldSpec,
@@ -211,6 +212,44 @@ def test_the_vector_is_in_the_sensors_axes_and_the_magnitude_is_not_changed_by_i
     a, b = drive(), drive(askew)
     assert_allclose(rotate(np.array(q), b["b_vector_nt"]), a["b_vector_nt"], atol=1e-8)
     assert_array_equal(a["b_truth_nt"], b["b_truth_nt"])
+
+
+def test_columns_turn_with_the_links_that_carry_the_sensors():
+    # imu_link is yawed by a quarter to the left: base_link's x is its -y, base_link's y its x.
+    # magnetometer_link lies on its back: y and z are turned over.
+    quiet = dataclasses.replace(ROBOT.imu, orientation_noise_std=0.0, gyro_noise_std=0.0, accel_noise_std=0.0)
+    plain = with_robot(KNOWN, imu=quiet)
+    turned = with_robot(
+        plain,
+        q_base_imu_link_xyzw=(0.0, 0.0, 0.5**0.5, 0.5**0.5),
+        q_base_magnetometer_link_xyzw=(1.0, 0.0, 0.0, 0.0),
+    )
+    a, b = (drive(scene, path_named("figure8"), duration_s=20.0) for scene in (plain, turned))
+    assert np.abs(a["imu_a"]).max() > 0.02
+    assert_allclose(b["imu_a"], a["imu_a"][:, [1, 0, 2]] * [1, -1, 1], atol=1e-12)
+    assert_allclose(b["imu_w"], a["imu_w"], atol=1e-12)
+    ahead = yaw_from_quat(b["imu_q_xyzw"]) - yaw_from_quat(a["imu_q_xyzw"])
+    assert_allclose(np.sin(ahead), 1, atol=1e-12)
+    assert_allclose(b["b_vector_nt"], a["b_vector_nt"] * [1, -1, -1], atol=1e-8)
+    assert_array_equal(b["b_truth_nt"], a["b_truth_nt"])
+
+
+def test_a_mount_turns_within_its_turned_link():
+    link, mount = quat_from_rpy([0.3, -0.2, 1.0]), quat_from_rpy([-0.7, 0.1, 0.4])
+    robot = dataclasses.replace(
+        ROBOT,
+        q_base_magnetometer_link_xyzw=tuple(link.tolist()),
+        q_base_imu_link_xyzw=tuple(mount.tolist()),
+        magnetometer=MagnetometerSpec(q_link_sensor_xyzw=tuple(mount.tolist())),
+        imu=ImuSpec(q_link_sensor_xyzw=tuple(link.tolist())),
+    )
+    v = np.array([1.0, 2.0, 3.0])
+    for q, outer, inner in (
+        (robot.q_base_magnetometer_xyzw, link, mount),
+        (robot.q_base_imu_xyzw, mount, link),
+    ):
+        assert_allclose(rotate(q, v), rotate(outer, rotate(inner, v)), atol=1e-14)
+    assert ROBOT.q_base_imu_xyzw == ROBOT.imu.q_link_sensor_xyzw
 
 
 def test_the_lidars_current_is_felt_when_it_is_on():

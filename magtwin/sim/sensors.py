@@ -20,7 +20,7 @@ from magtwin.frames import (
 )
 from magtwin.names import RefusedError
 from magtwin.sim.drive import Motion, twist_from_wheels, wheel_rates
-from magtwin.spec import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MountSpec
+from magtwin.spec import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, Quat
 
 Array = NDArray[np.float64]
 Columns = dict[str, NDArray[np.float64]]
@@ -45,10 +45,10 @@ def held(t: ArrayLike, rate_hz: float) -> tuple[Array, NDArray[np.intp]]:
     return stamps, np.searchsorted(stamps, t, side="right") - 1
 
 
-def into_sensor(v_link: Array, mount: MountSpec) -> Array:
-    """Vectors (N, 3) turned from a link's axes into those of a sensor mounted on it."""
+def into_sensor(v_base: Array, q_base_sensor_xyzw: Quat) -> Array:
+    """Vectors (N, 3) turned from base_link's axes into those of a sensor."""
     # einsum, as a product of so few columns is no work for the threads of a BLAS that `@` wakes.
-    return np.einsum("ni,ij->nj", v_link, matrix_from_quat(mount.q_link_sensor_xyzw))
+    return np.einsum("ni,ij->nj", v_base, matrix_from_quat(q_base_sensor_xyzw))
 
 
 def sense_odometry(motion: Motion, t: ArrayLike, rng: np.random.Generator) -> Columns:
@@ -79,15 +79,18 @@ def sense_odometry(motion: Motion, t: ArrayLike, rng: np.random.Generator) -> Co
     }
 
 
-def sense_imu(spec: ImuSpec, motion: Motion, t: ArrayLike, rng: np.random.Generator) -> Columns:
+def sense_imu(
+    spec: ImuSpec, q_base_imu_xyzw: Quat, motion: Motion, t: ArrayLike, rng: np.random.Generator
+) -> Columns:
     """Orientation, rates and acceleration with gravity removed, of a robot on a level floor.
 
-    a = (dv/dt, v w, 0) and w = (0, 0, w) in base_link, which the IMU's link is parallel to, brought
-    into the sensor's axes; then white noise on each axis, for the orientation as three small angles
-    in the sensor's axes. The IMU is taken as being at base_link's origin.
+    a = (dv/dt, v w, 0) and w = (0, 0, w) in base_link, brought into the sensor's axes; then white
+    noise on each axis, for the orientation as three small angles in the sensor's axes. The IMU is
+    taken as being at base_link's origin.
 
     Args:
-        spec: Rate, noise, and the sensor's axes in its link.
+        spec: Rate and noise.
+        q_base_imu_xyzw: The sensor's axes in base_link, which its link and its mount there make.
         motion: What the robot did.
         t: Times of the readings [s], shape (N,).
         rng: Source of noise.
@@ -99,9 +102,9 @@ def sense_imu(spec: ImuSpec, motion: Motion, t: ArrayLike, rng: np.random.Genera
     true = motion.at(stamps)
     zero = np.zeros(len(stamps))
     noise = rng.standard_normal((len(stamps), 9))
-    rates = into_sensor(np.column_stack([zero, zero, true.w]), spec)
-    acceleration = into_sensor(np.column_stack([true.a, true.v * true.w, zero]), spec)
-    q = quat_multiply(quat_from_yaw(true.pose[:, 2]), spec.q_link_sensor_xyzw)
+    rates = into_sensor(np.column_stack([zero, zero, true.w]), q_base_imu_xyzw)
+    acceleration = into_sensor(np.column_stack([true.a, true.v * true.w, zero]), q_base_imu_xyzw)
+    q = quat_multiply(quat_from_yaw(true.pose[:, 2]), q_base_imu_xyzw)
     q = quat_multiply(q, quat_from_rpy(spec.orientation_noise_std * noise[:, :3]))
     return {
         "imu_q_xyzw": canonical(q)[latest],

@@ -100,7 +100,7 @@ def simulate(
     true = motion.at(t)
     columns = _truth(true, t, robot.base_height_m)
     columns |= sense_odometry(motion, t, streams["odometry"])
-    columns |= sense_imu(robot.imu, motion, t, streams["imu"])
+    columns |= sense_imu(robot.imu, robot.q_base_imu_xyzw, motion, t, streams["imu"])
     columns |= sense_battery(robot.battery, t, streams["battery"])
     columns["lidar_on"] = lidar_on(robot.lidar, t, lidar)
     columns |= _map(anomaly_map, true.pose[:, :2], columns["yaw"], outside)
@@ -202,7 +202,7 @@ def _exact_field(scene: Scene, true: Moment, on: NDArray[np.bool_], t: Array) ->
         battery_a=excess_current_a(robot.battery, voltage),
     )
     return {
-        "b_vector_nt": into_sensor(vector, robot.magnetometer),
+        "b_vector_nt": into_sensor(vector, robot.q_base_magnetometer_xyzw),
         "b_truth_nt": np.sqrt(np.sum(vector * vector, axis=1)),
     }
 

@@ -1,6 +1,7 @@
 """Between plain data and a prim: fields of a spec as attributes, a pose as a transform, a link as a target.
 
-What is written is read back to the bit; an attribute is written only where its composed value differs.
+What is written is read back to the bit. A value is authored even where it equals the schema's fallback,
+which a reader without the schema does not see; over a layer that gives it already, it is not said again.
 """
 
 from dataclasses import fields
@@ -19,13 +20,17 @@ S = TypeVar("S")
 
 
 def write_figures(prim: Usd.Prim, noun: str, spec: Any, *, skip: Any = ()) -> Usd.Prim:
-    """Write each field of a spec, but those in `skip`, to the attribute that stands for it."""
+    """Write each field of a spec, but those in `skip`, to the attribute that stands for it.
+
+    None, "" and () are left to the fallback, unless a weaker layer gives another value.
+    """
     for field in fields(spec):
         if field.name in skip:
             continue
         attribute = prim.GetAttribute(attribute_name(noun, field.name))
         value = getattr(spec, field.name)
-        if plain_value(attribute) != (value.resolve() if isinstance(value, Path) else value):
+        unsaid = value not in (None, "", ()) and not attribute.HasAuthoredValue()
+        if unsaid or plain_value(attribute) != (value.resolve() if isinstance(value, Path) else value):
             attribute.Set(_usd_value(attribute, value))
     return prim
 
@@ -40,7 +45,7 @@ def read_figures(cls: type[S], prim: Usd.Prim, noun: str, **known: Any) -> S:
     values = dict(known)
     for field in fields(cls):  # type: ignore[arg-type]
         if field.name not in known:
-            values[field.name] = _read_value(prim.GetAttribute(attribute_name(noun, field.name)))
+            values[field.name] = plain_value(prim.GetAttribute(attribute_name(noun, field.name)))
     try:
         return cls(**values)
     except RefusedError as error:
@@ -71,12 +76,15 @@ def write_pose(prim: Usd.Prim, p: Vec3, q_xyzw: Quat | None = None) -> None:
 def read_pose(prim: Usd.Prim) -> tuple[Vec3, Quat]:
     """Position [m] and turn (xyzw) of an Xform in its parent.
 
-    What `write_pose` wrote comes back to the bit; any other rigid transform comes back as it composes.
+    What `write_pose` wrote comes back to the bit; any other rigid transform comes back as it composes,
+    its turn brought to unit length where it is in less than double precision.
     """
     xformable = UsdGeom.Xformable(prim)
     ops = {op.GetOpName(): op.Get() for op in xformable.GetOrderedXformOps()}
     if list(ops) in (["xformOp:translate"], ["xformOp:translate", "xformOp:orient"]):
         translate, orient = ops["xformOp:translate"], ops.get("xformOp:orient", Gf.Quatd(1))
+        if not isinstance(orient, Gf.Quatd):
+            orient = Gf.Quatd(orient).GetNormalized()
     else:
         local = xformable.GetLocalTransformation()
         translate, orient = local.ExtractTranslation(), local.RemoveScaleShear().ExtractRotationQuat()
@@ -124,7 +132,7 @@ def _usd_value(attribute: Usd.Attribute, value: Any) -> Any:
 
 
 def plain_value(attribute: Usd.Attribute) -> Any:
-    """An attribute's value as plain Python: numbers, text, tuples, a Path or None.
+    """An attribute's value as plain Python: numbers, text, tuples, a Path (which need not exist) or None.
 
     Raises:
         RefusedError: The layers give a value of another type than the schema does.
@@ -135,7 +143,7 @@ def plain_value(attribute: Usd.Attribute) -> Any:
             f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}, got {value!r}"
         )
     if isinstance(value, Sdf.AssetPath):
-        return Path(value.resolvedPath or value.path).resolve() if value.path else None
+        return _anchored(attribute, value) if value.path else None
     if isinstance(value, Gf.Matrix3d):
         return tuple(float(x) for row in value for x in row)
     if isinstance(value, Gf.Vec3d | Gf.Vec2d):
@@ -143,12 +151,9 @@ def plain_value(attribute: Usd.Attribute) -> Any:
     return tuple(value) if isinstance(value, Vt.StringArray) else value
 
 
-def _read_value(attribute: Usd.Attribute) -> Any:
-    """What `plain_value` gives; a file that is named must be there."""
-    value = plain_value(attribute)
-    if isinstance(value, Path) and not attribute.Get().resolvedPath:
-        raise RefusedError(
-            f"{place(attribute.GetPrim())}: {attribute.GetName()} names {attribute.Get().path}, "
-            "which is not there"
-        )
-    return value
+def _anchored(attribute: Usd.Attribute, value: Sdf.AssetPath) -> Path:
+    """The file that an asset path names, whether it is there or not."""
+    if value.resolvedPath:
+        return Path(value.resolvedPath).resolve()
+    layer = attribute.GetPropertyStack()[0].layer
+    return Path(Sdf.ComputeAssetPathRelativeToLayer(layer, value.path)).resolve()

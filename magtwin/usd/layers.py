@@ -1,6 +1,7 @@
 """Layers: new ones with units and defaults said, old ones opened, files named relative to them."""
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -59,6 +60,8 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
             text says what USD said of it.
     """
     path = existing(path, "USD file")
+    if path.is_dir():
+        raise RefusedError(f"{path}: a folder; give a USD file in it")
     heard = (
         UsdUtils.CoalescingDiagnosticDelegate()
     )  # keeps USD's warnings off the terminal: they are refusals
@@ -67,13 +70,18 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         stage.Reload()  # a layer that someone still holds would be shown as it was
         errors = stage.GetCompositionErrors()
     except Tf.ErrorException as error:
-        reason = str(error).strip().splitlines()[-1].strip()
-        raise RefusedError(f"{path}: cannot be opened as USD: {reason}") from error
+        raise RefusedError(f"{path}: cannot be opened as USD: {_reason(error)}") from error
     finally:
         heard.TakeUncoalescedDiagnostics()
     if errors:
         raise RefusedError(f"{path}: {_one_line(str(errors[0]))}")
     return stage
+
+
+def _reason(error: Tf.ErrorException) -> str:
+    """What USD said first, without where in its sources it said so; what it says later follows from that."""
+    said = getattr(error.args[0], "commentary", str(error)) if error.args else str(error)
+    return re.sub(r"pxrInternal_\w*?pxrReserved__(::|_)", "", _one_line(said))
 
 
 def _one_line(text: str) -> str:

@@ -10,6 +10,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError
+from magtwin.usd.geometry import linear_from_srgb
 from magtwin.usd.layers import WORLD, new_stage, open_stage
 from magtwin.usd.schema import apply_api, attribute_name, only_prim_with, place
 
@@ -179,8 +180,7 @@ def viridis() -> NDArray[np.float32]:
     """Linear colours: the 256 of the colour map, then that of nodes without a value, shape (257, 3)."""
     from matplotlib import colormaps
 
-    srgb = np.array(colormaps["viridis"].colors)  # type: ignore[attr-defined]
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    linear = linear_from_srgb(colormaps["viridis"].colors)  # type: ignore[attr-defined]
     return np.vstack([linear, UNKNOWN_COLOUR]).astype(np.float32)
 
 

@@ -19,6 +19,7 @@ from magtwin.spec import (
     MountSpec,
     PlatformFieldSpec,
     RobotSpec,
+    Spec,
 )
 from magtwin.usd.layers import open_stage
 from magtwin.usd.schema import prims_with
@@ -40,7 +41,7 @@ _DEFAULTS = RobotSpec(name="", asset=Path())
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobotSettings:
+class RobotSettings(Spec):
     """What a URDF cannot say of a robot; a robot.toml, or [robot] of a scene's TOML, holds its fields.
 
     What is None is taken from the URDF's own tags where it has them, else it is the default of its
@@ -62,6 +63,10 @@ class RobotSettings:
 
     conversion: Options = DEFAULTS
     """How the URDF is converted."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._above_zero("footprint_radius_m")
 
 
 def build_robot(
@@ -124,7 +129,8 @@ def read_robot(asset: str | os.PathLike[str]) -> RobotSpec:
     """The spec of a robot's asset.
 
     Raises:
-        RefusedError: The file is missing, is not USD, or is not an asset that `build_robot` made.
+        RefusedError: The file is missing, is not USD, or is not an asset that `build_robot` made. Whether
+            a network that it names is there is for its user to see.
     """
     path = existing(asset, "robot asset").resolve()
     stage = open_stage(path)

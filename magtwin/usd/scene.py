@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields, replace
@@ -13,13 +14,14 @@ from magtwin.files import existing, from_table, output, read_toml, sha256
 from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.names import RefusedError
 from magtwin.spec import ZERO3, EarthFieldSpec, LabSpec, MagnetometerSpec, RobotSpec, Scene, SourceSpec, Vec3
-from magtwin.usd.figures import check_prim_name, read_pose, target, write_pose
+from magtwin.usd.figures import check_prim_name, plain_value, read_pose, target, write_pose
 from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, read_lab
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, open_stage, relative_asset
 from magtwin.usd.maps import MAP, load_map, read_map
 from magtwin.usd.robot import RobotSettings, build_robot, read_robot, robot_of
 from magtwin.usd.schema import only_prim_with, place, prims_with, require_api
 from magtwin.usd.sensors import (
+    MAP_CHECKSUM,
     MAP_RELATIONSHIP,
     define_battery,
     define_drive,
@@ -67,8 +69,8 @@ def author_scene(
         The root layer, `folder/<name>.usda`.
 
     Raises:
-        RefusedError: The folder exists, a file is missing, is not what it should be, or a name cannot
-            name a file or a prim.
+        RefusedError: The folder exists, a file is missing, is not what it should be or not what its
+            checksum says, or a name cannot name a file or a prim.
     """
     _check(scene)
     with output(folder, force=force) as aside:
@@ -88,16 +90,18 @@ def author_scene(
     return Path(folder) / f"{scene.name}.usda"
 
 
-def read_scene(path: str | os.PathLike[str]) -> Scene:
+def read_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> Scene:
     """The scene of a stage.
 
     Args:
         path: Root layer, as `author_scene` wrote it or as others edited it. A start's yaw comes back
             from a quaternion, so in its last bits it can differ from what was authored.
+        check_network: Whether the weights that the magnetometer names must be there.
 
     Raises:
         RefusedError: The file or one that it names is missing, it has no lab, robot or map, a figure
-            is out of range, or the map is not what its checksum was taken of; names the prim.
+            is out of range, or the map is not what its checksum was taken of, or is another than the
+            scene was made with; names the prim.
     """
     stage = open_stage(path)
     _check_axes(stage, path)
@@ -108,19 +112,33 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     magnetometer = only_prim_with(prim, "magnetometer")
     field_map = require_api(target(magnetometer, MAP_RELATIONSHIP), "anomalyMap")
     read_map(field_map)
+    network = robot.magnetometer.network
+    if check_network and network is not None and not network.exists():
+        raise RefusedError(
+            f"{place(magnetometer)}: magtwin:magnetometer:network names {network}, which is not there"
+        )
     earths = prims_with(world, "earth")
     if len(earths) > 1:
         raise RefusedError(f"{place(earths[1])}: a second Earth's field; the first is {earths[0].GetPath()}")
     p, q = read_pose(prim)
-    return Scene(
-        name=Path(path).stem,
-        map_layer=_layer_of(field_map),
-        robot=robot,
-        lab=lab,
-        earth=read_earth(earths[0]) if earths else None,
-        sources=tuple(read_source(source) for source in prims_with(world, "source")),
-        start=(p[0], p[1], float(yaw_from_quat(q))),
-    )
+    earth = read_earth(earths[0]) if earths else None
+    sources = tuple(read_source(source) for source in prims_with(world, "source"))
+    try:
+        scene = Scene(
+            name=Path(path).stem,
+            map_layer=_layer_of(field_map),
+            map_sha256=plain_value(magnetometer.GetAttribute(MAP_CHECKSUM)),
+            robot=robot,
+            lab=lab,
+            earth=earth,
+            sources=sources,
+            start=(p[0], p[1], float(yaw_from_quat(q))),
+        )
+    except RefusedError as error:
+        raise RefusedError(f"{place(prim)}: {error}") from error
+    if scene.map_layer != Path(path).resolve():  # a flattened stage is its own map, and knows no checksum
+        _check_map(scene, f"{place(magnetometer)}: ")
+    return scene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,6 +210,7 @@ def scene_from_toml(
     return Scene(
         name=given.name,
         map_layer=existing(layer, "map layer"),
+        map_sha256=sha256(layer),
         robot=robot,
         lab=given.lab,
         earth=given.earth if own_map else None,
@@ -245,7 +264,7 @@ def _with_network(robot: RobotSpec, weights: Path) -> MagnetometerSpec:
 
 def _check(scene: Scene) -> None:
     """Refuse what would come out broken, before anything is written, by the names that the caller knows."""
-    if Path(scene.name).name != scene.name or scene.name.startswith("."):
+    if not re.fullmatch(r"\w[\w .-]*", scene.name):
         raise RefusedError(f"scene {scene.name!r} cannot name a file; use letters, digits, - and _")
     if check_prim_name(scene.robot.name, "robot") in TAKEN:
         raise RefusedError(f"robot {scene.robot.name!r} has the name of a part of the scene; rename it")
@@ -253,9 +272,19 @@ def _check(scene: Scene) -> None:
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise RefusedError(f"two sources are called {twice[0]!r}; give each a name of its own")
     load_map(scene.map_layer)
+    _check_map(scene)
     read_robot(scene.robot.asset)
     if scene.robot.magnetometer.network is not None:
         existing(scene.robot.magnetometer.network, "weights file")
+
+
+def _check_map(scene: Scene, where: str = "") -> None:
+    """Refuse a map that is another than the scene was made with, and so than its Earth and sources."""
+    if scene.map_sha256 and (seen := sha256(scene.map_layer)) != scene.map_sha256.lower():
+        raise RefusedError(
+            f"{where}{scene.map_layer}: has SHA-256 {seen}, but scene {scene.name!r} was made with a map of "
+            f"{scene.map_sha256}; put that map back, or make the scene anew with this one"
+        )
 
 
 def _check_axes(stage: Usd.Stage, path: str | os.PathLike[str]) -> None:
@@ -330,8 +359,11 @@ def _define_robot(stage: Usd.Stage, scene: Scene) -> None:
     define_platform(prim, robot.platform)
     for part, define in PARTS.items():
         define(stage, only_prim_with(prim, part).GetPath(), getattr(robot, part))
-    relationship = only_prim_with(prim, "magnetometer").GetRelationship(MAP_RELATIONSHIP)
-    relationship.SetTargets([only_prim_with(stage.GetPrimAtPath(WORLD), "anomalyMap").GetPath()])
+    magnetometer = only_prim_with(prim, "magnetometer")
+    map_prim = only_prim_with(stage.GetPrimAtPath(WORLD), "anomalyMap")
+    magnetometer.GetRelationship(MAP_RELATIONSHIP).SetTargets([map_prim.GetPath()])
+    if scene.map_sha256:
+        magnetometer.GetAttribute(MAP_CHECKSUM).Set(scene.map_sha256)
 
 
 def _settle(layer: Sdf.Layer, aside: Path, final: Path) -> None:

@@ -1,16 +1,17 @@
 """Sensors, drive, battery and magnetic sources as prims: `define_` authors one, `read_` gives its spec back.
 
 Every prim is an Xform with an applied schema of magtwin's, so that a runtime which has never heard of
-magtwin still places it. An attribute is authored where its composed value differs from the spec's, in
-the stage's edit target: layers over a robot hold only what they change.
+magtwin still places it. A figure is authored where no layer says it yet, be it the schema's fallback,
+or says otherwise, in the stage's edit target: layers over a robot hold only what they change.
 """
 
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
+from magtwin.frames import IDENTITY_XYZW, canonical, xyzw_from_wxyz
 from magtwin.names import RefusedError, hint
 from magtwin.spec import (
     BatterySpec,
@@ -21,6 +22,7 @@ from magtwin.spec import (
     MagnetometerSpec,
     MountSpec,
     PlatformFieldSpec,
+    Quat,
     RobotSpec,
     SourceSpec,
     Vec3,
@@ -40,6 +42,11 @@ BASE = "base_link"
 """Name of the link that REP-105 makes the robot's own frame."""
 
 MAP_RELATIONSHIP = "magtwin:magnetometer:map"
+MAP_CHECKSUM = "magtwin:magnetometer:mapSha256"
+"""What a scene adds to its robot's magnetometer: the map that it reads, and the checksum of its file."""
+
+PARALLEL = 1e-12
+"""Sine of half the angle between axes that count as parallel."""
 
 IMU_TYPE = "IsaacImuSensor"
 LIDAR_TYPE = "OmniLidar"
@@ -68,10 +75,10 @@ def define_magnetometer(stage: Usd.Stage, path: str | Sdf.Path, spec: Magnetomet
 
 
 def read_magnetometer(prim: Usd.Prim) -> MagnetometerSpec:
-    """The spec of an authored magnetometer.
+    """The spec of an authored magnetometer; whether its network is there is for its user to see.
 
     Raises:
-        RefusedError: It is none, a figure is out of range, or its network is missing.
+        RefusedError: It is none, or a figure is out of range.
     """
     return _read_mounted(MagnetometerSpec, prim, "magnetometer")
 
@@ -152,7 +159,7 @@ def read_battery(prim: Usd.Prim) -> BatterySpec:
 def define_footprint(prim: Usd.Prim, footprint_radius_m: float) -> Usd.Prim:
     """Mark `prim`, an Xform, as the root of a robot that needs a clear circle of this radius [m]."""
     attribute = apply_api(prim, "robot").GetAttribute(FOOTPRINT)
-    if attribute.Get() != footprint_radius_m:
+    if not attribute.HasAuthoredValue() or attribute.Get() != footprint_radius_m:
         attribute.Set(footprint_radius_m)
     return prim
 
@@ -211,20 +218,28 @@ def read_robot_prim(prim: Usd.Prim, asset: Path) -> RobotSpec:
     Raises:
         RefusedError: A part is missing or there twice, or a figure is out of range; names the prim.
     """
-    magnetometer = only_prim_with(prim, "magnetometer")
-    return RobotSpec(
-        name=prim.GetName(),
-        asset=asset,
-        footprint_radius_m=read_footprint(prim),
-        base_height_m=_p_root(prim, _base(prim))[2],
-        p_base_magnetometer=_p_base(prim, magnetometer),
-        drive=read_drive(prim),
-        battery=read_battery(only_prim_with(prim, "battery")),
-        platform=read_platform(prim),
-        magnetometer=read_magnetometer(magnetometer),
-        imu=read_imu(only_prim_with(prim, "imu")),
-        lidar=read_lidar(only_prim_with(prim, "lidar")),
-    )
+    magnetometer, imu = only_prim_with(prim, "magnetometer"), only_prim_with(prim, "imu")
+    parts: dict[str, Any] = {
+        "drive": read_drive(prim),
+        "battery": read_battery(only_prim_with(prim, "battery")),
+        "platform": read_platform(prim),
+        "magnetometer": read_magnetometer(magnetometer),
+        "imu": read_imu(imu),
+        "lidar": read_lidar(only_prim_with(prim, "lidar")),
+    }
+    try:
+        return RobotSpec(
+            name=prim.GetName(),
+            asset=asset,
+            footprint_radius_m=read_footprint(prim),
+            base_height_m=_p_root(prim, _base(prim))[2],
+            p_base_magnetometer=_p_base(prim, magnetometer),
+            q_base_magnetometer_link_xyzw=_q_base(prim, magnetometer.GetParent()),
+            q_base_imu_link_xyzw=_q_base(prim, imu.GetParent()),
+            **parts,
+        )
+    except RefusedError as error:
+        raise RefusedError(f"{place(prim)}: {error}") from error
 
 
 def _base(root: Usd.Prim) -> Usd.Prim:
@@ -241,6 +256,19 @@ def _p_base(root: Usd.Prim, sensor: Usd.Prim) -> Vec3:
     """A sensor's origin in the axes of its robot's base [m], wherever in the world the robot stands."""
     to_root = UsdGeom.XformCache().ComputeRelativeTransform(_base(root), root)[0]
     return tuple(to_root.GetInverse().Transform(_p_root(root, sensor)))
+
+
+def _q_base(root: Usd.Prim, link: Usd.Prim) -> Quat:
+    """A link's axes in those of its robot's base (xyzw, w >= 0), wherever in the world the robot stands."""
+    cache = UsdGeom.XformCache()
+    link_to_root, base_to_root = (
+        cache.ComputeRelativeTransform(prim, root)[0].RemoveScaleShear() for prim in (link, _base(root))
+    )
+    q: Gf.Quatd = (link_to_root * base_to_root.GetInverse()).ExtractRotationQuat().GetNormalized()
+    if q.GetImaginary().GetLength() <= PARALLEL:
+        return IDENTITY_XYZW
+    x, y, z, w = canonical(xyzw_from_wxyz((q.GetReal(), *q.GetImaginary()))).tolist()
+    return (x, y, z, w)
 
 
 def define_source(stage: Usd.Stage, parent: str | Sdf.Path, spec: SourceSpec) -> Usd.Prim:
@@ -299,5 +327,5 @@ def _write_foreign(prim: Usd.Prim, name: str, kind: Sdf.ValueTypeName, value: An
     if kind == Sdf.ValueTypeNames.Float:
         value = float(np.float32(np.clip(value, -SINGLE_MAX, SINGLE_MAX)))
     attribute = prim.GetAttribute(name) or prim.CreateAttribute(name, kind, custom=False)
-    if attribute.Get() != value:
+    if not attribute.HasAuthoredValue() or attribute.Get() != value:
         attribute.Set(value)

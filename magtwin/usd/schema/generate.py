@@ -20,8 +20,9 @@ INTRODUCTION = """\
 # magtwin's USD schemas
 
 Made from [schema.usda](../magtwin/usd/schema/schema.usda) by `make schema`. The library is codeless:
-applied API schemas on plain `Xform` prims, so a runtime that does not have it still places everything and
-keeps every value. `import magtwin.usd` registers it; other programs find it when `PXR_PLUGINPATH_NAME`
+applied API schemas on plain `Xform` prims, so a runtime that does not have it still places everything, and
+reads and keeps every value: magtwin authors each, also where it equals the fallback, unless it is empty.
+`import magtwin.usd` registers it; other programs find it when `PXR_PLUGINPATH_NAME`
 names `magtwin/usd/schema`. Lengths are metres, angles radians, fields nT, unless a name or a text says
 otherwise.
 """
