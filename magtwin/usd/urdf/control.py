@@ -124,9 +124,9 @@ def _commands(tags: Tags) -> Iterator[tuple[str, str]]:
         for joint in tags.findall(block, "joint"):
             name = _known(tags, joint.get("name", ""), joint)
             kinds = [e.get("name", "") for e in joint.findall("command_interface")]
-            for interface in (*joint.findall("command_interface"), *joint.findall("state_interface")):
-                tags.read(interface)
-            wanted = next((kind for kind in ("velocity", "position", "effort") if kind in kinds), None)
+            for element in (*joint.findall("command_interface"), *joint.findall("state_interface")):
+                tags.read(element)
+            wanted = next((kind for kind in COMMANDS if kind in kinds), None)
             if wanted is not None:
                 yield name, COMMANDS[wanted]
     for block in tags.blocks("transmission"):
