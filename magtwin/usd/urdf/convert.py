@@ -15,7 +15,7 @@ from magtwin.usd.layers import describe_stage, open_stage
 from magtwin.usd.sensors import write_pose
 from magtwin.usd.urdf.control import define_differential, define_safety, read_commands, read_drive
 from magtwin.usd.urdf.description import Description, origin_of, read_description
-from magtwin.usd.urdf.drive import NO_WHEELS, check_rules
+from magtwin.usd.urdf.drive import NO_WHEELS, WheelDrive, check_rules
 from magtwin.usd.urdf.gazebo import (
     Surface,
     define_springs,
@@ -39,7 +39,7 @@ from magtwin.usd.urdf.simready import check_metadata, metadata
 from magtwin.usd.urdf.source import read_source
 from magtwin.usd.urdf.tag import Tags
 from magtwin.usd.urdf.texture import TEXTURES
-from magtwin.usd.urdf.wheel import find_wheels, grip
+from magtwin.usd.urdf.wheel import find_wheels, fit_wheels, grip, not_on
 
 JOINTS = "joints"
 """Scope of the joints below the robot's prim."""
@@ -241,12 +241,14 @@ def _author(
     mechanism, tags = read_mechanism(description, options), Tags(description)
     check_rules(mechanism, options)
     drive, commands = read_drive(tags, mechanism), read_commands(tags, mechanism)
-    options = replace(options, drives=(*options.drives, *commands))
-    surfaces, wheels = read_surfaces(tags), NO_WHEELS
+    surfaces = read_surfaces(tags)
+    driven: tuple[str, ...] = ()
     if options.profile == "diff-drive":
         named = () if drive is None else (drive.left_wheel_joint, drive.right_wheel_joint)
-        wheels = find_wheels(mechanism, named)
-        surfaces = grip(mechanism, wheels, surfaces)
+        driven = find_wheels(mechanism, named)
+        surfaces = grip(mechanism, driven, surfaces)
+        commands = not_on(driven, commands)
+    options = replace(options, drives=(*options.drives, *commands))
     places, poses = place_links(mechanism, merge=options.merge_fixed), mechanism.poses()
     robot = UsdGeom.Xform.Define(stage, Sdf.Path.absoluteRootPath.AppendChild(names[""])).GetPrim()
     stage.SetDefaultPrim(robot)
@@ -279,6 +281,8 @@ def _author(
             define_frame(frame)
             ledger.link(name, "frame" if is_marker(description.links[name]) else "merged", frame)
     scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(JOINTS)).GetPath()
+    bodies = {name: stage.GetPrimAtPath(path) for name, path in paths.items() if name != WORLD}
+    wheels = fit_wheels(mechanism, driven, bodies) if driven else NO_WHEELS
     joints = _define_joints(stage, scope, mechanism, options, wheels, places, paths, ledger)
     links = [path for name, path in paths.items() if name != WORLD]
     _articulate(robot, links, joints, self_collision=self_collides(tags))
@@ -320,7 +324,7 @@ def _define_joints(
     scope: Sdf.Path,
     mechanism: Mechanism,
     options: Options,
-    wheels: Mapping[str, float],
+    wheels: Mapping[str, WheelDrive],
     places: dict[str, Place],
     paths: dict[str, Sdf.Path],
     ledger: Ledger,

@@ -13,7 +13,7 @@ from pxr import Gf, Sdf, Usd, UsdPhysics
 
 from magtwin.frames import wxyz_from_xyzw
 from magtwin.usd.urdf.description import Description
-from magtwin.usd.urdf.drive import NO_WHEELS, choose_drive, define_drive
+from magtwin.usd.urdf.drive import NO_WHEELS, WheelDrive, choose_drive, define_drive
 from magtwin.usd.urdf.inertia import quaternion
 from magtwin.usd.urdf.mechanism import Mechanism
 from magtwin.usd.urdf.options import DEFAULTS, Options
@@ -48,7 +48,7 @@ def define_joint(
     T: NDArray,
     mechanism: Mechanism,
     options: Options = DEFAULTS,
-    wheels: Mapping[str, float] = NO_WHEELS,
+    wheels: Mapping[str, WheelDrive] = NO_WHEELS,
 ) -> Usd.Prim:
     """Author a joint between two bodies; its mimic comes later, see `define_mimic`.
 
