@@ -492,3 +492,40 @@ def test_the_real_robot_passes_the_validators_and_nothing_is_silent(turtlebot, t
     assert any("tags without a meaning here are kept as text" in note for note in read_notes(out))
     assert len(report.losses) == 2  # the two meshes that upstream lacks
     assert all("is left out: its mesh" in loss for loss in report.losses)
+
+
+def test_settings_come_before_tags_and_leave_one_sensor_of_each_kind(tmp_path, real_data):
+    from magtwin.spec import ImuSpec, LidarSpec, MagnetometerSpec
+    from magtwin.usd.robot import RobotSettings, build_robot, read_robot
+
+    settings = RobotSettings(
+        lidar=LidarSpec(link="rplidar_link", scan_rate_hz=7.5),
+        imu=ImuSpec(link="oakd_imu_frame", rate_hz=200),
+        magnetometer=MagnetometerSpec(link="tower_sensor_plate"),
+        conversion=Options(missing_meshes="note"),
+    )
+    urdf = real_data / "turtlebot4" / "turtlebot4_gazebo_tags.urdf"
+    out = tmp_path / "turtlebot4" / "turtlebot4.usda"
+    report = build_robot(urdf, settings, out)
+    spec = read_robot(out)  # needs one of each
+    assert (spec.lidar.scan_rate_hz, spec.imu.link, spec.drive.v_max) == (7.5, "oakd_imu_frame", 0.46)
+    assert "lidar 'rplidar' of link 'rplidar_link': the settings say what it is, not the URDF's tags" in (
+        report.notes
+    )
+    assert "imu 'imu' of link 'imu_link' is not simulated here: the settings name another" in report.notes
+    assert_valid(out, tmp_path)
+
+
+def test_a_robot_without_settings_takes_its_sensors_and_drive_from_its_tags(tmp_path, real_data):
+    from magtwin.spec import MagnetometerSpec
+    from magtwin.usd.robot import RobotSettings, build_robot, read_robot
+
+    settings = RobotSettings(
+        magnetometer=MagnetometerSpec(link="tower_sensor_plate"),
+        conversion=Options(missing_meshes="note"),
+    )
+    out = tmp_path / "turtlebot4" / "turtlebot4.usda"
+    build_robot(real_data / "turtlebot4" / "turtlebot4_gazebo_tags.urdf", settings, out)
+    spec = read_robot(out)
+    assert (spec.imu.link, spec.imu.rate_hz, spec.lidar.link) == ("imu_link", 62, "rplidar_link")
+    assert (spec.drive.wheel_radius_m, spec.drive.v_max) == (0.03575, 0.46)

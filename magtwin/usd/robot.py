@@ -22,7 +22,7 @@ from magtwin.spec import (
     Spec,
 )
 from magtwin.usd.layers import open_stage
-from magtwin.usd.schema import prims_with
+from magtwin.usd.schema import NOUNS, prims_with
 from magtwin.usd.sensors import (
     define_battery,
     define_drive,
@@ -159,8 +159,6 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
         define_drive(robot, settings.drive or DriveSpec())
     define_platform(robot, settings.platform)
     define_battery(stage, _base(robot).AppendChild("battery"), settings.battery)
-    magnetometer = settings.magnetometer or MagnetometerSpec()
-    define_magnetometer(stage, _mount(links, "magnetometer", magnetometer), magnetometer)
     told: tuple[tuple[str, Any, Any, Any], ...] = (
         ("imu", settings.imu, ImuSpec(), define_imu),
         ("lidar", settings.lidar, LidarSpec(), define_lidar),
@@ -173,7 +171,36 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
             notes.append(f"no {name} is told of: one is thought to sit at {base.name}'s origin")
             define(stage, base.AppendChild(name), replace(spec, link=base.name))
         else:
-            define(stage, _mount(links, name, given or spec), given or spec)
+            path = _mount(links, name, given or spec)
+            notes += _make_way(robot, name, path)
+            define(stage, path, given or spec)
+    if settings.magnetometer is not None or not prims_with(robot, "magnetometer"):
+        magnetometer = settings.magnetometer or MagnetometerSpec()
+        path = _mount(links, "magnetometer", magnetometer)
+        notes += _make_way(robot, "magnetometer", path)
+        define_magnetometer(stage, path, magnetometer)
+    return notes
+
+
+def _make_way(robot: Usd.Prim, noun: str, path: Sdf.Path) -> list[str]:
+    """Let the settings' sensor at `path` be the robot's only one of its kind; notes of what gave way.
+
+    One of the URDF's tags on the same link is the same device and goes; one on another link stays for
+    other simulators.
+    """
+    stage, notes = robot.GetStage(), []
+    for prim in prims_with(robot, noun):
+        if prim.GetPath() == path:
+            continue
+        where = f"{noun} {prim.GetName()!r} of link {prim.GetParent().GetName()!r}"
+        if prim.GetParent().GetPath() == path.GetParentPath():
+            notes.append(f"{where}: the settings say what it is, not the URDF's tags")
+            stage.RemovePrim(prim.GetPath())
+            continue
+        notes.append(f"{where} is not simulated here: the settings name another")
+        prim.RemoveAPI(NOUNS[noun])
+        for attribute in prim.GetAuthoredPropertiesInNamespace(f"magtwin:{noun}"):
+            prim.RemoveProperty(attribute.GetName())
     return notes
 
 
