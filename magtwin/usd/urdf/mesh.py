@@ -82,6 +82,8 @@ class Piece:
         Normals turn by the inverse transpose of the linear part A, n' ~ A^-T n, times det A's sign so
         that they still point outwards.
         """
+        if np.array_equal(T, np.eye(4)):
+            return self
         A = T[:3, :3]
         det = np.linalg.det(A)
         if det == 0:
@@ -268,10 +270,12 @@ def _unit(normals: NDArray | None) -> NDArray | None:
 
 def has_area(points: NDArray, faces: NDArray) -> NDArray[np.bool_]:
     """Whether each triangle has an area, against the square of its longest edge."""
-    a, b, c = (points[faces[:, i]].astype(float) for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    longest = np.max([np.sum((q - p) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    return area > 1e-9 * longest
+    x, y, z = points.astype(float).T
+    a, b, c = faces.T
+    u, v, w = ((p[b] - p[a], p[c] - p[a], p[c] - p[b]) for p in (x, y, z))
+    uu, vv, ww = (u[i] ** 2 + v[i] ** 2 + w[i] ** 2 for i in range(3))
+    nx, ny, nz = v[0] * w[1] - w[0] * v[1], w[0] * u[1] - u[0] * w[1], u[0] * v[1] - v[0] * u[1]
+    return nx**2 + ny**2 + nz**2 > (1e-9 * np.maximum(uu, np.maximum(vv, ww))) ** 2
 
 
 def distinct(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -213,10 +213,11 @@ def _place(prim: Usd.Prim, pose: NDArray, scale: NDArray | None = None) -> None:
 def pose_of(T: NDArray) -> tuple[tuple[float, float, float], tuple[float, float, float, float] | None]:
     """Position and quaternion xyzw of a transform (4, 4); no quaternion where it does not turn.
 
-    Rounded to 1e-12, so that the text shows 0 where the arithmetic left 1e-17.
+    Rounded to 1e-12 (the quaternion to 1e-15: its w tells turns of 1e-6 from none), so that the text
+    shows 0 where the arithmetic left 1e-17.
     """
     x, y, z = (round(float(v), 12) + 0.0 for v in T[:3, 3])
     if np.allclose(T[:3, :3], np.eye(3), rtol=0, atol=1e-12):
         return (x, y, z), None
-    i, j, k, w = (round(float(v), 12) + 0.0 for v in quaternion(T[:3, :3]))
+    i, j, k, w = (round(float(v), 15) + 0.0 for v in quaternion(T[:3, :3]))
     return (x, y, z), (i, j, k, w)

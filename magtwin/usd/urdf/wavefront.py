@@ -1,7 +1,6 @@
 """Wavefront: triangles of an .obj with the materials of its .mtl."""
 
 import re
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,8 @@ from numpy.typing import NDArray
 from magtwin.names import RefusedError
 from magtwin.usd.geometry import linear_from_srgb
 from magtwin.usd.urdf.mesh import Paint, Piece
-from magtwin.usd.urdf.reading import Reading
+from magtwin.usd.urdf.polygon import cut_polygons
+from magtwin.usd.urdf.reading import Reading, numbers
 from magtwin.usd.urdf.texture import read_image
 
 UNREAD = ("curv", "curv2", "surf", "l", "p")
@@ -38,7 +38,7 @@ class _Group:
 def read_wavefront(reading: Reading) -> list[Piece]:
     """The triangles of a Wavefront OBJ, as `read_mesh` has it.
 
-    Polygons are cut into fans. A colour after a vertex's coordinates is read (as MeshLab writes it).
+    A colour after a vertex's coordinates is read (as MeshLab writes it).
     """
     path = reading.path
     rows: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}
@@ -97,16 +97,6 @@ def _absolute(word: str, rows: dict[str, list[str]]) -> str:
     return "/".join(parts)
 
 
-def _numbers(text: str, dtype: type) -> NDArray:
-    """Numbers apart by blanks, as far as they are numbers: quicker than one by one."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # said where a word is none
-        try:
-            return np.fromstring(text, dtype, sep=" ")
-        except ValueError:
-            return np.empty(0, dtype)
-
-
 def _corners(group: _Group, path: Path) -> NDArray[np.int64]:
     """Vertex, texture coordinate and normal of each corner, from 0; -1 is none; shape (N, 3)."""
     words = group.words
@@ -115,9 +105,9 @@ def _corners(group: _Group, path: Path) -> NDArray[np.int64]:
     doubled = sum("//" in word for word in words)
     if slashes in ({0}, {1}, {2}) and doubled in (0, len(words)):
         columns = [0, 2] if doubled else list(range(max(slashes) + 1))
-        numbers = _numbers(" ".join(words).replace("/", " "), np.int64)
-        if len(numbers) == len(words) * len(columns):
-            corners[:, columns] = numbers.reshape(len(words), len(columns))
+        values = numbers(" ".join(words).replace("/", " "), np.int64)
+        if len(values) == len(words) * len(columns):
+            corners[:, columns] = values.reshape(len(words), len(columns))
             if (corners[:, columns] > 0).all():
                 return corners - 1
     first = 0  # corners of several kinds, or malformed ones: one by one
@@ -140,7 +130,7 @@ def _table(rows: list[str], kind: str, least: int, path: Path) -> NDArray:
     if not rows:
         return np.empty((0, least))
     width = len(rows[0].split())
-    values = _numbers(" ".join(rows), float)
+    values = numbers(" ".join(rows), float)
     if width >= least and len(values) == len(rows) * width:
         return values.reshape(len(rows), width)
     try:
@@ -156,10 +146,7 @@ def _piece(group: _Group, paint: Paint | None, v: NDArray, vt: NDArray, vn: NDAr
             raise RefusedError(
                 f"{path}: a face names {name} {corners[:, column].max() + 1} of {len(table)}; export it again"
             )
-    cuts = counts - 2
-    first = np.repeat(np.cumsum(counts) - counts, cuts)
-    step = np.arange(cuts.sum()) - np.repeat(np.cumsum(cuts) - cuts, cuts)
-    index = corners[np.column_stack([first, first + step + 1, first + step + 2])]
+    index = corners[cut_polygons(v[:, :3], corners[:, 0], counts)]
     faces = index[:, :, 0]
     return Piece(
         points=v[:, :3],
