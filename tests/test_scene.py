@@ -32,6 +32,7 @@ from magtwin.spec import (
     Scene,
     SourceSpec,
 )
+from magtwin.twin import open_twin
 from magtwin.usd import sensors
 from magtwin.usd.figures import write_pose
 from magtwin.usd.lab import LAB, define_lab, read_lab
@@ -674,6 +675,16 @@ def test_a_scene_whose_weights_are_gone_is_read_when_they_are_not_wanted(parts, 
     with pytest.raises(RefusedError, match=r"magnetometer:network names .*net\.pth, which is not there"):
         read_scene(root)
     assert read_scene(root, check_network=False).robot.magnetometer.network == weights
+
+
+def test_a_twin_is_opened_with_other_weights_or_none_where_the_scenes_own_are_gone(parts, tmp_path):
+    root = author_scene(full_scene(parts), tmp_path / "s")
+    (tmp_path / "s" / "weights" / "net.pth").unlink()
+    others = shipped("weights", "lab.safetensors")
+    assert open_twin(root, net=others).scene.robot.magnetometer.network == others
+    assert open_twin(root, net="none").magnetometer is None
+    with pytest.raises(RefusedError, match=r"net\.pth, which is not there"):
+        open_twin(root)
 
 
 def test_a_robot_that_stands_nowhere_is_refused_by_prim(parts, tmp_path):
