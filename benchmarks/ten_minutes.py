@@ -28,8 +28,8 @@ from magtwin.learn.features import features
 from magtwin.learn.magnetometer import in_threads
 from magtwin.learn.model import FieldNet
 from magtwin.path import path_named
-from magtwin.twin import Twin, open_twin, simulate
-from magtwin.usd.scene import author_scene, scene_from_toml
+from magtwin.twin import Twin, open_twin, scene_from_toml, simulate
+from magtwin.usd.scene import author_scene
 
 HIDDEN = (512, 512, 512, 512)
 DURATION_S = 600.0

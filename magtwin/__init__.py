@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from magtwin.path import Path
     from magtwin.run import COLUMNS, Run
     from magtwin.spec import Scene
-    from magtwin.twin import Twin, open_twin, simulate
+    from magtwin.twin import Twin, open_twin, scene_from_toml, simulate
 
 __version__ = "0.1.0"
 
@@ -26,6 +26,7 @@ _HOME = {
     "Scene": "magtwin.spec",
     "Twin": "magtwin.twin",
     "open_twin": "magtwin.twin",
+    "scene_from_toml": "magtwin.twin",
     "simulate": "magtwin.twin",
 }
 
@@ -38,6 +39,7 @@ __all__ = [
     "Scene",
     "Twin",
     "open_twin",
+    "scene_from_toml",
     "simulate",
 ]
 

@@ -59,8 +59,9 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
         Print the summary as JSON.
     """
     from magtwin.files import output, shipped
+    from magtwin.twin import scene_from_toml
     from magtwin.usd.robot import build_robot
-    from magtwin.usd.scene import author_scene, scene_from_toml
+    from magtwin.usd.scene import author_scene
 
     steps = _steps(quiet=json)
     with output(out, force=force) as folder:
@@ -290,8 +291,9 @@ def scene(
         Print the summary as JSON.
     """
     from magtwin.files import shipped
+    from magtwin.twin import scene_from_toml
     from magtwin.usd.info import info_of_stage
-    from magtwin.usd.scene import author_scene, scene_from_toml
+    from magtwin.usd.scene import author_scene
 
     file = Path(spec)
     if not file.suffix and not file.is_file():

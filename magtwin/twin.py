@@ -63,6 +63,34 @@ def open_twin(scene_file: str | FilePath, *, net: str | FilePath | None = None) 
     return Twin(scene, scene_file, load_map(scene.map_layer), _magnetometer(scene))
 
 
+def scene_from_toml(
+    path: str | FilePath,
+    *,
+    map_layer: str | FilePath | None = None,
+    network: str | FilePath | None = None,
+    workshop: str | FilePath | None = None,
+) -> Scene:
+    """The scene that a TOML describes, its network read and its inputs named.
+
+    Args:
+        path: The TOML; files that it names are taken from its folder.
+        map_layer: Map to use in place of the one that it names, without the TOML's Earth and sources.
+        network: Weights to use in place of those that it names (.safetensors or .pth).
+        workshop: Folder to build the robot in, where the TOML names one by its URDF.
+
+    Raises:
+        RefusedError: A key is misspelt or missing, or a file is not there, or not what it should be.
+    """
+    from magtwin.usd.scene import scene_from_toml as scene_of
+
+    def inputs_of(weights: FilePath) -> tuple[str, ...]:
+        from magtwin.learn.model import load_net
+
+        return load_net(weights).features
+
+    return scene_of(path, map_layer=map_layer, network=network, workshop=workshop, inputs_of=inputs_of)
+
+
 def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
     """What runs the scene's magnetometer."""
     spec = scene.robot.magnetometer

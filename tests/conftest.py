@@ -19,7 +19,8 @@ def real_data() -> Path:
 def lab_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Root layer of the default lab, authored once into a folder of its own; not to be changed."""
     from magtwin.files import shipped
-    from magtwin.usd.scene import author_scene, scene_from_toml
+    from magtwin.twin import scene_from_toml
+    from magtwin.usd.scene import author_scene
 
     return author_scene(
         scene_from_toml(shipped("scenes", "lab.toml")), tmp_path_factory.mktemp("lab") / "lab"

@@ -1,7 +1,6 @@
 """A Scene through its layers and back; what cannot be a scene is refused by file and prim."""
 
 import importlib.util
-import json
 import math
 import re
 import shutil
@@ -15,6 +14,7 @@ from hypothesis import strategies as st
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade
 from validators import assert_valid
 
+import magtwin
 from magtwin.field.earth import earth_field_nt
 from magtwin.field.map import AnomalyMap
 from magtwin.files import sha256, shipped
@@ -412,15 +412,14 @@ def test_a_toml_gives_room_start_earth_and_sources(own_parts):
     assert (other.earth, other.sources) == (None, ()), "what made one map does not make another"
 
 
-def test_a_network_in_safetensors_brings_its_inputs_and_its_checksum(own_parts):
-    from safetensors.numpy import save_file
+def test_a_network_brings_its_inputs_and_its_checksum(own_parts):
+    from magtwin.learn.model import load_net
 
-    about = {"magtwin": json.dumps({"features": ["yaw_deg", "v_x"]})}
-    save_file({"w": np.zeros(2, np.float32)}, own_parts / "net.safetensors", metadata=about)
-    (own_parts / "scene.toml").write_text(TOML + 'network = "net.safetensors"\n')
-    magnetometer = scene_from_toml(own_parts / "scene.toml").robot.magnetometer
-    assert magnetometer.inputs == ("yaw_deg", "v_x")
-    assert magnetometer.network_sha256 == sha256(own_parts / "net.safetensors")
+    weights = shipped("weights", "lab.safetensors")
+    (own_parts / "scene.toml").write_text(TOML + f'network = "{weights}"\n')
+    magnetometer = magtwin.scene_from_toml(own_parts / "scene.toml").robot.magnetometer
+    assert magnetometer.inputs == load_net(weights).features
+    assert magnetometer.network_sha256 == sha256(weights)
 
 
 @pytest.mark.parametrize(
@@ -473,10 +472,11 @@ def test_a_broken_toml_is_refused_by_line_with_nothing_written(own_parts, tmp_pa
     assert not (tmp_path / "s").exists()
 
 
-def test_weights_that_are_no_safetensors_are_refused(own_parts):
-    (own_parts / "net.safetensors").write_bytes(b"none")
-    with pytest.raises(RefusedError, match=r"net\.safetensors: cannot be read as safetensors"):
-        scene_from_toml(own_parts / "scene.toml", network=own_parts / "net.safetensors")
+@pytest.mark.parametrize("name", ["net.safetensors", "net.pth", "net.txt"])
+def test_what_is_no_network_is_refused(own_parts, name):
+    (own_parts / name).write_bytes(b"none")
+    with pytest.raises(RefusedError, match=name.replace(".", r"\.")):
+        magtwin.scene_from_toml(own_parts / "scene.toml", network=own_parts / name)
 
 
 # What ships
@@ -507,7 +507,8 @@ def test_the_labs_stage_is_what_a_fresh_build_gives(tmp_path):
 
 
 def test_the_labs_stage_holds_what_its_toml_says():
-    assert read_scene(shipped("scenes", "lab", "lab.usda")) == scene_from_toml(shipped("scenes", "lab.toml"))
+    toml = shipped("scenes", "lab.toml")
+    assert read_scene(shipped("scenes", "lab", "lab.usda")) == magtwin.scene_from_toml(toml)
 
 
 def test_the_lab_passes_the_gates(tmp_path, lab_scene):

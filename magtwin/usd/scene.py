@@ -1,6 +1,5 @@
 """A Scene as layered USD: authored from its spec or its TOML, and read back from the composed stage."""
 
-import json
 import os
 import re
 import shutil
@@ -13,7 +12,7 @@ from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 from magtwin.files import existing, from_table, output, read_toml, sha256
 from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.names import RefusedError
-from magtwin.spec import ZERO3, EarthFieldSpec, LabSpec, MagnetometerSpec, RobotSpec, Scene, SourceSpec, Vec3
+from magtwin.spec import ZERO3, EarthFieldSpec, LabSpec, RobotSpec, Scene, SourceSpec, Vec3
 from magtwin.usd.figures import check_prim_name, plain_value, read_pose, target, write_pose
 from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, read_lab
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, open_stage, relative_asset
@@ -183,6 +182,7 @@ def scene_from_toml(
     map_layer: str | os.PathLike[str] | None = None,
     network: str | os.PathLike[str] | None = None,
     workshop: str | os.PathLike[str] | None = None,
+    inputs_of: Callable[[Path], tuple[str, ...]] = lambda weights: (),
 ) -> Scene:
     """The scene that a TOML describes, as scenes/lab.toml does.
 
@@ -193,6 +193,8 @@ def scene_from_toml(
         network: Weights to use in place of those that it names.
         workshop: Folder in which the asset is built of a robot that the TOML names by its URDF; a
             self-contained scene copies it from there.
+        inputs_of: Gives the names of the inputs of a weights file, which this room cannot read; see
+            `magtwin.twin.scene_from_toml`. Without it the scene leaves them open.
 
     Raises:
         RefusedError: A key is misspelt or missing, or a file is not there; with file and line.
@@ -205,7 +207,11 @@ def scene_from_toml(
     robot = _robot(given.robot, table["robot"], path, workshop)
     weights = Path(network).resolve() if network is not None else given.robot.network
     if weights is not None:
-        robot = replace(robot, magnetometer=_with_network(robot, existing(weights, "weights file")))
+        weights = existing(weights, "weights file")
+        magnetometer = replace(
+            robot.magnetometer, network=weights, network_sha256=sha256(weights), inputs=inputs_of(weights)
+        )
+        robot = replace(robot, magnetometer=magnetometer)
     own_map = map_layer is None
     return Scene(
         name=given.name,
@@ -245,21 +251,6 @@ def _robot(
 
 def _sources(path: Path) -> tuple[SourceSpec, ...]:
     return from_table(_SourceFile, read_toml(path), path).source
-
-
-def _with_network(robot: RobotSpec, weights: Path) -> MagnetometerSpec:
-    """The robot's magnetometer with these weights, their checksum and the inputs that they name."""
-    inputs: tuple[str, ...] = ()
-    if weights.suffix == ".safetensors":
-        from safetensors import SafetensorError, safe_open
-
-        try:
-            with safe_open(weights, framework="numpy") as file:
-                about = json.loads((file.metadata() or {}).get("magtwin", "{}"))
-            inputs = tuple(str(name) for name in about.get("features", ()))
-        except (SafetensorError, ValueError, AttributeError) as error:
-            raise RefusedError(f"{weights}: cannot be read as safetensors: {error}") from error
-    return replace(robot.magnetometer, network=weights, network_sha256=sha256(weights), inputs=inputs)
 
 
 def _check(scene: Scene) -> None:
