@@ -85,7 +85,7 @@ class Piece:
         if np.array_equal(T, np.eye(4)):
             return self
         A = T[:3, :3]
-        det = np.linalg.det(A)
+        det = A[0] @ np.cross(A[1], A[2])
         if det == 0:
             raise ValueError("a node's transform flattens the mesh")
         points = self.points @ A.T + T[:3, 3]
