@@ -104,6 +104,7 @@ def robot(
     mass: float | None = None,
     single_file: bool | None = None,
     strict: bool | None = None,
+    thumbnail: Annotated[bool, Parameter(negative="")] = False,
     report: Path | None = None,
     force: Force = False,
     json: Json = False,
@@ -144,6 +145,8 @@ def robot(
         One root layer and its meshes, in place of Isaac Sim's layers.
     strict
         Refuse a conversion that loses anything.
+    thumbnail
+        Draw a picture of the robot beside it, which NVIDIA's SimReady profiles ask for.
     report
         Where to write the whole report, a .json file.
     force
@@ -176,6 +179,7 @@ def robot(
         out,
         settings=settings,
         force=force,
+        thumbnail=_thumbnail if thumbnail else None,
         **{name: choice for name, choice in choices.items() if choice is not None},
     )
     if report is not None:
@@ -539,6 +543,12 @@ def _progress(title: str) -> Iterator[Any]:
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task(title, total=None, what="")
         yield lambda done, total, what: progress.update(task, completed=done, total=total, what=what)
+
+
+def _thumbnail(asset: Path, out: Path) -> None:
+    from magtwin.io.pictures import picture_of_stage
+
+    picture_of_stage(asset, out, size=(256, 256))
 
 
 def _pairs(option: str, texts: list[str]) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ def from_urdf(
     *,
     settings: str | os.PathLike[str] | RobotSettings | None = None,
     force: bool = False,
+    thumbnail: Callable[[Path, Path], object] | None = None,
     **choices: Any,
 ) -> Robot:
     """Convert a URDF or a xacro to a USD articulation that drives.
@@ -46,6 +48,8 @@ def from_urdf(
         settings: What a URDF cannot say (drive, battery, platform field, sensor mounts), as
             RobotSettings or a TOML of their fields. Without them the articulation alone is made.
         force: Whether a folder that exists is replaced.
+        thumbnail: Draws an asset, its first argument, to a PNG, its second, such as
+            `magtwin.io.pictures.picture_of_stage` does; SimReady assets have one, 256 pixels square.
         **choices: Fields of `Options`; they come before the conversion that the settings name.
 
     Returns:
@@ -63,8 +67,8 @@ def from_urdf(
     with output(out, force=force) as folder:
         folder.mkdir()
         if settings is None:
-            report = convert_with_report(urdf, folder / name, options=options)
+            report = convert_with_report(urdf, folder / name, options=options, thumbnail=thumbnail)
         else:
-            report = build_robot(urdf, settings, folder / name, options=options)
+            report = build_robot(urdf, settings, folder / name, options=options, thumbnail=thumbnail)
     asset = Path(out) / name
     return Robot(asset, read_robot(asset) if settings else None, report)

@@ -110,6 +110,7 @@ def test_options_of_the_command_reach_the_conversion(tmp_path, capsys):
     main(
         [
             *("robot", str(CART), "--out", str(tmp_path / "cart"), "--fix-base", "--report", str(report)),
+            "--thumbnail",
             *("--drive", "left:position:stiffness=7:damping=2:max_force=4", "--mass", "9"),
         ]
     )
@@ -120,6 +121,7 @@ def test_options_of_the_command_reach_the_conversion(tmp_path, capsys):
     assert drive.GetStiffnessAttr().Get() == pytest.approx(7 * 3.141592653589793 / 180)
     above = [stage.GetPrimAtPath(UsdPhysics.Joint(j).GetBody0Rel().GetTargets()[0]) for j in joints.values()]
     assert sum(not prim.HasAPI(UsdPhysics.RigidBodyAPI) for prim in above) == 1  # the one that bolts the base
+    assert len(list((tmp_path / "cart").rglob("*.png"))) == 1
     told = json.loads(report.read_text())
     assert told["mass_out_kg"] == pytest.approx(6.0)
     assert any("9" in line for line in told["lint"])
