@@ -67,7 +67,7 @@ def define_joint(
         wheels: Joints of driven wheels by name, see `choose_drive`.
 
     Raises:
-        RefusedError: A limit is missing, upside down, or not above 0; the text gives the line.
+        RefusedError: A limit is missing; the text gives the line.
     """
     description, reason = mechanism.description, mechanism.welded.get(joint.name)
     made = (UsdPhysics.FixedJoint if reason is not None else KINDS[joint.type]).Define(stage, path)
@@ -200,10 +200,6 @@ def _limit(made: Any, joint: Any, description: Description) -> None:
     limit = joint.limit
     if limit is None or limit.lower is None or limit.upper is None:
         raise description.refused("joint", joint.name, f"is {joint.type} and needs <limit lower= upper=>")
-    if not limit.lower < limit.upper:
-        raise description.refused(
-            "joint", joint.name, f"has its lower limit {limit.lower:g} above its upper {limit.upper:g}"
-        )
     if not limit.lower <= 0 <= limit.upper:
         description.note(
             f"joint {joint.name!r} stands at 0, outside its limits {limit.lower:g} to {limit.upper:g}: "
@@ -216,7 +212,9 @@ def _limit(made: Any, joint: Any, description: Description) -> None:
 def _tune(prim: Usd.Prim, joint: Any, axes: list[str], wheel: bool, description: Description) -> None:
     """Highest speed, damping and friction of a joint, as Newton and PhysX read them."""
     names, unit = Sdf.ValueTypeNames.Float, _unit(joint)
-    damping, friction = (_passive(joint, name, description) for name in ("damping", "friction"))
+    damping, friction = (
+        float(getattr(joint.dynamics, name, None) or 0.0) for name in ("damping", "friction")
+    )
     speed = _speed(joint, wheel, description)
     prim.AddAppliedSchema(NEWTON_API)
     if speed is not None and joint.type != "planar":
@@ -240,23 +238,9 @@ def _tune(prim: Usd.Prim, joint: Any, axes: list[str], wheel: bool, description:
 def _speed(joint: Any, wheel: bool, description: Description) -> float | None:
     """The URDF's highest speed [rad/s or m/s]; None if it gives none, but for a driven wheel."""
     speed = None if joint.limit is None else joint.limit.velocity
-    if speed is not None and not speed >= 0:
-        raise description.refused("joint", joint.name, f"has a velocity of {speed:g}; give one above 0")
     if speed and np.isfinite(speed):
         return float(speed)
     if wheel:
         description.note(f"joint {joint.name!r} gives no velocity: it may turn at {WHEEL_SPEED:g} rad/s")
         return WHEEL_SPEED
     return None
-
-
-def _passive(joint: Any, name: str, description: Description) -> float:
-    """A figure of a joint's `<dynamics>`, which yourdfpy leaves as text; 0 where there is none."""
-    text = getattr(joint.dynamics, name, None)
-    try:
-        value = float(text or 0.0)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value < np.inf:
-        raise description.refused("joint", joint.name, f"has a {name} of {text!r}; give a number from 0 up")
-    return value

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.names import hint
 from magtwin.usd.urdf.description import Description, origin_of
 from magtwin.usd.urdf.options import DEFAULTS, Options
 
@@ -65,8 +64,7 @@ def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mec
     suspension whose spring the URDF cannot hold. What follows a welded joint is welded too.
 
     Raises:
-        RefusedError: A joint mimics one that is not there or has no single value, or joints mimic each
-            other in a circle; the text gives the line.
+        RefusedError: A joint that mimics another has several axes, or the ratio 0; the text gives the line.
     """
     joints = {joint.name: joint for joint in description.joints.values()}
     welded = {}
@@ -132,36 +130,19 @@ def _welded(joint: Any, options: Options) -> str | None:
 
 
 def _resolved(joint: Any, joints: Mapping[str, Any], description: Description) -> Mimic:
-    """What a joint follows in the end, through joints that follow others themselves."""
-    multiplier, offset, seen, at = 1.0, 0.0, [joint.name], joint
+    """What a joint follows in the end, through joints that follow others; the description has no circle."""
+    multiplier, offset, at = 1.0, 0.0, joint
     while at.mimic is not None:
-        leader = at.mimic.joint
-        if leader not in joints:
-            raise description.refused(
-                "joint", at.name, f"mimics no joint {leader!r}; {hint(str(leader), joints)}"
-            )
-        if leader in seen:
-            raise description.refused(
-                "joint", joint.name, f"mimics itself in the end: {' -> '.join([*seen, leader])}"
-            )
-        step = [1.0 if at.mimic.multiplier is None else float(at.mimic.multiplier)]
-        step.append(0.0 if at.mimic.offset is None else float(at.mimic.offset))
-        if not np.isfinite(step).all() or step[0] == 0:
-            raise description.refused(
-                "joint",
-                at.name,
-                f"mimics with multiplier {step[0]:g} and offset {step[1]:g}; weld it instead",
-            )
-        multiplier, offset = multiplier * step[0], offset + multiplier * step[1]
-        at = joints[leader]
-        seen.append(leader)
-    for end in (joint, at):
-        if end.type not in (*SINGLE, "fixed"):
-            raise description.refused(
-                "joint",
-                joint.name,
-                f"mimics {at.name!r}, but {end.name!r} is {end.type} and has no one value",
-            )
+        ratio = 1.0 if at.mimic.multiplier is None else float(at.mimic.multiplier)
+        if ratio == 0:
+            raise description.refused("joint", at.name, "mimics with multiplier 0; make it fixed")
+        offset += multiplier * float(at.mimic.offset or 0.0)
+        multiplier *= ratio
+        at = joints[at.mimic.joint]
+    if joint.type not in SINGLE:
+        raise description.refused(
+            "joint", joint.name, f"is {joint.type} and has no one value with which to mimic {at.name!r}"
+        )
     return Mimic(at.name, multiplier, offset)
 
 
