@@ -229,9 +229,7 @@ def test_a_library_or_material_that_is_not_there_is_noted(tmp_path):
 # --- COLLADA --------------------------------------------------------------------------------------
 
 
-def dae(
-    path, nodes, *, up="Z_UP", unit=1.0, diffuse="<color>1 1 1 1</color>", images="", normals="", extra=""
-):
+def dae(path, nodes, *, up="Z_UP", unit=1.0, diffuse="<color>1 1 1 1</color>", images="", extra=""):
     """A COLLADA file of the tetrahedron, in nodes that are given as XML; {mesh} stands for it."""
     numbers = " ".join(map(str, POINTS.ravel()))
     index = " ".join(map(str, FACES.ravel()))
