@@ -430,6 +430,32 @@ def test_a_rule_that_fits_no_joint_is_refused(tmp_path):
         convert(follower(tmp_path, ""), drives=(DriveRule(joints="laed", damping=1.0),))
 
 
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        ({"type": "velocity"}, "without damping it holds no velocity; give damping="),
+        ({"type": "position", "damping": 1.0}, "without stiffness it holds no position"),
+        ({"type": "velocity", "damping": 1.0, "stiffness": 2.0}, "type velocity has no stiffness, got 2"),
+        ({"type": "none", "damping": 1.0}, "type none has no damping, got 1"),
+        ({"damping": float("nan")}, "damping must be a number from 0 up, got nan"),
+        ({"damping": 1.0, "max_force": 0.0}, r"max_force must be above 0, got 0\.0"),
+    ],
+)
+def test_a_rule_that_would_do_nothing_or_other_than_it_says_is_refused(rule, message):
+    with pytest.raises(RefusedError, match=rf"drive 'x': {message}"):
+        DriveRule(joints="x", **rule)
+
+
+def test_a_root_called_world_does_not_hold_the_base_unasked(tmp_path):
+    body = """<link name="world"/><link name="base">{BODY}</link>
+    <joint name="j" type="fixed"><parent link="world"/><child link="base"/></joint>"""
+    path = urdf(tmp_path, body, "desk")
+    assert any("the base 'base' floats" in note for note in convert(path)[2])
+    stage, _, notes = convert(path, fix_base=True)
+    assert [p for p in stage.Traverse() if p.IsA(UsdPhysics.FixedJoint)]
+    assert not any("floats" in note for note in notes)
+
+
 # --- the profile of bases with two driven wheels --------------------------------------------------
 
 

@@ -337,6 +337,10 @@ def _define_joints(
         pose = mechanism.poses()[base]
         root = define_root_joint(stage, scope.AppendChild(names[""]), (paths[WORLD], paths[base]), pose)
         made[""] = root
+    elif description.root == "world" and base != WORLD:
+        description.note(
+            f"link 'world' is no world: the base {base!r} floats, unless it is asked to be fixed"
+        )
     for child, joint in description.joints.items():
         above, pose = places[joint.parent]
         if child not in paths or above == child or (child == base and joint.type == "floating"):

@@ -1,5 +1,6 @@
 """What a user may ask of a conversion."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +31,22 @@ class DriveRule:
 
     max_force: float | None = None
     """Highest torque or force [N m or N]; the joint's effort unless given."""
+
+    def __post_init__(self) -> None:
+        wanted = {"velocity": "damping", "position": "stiffness"}.get(self.type)
+        for name, figure in (("stiffness", self.stiffness), ("damping", self.damping)):
+            if not 0 <= figure < math.inf:
+                raise RefusedError(
+                    f"drive {self.joints!r}: {name} must be a number from 0 up, got {figure!r}"
+                )
+            if name == wanted and figure == 0:
+                raise RefusedError(
+                    f"drive {self.joints!r}: without {name} it holds no {self.type}; give {name}="
+                )
+            if figure and (self.type == "none" or (self.type == "velocity" and name == "stiffness")):
+                raise RefusedError(f"drive {self.joints!r}: type {self.type} has no {name}, got {figure:g}")
+        if self.max_force is not None and not 0 < self.max_force < math.inf:
+            raise RefusedError(f"drive {self.joints!r}: max_force must be above 0, got {self.max_force!r}")
 
     @classmethod
     def parse(cls, text: str) -> "DriveRule":
