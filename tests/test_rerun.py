@@ -11,7 +11,7 @@ import rerun_cli
 from rerun.chunk import RrdReader
 
 from magtwin.field.map import AnomalyMap
-from magtwin.frames import quat_from_yaw, rotate
+from magtwin.frames import quat_from_rpy, quat_from_yaw, rotate
 from magtwin.io.layout import PANELS, STATES
 from magtwin.io.rerun import view, write_rrd
 from magtwin.io.tables import write_parquet
@@ -277,13 +277,29 @@ def test_the_field_arrow_goes_through_the_sensor_and_is_there_only_where_the_vec
     parts, written, tmp_path
 ):
     run, rest = parts
-    _, values = columns_of(written, "world/robot/magnetometer_link/magnetometer/field")
+    _, values = columns_of(written, "world/robot/magnetometer/field")
     arrow, tail = (np.array(values[f"Arrows3D:{key}"][-1][0]) for key in ("vectors", "origins"))
     b = run["b_vector_nt"][0]
     np.testing.assert_allclose(arrow / np.linalg.norm(arrow), b / np.linalg.norm(b), atol=1e-6)
     np.testing.assert_allclose(tail, -arrow / 2, atol=1e-6)
     write_rrd(a_run(rest["field"], rows=50, vector=False), tmp_path / "run.rrd", **rest)
-    assert not columns_of(tmp_path / "run.rrd", "world/robot/magnetometer_link/magnetometer/field")[1]
+    assert not columns_of(tmp_path / "run.rrd", "world/robot/magnetometer/field")[1]
+
+
+def test_the_arrow_is_at_the_sensor_though_its_link_is_a_mere_frame(parts, tmp_path):
+    run, rest = parts
+    turn = tuple(quat_from_rpy([0.1, 0.2, 0.3]).tolist())
+    robot = dataclasses.replace(
+        rest["scene"].robot,
+        p_base_magnetometer=(0.05, -0.02, 0.4),
+        q_base_magnetometer_link_xyzw=turn,
+        magnetometer=MagnetometerSpec(link="a_frame_without_mass_or_shape"),
+    )
+    scene = dataclasses.replace(rest["scene"], robot=robot)
+    write_rrd(run, tmp_path / "run.rrd", **rest | {"scene": scene})
+    _, values = columns_of(tmp_path / "run.rrd", "world/robot/magnetometer")
+    np.testing.assert_allclose(values["Transform3D:translation"][0][0], [0.05, -0.02, 0.4], atol=1e-6)
+    np.testing.assert_allclose(values["Transform3D:quaternion"][0][0], turn, atol=1e-6)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 10])
@@ -394,11 +410,26 @@ def test_view_refuses_what_is_missing_or_of_another_kind(tmp_path):
         view(tmp_path / "run.csv")
 
 
-def test_view_without_a_display_is_refused_and_names_the_browser(written, monkeypatch):
+@pytest.fixture
+def no_display(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
     if sys.platform != "linux":
         pytest.skip("only on Linux a display can be taken away")
+
+
+@pytest.mark.usefixtures("no_display")
+def test_view_of_a_parquet_file_without_a_display_names_no_file_that_is_gone(parts, tmp_path):
+    write_parquet(parts[0], tmp_path / "run.parquet")
+    with pytest.raises(RefusedError) as refused:
+        view(tmp_path / "run.parquet")
+    text = str(refused.value)
+    assert text.startswith(f"{tmp_path / 'run.parquet'}: the Rerun viewer opened no window: ")
+    assert text.endswith("; without a display view the .rrd of this run, which a browser shows too")
+
+
+@pytest.mark.usefixtures("no_display")
+def test_view_without_a_display_is_refused_and_names_the_browser(written):
     with pytest.raises(RefusedError, match=r"opened no window: .*DISPLAY.*; .*rerun --web-viewer --bind 127"):
         view(written)
 
@@ -407,7 +438,7 @@ def test_view_of_a_parquet_file_shows_its_series(parts, tmp_path, monkeypatch):
     run, _ = parts
     write_parquet(run, tmp_path / "run.parquet")
     seen = tmp_path / "seen.rrd"
-    monkeypatch.setattr("magtwin.io.rerun.show", lambda rrd: shutil.copy(rrd, seen))
+    monkeypatch.setattr("magtwin.io.rerun.show", lambda rrd, **_: shutil.copy(rrd, seen))
     view(tmp_path / "run.parquet")
     _, values = columns_of(seen, "series/disturbance")
     assert np.array_equal(np.ravel(values["Scalars:scalars"]), run["b_disturbance_nt"])

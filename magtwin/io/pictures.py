@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,8 +26,8 @@ from magtwin.usd.layers import open_stage
 MARGIN = 1.08
 """How much farther away the camera stands than what is seen would need."""
 
-GL_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri libosmesa6 libxrender1"
-"""Debian's packages that draw without a screen."""
+GL_PACKAGES = "libegl1 libgl1-mesa-dri libx11-6"
+"""Debian's packages that draw without a screen: EGL, Mesa's drivers for it, and what VTK loads first."""
 
 BACKGROUND = "#e9edf1"
 
@@ -166,12 +167,16 @@ def _plotter(size: tuple[int, int]) -> Any:
     from vtkmodules.vtkCommonCore import vtkLogger
     from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
+    refusal = RefusedError(
+        f"no OpenGL here, so no picture can be drawn; install it: apt-get install {GL_PACKAGES}"
+    )
+    if sys.platform == "linux" and not _loads("libX11.so", "libX11.so.6"):  # screen or none
+        raise refusal
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it tells of each way to draw that is not there
     window = vtkRenderWindow()  # VTK picks the first that works: a screen, EGL, at last OSMesa, untried
-    if isinstance(window, vtkmodules.vtkRenderingOpenGL2.vtkOSOpenGLRenderWindow) and not _has_osmesa():
-        raise RefusedError(
-            f"no OpenGL here, so no picture can be drawn; install it: apt-get install {GL_PACKAGES}"
-        )
+    software = isinstance(window, vtkmodules.vtkRenderingOpenGL2.vtkOSOpenGLRenderWindow)
+    if software and not _loads("libOSMesa.so", "libOSMesa.so.8", "libOSMesa.so.6"):
+        raise refusal
     import pyvista
 
     plotter = pyvista.Plotter(off_screen=True, window_size=list(size), lighting="none")
@@ -180,8 +185,9 @@ def _plotter(size: tuple[int, int]) -> Any:
     return plotter
 
 
-def _has_osmesa() -> bool:
-    for name in ("libOSMesa.so", "libOSMesa.so.8", "libOSMesa.so.6"):
+def _loads(*names: str) -> bool:
+    """Whether one of the shared libraries is there."""
+    for name in names:
         try:
             ctypes.CDLL(name)
         except OSError:
@@ -257,15 +263,15 @@ def _aim(plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int
 
 
 def _add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: str) -> None:
-    """A colour bar, in uT where the map is in nT."""
+    """A colour bar, in µT where the map is in nT."""
     import pyvista
 
-    unit, factor = ("uT", 1e-3) if unit == "nT" else (unit, 1.0)
+    unit, factor = ("µT", 1e-3) if unit == "nT" else (unit, 1.0)
     table = pyvista.LookupTable(colour_map, scalar_range=(least * factor, greatest * factor))
     points = pyvista.PolyData(np.zeros((2, 3)))
     points["field"] = np.array([least, greatest]) * factor
     actor = plotter.add_mesh(points, scalars="field", cmap=table, opacity=0, show_scalar_bar=False)
-    plotter.add_scalar_bar(
+    bar = plotter.add_scalar_bar(
         title=f"total field [{unit}]",
         mapper=actor.mapper,
         vertical=True,
@@ -276,3 +282,4 @@ def _add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit:
         fmt="%.1f",
         color=INK,
     )
+    bar.SetVerticalTitleSeparation(round(plotter.window_size[1] / 60))  # else it touches the top number

@@ -26,7 +26,7 @@ from magtwin.io.viewer import show
 from magtwin.names import RefusedError, find
 from magtwin.path import Path
 from magtwin.run import Run
-from magtwin.spec import MountSpec, Scene
+from magtwin.spec import RobotSpec, Scene
 from magtwin.usd.geometry import BASE_LINK, Link, Shape, open_stage, read_links, read_shapes, srgb_from_linear
 from magtwin.usd.maps import HEAT_MAP, HEAT_MAP_HEIGHT_M
 
@@ -111,7 +111,7 @@ def view(path: str | os.PathLike[str]) -> None:
         rrd = FilePath(folder) / f"{path.stem}.rrd"
         with _recording(run, rrd, layout(run)) as rec:
             _log_series(rec, run)
-        show(rrd)
+        show(rrd, shown=path)
 
 
 def _check_rows(run: Run, path: str | os.PathLike[str]) -> None:
@@ -217,7 +217,7 @@ def _log_scale(rec: rr.RecordingStream, field: AnomalyMap, scale: _Scale) -> Non
     x0, x1, y0, _ = field.extent
     length, breadth = 0.6 * (x1 - x0), 0.03 * (x1 - x0)
     cell = length / 256
-    corner = ((x0 + x1 - length) / 2, y0 - 0.42 - breadth, HEAT_MAP_HEIGHT_M)
+    corner = ((x0 + x1 - length) / 2, y0 - 0.5 - breadth, HEAT_MAP_HEIGHT_M)
     bar = np.broadcast_to(scale.table, (max(1, round(breadth / cell)), 256, 4))
     _log_image(rec, "world/scale", bar, cell, corner)
     share = np.linspace(0, 1, 5)
@@ -301,19 +301,21 @@ def _log_bodies(
         else:
             rec.log(entity, rr.Transform3D(translation=p, quaternion=rr.Quaternion(xyzw=q)), static=True)
     if np.isfinite(run["b_vector_nt"]).any():
-        _log_vector(rec, run, scene.robot.magnetometer, rows)
+        _log_vector(rec, run, scene.robot, rows)
 
 
-def _log_vector(rec: rr.RecordingStream, run: Run, mount: MountSpec, rows: NDArray[np.intp]) -> None:
+def _log_vector(rec: rr.RecordingStream, run: Run, robot: RobotSpec, rows: NDArray[np.intp]) -> None:
     """The field vector through the magnetometer, in its axes, where it is known.
 
     The sensor is at the middle of the arrow: whichever way the field dips, half of it is not in the robot.
+    It is placed in the robot's axes, as the link that carries it may be a mere frame that shows nothing.
     """
-    entity = f"world/robot/{_entity(mount.link)}/magnetometer"
+    entity = "world/robot/magnetometer"
     rec.log(
         entity,
         rr.Transform3D(
-            translation=mount.p_link_sensor, quaternion=rr.Quaternion(xyzw=mount.q_link_sensor_xyzw)
+            translation=robot.p_base_magnetometer,
+            quaternion=rr.Quaternion(xyzw=robot.q_base_magnetometer_xyzw),
         ),
         static=True,
     )

@@ -33,8 +33,12 @@ TOASTS_S = 6.0
 """How long the viewer's notices about itself stay in the picture [s]."""
 
 
-def show(rrd: str | os.PathLike[str]) -> None:
+def show(rrd: str | os.PathLike[str], *, shown: str | os.PathLike[str] | None = None) -> None:
     """Show a recording in a window; returns when it is closed.
+
+    Args:
+        rrd: The recording.
+        shown: The file that a refusal names, where `rrd` was made from it for this window alone.
 
     Raises:
         RefusedError: The file is missing, or the viewer cannot run here.
@@ -43,9 +47,14 @@ def show(rrd: str | os.PathLike[str]) -> None:
     command = [_binary(), "--bind", LOCALHOST, "--port", "auto", str(rrd)]
     result = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
     if result.returncode:
+        advice = (
+            f"use a browser: rerun --web-viewer --bind {LOCALHOST} {rrd}"
+            if shown is None
+            else "view the .rrd of this run, which a browser shows too"
+        )
         raise RefusedError(
-            f"{rrd}: the Rerun viewer opened no window: {_reason(result.stderr)}; without a display use "
-            f"a browser: rerun --web-viewer --bind {LOCALHOST} {rrd}"
+            f"{shown or rrd}: the Rerun viewer opened no window: {_reason(result.stderr)}; "
+            f"without a display {advice}"
         )
 
 
