@@ -444,6 +444,8 @@ def test_a_rule_that_fits_no_joint_is_refused(tmp_path):
 def test_a_rule_that_would_do_nothing_or_other_than_it_says_is_refused(rule, message):
     with pytest.raises(RefusedError, match=rf"drive 'x': {message}"):
         DriveRule(joints="x", **rule)
+    with pytest.raises(RefusedError, match="drive 'x': without damping"):
+        DriveRule.parse("x:velocity")
 
 
 def test_a_root_called_world_does_not_hold_the_base_unasked(tmp_path):

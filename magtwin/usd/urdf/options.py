@@ -60,6 +60,8 @@ class DriveRule:
         try:
             if joints and kind in get_args(_Kind) and gains.keys() <= {"stiffness", "damping", "max_force"}:
                 return cls(joints=joints, type=kind, **{name: float(x) for name, x in gains.items()})  # type: ignore[arg-type]
+        except RefusedError:
+            raise
         except ValueError:
             pass
         raise RefusedError(
