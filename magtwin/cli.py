@@ -77,13 +77,11 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
             scene_file, "figure8", folder, steps=steps, seed=seed, speed=0.2, title=f"Demo in {out}"
         )
         steps("Taking pictures")
-        _pictures(scene_file, folder)
+        _picture(scene_file, folder / "lab.png")
     _print_report(report, json)
     if not json:
-        _say(
-            f"\nLook at it:  magtwin view {out / 'run.rrd'}"
-            f"\nPictures:    {out / 'run.png'}, {out / 'lab.png'}"
-        )
+        pictures = ", ".join(str(file) for file in sorted(out.glob("*.png")))
+        _say(f"\nLook at it:  magtwin view {out / 'run.rrd'}\nPictures:    {pictures}")
 
 
 @app.command
@@ -656,14 +654,14 @@ def _run(
     return result.report(title)
 
 
-def _pictures(scene_file: Path, folder: Path) -> None:
-    """A picture of the lab; where no OpenGL is to be had, says so and goes on."""
+def _picture(scene_file: Path, out: Path) -> None:
+    """A picture of a stage; where no OpenGL is to be had, says so and goes on."""
     from magtwin.io.pictures import picture_of_stage
 
     try:
-        picture_of_stage(scene_file, folder / "lab.png")
+        picture_of_stage(scene_file, out)
     except RefusedError as error:
-        print(f"  no picture of the lab: {error}", file=sys.stderr)  # noqa: T201
+        print(f"  no picture of the stage: {error}", file=sys.stderr)  # noqa: T201
 
 
 def _info_of_usd(file: Path) -> Any:
