@@ -363,12 +363,12 @@ def run(
     json
         Print the summary as JSON.
     """
-    from magtwin.files import check_free, existing, output
+    from magtwin.files import existing, output
 
     existing(scene, "scene")
     if out is rrd is parquet is None:
         out = Path("run")
-    targets = [None if target is None else check_free(target, force=force) for target in (out, rrd, parquet)]
+    targets = (out, rrd, parquet)
     places = [target.resolve() for target in targets if target is not None]
     if len(set(places)) < len(places):
         raise RefusedError("two outputs have one name; give each its own")
@@ -390,7 +390,7 @@ def run(
         report = _run(scene, path, asides[0], rrd=asides[1], parquet=asides[2], **options)
     _print_report(report, json)
     if not json:
-        _say("Wrote " + ", ".join(str(target) for target in (out, rrd, parquet) if target is not None))
+        _say("Wrote " + ", ".join(str(target) for target in targets if target is not None))
 
 
 @net_app.command(name="convert")

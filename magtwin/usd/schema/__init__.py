@@ -5,7 +5,6 @@ The library is codeless: `schema.usda` is its source, `generate.py` makes `gener
 silent about those that come later; `register` therefore asks the registry whether it knows each one.
 """
 
-import json
 from pathlib import Path
 
 from pxr import Plug, Usd
@@ -45,12 +44,6 @@ def register() -> None:
             "of a stage; import magtwin.usd before opening one, or add "
             f"{FOLDER} to PXR_PLUGINPATH_NAME"
         )
-
-
-def schema_types() -> list[str]:
-    """Names of the schemas that the generated library declares, sorted."""
-    plugin = json.loads((FOLDER / "plugInfo.json").read_text(encoding="utf-8"))["Plugins"][0]
-    return sorted(plugin["Info"]["Types"])
 
 
 def attribute_name(noun: str, field: str) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Sdf, Usd
+from pxr import Usd
 
 from magtwin.names import RefusedError, hint
 from magtwin.spec import DriveSpec
@@ -331,8 +331,3 @@ def _known(tags: Tags, name: str, element: Element) -> str:
 def _literal(name: str) -> str:
     """A pattern that fits one name alone."""
     return "".join(f"[{c}]" if c in "*?[" else c for c in name)
-
-
-def joint_prim(stage: Usd.Stage, paths: Mapping[str, Sdf.Path], name: str) -> Usd.Prim | None:
-    """The prim of a joint by its name; none where it has none."""
-    return stage.GetPrimAtPath(paths[name]) if name in paths else None
