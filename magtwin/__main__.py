@@ -1,0 +1,5 @@
+"""`python -m magtwin` is `magtwin`."""
+
+from magtwin.cli import main
+
+main()

@@ -1,0 +1,50 @@
+"""The application: its name, where options come from, and how it ends."""
+
+import signal
+import sys
+
+from cyclopts import App
+from cyclopts.config import Env, Toml
+from cyclopts.exceptions import CycloptsError
+
+import magtwin
+from magtwin.names import RefusedError
+
+app = App(
+    name="magtwin",
+    help="Magnetic digital twins of robots: author labs and robots as USD, drive them, log what a "
+    "neural-network magnetometer reads.",
+    version=magtwin.__version__,
+    config=[Env("MAGTWIN_", show=False), Toml("magtwin.toml", search_parents=False)],
+    help_epilogue="Options also come from the environment (MAGTWIN_RUN_SEED=1) and from magtwin.toml. "
+    "Exit status: 0 done, 1 an input was refused, 2 wrong usage. --debug shows the traceback of a refusal.",
+)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the `magtwin` command; `arguments` are those of the command line unless given."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in arguments
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what is half-written goes
+    try:
+        app([a for a in arguments if a != "--debug"], exit_on_error=False, result_action="return_value")
+    except CycloptsError:
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:  # `magtwin info ... | head`
+        sys.stderr.close()
+        sys.exit(141)
+    except Exception as error:
+        if debug:
+            raise
+        if isinstance(error, RefusedError):
+            _fail(str(error))
+        if isinstance(error, OSError | MemoryError):
+            _fail(f"{error} ({type(error).__name__})")
+        _fail(f"a fault of magtwin's own, {type(error).__name__}: {error}; --debug shows where, do report it")
+
+
+def _fail(text: str) -> None:
+    print("magtwin: " + " ".join(text.split()), file=sys.stderr)  # noqa: T201
+    sys.exit(1)

@@ -1,0 +1,129 @@
+"""`magtwin robot`: a description in, a USD articulation out."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say
+from magtwin.names import RefusedError
+
+
+@app.command
+def robot(
+    urdf: Path,
+    *,
+    out: Path,
+    settings: Path | None = None,
+    package: Annotated[list[str] | None, Parameter(negative="")] = None,
+    arg: Annotated[list[str] | None, Parameter(negative="")] = None,
+    missing_meshes: Literal["refuse", "note"] | None = None,
+    collision: Literal["hull", "decomposition", "mesh"] | None = None,
+    profile: Literal["general", "diff-drive"] | None = None,
+    drive: Annotated[list[str] | None, Parameter(negative="")] = None,
+    fix_base: bool | None = None,
+    merge_fixed: bool | None = None,
+    density: float | None = None,
+    mass: float | None = None,
+    single_file: bool | None = None,
+    strict: bool | None = None,
+    thumbnail: Annotated[bool, Parameter(negative="")] = False,
+    report: Path | None = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Convert a URDF or a xacro to a USD articulation that drives.
+
+    Parameters
+    ----------
+    urdf
+        The robot's description, .urdf or .xacro.
+    out
+        Folder to make; it will hold NAME.usda and the layers it refers to.
+    settings
+        TOML with drive, battery, platform field, sensor mounts and conversion, such as
+        robots/turtlebot4/robot.toml; options given here come before its [conversion].
+    package
+        NAME=DIR: where a package lies that package:// or $(find) names; may be given again.
+    arg
+        NAME=VALUE: an argument of the xacro; may be given again.
+    missing_meshes
+        What to do about a mesh that is not there: refuse, or leave it out and note it.
+    collision
+        What a mesh collides as: its convex hull, a convex decomposition (extra "decomposition"), or itself.
+    profile
+        diff-drive: velocity drives on wheels, slippery casters, dead suspensions welded.
+    drive
+        PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X], TYPE velocity, position or none: how joints
+        whose name fits are driven; may be given again, the first that fits wins.
+    fix_base
+        Bolt the base to the world.
+    merge_fixed
+        Merge links on fixed joints into the body that they ride on; their frames stay.
+    density
+        Density of links without inertia [kg/m3].
+    mass
+        Mass of a data sheet to hold the robot's against [kg].
+    single_file
+        One root layer and its meshes, in place of Isaac Sim's layers.
+    strict
+        Refuse a conversion that loses anything.
+    thumbnail
+        Draw a picture of the robot beside it, which NVIDIA's SimReady profiles ask for.
+    report
+        Where to write the whole report, a .json file.
+    force
+        Replace what exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.files import check_free, output
+    from magtwin.robot import DriveRule, from_urdf
+
+    if report is not None:
+        check_suffix(report, (".json",), "a report")
+        check_free(report, force=force)
+    choices = {
+        "packages": {k: Path(v) for k, v in _pairs("package", package).items()} if package else None,
+        "arguments": _pairs("arg", arg) if arg else None,
+        "missing_meshes": missing_meshes,
+        "collision": collision,
+        "profile": profile,
+        "drives": tuple(DriveRule.parse(text) for text in drive) if drive else None,
+        "fix_base": fix_base,
+        "merge_fixed": merge_fixed,
+        "density": density,
+        "mass": mass,
+        "single_file": single_file,
+        "strict": strict,
+    }
+    made = from_urdf(
+        urdf,
+        out,
+        settings=settings,
+        force=force,
+        thumbnail=_thumbnail if thumbnail else None,
+        **{name: choice for name, choice in choices.items() if choice is not None},
+    )
+    if report is not None:
+        with output(report, force=force) as aside:
+            aside.write_text(made.report.to_json(), encoding="utf-8")
+    print_report(made.report.summary(), json)
+    if not json:
+        say(f"Wrote {made.asset}")
+
+
+def _thumbnail(asset: Path, out: Path) -> None:
+    from magtwin.io.pictures import picture_of_stage
+
+    picture_of_stage(asset, out, size=(256, 256))
+
+
+def _pairs(option: str, texts: list[str]) -> dict[str, str]:
+    """NAME=VALUE texts as a table."""
+    pairs = [text.partition("=") for text in texts]
+    for text, (name, equals, _) in zip(texts, pairs, strict=True):
+        if not (name and equals):
+            raise RefusedError(f"--{option} {text!r}: NAME=VALUE is wanted")
+    return {name: value for name, _, value in pairs}

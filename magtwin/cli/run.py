@@ -1,0 +1,190 @@
+"""`magtwin run` and `magtwin demo`: drive a scene's robot and write what happened."""
+
+import sys
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, Json, Seed, print_report, say, announcer
+from magtwin.names import RefusedError
+
+
+@app.command
+def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json: Json = False) -> None:
+    """Author a lab and a TurtleBot 4, drive a figure of eight, log what the magnetometer reads.
+
+    Writes the stages, run.rrd (opens in Rerun), run.parquet and pictures. Takes under a minute.
+
+    Parameters
+    ----------
+    out
+        Folder to make.
+    seed
+        Seed of all noise.
+    force
+        Replace the folder if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.files import output, shipped
+    from magtwin.twin import scene_from_toml
+    from magtwin.usd.robot import build_robot
+    from magtwin.usd.scene import author_scene
+
+    steps = announcer(quiet=json)
+    with output(out, force=force) as folder:
+        steps("Authoring the TurtleBot 4 from its URDF")
+        source = shipped("robots", "turtlebot4")
+        asset = folder / "robot" / "turtlebot4.usda"
+        build_robot(source / "turtlebot4.urdf", source / "robot.toml", asset)
+        steps("Authoring the lab around it, with its magnetic map")
+        scene = scene_from_toml(shipped("scenes", "lab.toml"))
+        scene = replace(scene, robot=replace(scene.robot, asset=asset))
+        scene_file = author_scene(scene, folder / "scene")
+        report = _run(
+            scene_file, "figure8", folder, steps=steps, seed=seed, speed=0.2, title=f"Demo in {out}"
+        )
+        steps("Taking pictures")
+        _picture(scene_file, folder / "lab.png")
+    print_report(report, json)
+    if not json:
+        pictures = ", ".join(str(file) for file in sorted(out.glob("*.png")))
+        say(f"\nLook at it:  magtwin view {out / 'run.rrd'}\nPictures:    {pictures}")
+
+
+@app.command
+def run(
+    scene: Path,
+    *,
+    path: str = "figure8",
+    net: Path | None = None,
+    seed: Seed = 0,
+    speed: float = 0.2,
+    duration: float | None = None,
+    rate_hz: float | None = None,
+    lidar: Literal["schedule", "on", "off"] = "schedule",
+    outside: Literal["nan", "clamp", "raise"] = "nan",
+    out: Path | None = None,
+    rrd: Path | None = None,
+    parquet: Path | None = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Drive a scene's robot along a path and write what happened.
+
+    With none of --out, --rrd and --parquet, writes the folder "run".
+
+    Parameters
+    ----------
+    scene
+        USD stage to drive in.
+    path
+        sine, lawnmower, figure8, narrow_figure8, curvilinear, or a CSV file of x,y [m].
+    net
+        Weights to use in place of the scene's (.safetensors or .pth); "none" for the disturbance by physics.
+    seed
+        Seed of all noise; one seed, one Run.
+    speed
+        Forward speed where the path is straight [m/s].
+    duration
+        How long to drive [s]; once along the path unless given, longer gives further laps.
+    rate_hz
+        Magnetometer readings a second [Hz]; the scene's unless given.
+    lidar
+        Whether the LiDAR follows its schedule, or stays on or off.
+    outside
+        What the map reads outside its extent: nan, the nearest value inside, or a refusal.
+    out
+        Folder to make, for run.rrd, run.parquet and run.png.
+    rrd
+        Rerun recording to write.
+    parquet
+        Parquet table to write.
+    force
+        Replace what exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.files import existing, output
+
+    existing(scene, "scene")
+    if out is rrd is parquet is None:
+        out = Path("run")
+    targets = (out, rrd, parquet)
+    places = [target.resolve() for target in targets if target is not None]
+    if len(set(places)) < len(places):
+        raise RefusedError("two outputs have one name; give each its own")
+    options: dict[str, Any] = {
+        "steps": announcer(quiet=json),
+        "net": net,
+        "seed": seed,
+        "speed": speed,
+        "duration_s": duration,
+        "rate_hz": rate_hz,
+        "lidar": lidar,
+        "outside": outside,
+        "title": f"{path} in {scene}",
+    }
+    with ExitStack() as stack:  # all are written, or none
+        asides = [t if t is None else stack.enter_context(output(t, force=force)) for t in targets]
+        if asides[0] is not None:
+            asides[0].mkdir()
+        report = _run(scene, path, asides[0], rrd=asides[1], parquet=asides[2], **options)
+    print_report(report, json)
+    if not json:
+        say("Wrote " + ", ".join(str(target) for target in targets if target is not None))
+
+
+def _run(
+    scene_file: Path,
+    path: str,
+    folder: Path | None,
+    *,
+    steps: Any,
+    title: str,
+    rrd: Path | None = None,
+    parquet: Path | None = None,
+    net: Path | None = None,
+    **options: Any,
+) -> Any:
+    """Run a scene and write the outputs asked for; returns the run's report."""
+    from magtwin.io.rerun import write_rrd
+    from magtwin.io.tables import write_parquet
+    from magtwin.path import resolve_path
+    from magtwin.twin import open_twin, simulate
+
+    planned = resolve_path(path)
+    twin = open_twin(scene_file, net=net)
+    steps(f"Driving {planned.name}")
+    result = simulate(twin, planned, **options)
+    steps("Writing the run")
+    for target in (folder / "run.parquet" if folder else None, parquet):
+        if target is not None:
+            write_parquet(result, target)
+    for target in (folder / "run.rrd" if folder else None, rrd):
+        if target is not None:
+            write_rrd(
+                result,
+                target,
+                scene=twin.scene,
+                scene_file=twin.scene_file,
+                field=twin.field,
+                planned=planned,
+            )
+    if folder:
+        from magtwin.io.plots import plot_run
+
+        plot_run(result, twin.field, folder / "run.png", planned=planned.p_xy)
+    return result.report(title)
+
+
+def _picture(scene_file: Path, out: Path) -> None:
+    """A picture of a stage; where no OpenGL is to be had, says so and goes on."""
+    from magtwin.io.pictures import picture_of_stage
+
+    try:
+        picture_of_stage(scene_file, out)
+    except RefusedError as error:
+        print(f"  no picture of the stage: {error}", file=sys.stderr)  # noqa: T201

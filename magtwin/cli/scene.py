@@ -1,0 +1,52 @@
+"""`magtwin scene`: a scene's TOML in, stages out."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, Json, print_report, say
+
+
+@app.command
+def scene(
+    spec: str,
+    *,
+    out: Path,
+    map: Path | None = None,  # noqa: A002 - the option is called --map
+    net: Path | None = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Author a scene from its TOML: the lab, its map, a robot with sensors.
+
+    Parameters
+    ----------
+    spec
+        TOML file, or the name of one that ships with magtwin: lab, aprilab.
+    out
+        Folder to make; it holds all that the stage needs and can be moved.
+    map
+        Map layer to use in place of the one that the TOML names.
+    net
+        Weights to use in place of those that the TOML names (.safetensors or .pth).
+    force
+        Replace the folder if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.files import shipped
+    from magtwin.twin import scene_from_toml
+    from magtwin.usd.info import info_of_stage
+    from magtwin.usd.scene import author_scene
+
+    file = Path(spec)
+    if not file.suffix and not file.is_file():
+        from magtwin.names import find
+
+        file = find("scene", spec, {f.stem: f for f in sorted(shipped("scenes").glob("*.toml"))})
+    with TemporaryDirectory() as workshop:
+        scene = scene_from_toml(file, map_layer=map, network=net, workshop=workshop)
+        root = author_scene(scene, out, force=force)
+    print_report(info_of_stage(root), json)
+    if not json:
+        say(f"Wrote {root}")
