@@ -1,11 +1,14 @@
 """AnomalyMap: the magnitude of the magnetic field over a floor, by position and heading."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.field.grid import Grid
+from magtwin.field.harmonic import HarmonicField
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
 
@@ -61,6 +64,21 @@ class AnomalyMap:
     created: str = ""
     """Day on which they were made, YYYY-MM-DD; "" where unknown."""
 
+    frame: str = ""
+    """Axes that x, y and heading are in, such as "world: x east, y north, z up"."""
+
+    datum: str = ""
+    """Where that frame lies: its origin in the room or on Earth, and what heights are above."""
+
+    height_m: float | None = None
+    """Height of the sensor above the floor at which the values hold [m]; none where unknown."""
+
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    """Figures of the method, by name: plain numbers, texts, and lists of them, as JSON can hold."""
+
+    harmonic: HarmonicField | None = None
+    """The vector field that the values were computed from; none where there is no such thing."""
+
     def __post_init__(self) -> None:
         values = _frozen(self.values_nt, float)
         if values.ndim != 3 or not (values.shape[0] >= 1 and min(values.shape[1:]) >= 2):
@@ -105,6 +123,15 @@ class AnomalyMap:
         if not isinstance(other, AnomalyMap):
             return NotImplemented
         return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+
+    @property
+    def grid(self) -> Grid:
+        """The nodes."""
+        _, rows, columns = self.values_nt.shape
+        headings = tuple(self.headings_rad.tolist())
+        return Grid(
+            origin_m=self.origin_m, cell_m=self.cell_m, headings_rad=headings, rows=rows, columns=columns
+        )
 
     @property
     def x_m(self) -> Array:

@@ -1,0 +1,119 @@
+"""Grid: nodes over x, y and heading, as surveys stand on and maps are kept on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.names import RefusedError
+
+Array = NDArray[np.float64]
+
+TURN = 2 * np.pi
+
+MOST_NODES = 50_000_000
+"""A larger grid is taken for a slip in its spacing: 0.4 GB of values."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Evenly spaced nodes over a floor, in one or more headings.
+
+    Node (h, j, i) lies at x = origin_m[0] + i cell_m[0], y = origin_m[1] + j cell_m[1] in world, with
+    the robot's heading at headings_rad[h].
+    """
+
+    origin_m: tuple[float, float]
+    """World x and y of node [0, 0] [m]."""
+
+    cell_m: tuple[float, float]
+    """Distance between nodes along x and y [m]."""
+
+    headings_rad: tuple[float, ...]
+    """Headings [rad], ascending in [0, 2 pi)."""
+
+    rows: int
+    """Number of nodes along y."""
+
+    columns: int
+    """Number of nodes along x."""
+
+    def __post_init__(self) -> None:
+        headings = np.asarray(self.headings_rad, float)
+        if not (
+            headings.ndim == 1
+            and headings.size
+            and np.all(np.diff(headings) > 0)
+            and headings[0] >= 0
+            and headings[-1] < TURN
+        ):
+            raise RefusedError(f"headings_rad of Grid must ascend in [0, 2 pi), got {self.headings_rad}")
+        for name in ("origin_m", "cell_m"):
+            pair = tuple(float(v) for v in getattr(self, name))
+            if len(pair) != 2 or not np.all(np.isfinite(pair)) or (name == "cell_m" and min(pair) <= 0):
+                above = " above 0" if name == "cell_m" else ""
+                raise RefusedError(f"{name} of Grid must be two lengths{above} [m], got {pair}")
+            object.__setattr__(self, name, pair)
+        object.__setattr__(self, "headings_rad", tuple(headings.tolist()))
+        if self.rows < 2 or self.columns < 2:
+            raise RefusedError(f"a Grid needs 2 x 2 nodes at least, got {self.rows} x {self.columns}")
+        if np.prod(self.shape, dtype=float) > MOST_NODES:
+            raise RefusedError(
+                f"a grid of {self.rows} x {self.columns} nodes in {len(headings)} headings is beyond "
+                f"{MOST_NODES:,} nodes; widen the spacing"
+            )
+
+    @classmethod
+    def over(cls, extent: ArrayLike, spacing_m: float, headings_rad: ArrayLike) -> "Grid":
+        """The grid of a spacing over a rectangle, centred in it, its nodes none outside.
+
+        Args:
+            extent: Least x, greatest x, least y, greatest y [m].
+            spacing_m: Distance between nodes both ways [m].
+            headings_rad: Headings [rad], ascending in [0, 2 pi).
+
+        Raises:
+            RefusedError: The spacing is not above 0, or leaves no cell.
+        """
+        x0, x1, y0, y1 = (float(v) for v in np.asarray(extent, float))
+        if not (np.isfinite(spacing_m) and spacing_m > 0):
+            raise RefusedError(f"spacing_m must be above 0 m, got {spacing_m!r}")
+        columns, rows = (int(np.floor(length / spacing_m + 1e-9)) + 1 for length in (x1 - x0, y1 - y0))
+        if min(columns, rows) < 2:
+            raise RefusedError(f"spacing_m {spacing_m:g} leaves no cell on {x1 - x0:g} x {y1 - y0:g} m")
+        return cls(
+            origin_m=(
+                (x0 + x1) / 2 - (columns - 1) * spacing_m / 2,
+                (y0 + y1) / 2 - (rows - 1) * spacing_m / 2,
+            ),
+            cell_m=(spacing_m, spacing_m),
+            headings_rad=tuple(np.asarray(headings_rad, float).ravel().tolist()),
+            rows=rows,
+            columns=columns,
+        )
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of headings, rows (y) and columns (x)."""
+        return len(self.headings_rad), self.rows, self.columns
+
+    @property
+    def x_m(self) -> Array:
+        """World x of the columns [m], shape (X,)."""
+        return np.asarray(self.origin_m[0] + self.cell_m[0] * np.arange(self.columns))
+
+    @property
+    def y_m(self) -> Array:
+        """World y of the rows [m], shape (Y,)."""
+        return np.asarray(self.origin_m[1] + self.cell_m[1] * np.arange(self.rows))
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Least x, greatest x, least y, greatest y of the nodes, in world [m]."""
+        (x, y), (dx, dy) = self.origin_m, self.cell_m
+        return x, x + dx * (self.columns - 1), y, y + dy * (self.rows - 1)
+
+    def poses(self) -> tuple[Array, Array]:
+        """World x and y of every node [m], shape (H, Y, X, 2), and its heading [rad], shape (H, Y, X)."""
+        yaw, y, x = np.meshgrid(np.asarray(self.headings_rad), self.y_m, self.x_m, indexing="ij")
+        return np.stack([x, y], axis=-1), yaw

@@ -1,0 +1,138 @@
+"""Readings: what a magnetometer said at known poses, the stuff that maps are made of."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.field.grid import Grid
+from magtwin.names import RefusedError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Readings:
+    """Readings of a magnetometer on a robot at known poses, one row each.
+
+    A reading has a magnitude, a vector, or both. Arrays are copied at birth and cannot be written to.
+    """
+
+    p_xy: Array
+    """Where base_link was, world x and y [m], shape (N, 2)."""
+
+    yaw: Array
+    """Heading of the robot, as recorded [rad], shape (N,)."""
+
+    b_nt: Array = None  # type: ignore[assignment]
+    """Magnitude of the field [nT], shape (N,); that of `b_body_nt` unless given."""
+
+    b_body_nt: Array | None = None
+    """Field in the robot's axes, forward, left, up [nT], shape (N, 3); none where only
+    magnitudes are known."""
+
+    run: NDArray[np.intp] = None  # type: ignore[assignment]
+    """Which of `runs` each row belongs to, shape (N,); all to the first unless given."""
+
+    runs: tuple[str, ...] = ("",)
+    """Names of the runs, or of the files, that the rows come from."""
+
+    t: Array | None = None
+    """Time of each row in its run [s], shape (N,); none where unknown."""
+
+    good: NDArray[np.bool_] = None  # type: ignore[assignment]
+    """Rows that are field, shape (N,): not latched, not stuck; all of them unless given."""
+
+    grid: Grid | None = None
+    """Nodes that the survey was to stand on; none where it was not gridded."""
+
+    node: NDArray[np.intp] | None = None
+    """Node of `grid` that each row stands on, heading, row, column, shape (N, 3); given with `grid`."""
+
+    height_m: float | None = None
+    """Height of the sensor above the floor [m]; none where unknown."""
+
+    name: str = ""
+    """What the survey is called."""
+
+    source: str = ""
+    """Files that the rows come from, with checksums."""
+
+    licence: str = ""
+    """SPDX name of the licence that they are under."""
+
+    created: str = ""
+    """Day of the survey, YYYY-MM-DD; "" where unknown."""
+
+    def __post_init__(self) -> None:
+        p = np.asarray(self.p_xy, float)
+        if p.ndim != 2 or p.shape[1] != 2 or not len(p):
+            raise RefusedError(f"p_xy of Readings must have shape (N, 2), N 1 or more, got {p.shape}")
+        n = len(p)
+        body = self.b_body_nt
+        if self.b_nt is None:
+            if body is None:
+                raise RefusedError("Readings need b_nt or b_body_nt, got neither")
+            object.__setattr__(self, "b_nt", np.linalg.norm(np.asarray(body, float), axis=-1))
+        if self.run is None:
+            object.__setattr__(self, "run", np.zeros(n, np.intp))
+        if self.good is None:
+            object.__setattr__(self, "good", np.ones(n, bool))
+        for name, (columns, kind) in SHAPES.items():
+            given = getattr(self, name)
+            if given is None:
+                continue
+            array: NDArray[Any] = np.array(given, kind)
+            shape = (n, columns) if columns else (n,)
+            if array.shape != shape:
+                raise RefusedError(f"{name} of Readings must have shape {shape}, got {array.shape}")
+            if not np.all(np.isfinite(array)):
+                row = int(np.argwhere(~np.isfinite(array))[0][0])
+                raise RefusedError(f"{name} of Readings must be finite, got {array[row]} in row {row}")
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        if not np.all(self.b_nt > 0):
+            raise RefusedError(
+                f"b_nt of Readings is a magnitude, above 0 nT, got {self.b_nt.min():g} in row "
+                f"{self.b_nt.argmin()}"
+            )
+        if not (self.run.min() >= 0 and self.run.max() < len(self.runs)):
+            raise RefusedError(
+                f"run of Readings must index runs ({len(self.runs)}), got {self.run.min()}..{self.run.max()}"
+            )
+        if (self.grid is None) != (self.node is None):
+            raise RefusedError("Readings of a gridded survey need both grid and node, got one of them")
+        if self.grid is not None and self.node is not None:
+            if self.node.min() < 0 or np.any(self.node.max(axis=0) >= self.grid.shape):
+                raise RefusedError(f"node of Readings must lie in the grid's {self.grid.shape}")
+
+    def __len__(self) -> int:
+        return len(self.p_xy)
+
+    def take(self, rows: ArrayLike) -> "Readings":
+        """Some of the readings.
+
+        Args:
+            rows: Their indices, or flags of shape (N,).
+
+        Returns:
+            Readings with these rows, in that order; all else as here.
+        """
+        index = np.asarray(rows)
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        some: dict[str, Any] = {k: None if given[k] is None else given[k][index] for k in SHAPES}
+        return Readings(**{**given, **some})
+
+
+SHAPES: dict[str, tuple[int, type]] = {
+    "p_xy": (2, float),
+    "yaw": (0, float),
+    "b_nt": (0, float),
+    "b_body_nt": (3, float),
+    "run": (0, np.intp),
+    "t": (0, float),
+    "good": (0, bool),
+    "node": (3, np.intp),
+}
+"""Columns of a row's share in each array, 0 for a plain column, and its kind."""
