@@ -103,9 +103,10 @@ class Readings:
             )
         if (self.grid is None) != (self.node is None):
             raise RefusedError("Readings of a gridded survey need both grid and node, got one of them")
-        if self.grid is not None and self.node is not None:
-            if self.node.min() < 0 or np.any(self.node.max(axis=0) >= self.grid.shape):
-                raise RefusedError(f"node of Readings must lie in the grid's {self.grid.shape}")
+        if self.grid is None or self.node is None:
+            return
+        if self.node.min() < 0 or np.any(self.node.max(axis=0) >= self.grid.shape):
+            raise RefusedError(f"node of Readings must lie in the grid's {self.grid.shape}")
 
     def __len__(self) -> int:
         return len(self.p_xy)
