@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.files import existing
 from magtwin.names import RefusedError, find, hint
+from magtwin.obstacles import Obstacles
 
 Array = NDArray[np.float64]
 
@@ -246,35 +247,144 @@ def curvilinear(
     return Path("curvilinear", points, closed=True)
 
 
+def split_lawnmower(
+    *,
+    x_first_m: float = -2.5,
+    x_last_m: float = 2.5,
+    y_first_m: float = -1.5,
+    y_last_m: float = 1.5,
+    y_split_m: float = 0.0,
+    step_m: float = 0.5,
+) -> Path:
+    """A lawnmower over each half of a floor that is split in y: the first from a0 to ae, the other back.
+
+    Args:
+        x_first_m: a0, x of the first sweep [m].
+        x_last_m: ae, no sweep lies beyond it [m].
+        y_first_m: y at which the sweeps of the first half begin [m].
+        y_last_m: y at which those of the second half end [m].
+        y_split_m: y that parts the halves [m].
+        step_m: Distance between sweeps, and of each half from the split line [m].
+    """
+    near, far = y_split_m - y_first_m, y_last_m - y_split_m
+    if not (near * far > 0 and abs(near) > step_m and abs(far) > step_m):
+        raise RefusedError(
+            f"y_split_m of a split_lawnmower must lie between y_first_m {y_first_m:g} and y_last_m "
+            f"{y_last_m:g}, more than step_m {step_m:g} from both, got {y_split_m:g}"
+        )
+    margin = math.copysign(step_m / 2, near)
+    there = lawnmower(
+        x_first_m=x_first_m, x_last_m=x_last_m, y_first_m=y_first_m, height_m=near - margin, step_m=step_m
+    )
+    x_turn = float(there.p_xy[-1, 0])
+    back = lawnmower(
+        x_first_m=x_turn,
+        x_last_m=x_first_m,
+        y_first_m=y_split_m + margin,
+        height_m=far - margin,
+        step_m=step_m,
+    )
+    return Path("split_lawnmower", np.vstack([there.p_xy, back.p_xy]))
+
+
+def continuous_cycle(
+    *, amplitude_m: float = 1.5, wavenumber_rad_m: float = 2 * math.pi / 5, half_length_m: float = 2.5
+) -> Path:
+    """A sine wave along x and its mirror image back, closed: y = -+A sin(w (x + a)).
+
+    Args:
+        amplitude_m: A [m].
+        wavenumber_rad_m: w [rad/m]; a multiple of pi / 2a closes it on the x axis.
+        half_length_m: a [m].
+    """
+    x = np.linspace(-half_length_m, half_length_m, 1001)
+    y = amplitude_m * np.sin(wavenumber_rad_m * (x + half_length_m))
+    there, back = np.column_stack([x, -y]), np.column_stack([x, y])[::-1]
+    return Path("continuous_cycle", np.vstack([there, back]), closed=True)
+
+
+def spline(p_xy: ArrayLike, *, closed: bool = False, spacing_m: float = 0.01, name: str = "spline") -> Path:
+    """A smooth curve through points: a cubic spline with continuous curvature over their chord length.
+
+    An open one has no curvature at its ends (a natural spline), a closed one is periodic.
+
+    Args:
+        p_xy: Points in world [m], shape (N, 2), neighbours apart.
+        closed: Whether it goes on from the last point to the first.
+        spacing_m: Distance between the points of the path, about [m].
+        name: What it is called.
+
+    Raises:
+        RefusedError: There are fewer than three points, or `spacing_m` is not above 0.
+    """
+    from scipy.interpolate import CubicSpline  # takes half a second
+
+    if not (math.isfinite(spacing_m) and spacing_m > 0):
+        raise RefusedError(f"spacing_m of a spline must be above 0 m, got {spacing_m!r}")
+    chords = Path(name, np.asarray(p_xy, float), closed)
+    if len(chords.p_xy) < 3 + closed:
+        raise RefusedError(f"path {name!r}: a spline needs three points that differ, got {len(chords.p_xy)}")
+    curve = CubicSpline(chords.s, chords.p_xy, bc_type="periodic" if closed else "natural")
+    count = max(len(chords.s), math.ceil(chords.length / spacing_m) + 1)
+    s = np.union1d(np.linspace(0.0, chords.length, count), chords.s)
+    return Path(name, curve(s), closed)
+
+
+def fast_sine() -> Path:
+    """Case A of the paper's Table 1, the high-frequency sine: ten waves of 1.5 m amplitude over 5 m."""
+    return Path("fast_sine", sine(amplitude_m=1.5, wavenumber_rad_m=4 * math.pi).p_xy)
+
+
+def curvilinear_2() -> Path:
+    """Case C of the paper's Table 1, its second curvilinear drive; it has no equation there, this is ours."""
+    points = curvilinear(half_length_m=2.4, half_width_m=1.5, lobes=3, depth=0.25).p_xy
+    return Path("curvilinear_2", points, closed=True)
+
+
 PATHS: Mapping[str, Callable[..., Path]] = MappingProxyType(
     {
         "sine": sine,
         "lawnmower": lawnmower,
+        "split_lawnmower": split_lawnmower,
         "figure8": figure8,
         "narrow_figure8": narrow_figure8,
+        "continuous_cycle": continuous_cycle,
         "curvilinear": curvilinear,
+        "curvilinear_2": curvilinear_2,
+        "fast_sine": fast_sine,
     }
 )
 """Functions that make paths, by name; each with defaults that fit a floor of 6 x 3.5 m."""
 
+CASES: Mapping[str, str] = MappingProxyType(
+    {
+        "A": "fast_sine",
+        "B": "curvilinear",
+        "C": "curvilinear_2",
+        "D": "split_lawnmower",
+        "E": "narrow_figure8",
+    }
+)
+"""Paths of the cases in Table 1 of the neural magnetometer paper (Penumarti et al. 2025)."""
+
 
 def path_named(name: str) -> Path:
-    """The path that `PATHS` calls `name`, with its default size.
+    """The path that `PATHS` calls `name`, or that of a case of `CASES`, with its default size.
 
     Raises:
         UnknownNameError: No such path; the text names the nearest one.
     """
-    return find("path", name, PATHS)()
+    return find("path", CASES.get(name, name), PATHS)()
 
 
 def resolve_path(name_or_file: str | os.PathLike[str]) -> Path:
-    """A path from a name of `PATHS`, or else from a CSV file.
+    """A path from a name of `PATHS`, a case A to E of `CASES`, or else from a CSV file.
 
     Raises:
         RefusedError: It is neither, or the file is not a path.
     """
     text = os.fspath(name_or_file)
-    if text in PATHS:
+    if text in PATHS or text in CASES:
         return path_named(text)
     file = FilePath(text)
     if file.exists() or file.suffix or file.name != text:
@@ -343,6 +453,31 @@ def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m:
             f"path {path.name} leaves the floor at point {i + 1} of {len(beyond)}, ({x:.3f}, {y:.3f}) m: "
             f"a robot of radius {footprint_radius_m:g} m is {beyond[i]:.3f} m outside the floor of "
             f"{floor_m[0]:g} x {floor_m[1]:g} m; move or shrink the path, or enlarge the floor"
+        )
+
+
+def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> None:
+    """Whether a round robot on the path passes all obstacles.
+
+    Args:
+        path: Where its centre goes.
+        obstacles: What it must not touch.
+        footprint_radius_m: Radius of the robot [m].
+
+    Raises:
+        RefusedError: It touches one; the text gives the first such point and the obstacle.
+    """
+    step = max(footprint_radius_m / 4, path.length / 100_000)  # a straight segment may be long
+    s = np.union1d(np.linspace(0.0, path.length, math.ceil(path.length / step) + 1), path.s)
+    p = path.at(np.minimum(s, path.length))
+    distance, which = obstacles.clearance(p, reach_m=footprint_radius_m)
+    touched = np.flatnonzero(distance < footprint_radius_m - 1e-9)
+    if len(touched):
+        i = int(touched[0])
+        raise RefusedError(
+            f"path {path.name} runs into {obstacles.names[which[i]]}: {s[i]:.3f} m along it, at "
+            f"({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, a robot of radius {footprint_radius_m:g} m is "
+            f"{footprint_radius_m - distance[i]:.3f} m too near; move the path, or the obstacle"
         )
 
 

@@ -10,15 +10,20 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from magtwin.names import RefusedError, UnknownNameError
+from magtwin.obstacles import Obstacles
 from magtwin.path import (
+    CASES,
     PATHS,
     Path,
+    check_clear,
     check_on_floor,
     lawnmower,
     path_named,
     read_path_csv,
     resolve_path,
     sine,
+    spline,
+    split_lawnmower,
 )
 
 FLOOR, FOOTPRINT = (6.0, 3.5), 0.171
@@ -265,3 +270,90 @@ def test_the_curvilinear_path_bends_both_ways():
 def test_arc_length_is_that_of_the_points():
     path = path_named("curvilinear")
     assert path.length == pytest.approx(sum(math.dist(a, b) for a, b in itertools.pairwise(path.p_xy)))
+
+
+def test_a_case_of_table_1_is_a_named_path():
+    assert {case: path_named(case).name for case in CASES} == dict(CASES)
+    assert list(CASES) == list("ABCDE")
+    assert resolve_path("A").name == "fast_sine"
+
+
+def test_the_fast_sine_is_the_released_one(real_data):
+    released = read_path_csv(real_data / "aprilab" / "paths" / "sinwave_data.csv")
+    _, distance = released.nearest(path_named("fast_sine").p_xy)
+    assert np.abs(distance).max() < 0.03  # the released one has 50 points a wave, whose chords cut its crests
+    assert path_named("fast_sine").length == pytest.approx(released.length, rel=0.01)
+
+
+def test_the_continuous_cycle_is_the_released_one(real_data):
+    released = read_path_csv(real_data / "aprilab" / "paths" / "continous_cycle.csv")
+    ours = path_named("continuous_cycle")
+    assert ours.closed
+    assert ours.length == pytest.approx(released.length, rel=1e-3)
+    _, distance = released.nearest(ours.p_xy)
+    assert np.abs(distance).max() < 0.01
+
+
+def test_a_split_lawnmower_mows_one_half_and_then_the_other_back():
+    path = split_lawnmower(y_split_m=0.3, step_m=0.5)
+    low = path.p_xy[:, 1] < 0.3
+    assert np.count_nonzero(np.diff(low)) == 1  # it crosses the split line once
+    assert low[0]
+    assert_allclose([path.p_xy[:, 1].min(), path.p_xy[:, 1].max()], [-1.5, 1.5])
+    gap = path.p_xy[~low, 1].min() - path.p_xy[low, 1].max()
+    assert gap == pytest.approx(0.5)
+    assert_allclose(path.p_xy[0, 0], path.p_xy[-1, 0])
+
+
+def test_a_split_line_outside_the_floor_is_refused():
+    with pytest.raises(RefusedError, match="y_split_m of a split_lawnmower must lie between"):
+        split_lawnmower(y_split_m=1.4)
+
+
+@settings(deadline=None)  # the first call imports scipy.interpolate
+@given(st.integers(3, 9), st.integers(0, 2**32 - 1), st.booleans())
+def test_a_spline_goes_through_its_points_without_a_kink(count, seed, closed):
+    rng = np.random.default_rng(seed)
+    angle = np.sort(rng.uniform(0, 2 * np.pi, count)) + np.arange(count)
+    points = np.column_stack([angle, rng.uniform(-1, 1, count)])
+    path = spline(points, closed=closed)
+    _, distance = path.nearest(points)
+    assert np.abs(distance).max() < 1e-9
+    fine = spline(points, closed=closed, spacing_m=0.001)
+    turn = fine.turn(np.linspace(0.1, 0.9, 50) * fine.length, 0.0005)
+    assert np.abs(turn).max() < 0.35
+
+
+def test_a_closed_spline_through_four_points_of_a_circle_is_nearly_round():
+    angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    path = spline(np.column_stack([np.cos(angle), np.sin(angle)]), closed=True)
+    assert_allclose(np.hypot(*path.p_xy.T), 1.0, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("points", "options", "says"),
+    [
+        ([[0, 0], [1, 0]], {}, "needs three points"),
+        ([[0, 0], [1, 0], [1, 0]], {}, "needs three points"),
+        ([[0, 0], [1, 0], [2, 1]], {"spacing_m": 0.0}, "above 0 m"),
+        ([[0, 0], [1, np.nan], [2, 1]], {}, "not finite"),
+    ],
+)
+def test_a_spline_through_too_little_is_refused(points, options, says):
+    with pytest.raises(RefusedError, match=says):
+        spline(points, **options)
+
+
+DESK = Obstacles(("/World/Desk",), (np.array([[0.5, -0.2], [1.0, -0.2], [1.0, 0.2], [0.5, 0.2]]),))
+
+
+def test_a_path_through_a_desk_is_refused_with_the_place_and_the_prim():
+    line = Path("line", np.array([[-2.0, 0.0], [2.0, 0.0]]))
+    with pytest.raises(RefusedError, match=r"path line runs into /World/Desk: 2\.3\d\d m along it"):
+        check_clear(line, DESK, 0.171)
+
+
+def test_a_path_that_passes_at_just_the_robot_s_radius_is_clear():
+    check_clear(Path("line", np.array([[-2.0, 0.371], [2.0, 0.371]])), DESK, 0.171)
+    with pytest.raises(RefusedError, match=r"0\.001 m too near"):
+        check_clear(Path("line", np.array([[-2.0, 0.37], [2.0, 0.37]])), DESK, 0.171)

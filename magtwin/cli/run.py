@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, Seed, print_report, say, announcer
+from magtwin.cli.terminal import Force, Json, Seed, announcer, print_report, say
 from magtwin.names import RefusedError
 
 
@@ -81,7 +81,8 @@ def run(
     scene
         USD stage to drive in.
     path
-        sine, lawnmower, figure8, narrow_figure8, curvilinear, or a CSV file of x,y [m].
+        sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle,
+        curvilinear, curvilinear_2; A to E, the cases of the paper's Table 1; or a CSV file of x,y [m].
     net
         Weights to use in place of the scene's (.safetensors or .pth); "none" for the disturbance by physics.
     seed
