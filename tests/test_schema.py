@@ -10,6 +10,7 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils, Vt
 
 from magtwin import spec
+from magtwin.field.harmonic import HarmonicField
 from magtwin.files import shipped
 from magtwin.names import RefusedError
 from magtwin.usd import schema, sensors
@@ -26,6 +27,7 @@ SPECS = {
     "drive": spec.DriveSpec,
     "platform": spec.PlatformFieldSpec,
     "lab": spec.LabSpec,
+    "harmonic": HarmonicField,
 }
 """The spec whose figures each noun's attributes hold."""
 
@@ -80,6 +82,8 @@ def other_value(attribute: Usd.Attribute):
         "bool[]": Vt.BoolArray([True, False]),
         "float[]": Vt.FloatArray([1.5]),
         "double[]": Vt.DoubleArray([1.5]),
+        "double3[]": Vt.Vec3dArray([Gf.Vec3d(1, 2, 3)]),
+        "double": 1.5,  # one without a fallback: unknown unless authored
     }[str(attribute.GetTypeName())]
 
 
