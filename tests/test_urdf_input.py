@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 
 from magtwin.names import RefusedError
 from magtwin.usd.urdf import xacro as our_xacro
+from magtwin.usd.urdf.convert import convert_urdf
 from magtwin.usd.urdf.description import read_description
 from magtwin.usd.urdf.expression import GLOBALS, Budget, ExpressionError, evaluate
 from magtwin.usd.urdf.package import Packages
@@ -409,6 +410,24 @@ def test_a_folder_of_the_packages_name_will_do_without_a_manifest(tmp_path):
     (tmp_path / "hand" / "meshes").mkdir(parents=True)
     (tmp_path / "hand" / "meshes" / "a.stl").write_text("")
     assert found(path) == tmp_path / "hand" / "meshes" / "a.stl"
+
+
+def test_a_description_does_not_choose_any_folder_around_it_as_its_package(tmp_path):
+    path = robot(tmp_path / "homes" / "me" / "downloads" / "arm")
+    (tmp_path / "homes" / "me" / "private").mkdir()
+    (tmp_path / "meshes").mkdir()  # too far above
+    (path.parent / "link").symlink_to(tmp_path)
+    for name in ("private", "me", "homes", "link", tmp_path.name, path.resolve().parts[1], "x" * 300):
+        with pytest.raises(RefusedError, match=r"no package '.*' around it; give --package"):
+            found(path, f"package://{name}/a.stl")
+
+
+@pytest.mark.parametrize("name", ["a" * 300 + ".stl", "loop/a.stl"])
+def test_a_file_that_cannot_be_looked_for_is_refused(tmp_path, name):
+    path = robot(tmp_path, name)
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(RefusedError, match=r":1: mesh '.*' cannot be looked for \(.*\)"):
+        convert_urdf(path, tmp_path / "arm.usda")
 
 
 def test_a_package_that_is_there_twice_is_noted(tmp_path):

@@ -12,14 +12,29 @@ MANIFEST = "package.xml"
 DEPTH, FOLDERS = 3, 5_000
 """How far below a folder packages are looked for, and in how many folders at most."""
 
+MARKS = (
+    MANIFEST,
+    "CMakeLists.txt",
+    "launch",
+    "mesh",
+    "meshes",
+    "model.config",
+    "models",
+    "robots",
+    "urdf",
+    "xacro",
+)
+"""What a folder holds, one of these, that is a package without saying so."""
+
 
 class Packages:
     """Folders of packages by name: those that the user gave, then those found around a file.
 
     Looked at in this order: given ones; those above the file, by their `package.xml`; those beside
-    them, down to DEPTH folders below (below the file's own folder where no package holds it); last, any
-    folder of that name that holds the file or lies beside it or its parents. Nothing is executed, no
-    environment variable is read, and symbolic links are not walked through.
+    them, down to DEPTH folders below (below the file's own folder where no package holds it); last, a
+    folder of that name that holds the file or lies beside it or its parents, no more than DEPTH above. It
+    must look like a package, see MARKS: a description chooses the name, and `package://home` is none.
+    Nothing is executed, no environment variable is read, and symbolic links are not walked through.
     """
 
     def __init__(self, given: Mapping[str, Path], file: Path) -> None:
@@ -56,8 +71,9 @@ class Packages:
                 if note not in self.notes:
                     self.notes.append(note)
             return first
-        around = [p for parent in (self._folder, *self._folder.parents) for p in (parent, parent / name)]
-        named = next((p for p in around if p.name == name and p.is_dir()), None)
+        above = (self._folder, *self._folder.parents[:DEPTH])
+        around = [p for parent in above for p in (parent, parent / name) if p.name == name]
+        named = next((p for p in around if p == self._folder or _looks_like_one(p)), None)
         if named is not None and name not in ("", ".", ".."):
             return named
         known = {*self._given, *found}
@@ -99,6 +115,14 @@ class Packages:
         folders = self._found.setdefault(name or folder.name, [])
         if folder not in folders:
             folders.append(folder)
+
+
+def _looks_like_one(folder: Path) -> bool:
+    """Whether a folder without a manifest is that of a package all the same."""
+    try:
+        return not folder.is_symlink() and any((folder / mark).exists() for mark in MARKS)
+    except OSError:  # a name that is too long, or a folder that may not be read
+        return False
 
 
 def _below(base: Path, depth: int) -> Iterator[Path]:

@@ -66,6 +66,14 @@ class Source:
             RefusedError: Its package is not there, or it lies outside of where the description may read.
         """
         start = f"{self.where(element)}: {what} {filename!r}"
+        try:
+            return self._found(filename, what, start)
+        except (OSError, RuntimeError) as error:  # a name that is too long, links in a circle
+            reason = getattr(error, "strerror", None) or error
+            raise RefusedError(f"{start} cannot be looked for ({reason})") from error
+
+    def _found(self, filename: str, what: str, start: str) -> Path:
+        """The file of `find_file`; `start` begins its refusals."""
         scheme, separator, rest = filename.partition("://")
         if separator and scheme not in ("package", "model", "file"):
             raise RefusedError(f"{start} is of scheme {scheme!r}; known: file, model, package")
