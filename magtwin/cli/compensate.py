@@ -1,0 +1,93 @@
+"""`magtwin compensate`: the platform's field taken out of a run's readings, by Tolles and Lawson's model."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say
+
+compensate_app = App(name="compensate", help="Take the platform's field out of a run (Tolles-Lawson).")
+app.command(compensate_app)
+
+
+@compensate_app.command
+def fit(
+    run: Path,
+    *,
+    out: Path,
+    terms: str = "permanent,induced6,eddy9",
+    band_hz: tuple[float, float] = (0.1, 0.9),
+    no_band: Annotated[bool, Parameter(negative="")] = False,
+    ridge: float | None = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Fit the model to a calibration run: one that turns about in a field that is uniform or well mapped.
+
+    A map that the same robot surveyed in several headings holds the platform's field already, so what is
+    left to fit is small; survey without the platform, or calibrate outdoors.
+
+    Parameters
+    ----------
+    run
+        Run with field vectors (.parquet).
+    out
+        Model to write, a .json file.
+    terms
+        Terms, comma between: permanent; induced3, induced5 or induced6; eddy3, eddy8 or eddy9; bias.
+    band_hz
+        Pass band of the manoeuvres [Hz].
+    no_band
+        Fit all frequencies, slow ones too.
+    ridge
+        Penalty of the regression; by cross-validation unless given.
+    force
+        Replace the file if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.files import check_free, output
+    from magtwin.io.tables import read_parquet
+    from magtwin.learn.tolles_lawson import fit_run
+
+    check_suffix(out, (".json",), "a Tolles-Lawson model")
+    check_free(out, force=force)
+    names = tuple(name.strip() for name in terms.split(",") if name.strip())
+    model = fit_run(read_parquet(run), terms=names, band_hz=None if no_band else band_hz, ridge=ridge)
+    with output(out, force=force) as aside:
+        model.save(aside)
+    print_report(model.report(f"Tolles-Lawson model of {run}"), json)
+    if not json:
+        say(f"Wrote {out}")
+
+
+@compensate_app.command
+def apply(run: Path, model: Path, *, out: Path, force: Force = False, json: Json = False) -> None:
+    """Take what a fitted model explains out of a run's b_measured_nt.
+
+    Parameters
+    ----------
+    run
+        Run with field vectors (.parquet).
+    model
+        Model that `magtwin compensate fit` wrote (.json).
+    out
+        Compensated run to write, a .parquet file.
+    force
+        Replace the file if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.files import check_free
+    from magtwin.io.tables import read_parquet, write_parquet
+    from magtwin.learn.tolles_lawson import TollesLawson, compensate_run
+
+    check_suffix(out, (".parquet",), "a run")
+    check_free(out, force=force)
+    compensated, report = compensate_run(read_parquet(run), TollesLawson.load(model))
+    write_parquet(compensated, out, force=force)
+    print_report(report, json)
+    if not json:
+        say(f"Wrote {out}")

@@ -1,0 +1,228 @@
+"""Tolles-Lawson: regressors as others have them, coefficients that come back, runs that get quiet."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from magtwin.field.map import AnomalyMap
+from magtwin.learn.tolles_lawson import (
+    TollesLawson,
+    compensate_run,
+    design_matrix,
+    fit_platform,
+    fit_run,
+    fit_tolles_lawson,
+)
+from magtwin.names import RefusedError
+from magtwin.path import path_named
+from magtwin.sim.simulate import simulate
+from magtwin.spec import EarthFieldSpec, PlatformFieldSpec, RobotSpec, Scene
+
+RATE_HZ = 20.0
+EARTH_NT = np.array([-2700.0, 24000.0, -38400.0])
+PLATFORM = PlatformFieldSpec(
+    hard_iron_nt=(415.0, 760.0, -300.0),
+    soft_iron=(0.008, 0.001, 0.0, 0.001, -0.004, 0.0005, 0.0, 0.0005, 0.002),
+    eddy_s=(0.004, 0.0, 0.0, 0.0, 0.004, 0.0, 0.0, 0.0, 0.006),
+)
+
+
+def manoeuvres(seconds: float, phase: float = 0.0) -> np.ndarray:
+    """The Earth's field in the axes of a platform that yaws, pitches and rolls, shape (N, 3)."""
+    t = np.arange(0, seconds, 1 / RATE_HZ) + phase
+    yaw = 2 * np.pi * t / 60
+    pitch, roll = np.radians(10) * np.sin(2 * np.pi * 0.21 * t), np.radians(15) * np.sin(2 * np.pi * 0.33 * t)
+    return Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll])).inv().apply(EARTH_NT)
+
+
+def with_platform(b: np.ndarray) -> np.ndarray:
+    rate = np.gradient(b, 1 / RATE_HZ, axis=0)
+    s, e = (np.reshape(m, (3, 3)) for m in (PLATFORM.soft_iron, PLATFORM.eddy_s))
+    return b + b @ s.T + PLATFORM.hard_iron_nt + rate @ e.T
+
+
+def test_regressors_are_those_of_deinterf():
+    peer = pytest.importorskip("deinterf.compensator.tmi.linear.terms")
+    from deinterf.foundation.sensors import MagVector
+    from deinterf.utils.data_ioc import DataIoC
+
+    b = manoeuvres(60)
+    container = DataIoC().with_data(MagVector(*b.T))
+    for ours, theirs in (
+        (("permanent", "induced5", "eddy8"), peer.Terms.Terms_16),
+        (("permanent", "induced6", "eddy9"), peer.Terms.Terms_18),
+    ):
+        matrix, names = design_matrix(b, 1.0, ours)  # its derivatives are a sample apart
+        assert matrix.shape[1] == len(names) == len(set(names))
+        assert_allclose(matrix, np.asarray(container[theirs]), rtol=1e-12, atol=1e-9)
+
+
+def test_the_diagonal_terms_are_those_of_the_whole_matrix():
+    b = manoeuvres(30)
+    whole, names = design_matrix(b, RATE_HZ)
+    diagonal, kept = design_matrix(b, RATE_HZ, ("induced3", "eddy3"))
+    assert kept == ("induced xx", "induced yy", "induced zz", "eddy xdx", "eddy ydy", "eddy zdz")
+    assert_allclose(diagonal, whole[:, [names.index(name) for name in kept]])
+
+
+def test_coefficients_of_a_linear_platform_come_back():
+    b = manoeuvres(300)
+    matrix, _ = design_matrix(b, RATE_HZ)
+    rng = np.random.default_rng(1)
+    true = np.concatenate([rng.normal(0, 300, 3), rng.normal(0, 3e-3, 6), rng.normal(0, 3e-3, 9)])
+    readings = np.linalg.norm(EARTH_NT) + matrix @ true
+    model = fit_tolles_lawson(readings, b, RATE_HZ, ridge=0.0)
+    assert_allclose(model.compensate(readings, b, RATE_HZ).std(), 0, atol=1e-3)  # nT, of a few hundred
+    assert model.residual_sd_nt < 1e-3
+
+
+def test_held_out_manoeuvres_lose_over_95_percent_of_the_platform_s_variance():
+    train, test = (with_platform(manoeuvres(180, phase)) for phase in (0.0, 500.0))
+    noise = np.random.default_rng(2).normal(0, 1, (2, len(train)))
+    model = fit_tolles_lawson(np.linalg.norm(train, axis=1) + noise[0], train, RATE_HZ)
+    readings = np.linalg.norm(test, axis=1) + noise[1]
+    assert readings.std() > 100
+    assert model.compensate(readings, test, RATE_HZ).var() < 0.05 * readings.var()
+
+
+def test_a_constant_bias_is_fitted_without_a_band():
+    b = manoeuvres(200)
+    readings = np.linalg.norm(with_platform(b), axis=1) + 1234.0
+    model = fit_tolles_lawson(
+        readings - np.linalg.norm(EARTH_NT), b, RATE_HZ, terms=("permanent", "eddy9", "bias"), band_hz=None
+    )
+    assert model.coefficients[-1] == pytest.approx(1234.0, abs=400)
+    assert abs(np.mean(model.compensate(readings, b, RATE_HZ)) - np.linalg.norm(EARTH_NT)) < 1
+
+
+def test_the_vector_fit_recovers_the_platform():
+    b = manoeuvres(120)
+    found = fit_platform(b, with_platform(b), RATE_HZ)
+    assert_allclose(found.hard_iron_nt, PLATFORM.hard_iron_nt, rtol=1e-6)
+    assert_allclose(found.soft_iron, PLATFORM.soft_iron, atol=1e-10)
+    assert_allclose(found.eddy_s, PLATFORM.eddy_s, atol=1e-10)
+    assert found.left_motor_nt_s == (0.0, 0.0, 0.0)
+
+
+def test_the_vector_fit_recovers_moments_to_two_percent_through_noise():
+    rng = np.random.default_rng(3)
+    b = manoeuvres(300)
+    wheels, on = rng.uniform(-8, 8, (len(b), 2)), rng.random(len(b)) < 0.3
+    motors = np.array([[22.0, 46.0, -17.0], [15.0, -34.0, -20.0]])
+    lidar = np.array([380.0, -210.0, -540.0])
+    measured = with_platform(b) + wheels @ motors + on[:, None] * lidar + rng.normal(0, 20, b.shape)
+    found = fit_platform(b, measured, RATE_HZ, wheel_rate=wheels, lidar_on=on)
+    assert_allclose(found.hard_iron_nt, PLATFORM.hard_iron_nt, rtol=0.02)
+    assert_allclose([found.left_motor_nt_s, found.right_motor_nt_s], motors, rtol=0.02, atol=0.3)
+    assert_allclose(found.lidar_nt, lidar, rtol=0.02)
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    """A robot that drives about in a uniform field, above a map that knows only that field."""
+    earth = EarthFieldSpec(
+        b_world_nt=tuple(EARTH_NT.tolist()),
+        latitude_deg=29.65,
+        longitude_deg=-82.35,
+        height_m=50,
+        date="2026-01-01",
+    )
+    robot = RobotSpec(name="robot", asset="robot.usda", platform=PLATFORM)
+    scene = Scene(name="field", map_layer="flat.usdc", robot=robot, earth=earth)
+    flat = AnomalyMap(
+        values_nt=np.full((1, 2, 2), np.linalg.norm(EARTH_NT)),
+        origin_m=(-3, -2),
+        cell_m=(6, 4),
+        headings_rad=np.zeros(1),
+    )
+
+    def run(path: str, seed: int):
+        return simulate(
+            scene, path_named(path), anomaly_map=flat, rng=np.random.default_rng(seed), rate_hz=20
+        )
+
+    return run
+
+
+def test_a_run_compensated_by_another_s_fit_loses_over_95_percent_of_its_variance(calibration):
+    model = fit_run(calibration("figure8", 1), band_hz=None)
+    run, report = compensate_run(calibration("curvilinear", 2), model)
+    removed = {figure.name: figure.value for figure in report.figures}["variance removed"]
+    assert removed > 0.95
+    left = run["b_measured_nt"] - run["b_map_nt"]
+    assert left.std() < 0.25 * calibration("curvilinear", 2)["b_disturbance_nt"].std()
+    assert run.facts["tolles_lawson"] == "permanent induced6 eddy9"
+
+
+def test_a_run_without_vectors_is_refused(calibration):
+    run = calibration("figure8", 1)
+    blind = run.with_columns(b_vector_nt=np.full((run.rows, 3), np.nan))
+    with pytest.raises(RefusedError, match="no field vectors in b_vector_nt"):
+        fit_run(blind)
+
+
+def test_the_longest_unbroken_stretch_is_used(calibration):
+    run = calibration("figure8", 1)
+    measured = run["b_measured_nt"].copy()
+    measured[40] = np.nan
+    model = fit_run(run.with_columns(b_measured_nt=measured), band_hz=None, ridge=1e-6)
+    b, v = (run[name][41:] for name in ("b_measured_nt", "b_vector_nt"))
+    same = fit_tolles_lawson(b - run["b_map_nt"][41:], v, 20.0, band_hz=None, ridge=1e-6)
+    assert_allclose(model.coefficients, same.coefficients, rtol=1e-6)
+
+
+def test_a_model_comes_back_from_its_file(tmp_path):
+    b = with_platform(manoeuvres(100))
+    model = fit_tolles_lawson(np.linalg.norm(b, axis=1), b, RATE_HZ)
+    model.save(tmp_path / "model.json")
+    assert TollesLawson.load(tmp_path / "model.json") == model
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("{", "not a Tolles-Lawson model"),
+        ("[]", "not a Tolles-Lawson model"),
+        ('{"terms": ["permanent"]}', "KeyError: 'coefficients'"),
+        ("[" * 100_000, "RecursionError"),
+    ],
+)
+def test_a_file_that_is_no_model_is_refused(tmp_path, text, says):
+    (tmp_path / "model.json").write_text(text)
+    with pytest.raises(RefusedError, match=says):
+        TollesLawson.load(tmp_path / "model.json")
+
+
+def test_a_model_whose_coefficients_do_not_fit_its_terms_is_refused(tmp_path):
+    broken = {"terms": ["permanent"], "coefficients": [1], "band_hz": None, "ridge": 0, "residual_sd_nt": 0}
+    (tmp_path / "model.json").write_text(json.dumps(broken))
+    with pytest.raises(RefusedError, match="1 coefficients for 3 columns"):
+        TollesLawson.load(tmp_path / "model.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"terms": ("permanent", "induced")}, "no Tolles-Lawson term 'induced'"),
+        ({"terms": ("eddy8", "eddy9")}, "each once"),
+        ({"terms": ()}, "at least one"),
+        ({"rate_hz": 0.0}, "rate_hz must be above 0"),
+        ({"band_hz": (0.9, 0.1)}, "band_hz must ascend"),
+        ({"band_hz": (0.1, 10.0)}, "half the rate, 10 Hz"),
+        ({"ridge": -1.0}, "ridge must not be below 0"),
+        ({"b_nt": np.full(400, np.nan)}, "b_nt must be finite, got nan in row 0"),
+        ({"b_nt": np.ones(3)}, r"must have shape \(400,\)"),
+        ({"b_vector_nt": np.zeros((400, 3))}, "not zero"),
+        ({"b_vector_nt": np.zeros((400, 2))}, r"shape \(N, 3\)"),
+        ({"b_nt": np.ones(10), "b_vector_nt": np.ones((10, 3))}, "10 readings are too few for 18"),
+        ({"b_nt": np.ones(25), "b_vector_nt": np.ones((25, 3))}, "too few for the band-pass"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused(change, says):
+    b = manoeuvres(20)
+    given = {"b_nt": np.linalg.norm(b, axis=1), "b_vector_nt": b, "rate_hz": RATE_HZ, **change}
+    with pytest.raises(RefusedError, match=says):
+        fit_tolles_lawson(**given)
