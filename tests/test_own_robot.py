@@ -105,6 +105,20 @@ def test_from_urdf_gives_asset_spec_and_report(tmp_path):
     assert any("lidar" in note for note in made.report.notes)
 
 
+def test_settings_name_links_and_joints_as_the_urdf_does_though_usd_calls_them_otherwise(tmp_path):
+    text = CART.read_text().replace('"mast"', '"mast-top"').replace('"left"', '"left.wheel"')
+    (tmp_path / "cart.urdf").write_text(text.replace('"right"', '"右"'))
+    settings = RobotSettings(
+        drive=DriveSpec(left_wheel_joint="left.wheel", right_wheel_joint="右"),
+        magnetometer=MagnetometerSpec(link="mast-top"),
+    )
+    made = from_urdf(tmp_path / "cart.urdf", tmp_path / "cart", settings=settings)
+    assert made.spec is not None
+    assert made.spec.drive.left_wheel_joint == "left_wheel"
+    assert made.spec.drive.right_wheel_joint == "右"
+    assert made.spec.magnetometer.link == "mast_top"
+
+
 def test_options_of_the_command_reach_the_conversion(tmp_path, capsys):
     report = tmp_path / "report.json"
     main(

@@ -360,7 +360,6 @@ REFUSED = {
     "no mass": (NO_MASS, r":3: link 'b' has a mass of 0"),
     "inertia": (f'<link name="b">{FLAT}</link>', r":3: link 'b' has an impossible inertia: no body has"),
     "friction": (LINK + NEGATIVE, r"arm\.urdf:3: mu1 must be a finite number not below 0, got '-1'"),
-    "reserved": (LINK.replace("base_link", "joints"), "'joints' would become prim 'joints', which is taken"),
     "no number": (NO_NUMBER, r":3: link 'b': radius of <sphere> must be a finite number, got 'big'"),
 }
 
@@ -369,12 +368,46 @@ REFUSED = {
 def test_a_bad_description_is_refused_in_one_line_and_nothing_is_written(tmp_path, case):
     body, message = REFUSED[case]
     path = urdf(tmp_path, body)
-    (tmp_path / "arms").mkdir()
+    (tmp_path / "arms" / "meshes").mkdir(parents=True)
     tetrahedron(tmp_path / "t.stl")
     with pytest.raises(RefusedError, match=message) as refusal:
         convert_urdf(path, tmp_path / "out" / "arm.usda")
     assert "\n" not in str(refusal.value)
     assert not list(tmp_path.glob("out/**/*"))
+
+
+NAMED = """
+<link name="底座">{BODY}</link> <link name="a-b">{BODY}</link> <link name="a_b">{BODY}</link>
+<link name="visuals"/> <link name="joints">{BODY}</link> <link name="1st wheel">{BODY}</link>
+<joint name="右" type="fixed"><parent link="底座"/><child link="a-b"/></joint>
+<joint name="j.1" type="fixed"><parent link="底座"/><child link="a_b"/></joint>
+<joint name="j_1" type="fixed"><parent link="a-b"/><child link="visuals"/><origin xyz="0 0 1"/></joint>
+<joint name="joints" type="continuous"><parent link="底座"/><child link="joints"/></joint>
+<joint name="w 1" type="continuous"><parent link="底座"/><child link="1st wheel"/></joint>"""
+
+
+def test_no_name_is_refused_and_one_that_usd_has_no_place_for_is_shown(tmp_path):
+    stage, robot = convert(urdf(tmp_path, NAMED, "my robot"))
+    notes = read_notes(tmp_path / "my robot.usda")
+    renamed = {
+        "my_robot": "my robot",
+        "a_b_2": "a-b",
+        "visuals_2": "visuals",
+        "joints_2": "joints",
+        "_1st_wheel": "1st wheel",
+        "j_1_2": "j.1",
+        "w_1": "w 1",
+    }
+    shown = {p.GetName(): p.GetDisplayName() for p in stage.Traverse() if p.GetDisplayName()}
+    assert shown == renamed
+    for name, was in renamed.items():
+        assert any(note.endswith(f"{was!r} is called {name!r} in USD") for note in notes)
+    assert {p.GetName() for p in robot.GetChild("joints").GetChildren()} == {"右", "j_1_2", "joints", "w_1"}
+    for link in ("底座", "a_b", "a_b_2", "a_b_2/visuals_2", "joints_2", "_1st_wheel"):
+        assert robot.GetPrimAtPath(link), link
+    height = UsdGeom.BBoxCache(0, ["default"]).ComputeWorldBound(robot).ComputeAlignedRange().GetMax()[2]
+    assert_allclose(height, 0.1, rtol=1e-6)  # no frame moves the shapes beside it
+    assert_valid(tmp_path / "my robot.usda", tmp_path)
 
 
 JOINTS = {

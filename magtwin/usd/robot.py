@@ -205,12 +205,13 @@ def _make_way(robot: Usd.Prim, noun: str, path: Sdf.Path) -> list[str]:
 
 
 def _links(robot: Usd.Prim) -> dict[str, Sdf.Path]:
-    """Paths of a robot's links by name, those that only name a place included."""
+    """Paths of a robot's links by name, the URDF's and USD's, those that only name a place included."""
     named = ("IsaacLinkAPI", "IsaacSiteAPI")
     return {
-        prim.GetName(): prim.GetPath()
+        name: prim.GetPath()
         for prim in Usd.PrimRange(robot)
         if any(api in named for api in prim.GetPrimTypeInfo().GetAppliedAPISchemas())
+        for name in {prim.GetName(), prim.GetDisplayName() or prim.GetName()}
     }
 
 

@@ -176,7 +176,8 @@ def define_drive(prim: Usd.Prim, spec: DriveSpec) -> Usd.Prim:
         RefusedError: No joint has the name that the spec gives.
     """
     write_figures(apply_api(prim, "drive"), "drive", spec, skip=JOINT_FIELDS)
-    joints = {p.GetName(): p for p in Usd.PrimRange(prim) if p.IsA(UsdPhysics.Joint)}
+    found = [p for p in Usd.PrimRange(prim) if p.IsA(UsdPhysics.Joint)]
+    joints = {p.GetDisplayName() or p.GetName(): p for p in found} | {p.GetName(): p for p in found}
     for field in JOINT_FIELDS:
         name = getattr(spec, field)
         if name not in joints:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
+from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 
 from magtwin.files import check_free, output, sha256
 from magtwin.names import RefusedError
@@ -30,11 +30,11 @@ from magtwin.usd.urdf.lint import lint
 from magtwin.usd.urdf.material import LOOKS
 from magtwin.usd.urdf.mechanism import Mechanism, read_mechanism
 from magtwin.usd.urdf.merge import WORLD, Place, carried, place_links, riders
-from magtwin.usd.urdf.mesh_layer import MeshLayer, gather
+from magtwin.usd.urdf.mesh_layer import MeshLayer, free_name, gather
 from magtwin.usd.urdf.options import DEFAULTS, Options
 from magtwin.usd.urdf.report import ConversionReport, Ledger, make_report
 from magtwin.usd.urdf.sensor import define_sensors
-from magtwin.usd.urdf.shape import define_collider, define_visual, pose_of
+from magtwin.usd.urdf.shape import COLLISIONS, VISUALS, define_collider, define_visual, pose_of
 from magtwin.usd.urdf.simready import check_metadata, metadata
 from magtwin.usd.urdf.source import read_source
 from magtwin.usd.urdf.tag import Tags
@@ -251,6 +251,7 @@ def _author(
     options = replace(options, drives=(*options.drives, *commands))
     places, poses = place_links(mechanism, merge=options.merge_fixed), mechanism.poses()
     robot = UsdGeom.Xform.Define(stage, Sdf.Path.absoluteRootPath.AppendChild(names[""])).GetPrim()
+    _show_name(robot, description.name)
     stage.SetDefaultPrim(robot)
     Usd.ModelAPI(robot).SetKind("component")
     paths = {WORLD: robot.GetPath()}
@@ -259,6 +260,7 @@ def _author(
             continue
         body = UsdGeom.Xform.Define(stage, robot.GetPath().AppendChild(names[name])).GetPrim()
         write_pose(body, *pose_of(poses[name]))
+        _show_name(body, name)
         paths[name] = body.GetPath()
         ledger.link(name, "body", body)
         parts = []
@@ -278,6 +280,7 @@ def _author(
         if above != name:
             frame = UsdGeom.Xform.Define(stage, paths[above].AppendChild(names[name])).GetPrim()
             write_pose(frame, *pose_of(pose))
+            _show_name(frame, name)
             define_frame(frame)
             ledger.link(name, "frame" if is_marker(description.links[name]) else "merged", frame)
     scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(JOINTS)).GetPath()
@@ -353,6 +356,7 @@ def _define_joints(
         path, ends = scope.AppendChild(names[joint.name]), (paths[above], paths[child])
         at = mechanism.pose(joint) if joint.name in mechanism.welded else origin_of(joint)
         prim = define_joint(stage, path, joint, ends, pose @ at, mechanism, options, wheels)
+        _show_name(prim, joint.name)
         made[joint.name] = prim
         ledger.joint(joint.name, prim)
     joints = {joint.name: joint for joint in description.joints.values()}
@@ -376,40 +380,58 @@ def _articulate(
     robot.CreateRelationship("isaac:physics:robotJoints", custom=False).SetTargets(joints)
 
 
-def _joint_names(description: Description) -> dict[str, str]:
-    """Names of the prims of the root joint ("") and of the joints, as USD allows them.
+def identifier(name: str) -> str:
+    """A name as USD allows it: letters and digits of any script stay, whatever else is an underscore."""
+    if Sdf.Path.IsValidIdentifier(name):
+        return name
+    kept = "".join(c if Sdf.Path.IsValidIdentifier(f"_{c}") else "_" for c in name)
+    return kept if Sdf.Path.IsValidIdentifier(kept) else f"_{kept}"
 
-    Raises:
-        RefusedError: Two joints would get one name.
-    """
-    names: dict[str, str] = {}
-    for joint in description.joints.values():
-        name = Tf.MakeValidIdentifier(joint.name)
-        if name in names.values():
-            raise description.refused(
-                "joint", joint.name, f"would become prim {name!r}, which is taken; rename it"
-            )
-        if name != joint.name:
-            description.note(f"joint {joint.name!r} is called {name!r} in USD")
-        names[joint.name] = name
+
+def _show_name(prim: Usd.Prim, name: str) -> None:
+    """Let viewers, and whoever looks for it, find a prim under the name that the description has for it."""
+    if prim.GetName() != name:
+        prim.SetDisplayName(name)
+
+
+def _joint_names(description: Description) -> dict[str, str]:
+    """Names of the prims of the root joint ("") and of the joints, as USD allows them."""
+    joints = [joint.name for joint in description.joints.values()]
+    names, taken = _free_names(joints, set(), "joint ", description), set(joints)
     free = ("root_joint", *(f"root_joint_{i}" for i in range(2, len(names) + 3)))
-    names[""] = next(name for name in free if name not in names.values())
+    names[""] = next(name for name in free if name not in taken.union(names.values()))
     return names
 
 
 def _prim_names(description: Description) -> dict[str, str]:
     """Names of the prims of the robot ("") and of its links, as USD allows them.
 
-    Raises:
-        RefusedError: Two links would get one name, or one that the robot's own scopes have.
+    No link has a name that a scope of the robot or of a body has.
     """
-    names: dict[str, str] = {}
-    reserved = (JOINTS, LOOKS)
-    for link in ("", *description.links):
-        name = Tf.MakeValidIdentifier(link or description.name)
-        if link and (name in reserved or name in [n for key, n in names.items() if key]):
-            raise description.refused("link", link, f"would become prim {name!r}, which is taken; rename it")
-        if name != (link or description.name):
-            description.note(f"{link or description.name!r} is called {name!r} in USD")
-        names[link] = name
+    robot = identifier(description.name)
+    if robot != description.name:
+        description.note(f"{description.name!r} is called {robot!r} in USD")
+    scopes = {JOINTS, LOOKS, VISUALS, COLLISIONS}
+    return {"": robot, **_free_names(description.links, scopes, "", description)}
+
+
+def _free_names(
+    wanted: Iterable[str], taken: set[str], what: str, description: Description
+) -> dict[str, str]:
+    """Names as USD allows them, no two alike; those that need no change come first, the others are noted.
+
+    Args:
+        wanted: Names in the description.
+        taken: Names that none may have.
+        what: What is named, for notes.
+        description: Takes the notes.
+    """
+    wanted = list(wanted)
+    used = taken | {name for name in wanted if identifier(name) == name}
+    names = {}
+    for name in wanted:
+        names[name] = name
+        if identifier(name) != name or name in taken:
+            names[name] = free_name(identifier(name), used)
+            description.note(f"{what}{name!r} is called {names[name]!r} in USD")
     return names
