@@ -173,12 +173,12 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
         else:
             path = _mount(links, name, given or spec)
             notes += _make_way(robot, name, path)
-            define(stage, path, given or spec)
+            define(stage, path, replace(given or spec, link=path.GetParentPath().name))
     if settings.magnetometer is not None or not prims_with(robot, "magnetometer"):
         magnetometer = settings.magnetometer or MagnetometerSpec()
         path = _mount(links, "magnetometer", magnetometer)
         notes += _make_way(robot, "magnetometer", path)
-        define_magnetometer(stage, path, magnetometer)
+        define_magnetometer(stage, path, replace(magnetometer, link=path.GetParentPath().name))
     return notes
 
 
