@@ -1,5 +1,7 @@
 """A map through its layer and back, and the coloured floor that goes with it."""
 
+import datetime
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,11 +11,26 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 from validators import assert_valid
 
+from magtwin.field.colours import colour_limits
+from magtwin.field.harmonic import HarmonicField
 from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError
-from magtwin.usd.maps import HEAT_MAP, MAP, colour_index, heading_variants, load_map, save_map, viridis
+from magtwin.usd.maps import (
+    HEAT_MAP,
+    MAP,
+    colour_index,
+    heading_variants,
+    load_epochs,
+    load_map,
+    save_map,
+    save_map_series,
+    viridis,
+)
+from magtwin.usd.schema import attribute_name
 
 VALUES = "magtwin:anomalyMap:values"
+HEIGHT = "magtwin:anomalyMap:heightM"
+PARAMETERS = "magtwin:anomalyMap:parameters"
 
 
 def a_map(shape=(4, 3, 5), **changes) -> AnomalyMap:
@@ -31,6 +48,18 @@ def a_map(shape=(4, 3, 5), **changes) -> AnomalyMap:
         "created": "2026-01-02",
     }
     return AnomalyMap(**(given | changes))
+
+
+def a_field(dipoles=3, seed=0) -> HarmonicField:
+    rng = np.random.default_rng(seed)
+    return HarmonicField(
+        p_world_dipole=rng.normal(size=(dipoles, 3)),
+        m_world=rng.normal(size=(dipoles, 3)),
+        b_uniform_nt=rng.normal(2e4, 1e3, 3),
+        hard_iron_nt=rng.normal(0, 300, 3),
+        soft_iron=rng.normal(0, 0.01, (3, 3)),
+        p_base_sensor=(0.01, 0.0, 0.35),
+    )
 
 
 def save_and_load(field, folder) -> AnomalyMap:
@@ -65,6 +94,224 @@ def test_any_map_in_single_precision_survives_its_layer(tmp_path_factory, values
         headings_rad=np.arange(len(values)) * np.pi / 2,
     )
     assert save_and_load(field, tmp_path_factory.mktemp("map")) == field
+
+
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+figures = st.dictionaries(
+    st.text(),
+    st.recursive(
+        numbers | st.integers(-(2**63), 2**63) | st.text() | st.booleans(),
+        lambda some: st.lists(some, max_size=3),
+    ),
+    max_size=4,
+)
+texts = st.text(st.characters(blacklist_categories=("Cs",), blacklist_characters="\x00"))
+
+
+@settings(deadline=None, max_examples=30)
+@given(texts, texts, st.none() | numbers, figures)
+def test_what_a_map_knows_of_itself_survives_its_layer(tmp_path_factory, frame, datum, height, parameters):
+    field = a_map((1, 2, 2), frame=frame, datum=datum, height_m=height, parameters=parameters)
+    assert save_and_load(field, tmp_path_factory.mktemp("map")) == field
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 4), st.randoms(use_true_random=False))
+def test_a_harmonic_field_survives_the_layer_to_the_last_bit(tmp_path_factory, dipoles, random):
+    field = a_map((1, 2, 2), harmonic=a_field(dipoles, random.randrange(2**32)))
+    assert save_and_load(field, tmp_path_factory.mktemp("map")).harmonic == field.harmonic
+
+
+def test_a_layer_from_before_frame_height_and_figures_still_loads(tmp_path):
+    save_map(a_map(), tmp_path / "m.usdc")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
+    prim = layer.GetPrimAtPath(MAP)
+    for name in ("frame", "datum", "parameters"):
+        prim.RemoveProperty(prim.attributes[f"magtwin:anomalyMap:{name}"])
+    for name in ("name", "method", "source", "licence", "created", "checksum"):  # which never varied
+        attribute = prim.attributes[f"magtwin:anomalyMap:{name}"]
+        value = attribute.default
+        prim.RemoveProperty(attribute)
+        Sdf.AttributeSpec(
+            prim, attribute_name("anomalyMap", name), Sdf.ValueTypeNames.String, Sdf.VariabilityUniform
+        ).default = value
+    layer.Save()
+    assert load_map(tmp_path / "m.usdc") == a_map()
+
+
+@pytest.mark.parametrize(
+    "parameters", [{"a": np.nan}, {"a": np.zeros(2)}, {"a": {1, 2}}], ids=["nan", "array", "set"]
+)
+def test_figures_that_json_does_not_hold_are_refused_and_nothing_is_written(tmp_path, parameters):
+    with pytest.raises(RefusedError, match="parameters of map 'small' must be finite numbers, texts"):
+        save_map(a_map(parameters=parameters), tmp_path / "m.usdc")
+    assert list(tmp_path.iterdir()) == []
+
+
+def epochs() -> list[AnomalyMap]:
+    """Three surveys of one floor, of which the second has a harmonic field and the third no variance."""
+    base, rng = a_map(), np.random.default_rng(5)
+    maps = []
+    for k, day in enumerate(("2025-12-31", "2026-01-10", "2026-02-01")):
+        values = base.values_nt + np.round(rng.normal(0, 50, base.values_nt.shape))
+        maps.append(
+            a_map(
+                values_nt=values.astype(np.float32).astype(float),
+                valid=rng.random(values.shape) < 0.9,
+                variance_nt2=None if k == 2 else np.full(values.shape, 4.0 + 4 * k),
+                name=f"survey {k}",
+                source=f"file {k}",
+                created=day,
+                height_m=0.35,
+                parameters={"k": k},
+                harmonic=a_field() if k == 1 else None,
+            )
+        )
+    return maps
+
+
+def test_every_epoch_comes_back_from_a_series_and_the_latest_without_a_date(tmp_path):
+    first, second, third = maps = epochs()
+    save_map_series([third, first, second], tmp_path / "m.usdc")
+    assert load_epochs(tmp_path / "m.usdc") == tuple(maps)
+    for field in maps:
+        assert load_map(tmp_path / "m.usdc", field.created) == field
+        assert load_map(tmp_path / "m.usdc", datetime.date.fromisoformat(field.created)) == field
+    assert load_map(tmp_path / "m.usdc") == third
+
+
+def test_between_two_epochs_the_field_is_linear_in_time_and_surer_than_each(tmp_path):
+    maps = epochs()
+    save_map_series(maps, tmp_path / "m.usdc")
+    field = load_map(tmp_path / "m.usdc", "2026-01-05")  # half the ten days
+    before, after = maps[:2]
+    assert_allclose(field.values_nt, (before.values_nt + after.values_nt) / 2)
+    assert_allclose(field.variance_nt2, (4.0 + 8.0) / 4)
+    assert_array_equal(field.valid, before.valid & after.valid)
+    assert field.created == "2026-01-05"
+    assert field.source == "file 0; file 1"
+    assert field.harmonic is None
+    assert load_map(tmp_path / "m.usdc", "2026-01-20").variance_nt2 is None
+
+
+def test_a_reader_that_knows_usd_alone_sees_the_drift_at_days_since_2000(tmp_path):
+    maps = epochs()
+    save_map_series(maps, tmp_path / "m.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (9496.0, 9528.0)
+    values = stage.GetPrimAtPath(MAP).GetAttribute(VALUES)
+    assert values.GetTimeSamples() == [9496.0, 9506.0, 9528.0]
+    halfway = np.array(values.Get(9501.0)).reshape(4, 3, 5)
+    assert_allclose(halfway, (maps[0].values_nt + maps[1].values_nt) / 2, rtol=1e-6)
+
+
+def test_a_series_comes_along_with_a_stage_that_runs_at_another_pace(tmp_path):
+    maps = epochs()
+    save_map_series(maps, tmp_path / "m.usdc")
+    stage = Usd.Stage.CreateNew(str(tmp_path / "scene.usda"))
+    stage.SetTimeCodesPerSecond(30.0)  # USD stretches the layer's time codes by 30 / 24
+    stage.GetRootLayer().subLayerPaths.append("./m.usdc")
+    stage.Save()
+    assert load_epochs(tmp_path / "scene.usda") == tuple(maps)
+
+
+def test_the_coloured_floor_of_a_series_changes_with_time(tmp_path):
+    maps = epochs()
+    save_map_series(maps, tmp_path / "m.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
+    prim = stage.GetPrimAtPath(HEAT_MAP)
+    legend, primvar = prim.GetCustomDataByKey("magtwin"), UsdGeom.Mesh(prim).GetDisplayColorPrimvar()
+    for time, field in ((9496.0, maps[0]), (9506.0, maps[1]), (Usd.TimeCode.Default(), maps[2])):
+        index = colour_index(field.values_nt[0], field.valid[0], legend["least"], legend["greatest"])
+        assert_array_equal(np.array(primvar.ComputeFlattened(time)), viridis()[index.ravel()])
+
+
+@pytest.mark.parametrize("date", ["2025-12-30", "2026-02-02"])
+def test_a_date_outside_the_span_is_refused_with_the_span(tmp_path, date):
+    save_map_series(epochs(), tmp_path / "m.usdc")
+    with pytest.raises(RefusedError, match=f"{date} lies beyond .* reaches from 2025-12-31 to 2026-02-01"):
+        load_map(tmp_path / "m.usdc", date)
+
+
+def test_a_date_of_a_map_of_one_day_is_that_day_or_refused(tmp_path):
+    save_map(a_map(), tmp_path / "m.usdc")
+    assert load_map(tmp_path / "m.usdc", "2026-01-02") == a_map()
+    with pytest.raises(RefusedError, match="is of 2026-01-02 only"):
+        load_map(tmp_path / "m.usdc", "2026-01-03")
+    save_map(a_map(created=""), tmp_path / "m.usdc", force=True)
+    with pytest.raises(RefusedError, match="created of map 'small' must be a day YYYY-MM-DD, got ''"):
+        load_map(tmp_path / "m.usdc", "2026-01-02")
+
+
+@pytest.mark.parametrize("date", ["soon", "20260102", "2026-W01-5", "2026-02-30"])
+def test_a_date_that_is_no_day_is_refused(tmp_path, date):
+    save_map(a_map(), tmp_path / "m.usdc")
+    with pytest.raises(RefusedError, match=f"date must be a day YYYY-MM-DD, got '{date}'"):
+        load_map(tmp_path / "m.usdc", date)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"created": ""}, "created of map 'small' must be a day"),
+        ({"created": "2026-01-02"}, "are both of 2026-01-02"),
+        ({"origin_m": (0.0, 0.0)}, r"origin_m is \(-3.0, -1.75\) on 2026-01-02 and \(0.0, 0.0\)"),
+        ({"height_m": 0.5}, "height_m is None on 2026-01-02 and 0.5 on"),
+        ({"frame": "map"}, "frame is '' on 2026-01-02 and 'map' on"),
+        ({"headings_rad": [0.0, 1.0, 2.0, 3.0]}, "headings_rad is"),
+    ],
+)
+def test_maps_that_are_no_epochs_of_one_are_refused(tmp_path, change, said):
+    with pytest.raises(RefusedError, match=said):
+        save_map_series([a_map(), a_map(**({"created": "2026-01-03"} | change))], tmp_path / "m.usdc")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_grids_of_other_size_and_a_single_map_are_no_series(tmp_path):
+    with pytest.raises(RefusedError, match=r"\(4, 3, 5\) nodes on 2026-01-02 and \(4, 3, 6\)"):
+        save_map_series([a_map(), a_map((4, 3, 6), created="2026-01-03")], tmp_path / "m.usdc")
+    with pytest.raises(RefusedError, match="two at least, got 1"):
+        save_map_series([a_map()], tmp_path / "m.usdc")
+
+
+def test_an_epoch_that_was_tampered_with_is_refused_when_it_is_asked_for(tmp_path):
+    maps = epochs()
+    save_map_series(maps, tmp_path / "m.usdc")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
+    layer.SetTimeSample(MAP.AppendProperty(VALUES), 9506.0, [4e4] * 60)
+    layer.Save()
+    assert load_map(tmp_path / "m.usdc") == maps[2]
+    with pytest.raises(RefusedError, match="not those that its checksum was taken of"):
+        load_map(tmp_path / "m.usdc", "2026-01-10")
+
+
+def test_days_that_do_not_ascend_with_time_are_refused(tmp_path):
+    save_map_series(epochs(), tmp_path / "m.usdc")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
+    layer.SetTimeSample(MAP.AppendProperty("magtwin:anomalyMap:created"), 9506.0, "2027-01-01")
+    layer.Save()
+    with pytest.raises(
+        RefusedError, match="the days of its epochs must ascend with time, got 2025-12-31, 2027"
+    ):
+        load_epochs(tmp_path / "m.usdc")
+
+
+def test_the_coloured_floor_of_a_fine_map_stays_light_and_reaches_its_border(tmp_path):
+    field = a_map((1, 301, 402))
+    save_map(field, tmp_path / "m.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
+    prim = stage.GetPrimAtPath(HEAT_MAP)
+    mesh, legend = UsdGeom.Mesh(prim), prim.GetCustomDataByKey("magtwin")
+    assert legend["everyNode"] == 2
+    assert 25_000 < len(mesh.GetFaceVertexCountsAttr().Get()) <= 60_000
+    points = np.array(mesh.GetPointsAttr().Get())
+    x0, x1, y0, y1 = field.extent
+    assert_allclose([*points.min(axis=0)[:2], *points.max(axis=0)[:2]], [x0, y0, x1, y1], rtol=1e-6)
+    colours = np.array(mesh.GetDisplayColorPrimvar().ComputeFlattened())
+    at = np.rint((points[:, :2] - field.origin_m) / field.cell_m).astype(int)
+    values = field.values_nt[0][at[:, 1], at[:, 0]]
+    index = colour_index(values, values > 0, legend["least"], legend["greatest"])
+    assert_array_equal(colours, viridis()[index])
 
 
 def test_masked_nodes_may_hold_nan(tmp_path):
@@ -122,7 +369,7 @@ def test_the_heat_map_stands_at_the_nodes_and_is_coloured_by_heading(tmp_path):
         colours = np.array(mesh.GetDisplayColorPrimvar().ComputeFlattened())
         index = colour_index(values, values > 0, legend["least"], legend["greatest"])
         assert_array_equal(colours, viridis()[index.ravel()])
-    assert (legend["least"], legend["greatest"]) == (field.values_nt.min(), field.values_nt.max())
+    assert (legend["least"], legend["greatest"]) == colour_limits(field.values_nt)
     assert legend["unit"] == "nT"
 
 
@@ -218,10 +465,24 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
         ),
         ("magtwin:anomalyMap:unit", Sdf.ValueTypeNames.Token, "uT", "the map is in 'uT', magtwin reads nT"),
         (VALUES, Sdf.ValueTypeNames.String, "many", r"values must be a float\[\]"),
+        (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": 1', "parameters is not JSON"),
+        (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": NaN}', r"not JSON \(NaN is no JSON number\)"),
+        (PARAMETERS, Sdf.ValueTypeNames.String, "[" * 10_000, "parameters is not JSON"),
+        (PARAMETERS, Sdf.ValueTypeNames.String, "[1]", "parameters must be a JSON object"),
+        (PARAMETERS, Sdf.ValueTypeNames.Double, 1.0, "parameters must be a string"),
+        (HEIGHT, Sdf.ValueTypeNames.Double, np.nan, r"heightM must be a length \[m\], got nan"),
+        (HEIGHT, Sdf.ValueTypeNames.String, "high", r"heightM must be a length \[m\], got 'high'"),
+        (
+            "magtwin:harmonic:hardIronNt",
+            Sdf.ValueTypeNames.Double3,
+            Gf.Vec3d(0, 0, 1),
+            "not those that its checksum",
+        ),
+        ("magtwin:harmonic:mWorld", Sdf.ValueTypeNames.Float3Array, [Gf.Vec3f(1)], r"must be a double3\[\]"),
     ],
 )
 def test_a_tampered_map_is_refused_by_file_and_prim(tmp_path, attribute, kind, value, said):
-    save_map(a_map(), tmp_path / "m.usdc")
+    save_map(a_map(height_m=0.35, harmonic=a_field()), tmp_path / "m.usdc")
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
     prim = layer.GetPrimAtPath(MAP)
     if prim.attributes[attribute].typeName != kind:
@@ -230,4 +491,14 @@ def test_a_tampered_map_is_refused_by_file_and_prim(tmp_path, attribute, kind, v
     prim.attributes[attribute].default = value
     layer.Save()
     with pytest.raises(RefusedError, match=rf"m\.usdc </World/AnomalyMap>: .*{said}"):
+        load_map(tmp_path / "m.usdc")
+
+
+def test_a_harmonic_field_that_lost_a_part_is_refused(tmp_path):
+    save_map(a_map(harmonic=a_field()), tmp_path / "m.usdc")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
+    prim = layer.GetPrimAtPath(MAP)
+    prim.RemoveProperty(prim.attributes["magtwin:harmonic:softIron"])
+    layer.Save()
+    with pytest.raises(RefusedError, match="its harmonic field has no magtwin:harmonic:softIron"):
         load_map(tmp_path / "m.usdc")

@@ -1,18 +1,29 @@
 """An AnomalyMap as a USD layer: its arrays on one prim, and a coloured floor that any viewer shows."""
 
+import datetime
 import hashlib
+import itertools
+import json
+import math
 import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
+from magtwin.field.colours import COLOUR_MAP, colour_limits
+from magtwin.field.epochs import at_date, day_number, day_of, in_order
+from magtwin.field.harmonic import SHAPES as HARMONIC
+from magtwin.field.harmonic import HarmonicField
 from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError
 from magtwin.usd.geometry import linear_from_srgb
 from magtwin.usd.layers import WORLD, new_stage, open_stage
-from magtwin.usd.schema import apply_api, attribute_name, only_prim_with, place
+from magtwin.usd.schema import NOUNS, apply_api, attribute_name, only_prim_with, place
 
 MAP = WORLD.AppendChild("AnomalyMap")
 HEAT_MAP = MAP.AppendChild("HeatMap")
@@ -24,14 +35,21 @@ HEAT_MAP_HEIGHT_M = 0.004
 UNKNOWN_COLOUR = (0.2, 0.2, 0.2)
 """Linear colour of nodes without a value."""
 
+MOST_QUADS = 60_000
+"""Quads of the coloured floor; of a finer map it shows every second node, or third, ..."""
+
 UNIT = "nT"
 TEXTS = ("name", "method", "source", "licence", "created")
+PLACES = ("frame", "datum")
+
+DAYS_PER_SECOND = 24.0
+"""Time codes, which are days, that a viewer plays in a second; USD's own figure where a stage has none."""
 
 
 def save_map(field: AnomalyMap, path: str | os.PathLike[str], *, force: bool = False) -> None:
     """Write a map as a layer that any stage can sublayer.
 
-    Values become single precision (steps of 0.004 nT at 42,000 nT).
+    Values become single precision (steps of 0.004 nT at 42,000 nT); a harmonic field stays as it is.
 
     Args:
         field: The map.
@@ -39,40 +57,106 @@ def save_map(field: AnomalyMap, path: str | os.PathLike[str], *, force: bool = F
         force: Whether one that exists is replaced.
 
     Raises:
-        RefusedError: The file exists and `force` was not given, or has another suffix.
+        RefusedError: The file exists and `force` was not given, or has another suffix; or a figure of
+            the map is none that JSON can hold.
     """
-    if Path(path).suffix not in (".usdc", ".usd"):
-        raise RefusedError(f"{path}: a map layer ends in .usdc or .usd")
-    about = f"Magnetic anomaly map {field.name}: total field over x, y and heading. {field.source}"
-    with new_stage(path, about, force=force) as stage:
-        prim = apply_api(UsdGeom.Xform.Define(stage, MAP).GetPrim(), "anomalyMap")
-        _write_arrays(prim, field)
-        _define_heat_map(stage, field)
+    _save((field,), path, force)
 
 
-def load_map(path: str | os.PathLike[str]) -> AnomalyMap:
+def save_map_series(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], *, force: bool = False) -> None:
+    """Write the epochs of a map as one layer: a time sample a day, the time code days since 2000-01-01.
+
+    What the epochs share is written once. Whoever asks without a time gets the latest epoch, and its
+    colours; a viewer that plays the layer shows the field drift.
+
+    Args:
+        maps: Two or more maps of one grid, each with its day in `created`, in any order.
+        path: File to make, .usdc or .usd.
+        force: Whether one that exists is replaced.
+
+    Raises:
+        RefusedError: As for `save_map`, and for maps that are no epochs of one (`magtwin.field.epochs`).
+    """
+    _save(in_order(maps), path, force)
+
+
+def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = None) -> AnomalyMap:
     """The map of a layer, or of a stage that holds one.
+
+    Args:
+        path: The layer or stage.
+        date: Day that the map is asked for, or its name YYYY-MM-DD, linear in time between the epochs
+            around it; the latest unless given.
 
     Raises:
         RefusedError: The file is missing, is not USD, holds no map or several, its arrays do not fit
-            together, or they are not what the checksum was taken of.
+            together, or they are not what the checksum was taken of; or the day is none, or before the
+            first or after the last epoch.
     """
+    if date is not None:
+        return at_date(load_epochs(path), date)
     stage = open_stage(path)
     return read_map(only_prim_with(stage.GetPseudoRoot(), "anomalyMap"))
 
 
+def load_epochs(path: str | os.PathLike[str]) -> tuple[AnomalyMap, ...]:
+    """Every epoch of a layer's or stage's map, the earliest first; one where it has a single one.
+
+    Raises:
+        RefusedError: As for `load_map`, for any of the epochs.
+    """
+    stage = open_stage(path)
+    prim = only_prim_with(stage.GetPseudoRoot(), "anomalyMap")
+    epochs = tuple(_read(prim, sample) for sample in _samples(prim))
+    if not epochs:
+        return (read_map(prim),)
+    days = [day_of(m) for m in epochs]
+    if any(late <= early for early, late in itertools.pairwise(days)):
+        raise RefusedError(
+            f"{place(prim)}: the days of its epochs must ascend with time, got {', '.join(map(str, days))}"
+        )
+    return epochs
+
+
 def read_map(prim: Usd.Prim) -> AnomalyMap:
-    """The map of a prim; refusals as for `load_map`."""
+    """The map of a prim, of the latest day where it has several; refusals as for `load_map`."""
+    return _read(prim, None)
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """A time of the layer that holds a map's epochs: read there, so that no offset or scale rounds it."""
+
+    layer: Sdf.Layer
+    prim: Sdf.Path
+    time: float
+
+    def get(self, attribute: str) -> Any:
+        """An attribute's value at this very time, or None."""
+        value = self.layer.QueryTimeSample(self.prim.AppendProperty(attribute), self.time)
+        return None if isinstance(value, Sdf.ValueBlock) else value
+
+
+def _samples(prim: Usd.Prim) -> list[_Sample]:
+    """Times at which the map's values are given, the earliest first."""
+    for spec in prim.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack():
+        if times := spec.layer.ListTimeSamplesForPath(spec.path):
+            return [_Sample(spec.layer, spec.path.GetPrimPath(), time) for time in times]
+    return []
+
+
+def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
+    """The map of a prim at a time, or its default."""
     if (unit := _get(prim, "unit")) != UNIT:
         raise RefusedError(f"{place(prim)}: the map is in {unit!r}, magtwin reads {UNIT}; make the map anew")
-    checksum = _get(prim, "checksum")
-    arrays = {name: np.array(_get(prim, name)) for name in ("values", "valid", "variance")}
-    if checksum != _checksum(*arrays.values()):
+    checksum = _get(prim, "checksum", sample)
+    values, valid, variance = (np.array(_get(prim, name, sample)) for name in ("values", "valid", "variance"))
+    harmonic = _read_harmonic(prim, sample)
+    if checksum != _checksum(values, valid, variance, harmonic):
         raise RefusedError(
             f"{place(prim)}: the map's values are not those that its checksum was taken of; make the map anew"
         )
     shape = tuple(_get(prim, "shape"))
-    values, valid, variance = arrays.values()
     if len(shape) != 3 or not values.size == valid.size == np.prod(shape):
         raise RefusedError(
             f"{place(prim)}: shape {list(shape)} does not fit {values.size} values and {valid.size} flags"
@@ -87,55 +171,189 @@ def read_map(prim: Usd.Prim) -> AnomalyMap:
             origin_m=tuple(_get(prim, "origin")),
             cell_m=tuple(_get(prim, "cellSize")),
             headings_rad=np.deg2rad(np.array(_get(prim, "headings"), float)),
-            **{name: _get(prim, name) for name in TEXTS},
+            height_m=_read_height(prim),
+            parameters=_read_parameters(prim, _get(prim, "parameters", sample)),
+            harmonic=None if harmonic is None else HarmonicField(**harmonic),
+            **{name: _get(prim, name) for name in PLACES},
+            **{name: _get(prim, name, sample) for name in TEXTS},
         )
     except RefusedError as error:
         raise RefusedError(f"{place(prim)}: {error}") from error
 
 
-def _write_arrays(prim: Usd.Prim, field: AnomalyMap) -> None:
-    values = field.values_nt.astype(np.float32).ravel()
-    valid = np.ascontiguousarray(field.valid).ravel()
-    variance = np.empty(0, np.float32)
-    if field.variance_nt2 is not None:
-        variance = field.variance_nt2.astype(np.float32).ravel()
-    written = {
-        "values": Vt.FloatArray.FromNumpy(values),
-        "valid": Vt.BoolArray.FromNumpy(valid),
-        "variance": Vt.FloatArray.FromNumpy(variance),
+def _read_height(prim: Usd.Prim) -> float | None:
+    attribute = prim.GetAttribute(attribute_name("anomalyMap", "height_m"))
+    height = attribute.Get()
+    if height is None:
+        return None
+    if not isinstance(height, float) or not math.isfinite(height):
+        raise RefusedError(
+            f"{attribute.GetName()} must be a length [m], got {height!r}; clear it where unknown"
+        )
+    return height
+
+
+def _read_parameters(prim: Usd.Prim, text: str) -> dict[str, Any]:
+    """Figures from their JSON; nothing where there is none."""
+    if not text:
+        return {}
+    name = attribute_name("anomalyMap", "parameters")
+    try:
+        figures = json.loads(text, parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise RefusedError(f"{name} is not JSON ({error}), got {text[:60]!r}; make the map anew") from error
+    if not isinstance(figures, dict):
+        raise RefusedError(f"{name} must be a JSON object, got {text[:60]!r}; make the map anew")
+    return figures
+
+
+def _no_number(word: str) -> float:
+    raise ValueError(f"{word} is no JSON number")
+
+
+def _read_harmonic(prim: Usd.Prim, sample: _Sample | None) -> dict[str, NDArray] | None:
+    """The arrays of the harmonic field, in the schema's order; None where there is none at that time."""
+    if not prim.HasAPI(NOUNS["harmonic"]):
+        return None
+    arrays = {}
+    for name, shape in HARMONIC.items():
+        attribute = prim.GetAttribute(attribute_name("harmonic", name))
+        authored = (
+            attribute.GetResolveInfo(Usd.TimeCode.Default()).GetSource() == Usd.ResolveInfoSourceDefault
+        )
+        value = sample.get(attribute.GetName()) if sample else attribute.Get() if authored else None
+        if value is None:
+            continue
+        _check_type(attribute, value)
+        arrays[name] = np.array(value, float).reshape([-1 if n < 0 else n for n in shape])
+    if arrays and len(arrays) < len(HARMONIC):
+        lost = ", ".join(attribute_name("harmonic", name) for name in HARMONIC.keys() - arrays.keys())
+        raise RefusedError(f"{place(prim)}: its harmonic field has no {lost}; make the map anew")
+    return arrays or None
+
+
+def _save(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], force: bool) -> None:
+    """Write maps of one grid, the earliest first: the last as the default, all of several as time samples."""
+    if Path(path).suffix not in (".usdc", ".usd"):
+        raise RefusedError(f"{path}: a map layer ends in .usdc or .usd")
+    latest = maps[-1]
+    times = [float(day_number(day_of(m))) for m in maps] if len(maps) > 1 else []
+    samples = [_of_a_day(m) for m in maps]
+    about = f"Magnetic anomaly map {latest.name}: total field over x, y and heading. {latest.source}"
+    with new_stage(path, about, force=force) as stage:
+        prim = apply_api(UsdGeom.Xform.Define(stage, MAP).GetPrim(), "anomalyMap")
+        if any(m.harmonic is not None for m in maps):
+            apply_api(prim, "harmonic")
+        for name, value in {**_of_the_floor(latest), **samples[-1]}.items():
+            if value is not None:
+                prim.GetAttribute(name).Set(value)
+        for time, sample in zip(times, samples, strict=bool(times)):
+            for name, value in sample.items():
+                if attribute := prim.GetAttribute(name):
+                    attribute.Set(Sdf.ValueBlock() if value is None else value, time)
+        if times:
+            stage.SetStartTimeCode(times[0])
+            stage.SetEndTimeCode(times[-1])
+            stage.SetTimeCodesPerSecond(DAYS_PER_SECOND)
+            stage.SetFramesPerSecond(DAYS_PER_SECOND)
+        _define_heat_map(stage, maps, times)
+
+
+def _of_the_floor(field: AnomalyMap) -> dict[str, Any]:
+    """Values of the attributes that the epochs of a map share, by name."""
+    given = {
         "shape": Vt.IntArray(field.values_nt.shape),
         "origin": Gf.Vec2d(*field.origin_m),
         "cellSize": Gf.Vec2d(*field.cell_m),
         "headings": Vt.DoubleArray(np.rad2deg(field.headings_rad).tolist()),
         "unit": UNIT,
-        "checksum": _checksum(values, valid, variance),
+        "height_m": field.height_m,
+        **{name: getattr(field, name) for name in PLACES},
+    }
+    return {attribute_name("anomalyMap", name): value for name, value in given.items()}
+
+
+def _of_a_day(field: AnomalyMap) -> dict[str, Any]:
+    """Values of the attributes that differ from day to day, by name; None for what there is not."""
+    values = field.values_nt.astype(np.float32).ravel()
+    valid = np.ascontiguousarray(field.valid).ravel()
+    variance = np.empty(0, np.float32)
+    if field.variance_nt2 is not None:
+        variance = field.variance_nt2.astype(np.float32).ravel()
+    harmonic = None
+    if field.harmonic is not None:
+        harmonic = {name: getattr(field.harmonic, name) for name in HARMONIC}
+    given = {
+        "values": Vt.FloatArray.FromNumpy(values),
+        "valid": Vt.BoolArray.FromNumpy(valid),
+        "variance": Vt.FloatArray.FromNumpy(variance),
+        "checksum": _checksum(values, valid, variance, harmonic),
+        "parameters": _written_parameters(field),
         **{name: getattr(field, name) for name in TEXTS},
     }
-    for name, value in written.items():
-        prim.GetAttribute(attribute_name("anomalyMap", name)).Set(value)
+    return {
+        **{attribute_name("anomalyMap", name): value for name, value in given.items()},
+        **{
+            attribute_name("harmonic", name): _usd_array(harmonic[name], shape) if harmonic else None
+            for name, shape in HARMONIC.items()
+        },
+    }
 
 
-def _get(prim: Usd.Prim, name: str):  # type: ignore[no-untyped-def]
+def _usd_array(array: NDArray, shape: tuple[int, ...]) -> Any:
+    """A part of a harmonic field as the type of its attribute; -1 in `shape` is any number of rows."""
+    if shape == (3, 3):
+        return Gf.Matrix3d(*array.ravel().tolist())
+    return (
+        Gf.Vec3d(*array.tolist()) if shape == (3,) else Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(array))
+    )
+
+
+def _written_parameters(field: AnomalyMap) -> str:
+    if not field.parameters:
+        return ""
+    try:
+        return json.dumps(dict(field.parameters), allow_nan=False, ensure_ascii=False)
+    except (TypeError, ValueError) as error:
+        raise RefusedError(
+            f"parameters of map {field.name!r} must be finite numbers, texts and lists of them ({error})"
+        ) from error
+
+
+def _get(prim: Usd.Prim, name: str, sample: _Sample | None = None) -> Any:
     """Value of one of the map's attributes, of the type that the schema says."""
     attribute = prim.GetAttribute(attribute_name("anomalyMap", name))
-    value, kind = attribute.Get(), attribute.GetTypeName()
+    value = sample.get(attribute.GetName()) if sample else attribute.Get()
+    return _check_type(attribute, value)
+
+
+def _check_type(attribute: Usd.Attribute, value: Any) -> Any:
+    kind = attribute.GetTypeName()
     if not isinstance(value, type(kind.defaultValue)):
-        raise RefusedError(f"{place(prim)}: {attribute.GetName()} must be a {kind}")
+        raise RefusedError(f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}")
     return value
 
 
-def _checksum(values: NDArray, valid: NDArray, variance: NDArray) -> str:
-    """SHA-256 over the bytes of the arrays, little-endian float32 and one byte a flag."""
+def _checksum(
+    values: NDArray, valid: NDArray, variance: NDArray, harmonic: Mapping[str, NDArray] | None
+) -> str:
+    """SHA-256 over the bytes of the arrays: float32, one byte a flag, float64; little-endian."""
     digest = hashlib.sha256(values.astype("<f4").tobytes())
     digest.update(valid.astype(np.uint8).tobytes())
     digest.update(variance.astype("<f4").tobytes())
+    for array in (harmonic or {}).values():
+        digest.update(array.astype("<f8").tobytes())
     return digest.hexdigest()
 
 
-def _define_heat_map(stage: Usd.Stage, field: AnomalyMap) -> None:
-    """A grid of quads, one vertex a node, coloured by a variant a heading."""
-    _, rows, columns = field.values_nt.shape
-    x, y = np.meshgrid(field.x_m, field.y_m)
+def _define_heat_map(stage: Usd.Stage, maps: Sequence[AnomalyMap], times: Sequence[float]) -> None:
+    """A grid of quads, a vertex a node or every few, coloured by a variant a heading."""
+    latest = maps[-1]
+    _, rows, columns = latest.values_nt.shape
+    every = _every(rows, columns)
+    j, i = _kept(rows, every), _kept(columns, every)
+    rows, columns = len(j), len(i)
+    x, y = np.meshgrid(latest.x_m[i], latest.y_m[j])
     points = np.stack([x, y, np.full_like(x, HEAT_MAP_HEIGHT_M)], axis=-1).reshape(-1, 3).astype(np.float32)
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     quads = np.stack([corner, corner + 1, corner + columns + 1, corner + columns], axis=-1).astype(np.int32)
@@ -149,24 +367,48 @@ def _define_heat_map(stage: Usd.Stage, field: AnomalyMap) -> None:
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateDoubleSidedAttr(True)
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_define_material(stage))
-    known = field.values_nt[field.valid]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    low, high = colour_limits(np.concatenate([m.values_nt[m.valid] for m in maps]))
     mesh.GetPrim().SetCustomData(
-        {"magtwin": {"colourMap": "viridis", "least": low, "greatest": high, "unit": UNIT}}
+        {
+            "magtwin": {
+                "colourMap": COLOUR_MAP,
+                "least": low,
+                "greatest": high,
+                "unit": UNIT,
+                "everyNode": every,  # of so many nodes both ways one is a vertex
+            }
+        }
     )
     primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
         "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
     )
     variants = mesh.GetPrim().GetVariantSets().AddVariantSet("heading")
-    names, palette = heading_variants(field.headings_rad), viridis()
-    for name, layer, valid in zip(names, field.values_nt, field.valid, strict=True):
+    names, palette = heading_variants(latest.headings_rad), viridis()
+    for h, name in enumerate(names):
         variants.AddVariant(name)
         variants.SetVariantSelection(name)
         with variants.GetVariantEditContext():
-            used, index = np.unique(colour_index(layer, valid, low, high), return_inverse=True)
+            layers = [colour_index(m.values_nt[h], m.valid[h], low, high)[np.ix_(j, i)] for m in maps]
+            used, index = np.unique(np.stack(layers), return_inverse=True)
+            index = index.reshape(len(maps), -1).astype(np.int32)
             primvar.Set(Vt.Vec3fArray.FromNumpy(palette[used]))
-            primvar.SetIndices(Vt.IntArray.FromNumpy(index.astype(np.int32).ravel()))
+            primvar.SetIndices(Vt.IntArray.FromNumpy(index[-1]))
+            for time, row in zip(times, index, strict=bool(times)):
+                primvar.SetIndices(Vt.IntArray.FromNumpy(row), time)
     variants.SetVariantSelection(names[0])
+
+
+def _every(rows: int, columns: int) -> int:
+    """The least stride over the nodes that keeps the coloured floor within `MOST_QUADS`."""
+    every = 1
+    while (len(_kept(rows, every)) - 1) * (len(_kept(columns, every)) - 1) > MOST_QUADS:
+        every += 1
+    return every
+
+
+def _kept(count: int, every: int) -> NDArray[np.intp]:
+    """Indices of the vertices among `count` nodes: the first, each so many on, and the last."""
+    return np.unique(np.append(np.arange(0, count, every), count - 1))
 
 
 def heading_variants(headings_rad: NDArray) -> list[str]:
@@ -180,7 +422,7 @@ def viridis() -> NDArray[np.float32]:
     """Linear colours: the 256 of the colour map, then that of nodes without a value, shape (257, 3)."""
     from matplotlib import colormaps
 
-    linear = linear_from_srgb(colormaps["viridis"].colors)  # type: ignore[attr-defined]
+    linear = linear_from_srgb(colormaps[COLOUR_MAP].colors)  # type: ignore[attr-defined]
     return np.vstack([linear, UNKNOWN_COLOUR]).astype(np.float32)
 
 
