@@ -125,6 +125,15 @@ class Readings:
         some: dict[str, Any] = {k: None if given[k] is None else given[k][index] for k in SHAPES}
         return Readings(**{**given, **some})
 
+    def masked(self, good: ArrayLike) -> "Readings":
+        """The same readings with other flags.
+
+        Args:
+            good: Rows that are field, shape (N,).
+        """
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Readings(**{**given, "good": good})
+
 
 SHAPES: dict[str, tuple[int, type]] = {
     "p_xy": (2, float),

@@ -1,4 +1,4 @@
-"""A survey on disk: one CSV a heading, as the APRILab's, read into an AnomalyMap."""
+"""A gridded survey on disk: one CSV a heading, as the APRILab's, read into Readings; the map of its nodes."""
 
 import math
 import os
@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.field.grid import Grid
 from magtwin.field.map import AnomalyMap
+from magtwin.field.readings import Readings
 from magtwin.files import existing, sha256
 from magtwin.frames import wrap_angle
 from magtwin.names import RefusedError
@@ -22,14 +24,90 @@ SUFFIX = "_map.csv"
 LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
 """Bounds of a survey's mean [nT]; the Earth's field lies in 22,000..67,000 nT, a building bends it."""
 
-NT_PER = {"tesla": 1e9, "gauss": 1e5, "uT": 1e3, "mG": 1e2}
-"""Units that a survey may be in by mistake."""
+NT_PER = {"T": 1e9, "G": 1e5, "uT": 1e3, "mG": 1e2}
+"""Units that a survey may be in by mistake, and the nT that each is."""
 
 WIDEST_DEG = 90.0
 """Headings farther apart than this are taken for an incomplete survey unless the caller names them."""
 
 GRAIN_M = 1e-6
 """Coordinates closer than this are one."""
+
+SAID = 60
+"""Characters of a file's own text that a refusal quotes."""
+
+
+def read_grid(
+    folder: str | os.PathLike[str],
+    *,
+    name: str | None = None,
+    licence: str = "",
+    headings_deg: tuple[float, ...] | None = None,
+) -> Readings:
+    """The readings of a survey folder, `0_map.csv`, `90_map.csv`, `180_map.csv`, `270_map.csv`.
+
+    Each file begins with the line `# x,y,theta,scalar_mag` and has one row a node, in any order:
+    x and y in world [m], the recorded heading [rad], the total field [nT]. A node's heading is the
+    nominal one of the file's name; the reading's `yaw` is the recorded one.
+
+    Args:
+        folder: Folder that holds the files. Other files in it are left alone.
+        name: Name of the survey; that of the folder unless given.
+        licence: SPDX name of the survey's licence.
+        headings_deg: Headings that the survey has [deg]. Unless given, the files must be evenly
+            spaced on the circle and at most 90 deg apart, so that a lost file is noticed.
+
+    Returns:
+        Readings in the order of the rows, heading after heading, one run a file, with `grid` and
+        `node`; all of them good: `magtwin.field.latch` finds those that are not.
+
+    Raises:
+        RefusedError: A file or a heading is missing, a row or a value is none, the grid has a hole or
+            a node two values, the headings' grids differ, or the unit is not nT; with file and line.
+    """
+    return _readings(_read(folder, headings_deg), Path(folder), name, licence)
+
+
+def node_map(readings: Readings) -> AnomalyMap:
+    """The map whose values are the readings themselves, each at its node.
+
+    Args:
+        readings: A gridded survey. Of several good readings at one node the mean counts.
+
+    Returns:
+        The map on the survey's grid; nodes with no good reading are not valid, and keep the mean of
+        the others, or nan, as their value. Nothing is known of the variance.
+
+    Raises:
+        RefusedError: The readings are not gridded.
+    """
+    if readings.grid is None or readings.node is None:
+        raise RefusedError(
+            f"survey {readings.name!r} is not gridded, so that its nodes make no map; "
+            "fit a model to it (magtwin.field.fit, `magtwin map fit`)"
+        )
+    grid = readings.grid
+    flat = np.ravel_multi_index(tuple(readings.node.T), grid.shape)
+    size = int(np.prod(grid.shape))
+    means = []
+    for rows in (readings.good, ~readings.good):
+        count = np.bincount(flat[rows], minlength=size)
+        total = np.bincount(flat[rows], weights=readings.b_nt[rows], minlength=size)
+        means.append(np.divide(total, count, out=np.full(size, np.nan), where=count > 0))
+    valid = np.isfinite(means[0])
+    return AnomalyMap(
+        values_nt=np.where(valid, *means).reshape(grid.shape),
+        valid=valid.reshape(grid.shape),
+        origin_m=grid.origin_m,
+        cell_m=grid.cell_m,
+        headings_rad=np.asarray(grid.headings_rad),
+        name=readings.name,
+        method="survey, one reading a node and heading, the robot at rest",
+        source=readings.source,
+        licence=readings.licence,
+        created=readings.created,
+        height_m=readings.height_m,
+    )
 
 
 def read_survey(
@@ -38,33 +116,34 @@ def read_survey(
     name: str | None = None,
     licence: str = "",
     headings_deg: tuple[float, ...] | None = None,
+    keep_latched: bool = False,
 ) -> tuple[AnomalyMap, Report]:
-    """The map of a survey folder, `0_map.csv`, `90_map.csv`, `180_map.csv`, `270_map.csv`, and its report.
-
-    Each file begins with the line `# x,y,theta,scalar_mag` and has one row a node, in any order:
-    x and y in world [m], the recorded heading [rad], the total field [nT]. The layer's heading is the
-    nominal one of the file's name; the report says how far the recorded ones are from it.
+    """The map of a survey folder's nodes, and its report.
 
     Args:
-        folder: Folder that holds the files. Other files in it are left alone.
+        folder: As `read_grid` takes it, and so the next three.
         name: Name of the map; that of the folder unless given.
         licence: SPDX name of the survey's licence.
-        headings_deg: Headings that the survey has [deg]. Unless given, the files must be evenly
-            spaced on the circle and at most 90 deg apart, so that a lost file is noticed.
+        headings_deg: Headings that the survey has [deg].
+        keep_latched: Whether readings of a sensor that had lost lock stay valid nodes.
 
     Returns:
-        The map; every node is valid, and nothing is known of its variance. And the report: the map's
-        figures; the median and the largest deviation of a recorded heading from the nominal one, with
-        the worst row; how many readings repeat the one before in their row to the last digit, which a
-        sensor that lost lock does and a field does not.
+        The map, in which latched nodes are not valid (`magtwin.field.latch`). And the report: the
+        map's figures; the median and the largest deviation of a recorded heading from the nominal
+        one, with the worst row; how many readings repeat the one before in their row to the last
+        digit; what was found latched, stuck or outlying.
 
     Raises:
-        RefusedError: A file or a heading is missing, a row or a value is none, the grid has a hole or
-            a node two values, the headings' grids differ, or the unit is not nT; with file and line.
+        RefusedError: As `read_grid`, with file and line.
     """
+    from magtwin.field.latch import mask_latched
+
     layers = _read(folder, headings_deg)
-    field = _assemble(layers, Path(folder), name, licence)
-    return field, _report(layers, field, folder)
+    readings, found = mask_latched(_readings(layers, Path(folder), name, licence))
+    if keep_latched:
+        readings = readings.masked(np.ones(len(readings), bool))
+    field = node_map(readings)
+    return field, _report(layers, field, folder, found)
 
 
 def import_survey(
@@ -73,9 +152,12 @@ def import_survey(
     name: str | None = None,
     licence: str = "",
     headings_deg: tuple[float, ...] | None = None,
+    keep_latched: bool = False,
 ) -> AnomalyMap:
     """The map alone of `read_survey`, with its arguments and refusals."""
-    return read_survey(folder, name=name, licence=licence, headings_deg=headings_deg)[0]
+    return read_survey(
+        folder, name=name, licence=licence, headings_deg=headings_deg, keep_latched=keep_latched
+    )[0]
 
 
 @dataclass(frozen=True)
@@ -159,14 +241,14 @@ def _read_layer(path: Path, heading_deg: float) -> _Layer:
         raise RefusedError(f"{path}: empty; expected the line '# {','.join(COLUMNS)}' and a row a node")
     first, *rest = text.splitlines()
     if tuple(word.strip() for word in first.lstrip("#").split(",")) != COLUMNS:
-        raise RefusedError(f"{path}:1: must be the header '# {','.join(COLUMNS)}', got {first[:60]!r}")
+        raise RefusedError(f"{path}:1: must be the header '# {','.join(COLUMNS)}', got {first[:SAID]!r}")
     lines = [(number, line) for number, line in enumerate(rest, 2) if line.strip()]
     if not lines:
         raise RefusedError(f"{path}: no rows below the header; expected one a node")
     table = np.array([_row(path, number, line) for number, line in lines])
     x, y, theta, field = table.T
     layer = _Layer(path, heading_deg, np.array([n for n, _ in lines]), x, y, theta, field, sha256(path))
-    _check_unit(layer)
+    check_unit(field, str(path), "scalar_mag")
     return layer
 
 
@@ -181,7 +263,9 @@ def _row(path: Path, number: int, line: str) -> list[float]:
         try:
             value = float(word)
         except ValueError:
-            raise RefusedError(f"{path}:{number}: {column} must be a number, got {word.strip()!r}") from None
+            raise RefusedError(
+                f"{path}:{number}: {column} must be a number, got {word.strip()[:SAID]!r}"
+            ) from None
         if not math.isfinite(value):
             raise RefusedError(
                 f"{path}:{number}: {column} is {value}; every node needs a finite value, measure it again"
@@ -192,8 +276,18 @@ def _row(path: Path, number: int, line: str) -> list[float]:
     return values
 
 
-def _check_unit(layer: _Layer) -> None:
-    mean = float(layer.field.mean())
+def check_unit(b_nt: Array, where: str, column: str) -> None:
+    """Refuse readings whose mean cannot be the Earth's field in nT.
+
+    Args:
+        b_nt: Magnitudes of the field as taken for nT, shape (N,).
+        where: File, for the refusal.
+        column: Its column.
+
+    Raises:
+        RefusedError: The mean lies outside 10,000..100,000 nT; the text names the unit that would fit.
+    """
+    mean = float(b_nt.mean())
     if LEAST_MEAN_NT <= mean <= GREATEST_MEAN_NT:
         return
     fits = [
@@ -202,12 +296,12 @@ def _check_unit(layer: _Layer) -> None:
         if LEAST_MEAN_NT <= mean * factor <= GREATEST_MEAN_NT
     ]
     raise RefusedError(
-        f"{layer.path}: the mean of scalar_mag is {mean:.6g}, outside {LEAST_MEAN_NT:,.0f}.."
+        f"{where}: the mean of {column} is {mean:.6g}, outside {LEAST_MEAN_NT:,.0f}.."
         f"{GREATEST_MEAN_NT:,.0f} nT; " + (" or ".join(fits) or "no usual unit makes it the Earth's field")
     )
 
 
-def _assemble(layers: list[_Layer], folder: Path, name: str | None, licence: str) -> AnomalyMap:
+def _readings(layers: list[_Layer], folder: Path, name: str | None, licence: str) -> Readings:
     axes = [(_axis(s, "x", s.x), _axis(s, "y", s.y)) for s in layers]
     for layer, own in zip(layers, axes, strict=True):
         for label, first, axis in zip("xy", axes[0], own, strict=True):
@@ -217,19 +311,29 @@ def _assemble(layers: list[_Layer], folder: Path, name: str | None, licence: str
                     f"{_span(axis)}, there {_span(first)}; survey every heading on one grid"
                 )
     x, y = axes[0]
-    return AnomalyMap(
-        values_nt=np.stack([_grid(s, x, y) for s in layers]),
+    grid = Grid(
         origin_m=(float(x[0]), float(y[0])),
         cell_m=(float((x[-1] - x[0]) / (len(x) - 1)), float((y[-1] - y[0]) / (len(y) - 1))),
-        headings_rad=np.radians([s.heading_deg for s in layers]),
+        headings_rad=tuple(np.radians([s.heading_deg for s in layers]).tolist()),
+        rows=len(y),
+        columns=len(x),
+    )
+    run = np.repeat(np.arange(len(layers)), [len(s.x) for s in layers])
+    return Readings(
+        p_xy=np.concatenate([np.column_stack([s.x, s.y]) for s in layers]),
+        yaw=np.concatenate([s.theta for s in layers]),
+        b_nt=np.concatenate([s.field for s in layers]),
+        run=run,
+        runs=tuple(s.path.name for s in layers),
+        grid=grid,
+        node=np.column_stack([run, np.concatenate([_nodes(s, x, y) for s in layers])]),
         name=folder.resolve().name if name is None else name,
-        method="survey, one reading a node and heading, the robot at rest",
         source="; ".join(f"{s.path.name} sha256:{s.sha256}" for s in layers),
         licence=licence,
     )
 
 
-def _report(layers: list[_Layer], field: AnomalyMap, folder: str | os.PathLike[str]) -> Report:
+def _report(layers: list[_Layer], field: AnomalyMap, folder: str | os.PathLike[str], found: Report) -> Report:
     """What the survey holds, and how well its headings were kept."""
     deviation = [np.degrees(np.abs(wrap_angle(s.theta - np.radians(s.heading_deg)))) for s in layers]
     worst = max(range(len(layers)), key=lambda k: deviation[k].max())
@@ -251,8 +355,9 @@ def _report(layers: list[_Layer], field: AnomalyMap, folder: str | os.PathLike[s
             Figure(
                 "repeated readings", repeated, note="equal to the one before in the row to the last digit"
             ),
+            *found.figures,
         ),
-        {"files": {s.path.name: s.sha256 for s in layers}},
+        {"files": {s.path.name: s.sha256 for s in layers}, **found.facts},
     )
 
 
@@ -280,8 +385,8 @@ def _span(axis: Array) -> str:
     return f"{axis[0]:g}..{axis[-1]:g} m in {len(axis)} nodes"
 
 
-def _grid(layer: _Layer, x: Array, y: Array) -> Array:
-    """The layer's field [nT] on the grid, shape (Y, X)."""
+def _nodes(layer: _Layer, x: Array, y: Array) -> NDArray[np.intp]:
+    """Row and column of each reading's node, shape (N, 2); every node once."""
     i = np.rint((layer.x - x[0]) / (x[1] - x[0])).astype(int)
     j = np.rint((layer.y - y[0]) / (y[1] - y[0])).astype(int)
     node = j * len(x) + i
@@ -300,6 +405,4 @@ def _grid(layer: _Layer, x: Array, y: Array) -> Array:
             f"{layer.path}: {len(hole)} of {len(x) * len(y)} nodes have no row, the first at "
             f"({x[first_i]:g}, {y[first_j]:g}); the grid must be whole"
         )
-    grid = np.empty(len(node))
-    grid[node] = layer.field
-    return grid.reshape(len(y), len(x))
+    return np.column_stack([j, i])
