@@ -4,6 +4,7 @@ import datetime
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -173,11 +174,11 @@ def drift(maps: Sequence[AnomalyMap]) -> Report:
     return Report(f"drift of map {maps[-1].name}", tuple(figures))
 
 
-def _same(a: object, b: object) -> bool:
+def _same(a: Any, b: Any) -> bool:
     """Whether texts are equal, and lengths and angles but for rounding."""
     if isinstance(a, str) or a is None or b is None:
         return a == b
-    return np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=0, atol=GRAIN)  # type: ignore[arg-type]
+    return np.shape(a) == np.shape(b) and bool(np.allclose(a, b, rtol=0, atol=GRAIN))
 
 
 def _joined(first: str, second: str) -> str:
