@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -9,17 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.grid import Grid
 from magtwin.field.harmonic import HarmonicField
+from magtwin.field.lookup import EDGE, Lookup
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
 
 Array = NDArray[np.float64]
 
 TURN = 2 * np.pi
-EDGE = 1e-9
-"""Rounding that a lookup forgives, in cells at the border and as weight of a masked node."""
-
-BLOCK = 8192
-"""Points worked on at a time: their temporaries stay in the second-level cache."""
+Outside = Literal["nan", "clamp", "raise"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -163,18 +161,12 @@ class AnomalyMap:
         _, rows, columns = self.values_nt.shape
         return np.all((u >= -EDGE) & (u <= np.array([columns - 1, rows - 1]) + EDGE), axis=-1)
 
-    def lookup(
-        self,
-        p_xy: ArrayLike,
-        yaw: ArrayLike,
-        *,
-        outside: Literal["nan", "clamp", "raise"] = "nan",
-    ) -> Array:
+    def lookup(self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan") -> Array:
         """Field at poses, linear in heading, y and x between the nodes around each.
 
         B = sum over the 8 nodes of w_h w_y w_x B_hyx. Heading lies on a circle: between the last
         layer and 2 pi above the first one it is interpolated as between any two. With one layer only
-        the heading does not matter.
+        the heading does not matter. A pose gives the same bytes alone and among others.
 
         Args:
             p_xy: Points in world [m], shape (..., 2).
@@ -188,30 +180,58 @@ class AnomalyMap:
         Raises:
             RefusedError: A point lies off the grid and `outside` is "raise".
         """
-        if outside not in ("nan", "clamp", "raise"):
-            raise RefusedError(f'outside must be "nan", "clamp" or "raise", got {outside!r}')
-        p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
-        if p.ndim == 0 or p.shape[-1] != 2:
-            raise RefusedError(f"p_xy must have shape (..., 2), got {p.shape}")
-        shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
-        p = np.broadcast_to(p, (*shape, 2)).reshape(-1, 2)
-        angle = np.broadcast_to(yaw, shape).reshape(-1)
-        if outside == "raise":
-            self._refuse_outside(p)
-        out = np.empty(len(p))
-        values, holes = self.values_nt.ravel(), None
-        if not self.valid.all():
-            values = np.where(self.valid.ravel(), values, 0.0)
-            holes = (~self.valid).ravel().astype(float)
-        row = self.values_nt.shape[2]
-        for start in range(0, len(p), BLOCK):
-            part = slice(start, start + BLOCK)
-            nodes, weights, unknown = self._corners(p[part], angle[part], clamp=outside == "clamp")
-            out[part] = _blend(values, nodes, weights, row)
-            if holes is not None:
-                unknown |= _blend(holes, nodes, weights, row) > EDGE
-            out[part][unknown] = np.nan
-        return out.reshape(shape)
+        return self._look(p_xy, yaw, outside, gradient=False)[0]
+
+    def gradient(self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan") -> Array:
+        """What `lookup` changes by, per metre and per radian: its exact derivatives within a cell.
+
+        At a border between cells they are those of the cell with the greater x, y or heading.
+
+        Args:
+            p_xy: Points in world [m], shape (..., 2).
+            yaw: Headings [rad], shape (...); the two shapes are broadcast.
+            outside: What a point off the grid gives: nan, the nearest point's, without a change
+                across the border, or a refusal.
+
+        Returns:
+            dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad], shape (..., 3); nan where `lookup` is, and where
+            a masked node would have a part.
+
+        Raises:
+            RefusedError: A point lies off the grid and `outside` is "raise".
+        """
+        return self._look(p_xy, yaw, outside, gradient=True)[1]
+
+    def lookup_with_gradient(
+        self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
+    ) -> tuple[Array, Array]:
+        """What `lookup` and `gradient` give, shapes (...) and (..., 3), for the price of the latter."""
+        return self._look(p_xy, yaw, outside, gradient=True)
+
+    def at(self, x: float, y: float, yaw: float, *, outside: Outside = "nan") -> float:
+        """Field at one pose [nT]: what `lookup` gives, in about a microsecond.
+
+        Args:
+            x: World x [m].
+            y: World y [m].
+            yaw: Heading [rad].
+            outside: As for `lookup`.
+
+        Raises:
+            RefusedError: The point lies off the grid and `outside` is "raise".
+        """
+        if outside == "nan":
+            return self._lookup.at(x, y, yaw)
+        self._check_outside(np.array([[x, y]]), outside)
+        return self._lookup.at(x, y, yaw, clamp=outside == "clamp")
+
+    def at_with_gradient(
+        self, x: float, y: float, yaw: float, *, outside: Outside = "nan"
+    ) -> tuple[float, float, float, float]:
+        """Field at one pose [nT], dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad]; all else as for `at`."""
+        if outside != "nan":
+            self._check_outside(np.array([[x, y]]), outside)
+        return self._lookup.at_with_gradient(x, y, yaw, clamp=outside == "clamp")
 
     def report(self) -> Report:
         """The figures that tell one map from another, over its valid nodes.
@@ -251,7 +271,32 @@ class AnomalyMap:
             figures.append(Figure("heading amplitude", round(float(np.hypot(c, s)), 1), "nT"))
         return Report(f"map {self.name}", tuple(figures), {"method": self.method, "licence": self.licence})
 
-    def _refuse_outside(self, p: Array) -> None:
+    @cached_property
+    def _lookup(self) -> Lookup:
+        return Lookup(self.values_nt, self.valid, self.origin_m, self.cell_m, self.headings_rad)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields: what lookup keeps is made anew from them."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def _look(
+        self, p_xy: ArrayLike, yaw: ArrayLike, outside: Outside, *, gradient: bool
+    ) -> tuple[Array, Array]:
+        p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
+        if p.ndim == 0 or p.shape[-1] != 2:
+            raise RefusedError(f"p_xy must have shape (..., 2), got {p.shape}")
+        shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
+        p = np.broadcast_to(p, (*shape, 2)).reshape(-1, 2)
+        self._check_outside(p, outside)
+        angle = np.broadcast_to(yaw, shape).reshape(-1)
+        b, slopes = self._lookup.lookup(p, angle, clamp=outside == "clamp", gradient=gradient)
+        return b.reshape(shape), slopes.reshape(*shape, 3) if gradient else slopes
+
+    def _check_outside(self, p: Array, outside: Outside) -> None:
+        if outside not in ("nan", "clamp", "raise"):
+            raise RefusedError(f'outside must be "nan", "clamp" or "raise", got {outside!r}')
+        if outside != "raise":
+            return
         off = ~(self.contains(p) | np.isnan(p).any(axis=-1))
         if off.any():
             x0, x1, y0, y1 = self.extent
@@ -261,65 +306,6 @@ class AnomalyMap:
                 f"(x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m), the first at ({where}); "
                 'keep inside, or ask for outside="clamp" or "nan"'
             )
-
-    def _corners(
-        self, p: Array, yaw: Array, *, clamp: bool
-    ) -> tuple[tuple[NDArray[np.intp], ...], tuple[Array, ...], NDArray[np.bool_]]:
-        """Flat index of the low corner in both layers, the weights of the high ones, and what is unknown."""
-        _, rows, columns = self.values_nt.shape
-        low, part, unknown = [], [], ~np.isfinite(yaw)
-        for axis, count in ((0, columns), (1, rows)):
-            u = (p[:, axis] - self.origin_m[axis]) / self.cell_m[axis]
-            inside = (u >= -EDGE) & (u <= count - 1 + EDGE)
-            unknown |= np.isnan(u) if clamp else ~inside
-            u = np.clip(np.where(np.isnan(u), 0.0, u), 0, count - 1)
-            cell = np.minimum(u.astype(np.intp), count - 2)
-            low.append(cell)
-            part.append(u - cell)
-        node = low[1] * columns + low[0]
-        h0, h1, turned = self._layers(np.where(unknown, 0.0, yaw))
-        size = rows * columns
-        return (h0 * size + node, h1 * size + node), (part[0], part[1], turned), unknown
-
-    def _layers(self, yaw: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-        """Index of the layers below and above each heading, and how far it lies between them, 0 to 1."""
-        knots = np.append(self.headings_rad, self.headings_rad[0] + TURN)
-        count = len(knots) - 1
-        if count == 1:
-            zero = np.zeros(yaw.shape, np.intp)
-            return zero, zero, np.zeros(yaw.shape)
-        angle = yaw - knots[0]
-        angle -= TURN * np.floor(angle / TURN)
-        angle = np.clip(angle, 0, TURN)
-        if np.abs(np.diff(knots) - TURN / count).max() < 1e-12:  # evenly spaced: no search
-            u = angle * (count / TURN)
-            low = np.minimum(u.astype(np.intp), count - 1)
-            part = u - low
-        else:
-            low = np.searchsorted(knots[1:-1] - knots[0], angle, side="right")
-            part = (angle - (knots[low] - knots[0])) / np.diff(knots)[low]
-        high = low + 1
-        high[high == count] = 0
-        return low, high, part
-
-
-def _blend(values: Array, nodes: tuple[NDArray[np.intp], ...], weights: tuple[Array, ...], row: int) -> Array:
-    """Trilinear sums over flat `values`: low corners in both layers, weights of the high x, y, heading."""
-    wx, wy, wh = weights
-    layers = []
-    for node in nodes:
-        low = _between(values.take(node), values.take(node + 1), wx)
-        high = _between(values.take(node + row), values.take(node + (row + 1)), wx)
-        layers.append(_between(low, high, wy))
-    return _between(layers[0], layers[1], wh)
-
-
-def _between(low: Array, high: Array, weight: Array) -> Array:
-    """Sum low (1 - w) + high w: exact at w = 0 and at w = 1; overwrites both."""
-    high *= weight
-    low *= 1 - weight
-    low += high
-    return low
 
 
 def _frozen(values: ArrayLike, kind: type) -> NDArray[Any]:

@@ -1,0 +1,236 @@
+"""Loops over poses, compiled with numba: what `lookup.py` opens where they pay, and nobody else.
+
+They do, operation by operation, what the numpy and the plain Python of `lookup.py` do, so that all give
+the same bytes: no fused multiplication, no reordered sum, nothing shared between poses. Machine code is
+kept where numba keeps it, in `__pycache__` beside this file or, where that cannot be written to, in the
+user's cache folder; where neither can, each process compiles anew.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import njit, types
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Nodes = NDArray[np.int32]
+
+TURN = 2 * np.pi
+
+HEADER = 10
+"""Figures of a map before its headings in a table; see `lookup`."""
+
+BLOCK = 512
+"""Poses worked on at a time: their weights stay in the first-level cache."""
+
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+
+_IN = types.Array(types.float64, 1, "C", readonly=True)
+_OUT = types.Array(types.float64, 1, "C")
+_NEXT = np.uint64(1)  # unsigned: numba would else look for indices from the end, and not vectorise
+
+
+def compiled(*signature: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Compile for one signature, at import, or take the machine code that was kept."""
+
+    def compile_or_take(function: Callable[..., Any]) -> Any:
+        try:
+            return njit(signature, cache=True, **OPTIONS)(function)
+        except (RuntimeError, OSError):  # nowhere to keep it, or no room there
+            return njit(signature, **OPTIONS)(function)
+
+    return compile_or_take
+
+
+@njit(**OPTIONS)
+def _place(
+    table: Array, q: Array, yaw: Array, clamp: bool, wx: Array, wy: Array, wh: Array, node: Nodes
+) -> None:
+    """Lowest node of each pose in the first layer, weights of the higher ones, angles above that layer.
+
+    The x weight is nan where the field is not known. Angles are in [0, 2 pi], in the place of weights.
+    """
+    x0, y0, dx, dy, first, edge = table[0], table[1], table[2], table[3], table[4], table[5]
+    columns, right, top = table[8], table[8] - 1, table[7] - 1
+    for n in range(yaw.shape[0]):
+        u = (q[2 * n] - x0) / dx
+        v = (q[2 * n + 1] - y0) / dy
+        a = yaw[n] - first
+        inside = (u >= -edge) & (u <= right + edge) & (v >= -edge) & (v <= top + edge)
+        known = ((u == u) & (v == v) if clamp else inside) & (a - a == 0)
+        u = min(max(u if known else 0.0, 0.0), right)
+        v = min(max(v if known else 0.0, 0.0), top)
+        a = a if known else 0.0
+        a -= TURN * np.floor(a / TURN)
+        i, j = min(np.floor(u), right - 1), min(np.floor(v), top - 1)
+        wx[n] = u - i if known else np.nan
+        wy[n] = v - j
+        wh[n] = min(max(a, 0.0), TURN)
+        node[n] = np.int32(j * columns + i)
+
+
+@njit(**OPTIONS)
+def _even(layers: float, per_rad: float, layer: float, wh: Array, node: Nodes) -> None:
+    """Up from the first layer to that below each angle, where layers are evenly apart."""
+    for n in range(wh.shape[0]):
+        u = wh[n] * per_rad
+        low = min(np.floor(u), layers - 1)
+        wh[n] = u - low
+        node[n] += np.int32(low * layer)
+
+
+@njit(**OPTIONS)
+def _uneven(knots: Array, gaps: Array, layer: float, wh: Array, slope: Array, node: Nodes) -> None:
+    """The same where they are not; `slope` is that of each heading weight."""
+    for n in range(wh.shape[0]):
+        low, high = 0, knots.shape[0]
+        while high - low > 1:
+            middle = (low + high) // 2
+            if wh[n] >= knots[middle]:
+                low = middle
+            else:
+                high = middle
+        wh[n] = (wh[n] - knots[low]) / gaps[low]
+        slope[n] = 1 / gaps[low]
+        node[n] += np.int32(low * layer)
+
+
+@njit(**OPTIONS)
+def _one(t: Array, k: np.uint64, row: np.uint64, layer: np.uint64, x: float, y: float, h: float) -> float:
+    """Trilinear sum over flat values; k is the lowest of the 8 nodes, x, y and h weigh the higher ones."""
+    m, lx, ly = k + layer, 1 - x, 1 - y
+    low = (t[k] * lx + t[k + _NEXT] * x) * ly + (t[k + row] * lx + t[k + row + _NEXT] * x) * y
+    high = (t[m] * lx + t[m + _NEXT] * x) * ly + (t[m + row] * lx + t[m + row + _NEXT] * x) * y
+    return low * (1 - h) + high * h
+
+
+@njit(**OPTIONS)
+def _blend(
+    t: Array, row: np.uint64, layer: np.uint64, node: Nodes, wx: Array, wy: Array, wh: Array, out: Array
+) -> None:
+    """Trilinear sums of many poses."""
+    for n in range(out.shape[0]):
+        out[n] = _one(t, np.uint64(node[n]), row, layer, wx[n], wy[n], wh[n])
+
+
+@njit(**OPTIONS)
+def _sides(
+    t: Array,
+    row: np.uint64,
+    layer: np.uint64,
+    node: Nodes,
+    wx: Array,
+    wy: Array,
+    wh: Array,
+    sign: float,
+    out: Array,
+) -> None:
+    """High side of the cell plus `sign` times the low one, along x, y and heading, shape (3 N,)."""
+    for n in range(wx.shape[0]):
+        k = np.uint64(node[n])
+        m = k + layer
+        x, y, h = wx[n], wy[n], wh[n]
+        b000, b001, b010, b011 = t[k], t[k + _NEXT], t[k + row], t[k + row + _NEXT]
+        b100, b101, b110, b111 = t[m], t[m + _NEXT], t[m + row], t[m + row + _NEXT]
+        b00, b01 = b000 * (1 - x) + b001 * x, b010 * (1 - x) + b011 * x
+        b10, b11 = b100 * (1 - x) + b101 * x, b110 * (1 - x) + b111 * x
+        x0 = (b001 + sign * b000) * (1 - y) + (b011 + sign * b010) * y
+        x1 = (b101 + sign * b100) * (1 - y) + (b111 + sign * b110) * y
+        out[3 * n] = x0 * (1 - h) + x1 * h
+        out[3 * n + 1] = (b01 + sign * b00) * (1 - h) + (b11 + sign * b10) * h
+        out[3 * n + 2] = (b10 * (1 - y) + b11 * y) + sign * (b00 * (1 - y) + b01 * y)
+
+
+@compiled(_IN, _IN, _IN, types.boolean, _OUT, _OUT)
+def lookup(table: Array, q: Array, yaw: Array, clamp: bool, out: Array, gradient: Array) -> None:
+    """Field at poses, and its gradient where `gradient` is not empty.
+
+    Args:
+        table: A map: x and y of the first node, spacing along x and y, first heading, rounding that is
+            forgiven, number of layers, rows, columns, layers a radian (below 0 where they are not
+            evenly apart); for each layer its angle above the first; for each layer the angle to the
+            next; the values, with the first layer once more at the end; in the same order 1 for each
+            masked node and 0 for the others, where any is masked.
+        q: Points x, y, x, y, ... in world [m], shape (2 N,).
+        yaw: Headings [rad], shape (N,).
+        clamp: Whether points off the grid count as the nearest on it.
+        out: Takes the field [nT], shape (N,).
+        gradient: Takes dB/dx, dB/dy [nT/m], dB/dyaw [nT/rad] pose by pose, shape (3 N,) or (0,).
+    """
+    x0, y0, dx, dy, edge = table[0], table[1], table[2], table[3], table[5]
+    layers, layer, per_rad = int(table[6]), table[7] * table[8], table[9]
+    nodes = int((table[6] + 1) * layer)
+    knots, gaps = table[HEADER : HEADER + layers], table[HEADER + layers : HEADER + 2 * layers]
+    values = table[HEADER + 2 * layers : HEADER + 2 * layers + nodes]
+    masked = table[HEADER + 2 * layers + nodes :]
+    row, up = np.uint64(table[8]), np.uint64(layer)
+    wxs, wys, whs, nodes_at = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.int32)
+    slopes, holes, sides = np.full(BLOCK, per_rad), np.empty(BLOCK), np.empty(3 * BLOCK)
+    for start in range(0, yaw.shape[0], BLOCK):
+        stop = min(start + BLOCK, yaw.shape[0])
+        count = stop - start
+        at, b = q[2 * start : 2 * stop], out[start:stop]
+        wx, wy, wh, node, hole = wxs[:count], wys[:count], whs[:count], nodes_at[:count], holes[:count]
+        _place(table, at, yaw[start:stop], clamp, wx, wy, wh, node)
+        if per_rad >= 0:
+            _even(table[6], per_rad, layer, wh, node)
+        else:
+            _uneven(knots, gaps, layer, wh, slopes, node)
+        _blend(values, row, up, node, wx, wy, wh, b)
+        if masked.shape[0] > 0:
+            _blend(masked, row, up, node, wx, wy, wh, hole)
+            for n in range(count):
+                b[n] = np.nan if hole[n] > edge else b[n]
+        if gradient.shape[0] == 0:
+            continue
+        g = gradient[3 * start : 3 * stop]
+        _sides(values, row, up, node, wx, wy, wh, -1.0, g)
+        if masked.shape[0] > 0:
+            _sides(masked, row, up, node, wx, wy, wh, 1.0, sides)
+        else:
+            sides[:] = 0
+        for n in range(count):
+            u, v = (at[2 * n] - x0) / dx, (at[2 * n + 1] - y0) / dy
+            sx = 1 / dx if (u >= -edge) & (u <= table[8] - 1 + edge) else 0.0
+            sy = 1 / dy if (v >= -edge) & (v <= table[7] - 1 + edge) else 0.0
+            sh = slopes[n]
+            known = b[n] == b[n]
+            g[3 * n] = g[3 * n] * sx if known & ((sx == 0) | (sides[3 * n] <= edge)) else np.nan
+            g[3 * n + 1] = g[3 * n + 1] * sy if known & ((sy == 0) | (sides[3 * n + 1] <= edge)) else np.nan
+            g[3 * n + 2] = g[3 * n + 2] * sh if known & ((sh == 0) | (sides[3 * n + 2] <= edge)) else np.nan
+
+
+@compiled(_IN, types.float64, types.float64, types.float64)
+def at(table: Array, x: float, y: float, yaw: float) -> float:
+    """Field at one pose [nT], nan off the grid; arguments as those of `lookup`."""
+    edge, layers, rows, columns = table[5], table[6], table[7], table[8]
+    u, v, a = (x - table[0]) / table[2], (y - table[1]) / table[3], yaw - table[4]
+    known = (u >= -edge) & (u <= columns - 1 + edge) & (v >= -edge) & (v <= rows - 1 + edge)
+    if not (known & (a - a == 0)):
+        return np.nan
+    u, v = min(max(u, 0.0), columns - 1), min(max(v, 0.0), rows - 1)
+    i, j = min(np.floor(u), columns - 2), min(np.floor(v), rows - 2)
+    a -= TURN * np.floor(a / TURN)
+    a = min(max(a, 0.0), TURN)
+    if table[9] >= 0:
+        h = min(np.floor(a * table[9]), layers - 1)
+        weight = a * table[9] - h
+    else:
+        count = int(layers)
+        low, high = 0, count
+        while high - low > 1:
+            middle = (low + high) // 2
+            if a >= table[HEADER + middle]:
+                low = middle
+            else:
+                high = middle
+        h, weight = float(low), (a - table[HEADER + low]) / table[HEADER + count + low]
+    row, layer = np.uint64(columns), np.uint64(rows * columns)
+    start = np.uint64(HEADER + 2 * layers)
+    node = np.uint64((h * rows + j) * columns + i)
+    if table.shape[0] > HEADER + 2 * layers + (layers + 1) * rows * columns:
+        masked = start + np.uint64(layers + 1) * layer
+        if _one(table, masked + node, row, layer, u - i, v - j, weight) > edge:
+            return np.nan
+    return _one(table, start + node, row, layer, u - i, v - j, weight)
