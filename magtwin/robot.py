@@ -1,4 +1,4 @@
-"""Robot: an articulation made from a URDF, for scripts and for `magtwin robot`."""
+"""Robot: an articulation made from a URDF, for scripts and for `magtwin robot`; and where its links stand."""
 
 import dataclasses
 import os
@@ -11,10 +11,11 @@ from magtwin.files import existing, output
 from magtwin.spec import RobotSpec
 from magtwin.usd.robot import RobotSettings, build_robot, read_robot, read_settings
 from magtwin.usd.urdf.convert import convert_with_report
+from magtwin.usd.urdf.kinematics import link_poses
 from magtwin.usd.urdf.options import DEFAULTS, DriveRule, Options
 from magtwin.usd.urdf.report import ConversionReport
 
-__all__ = ["DriveRule", "Options", "Robot", "RobotSettings", "from_urdf"]
+__all__ = ["DriveRule", "Options", "Robot", "RobotSettings", "from_urdf", "link_poses"]
 
 
 @dataclass(frozen=True)

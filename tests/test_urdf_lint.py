@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 from magtwin.names import RefusedError
 from magtwin.usd.urdf.description import read_description
 from magtwin.usd.urdf.lint import lint
+from magtwin.usd.urdf.model import Geometry, Mesh
 
 DATA = Path(__file__).parent / "data" / "urdf"
 
@@ -59,8 +61,13 @@ def test_the_mass_is_held_against_a_data_sheet_within_5_percent():
 
 def test_a_mesh_counts_where_it_can_be_read():
     description = read_description(DATA / "lint_fine.urdf")
-    for part in (*description.links["base_link"].visuals, *description.links["base_link"].collisions):
-        part.geometry.box, part.geometry.mesh = None, "cube"
+    base = description.links["base_link"]
+    mesh = Geometry(mesh=Mesh("cube", np.ones(1)))
+    visuals, collisions = (
+        tuple(replace(part, geometry=mesh) for part in parts) for parts in (base.visuals, base.collisions)
+    )
+    base = replace(base, visuals=visuals, collisions=collisions)
+    description = replace(description, links={**description.links, "base_link": base})
     cube = 0.01 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     lines = lint(description, vertices=lambda mesh: cube)
     assert [line.split(";")[0] for line in lines] == [

@@ -16,6 +16,7 @@ from magtwin.spec import DriveSpec
 from magtwin.usd.sensors import define_drive
 from magtwin.usd.urdf.drive import POSITION_STIFFNESS, WHEEL_DAMPING
 from magtwin.usd.urdf.mechanism import Mechanism
+from magtwin.usd.urdf.model import Link
 from magtwin.usd.urdf.options import DriveRule
 from magtwin.usd.urdf.tag import Element, Tags
 
@@ -310,7 +311,7 @@ def _spec(
         raise RefusedError(f"{where}: {error}") from error
 
 
-def _radius(link: Any) -> float | None:
+def _radius(link: Link) -> float | None:
     """Radius of a wheel's round shape [m]."""
     for shape in (*link.collisions, *link.visuals):
         for kind in ("cylinder", "sphere"):

@@ -1,16 +1,14 @@
 """Description: a URDF that was read and checked, links and joints in the order of their tree.
 
-yourdfpy reads links, joints and materials; what it drops (capsules, `<gazebo>` and the like) is read from
-the same XML, or stays at hand there.
+Links, joints and materials are values, see `model`; what is not of URDF's grammar (`<gazebo>` and the like)
+stays at hand in the XML.
 """
 
-import io
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -18,6 +16,16 @@ from numpy.typing import NDArray
 
 from magtwin.names import RefusedError, hint
 from magtwin.usd.urdf.grammar import check_grammar
+from magtwin.usd.urdf.model import (
+    Inertial,
+    Joint,
+    Link,
+    Material,
+    Shape,
+    read_joint,
+    read_link,
+    read_material,
+)
 from magtwin.usd.urdf.source import Source, read_source
 
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating")
@@ -28,17 +36,6 @@ AXIAL = JOINT_TYPES[1:5]
 
 MOVING = JOINT_TYPES[1:4]
 """Those with one degree of freedom."""
-
-
-@dataclass(frozen=True)
-class Capsule:
-    """A `<capsule>`, which yourdfpy does not know; it stands in `geometry.capsule`."""
-
-    radius: float
-    """Radius of the cylinder and of its round ends [m]."""
-
-    length: float
-    """Length along z, without the ends [m]."""
 
 
 @dataclass(frozen=True)
@@ -54,14 +51,14 @@ class Description:
     root: str
     """Name of the link that no joint holds."""
 
-    links: Mapping[str, Any]
-    """yourdfpy's links by name, parents before children."""
+    links: Mapping[str, Link]
+    """Links by name, parents before children."""
 
-    joints: Mapping[str, Any]
-    """yourdfpy's joints by the name of the link that they hold, parents before children."""
+    joints: Mapping[str, Joint]
+    """Joints by the name of the link that they hold, parents before children."""
 
-    materials: Mapping[str, Any] = field(default_factory=dict)
-    """yourdfpy's robot-wide materials by name."""
+    materials: Mapping[str | None, Material] = field(default_factory=dict)
+    """Robot-wide materials by name."""
 
     notes: list[str] = field(default_factory=list)
     """What was repaired, guessed or left out on the way to USD: one line each, nothing silent."""
@@ -76,7 +73,7 @@ class Description:
 
     @property
     def xml(self) -> ElementTree.Element:
-        """The whole `<robot>`, for what yourdfpy does not read."""
+        """The whole `<robot>`, for what `links` and `joints` do not hold."""
         return self.source.xml
 
     def where(self, element: ElementTree.Element | None) -> str:
@@ -126,9 +123,9 @@ class Description:
         return poses
 
 
-def origin_of(part: Any) -> NDArray[np.float64]:
+def origin_of(part: Joint | Shape | Inertial) -> NDArray[np.float64]:
     """Pose of a joint, visual, collision or inertial in its link, shape (4, 4); identity if none is given."""
-    return np.eye(4) if part.origin is None else np.asarray(part.origin, float)
+    return np.eye(4) if part.origin is None else part.origin
 
 
 def read_description(source: Source | str | os.PathLike[str]) -> Description:
@@ -146,32 +143,38 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
     _check_names(source)
     description = Description(source=source, name=source.xml.get("name", ""), root="", links={}, joints={})
     description._take_notes()
-    robot = _read(description)
-    links = {link.name: link for link in robot.links}
-    held = {joint.child: joint for joint in robot.joints}
+    clean = [
+        check_grammar(part, description.where, description.note)
+        for part in source.xml
+        if part.tag in ("link", "joint", "material")
+    ]
+    links = [_without_empty(read_link(e), description) for e in clean if e.tag == "link"]
+    joints = [read_joint(e) for e in clean if e.tag == "joint"]
+    materials = [read_material(e) for e in clean if e.tag == "material"]
+    held = {joint.child: joint for joint in joints}
     description = replace(
         description,
-        links=links,
+        links={link.name: link for link in links},
         joints=held,
-        materials=MappingProxyType({m.name: m for m in robot.materials}),
+        materials=MappingProxyType({m.name: m for m in materials}),
     )
-    _check_joints(description, robot.joints)
-    roots = [name for name in links if name not in held]
+    _check_joints(description, joints)
+    roots = [name for name in description.links if name not in held]
     if not roots:
-        first = robot.joints[0].name
+        first = joints[0].name
         raise description.refused("joint", first, "closes a circle: no link is the root; remove one joint")
     if len(roots) > 1:
         raise description.refused(
             "link", roots[1], f"hangs in the air: a robot has one root, this has {', '.join(roots)}"
         )
-    order = _order(roots[0], robot.joints)
-    if len(order) < len(links):
-        astray = next(name for name in links if name not in order)
+    order = _order(roots[0], joints)
+    if len(order) < len(description.links):
+        astray = next(name for name in description.links if name not in order)
         raise description.refused("joint", held[astray].name, "closes a circle; remove one joint of it")
     return replace(
         description,
         root=roots[0],
-        links=MappingProxyType({name: links[name] for name in order}),
+        links=MappingProxyType({name: description.links[name] for name in order}),
         joints=MappingProxyType({name: held[name] for name in order if name in held}),
     )
 
@@ -203,63 +206,20 @@ def _check_names(source: Source) -> None:
                 raise RefusedError(f"{where(joint)}: joint {joint.get('name')!r} has no <{end} link=>")
 
 
-def _read(description: Description) -> Any:
-    """Yourdfpy's robot, with capsules; its meshes and its scene graph are left alone.
+def _without_empty(link: Link, description: Description) -> Link:
+    """A link without its primitives of size 0, which are noted."""
 
-    yourdfpy is given links, joints and materials as the grammar has them, a capsule as a cylinder.
-    """
-    import yourdfpy
+    def kept(shapes: Sequence[Shape], role: str) -> tuple[Shape, ...]:
+        for shape in shapes:
+            if shape.geometry.empty:
+                text = f"link {link.name!r}: a {role} {shape.geometry.kind} of size 0 is left out"
+                description.note(text, lost=True)
+        return tuple(shape for shape in shapes if not shape.geometry.empty)
 
-    clean = ElementTree.Element("robot", name=description.name)
-    for part in description.xml:
-        if part.tag in ("link", "joint", "material"):
-            clean.append(check_grammar(part, description.where, description.note))
-    capsules = list(clean.iter("capsule"))
-    for capsule in capsules:
-        capsule.tag = "cylinder"
-    try:
-        robot = yourdfpy.URDF.load(
-            io.BytesIO(ElementTree.tostring(clean)),
-            build_scene_graph=False,
-            load_meshes=False,
-            load_collision_meshes=False,
-        ).robot
-    except (ValueError, KeyError, IndexError, AttributeError, TypeError) as error:
-        raise RefusedError(f"{description.path}: not a URDF: {type(error).__name__}: {error}") from error
-    for link, element in zip(robot.links, clean.findall("link"), strict=True):
-        link.visuals = _shapes(link.visuals, element.findall("visual"), capsules, link.name, description)
-        link.collisions = _shapes(
-            link.collisions, element.findall("collision"), capsules, link.name, description
-        )
-    return robot
+    return replace(link, visuals=kept(link.visuals, "visual"), collisions=kept(link.collisions, "collision"))
 
 
-def _shapes(
-    shapes: list[Any],
-    elements: list[ElementTree.Element],
-    capsules: list[ElementTree.Element],
-    link: str,
-    description: Description,
-) -> list[Any]:
-    """Visuals or collisions of a link, capsules put right, those without any size left out with a note."""
-    kept = []
-    for shape, element in zip(shapes, elements, strict=True):
-        (form,) = element.find("geometry") or [None]
-        assert form is not None  # the grammar saw to it
-        shape.geometry.capsule = None
-        if form in capsules:
-            made = shape.geometry.cylinder
-            shape.geometry.cylinder, shape.geometry.capsule = None, Capsule(made.radius, made.length)
-        sizes = [float(word) for name in ("size", "radius", "length") for word in form.get(name, "").split()]
-        if form.tag != "mesh" and 0 in sizes and not (form in capsules and sizes[0] > 0):
-            kind = "capsule" if form in capsules else form.tag
-            description.note(f"link {link!r}: a {element.tag} {kind} of size 0 is left out", lost=True)
-            continue
-        kept.append(shape)
-    return kept
-
-
-def _check_joints(description: Description, joints: list[Any]) -> None:
+def _check_joints(description: Description, joints: Sequence[Joint]) -> None:
     """Each joint is of a known type, has an axis and a range, and holds a link that no other holds."""
     held: dict[str, str] = {}
     named = {joint.name: joint for joint in joints}
@@ -287,7 +247,7 @@ def _check_joints(description: Description, joints: list[Any]) -> None:
             _check_mimic(description, joint, named)
 
 
-def _check_limit(description: Description, joint: Any) -> None:
+def _check_limit(description: Description, joint: Joint) -> None:
     """The range of a joint does not stand on its head."""
     limit = joint.limit
     if limit is None or limit.lower is None or limit.upper is None or joint.type in ("fixed", "continuous"):
@@ -298,7 +258,7 @@ def _check_limit(description: Description, joint: Any) -> None:
         )
 
 
-def _check_mimic(description: Description, joint: Any, named: Mapping[str, Any]) -> None:
+def _check_mimic(description: Description, joint: Joint, named: Mapping[str, Joint]) -> None:
     """What a joint mimics is there, moves, and does not mimic it in turn."""
     chain = [joint.name]
     while (mimic := named[chain[-1]].mimic) is not None:
@@ -319,7 +279,7 @@ def _check_mimic(description: Description, joint: Any, named: Mapping[str, Any])
         )
 
 
-def _order(root: str, joints: list[Any]) -> list[str]:
+def _order(root: str, joints: Sequence[Joint]) -> list[str]:
     """Links from the root outwards, depth first, each parent's joints in the order of the file."""
     below: dict[str, list[str]] = {}
     for joint in joints:

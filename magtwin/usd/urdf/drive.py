@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pxr import Usd, UsdPhysics
@@ -15,6 +15,7 @@ from pxr import Usd, UsdPhysics
 from magtwin.names import RefusedError, hint
 from magtwin.usd.urdf.description import Description
 from magtwin.usd.urdf.mechanism import SINGLE, Mechanism
+from magtwin.usd.urdf.model import Joint
 from magtwin.usd.urdf.options import DriveRule, Options
 
 WHEEL_DAMPING = 5.0
@@ -84,7 +85,7 @@ def check_rules(mechanism: Mechanism, options: Options) -> None:
 
 
 def choose_drive(
-    joint: Any, mechanism: Mechanism, options: Options, wheels: Mapping[str, WheelDrive] = NO_WHEELS
+    joint: Joint, mechanism: Mechanism, options: Options, wheels: Mapping[str, WheelDrive] = NO_WHEELS
 ) -> Drive | None:
     """The drive of a joint that moves; None if it has none: it follows another, or has several axes.
 
@@ -92,7 +93,7 @@ def choose_drive(
     joints a position; with the profile diff-drive, continuous joints that are no wheels are left free.
 
     Args:
-        joint: yourdfpy's joint.
+        joint: The joint.
         mechanism: Joints of the description; its description takes notes of what was guessed.
         options: Rules and profile.
         wheels: Drives of driven wheels by name of the joint.
@@ -148,7 +149,7 @@ def define_drive(prim: Usd.Prim, axis: str, drive: Drive) -> None:
         made.CreateTargetVelocityAttr(0.0)
 
 
-def _effort(joint: Any, guess: float, description: Description) -> float:
+def _effort(joint: Joint, guess: float, description: Description) -> float:
     """The URDF's effort, or the guess with a note."""
     effort = None if joint.limit is None else joint.limit.effort
     if not effort:
@@ -162,7 +163,7 @@ def _effort(joint: Any, guess: float, description: Description) -> float:
     return float(effort)
 
 
-def _target(joint: Any) -> float:
+def _target(joint: Joint) -> float:
     """The position nearest to 0 that a joint's limits allow [rad or m]."""
     limit = joint.limit
     if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:

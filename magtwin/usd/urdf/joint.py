@@ -16,6 +16,7 @@ from magtwin.usd.urdf.description import Description
 from magtwin.usd.urdf.drive import NO_WHEELS, WheelDrive, choose_drive, define_drive
 from magtwin.usd.urdf.inertia import quaternion
 from magtwin.usd.urdf.mechanism import Mechanism
+from magtwin.usd.urdf.model import Joint
 from magtwin.usd.urdf.options import DEFAULTS, Options
 
 JOINT_API, NEWTON_API, NEWTON_MIMIC_API = "IsaacJointAPI", "NewtonJointAPI", "NewtonMimicAPI"
@@ -43,7 +44,7 @@ MIMIC_FREQUENCY = 100.0
 def define_joint(
     stage: Usd.Stage,
     path: Sdf.Path,
-    joint: Any,
+    joint: Joint,
     ends: tuple[Sdf.Path, Sdf.Path],
     T: NDArray,
     mechanism: Mechanism,
@@ -59,7 +60,7 @@ def define_joint(
     Args:
         stage: Written to in its edit target.
         path: Path of the joint's prim.
-        joint: yourdfpy's joint; not a floating one.
+        joint: The joint; not a floating one.
         ends: Paths of the parent's and the child's body.
         T: Pose in the parent's body of the joint at 0, or at rest if it is welded, shape (4, 4).
         mechanism: Joints of the description; its description takes notes of what was guessed.
@@ -115,7 +116,7 @@ def define_root_joint(
     return made.GetPrim()
 
 
-def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Any, lead: Any, mechanism: Mechanism) -> None:
+def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Joint, lead: Joint, mechanism: Mechanism) -> None:
     """Author that a joint follows another, for Newton and for PhysX.
 
     Newton: q = coef0 + coef1 q_leader, coef0 in degrees where the follower turns. PhysX, until it reads
@@ -126,8 +127,8 @@ def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Any, lead: Any, mechan
     Args:
         prim: The follower's.
         leader: The leader's.
-        joint: yourdfpy's joint of the follower.
-        lead: yourdfpy's joint of the leader.
+        joint: The follower.
+        lead: The leader.
         mechanism: Joints of the description.
     """
     mimic, kinds = mechanism.mimics[joint.name], Sdf.ValueTypeNames
@@ -153,7 +154,7 @@ def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Any, lead: Any, mechan
     _write(prim, f"{space}:dampingRatio", kinds.Float, 0.0)
 
 
-def _free_axes(made: Any, joint: Any, token: str, description: Description) -> list[str]:
+def _free_axes(made: Any, joint: Joint, token: str, description: Description) -> list[str]:
     """Author axis and limits of a joint that moves; returns the names of the axes that are free."""
     if joint.type != "planar":
         made.CreateAxisAttr(token)
@@ -183,7 +184,7 @@ def _quatf(R: NDArray) -> Gf.Quatf:
     return Gf.Quatf(*(round(float(v), 9) + 0.0 for v in wxyz_from_xyzw(quaternion(R))))
 
 
-def _unit(joint: Any) -> float:
+def _unit(joint: Joint) -> float:
     """UsdPhysics' measure of a joint's value, over URDF's."""
     return 1.0 if joint.type == "prismatic" else 180 / np.pi
 
@@ -193,7 +194,7 @@ def _write(prim: Usd.Prim, name: str, kind: Sdf.ValueTypeName, value: object) ->
     prim.CreateAttribute(name, kind, custom=False).Set(value)
 
 
-def _limit(made: Any, joint: Any, description: Description) -> None:
+def _limit(made: Any, joint: Joint, description: Description) -> None:
     """Range of a revolute or prismatic joint; a continuous one has none."""
     if joint.type == "continuous":
         return
@@ -209,7 +210,7 @@ def _limit(made: Any, joint: Any, description: Description) -> None:
     made.CreateUpperLimitAttr(limit.upper * _unit(joint))
 
 
-def _tune(prim: Usd.Prim, joint: Any, axes: list[str], wheel: bool, description: Description) -> None:
+def _tune(prim: Usd.Prim, joint: Joint, axes: list[str], wheel: bool, description: Description) -> None:
     """Highest speed, damping and friction of a joint, as Newton and PhysX read them."""
     names, unit = Sdf.ValueTypeNames.Float, _unit(joint)
     damping, friction = (
@@ -235,7 +236,7 @@ def _tune(prim: Usd.Prim, joint: Any, axes: list[str], wheel: bool, description:
             _write(prim, f"physxJointAxis:{axis}:maxJointVelocity", names, speed * unit)
 
 
-def _speed(joint: Any, wheel: bool, description: Description) -> float | None:
+def _speed(joint: Joint, wheel: bool, description: Description) -> float | None:
     """The URDF's highest speed [rad/s or m/s]; None if it gives none, but for a driven wheel."""
     speed = None if joint.limit is None else joint.limit.velocity
     if speed and np.isfinite(speed):

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from magtwin.frames import matrix_from_quat, wxyz_from_xyzw
 from magtwin.names import RefusedError
 from magtwin.usd.urdf.description import Description, origin_of
 from magtwin.usd.urdf.inertia import MassProperties, combined, principal_axes
+from magtwin.usd.urdf.model import Link
 from magtwin.usd.urdf.solid import read_solid
 
 LINK_API, SITE_API = "IsaacLinkAPI", "IsaacSiteAPI"
@@ -22,8 +22,8 @@ LINK_API, SITE_API = "IsaacLinkAPI", "IsaacSiteAPI"
 class Rider:
     """A link that is a body or part of one."""
 
-    link: Any
-    """yourdfpy's link."""
+    link: Link
+    """The link."""
 
     pose: NDArray[np.float64]
     """Its pose in the body, shape (4, 4)."""
@@ -35,7 +35,7 @@ class Rider:
     """What it shows, below the body's prim."""
 
 
-def is_marker(link: Any) -> bool:
+def is_marker(link: Link) -> bool:
     """Whether a link only names a place: it has neither mass nor shape."""
     return link.inertial is None and not link.visuals and not link.collisions
 
@@ -138,11 +138,11 @@ def _of_shapes(
     return filled
 
 
-def _checked(link: Any, tensor: NDArray, origin: NDArray, description: Description) -> NDArray[np.float64]:
+def _checked(link: Link, tensor: NDArray, origin: NDArray, description: Description) -> NDArray[np.float64]:
     """An inertia in its link's axes, repaired where it just missed being one.
 
     Args:
-        link: yourdfpy's link.
+        link: The link.
         tensor: In the axes of the `<inertial>`, shape (3, 3).
         origin: Pose of the `<inertial>` in the link, shape (4, 4).
         description: Takes a note of a repair.

@@ -2,17 +2,17 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.names import RefusedError
 from magtwin.usd.urdf.description import Description, origin_of
+from magtwin.usd.urdf.model import Geometry, Mesh, Shape
 
 Array = NDArray[np.float64]
 
-Vertices = Callable[[Any], Array]
+Vertices = Callable[[Mesh], Array]
 """Vertices of a URDF `<mesh>`, scaled [m], shape (V, 3)."""
 
 OUTSIDE = 0.1
@@ -200,7 +200,7 @@ def _mass(description: Description, mass: float | None) -> Iterator[str]:
         yield f"the links weigh {total:.6g} kg in all, the data sheet says {mass:g} kg ({more:+.0%})"
 
 
-def _box_of(part: Any, vertices: Vertices | None) -> list[Array]:
+def _box_of(part: Shape, vertices: Vertices | None) -> list[Array]:
     """Corners of a box around a visual or collision in its link's frame, shape (8, 3); [] for none."""
     geometry = part.geometry
     if geometry.mesh is not None:
@@ -215,18 +215,19 @@ def _box_of(part: Any, vertices: Vertices | None) -> list[Array]:
     return [_moved(origin_of(part), corners)]
 
 
-def _half(geometry: Any) -> Array:
+def _half(geometry: Geometry) -> Array:
     """Half the edges of the box around a primitive at its origin [m], shape (3,)."""
     if geometry.box is not None:
         return np.asarray(geometry.box.size, float) / 2
     if geometry.sphere is not None:
         return np.full(3, float(geometry.sphere.radius))
     round_one = geometry.cylinder or geometry.capsule
+    assert round_one is not None  # a geometry is one of these
     radius, half = float(round_one.radius), float(round_one.length) / 2
     return np.array([radius, radius, half + (radius if geometry.capsule else 0.0)])
 
 
-def _volume(parts: Iterable[Any], vertices: Vertices | None) -> float:
+def _volume(parts: Iterable[Shape], vertices: Vertices | None) -> float:
     """What shapes hold at most [m3]: primitives exactly, meshes by their boxes; inf where one is unknown."""
     total = 0.0
     for part in parts:
@@ -240,12 +241,13 @@ def _volume(parts: Iterable[Any], vertices: Vertices | None) -> float:
             total += 4 / 3 * np.pi * float(geometry.sphere.radius) ** 3
         else:
             round_one = geometry.cylinder or geometry.capsule
+            assert round_one is not None
             radius, length = float(round_one.radius), float(round_one.length)
             total += np.pi * radius**2 * (length + (4 / 3 * radius if geometry.capsule else 0.0))
     return total
 
 
-def _read(mesh: Any, vertices: Vertices | None) -> Array | None:
+def _read(mesh: Mesh, vertices: Vertices | None) -> Array | None:
     """Vertices of a mesh, none where it cannot be read."""
     if vertices is None:
         return None

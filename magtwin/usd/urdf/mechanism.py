@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.usd.urdf.description import Description, origin_of
+from magtwin.usd.urdf.model import Joint
 from magtwin.usd.urdf.options import DEFAULTS, Options
 
 SINGLE = ("revolute", "continuous", "prismatic")
@@ -43,7 +43,7 @@ class Mechanism:
     rests: Mapping[str, float]
     """Value at which the robot is authored [rad or m], of the joints where it is not 0."""
 
-    def pose(self, joint: Any) -> NDArray[np.float64]:
+    def pose(self, joint: Joint) -> NDArray[np.float64]:
         """T_parent_child of a joint's links at rest, shape (4, 4)."""
         T, rest = origin_of(joint), self.rests.get(joint.name, 0.0)
         return T @ displacement(joint, rest) if rest else T
@@ -78,7 +78,7 @@ def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mec
     for name, joint in joints.items():
         if name in welded:
             limit = joint.limit
-            if welded[name] and limit.lower is not None and limit.lower == limit.upper != 0:
+            if welded[name] and limit and limit.lower is not None and limit.lower == limit.upper != 0:
                 rests[name] = float(limit.lower)
             if joint.mimic is not None:
                 description.note(
@@ -99,7 +99,7 @@ def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mec
     return Mechanism(description, welded, mimics, rests)
 
 
-def displacement(joint: Any, value: float) -> NDArray[np.float64]:
+def displacement(joint: Joint, value: float) -> NDArray[np.float64]:
     """Motion of a joint's child from its place at 0: a turn about the axis, or a slide along it, (4, 4).
 
     R = 1 + sin(q) K + (1 - cos(q)) K^2, K the cross product with the unit axis (Rodrigues).
@@ -113,7 +113,7 @@ def displacement(joint: Any, value: float) -> NDArray[np.float64]:
     return T
 
 
-def _welded(joint: Any, options: Options) -> str | None:
+def _welded(joint: Joint, options: Options) -> str | None:
     """Why a joint cannot move; "" if it is fixed, None if it can."""
     limit = joint.limit
     if joint.type == "fixed":
@@ -129,7 +129,7 @@ def _welded(joint: Any, options: Options) -> str | None:
     return None
 
 
-def _resolved(joint: Any, joints: Mapping[str, Any], description: Description) -> Mimic:
+def _resolved(joint: Joint, joints: Mapping[str, Joint], description: Description) -> Mimic:
     """What a joint follows in the end, through joints that follow others; the description has no circle."""
     multiplier, offset, at = 1.0, 0.0, joint
     while at.mimic is not None:
@@ -146,9 +146,9 @@ def _resolved(joint: Any, joints: Mapping[str, Any], description: Description) -
     return Mimic(at.name, multiplier, offset)
 
 
-def _rest_of(leader: Any, welded: Mapping[str, str]) -> float:
+def _rest_of(leader: Joint, welded: Mapping[str, str]) -> float:
     """Where a joint that follows none rests."""
     limit = leader.limit
-    if welded.get(leader.name) and limit.lower is not None and limit.lower == limit.upper:
+    if welded.get(leader.name) and limit and limit.lower is not None and limit.lower == limit.upper:
         return float(limit.lower)
     return 0.0

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 from magtwin.usd.urdf.description import origin_of
 from magtwin.usd.urdf.link import is_marker
 from magtwin.usd.urdf.mechanism import Mechanism
+from magtwin.usd.urdf.model import Shape
 
 Place = tuple[str, NDArray[np.float64]]
 """Name of a body, and a pose in it, shape (4, 4)."""
@@ -58,11 +58,11 @@ def riders(places: dict[str, Place], body: str) -> Iterator[tuple[str, NDArray[n
             yield name, pose
 
 
-def carried(shapes: Iterable[Any], pose: NDArray, link: str, body: str) -> list[Any]:
+def carried(shapes: Iterable[Shape], pose: NDArray, link: str, body: str) -> list[Shape]:
     """Visuals or colliders of a link as those of the body that it is part of.
 
     Args:
-        shapes: yourdfpy's visuals or collisions.
+        shapes: Visuals or collisions.
         pose: Of the link in the body, shape (4, 4).
         link: Name of the link, which its shapes without a name get on another's body.
         body: Name of the body's own link, whose shapes stay as they are.

@@ -281,8 +281,8 @@ def has_area(points: NDArray, faces: NDArray) -> NDArray[np.bool_]:
 def distinct(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The distinct rows of an array of floats, in the order in which they first appear.
 
-    Sorting one 64-bit hash a row is several times quicker than sorting rows; should two rows that
-    differ have one hash, rows are sorted after all.
+    One sort of a 64-bit word a row, its hash above its index, is many times quicker than sorting rows;
+    should two rows that differ have one hash, rows are sorted after all.
 
     Args:
         rows: Taken in single precision, shape (N, K).
@@ -291,17 +291,21 @@ def distinct(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         Index of the first row of each kind, shape (D,), and which kind each row is, shape (N,).
     """
     words = np.ascontiguousarray(rows + np.float32(0), np.float32).view(np.uint32)  # + 0 makes -0 into 0
-    hashed = np.zeros(len(words), np.uint64)
+    hashed, here = np.zeros(len(words), np.uint64), np.arange(len(words))
     for column in words.T:
         hashed = (hashed ^ column) * np.uint64(0x9E3779B97F4A7C15)
         hashed ^= hashed >> np.uint64(32)
-    _, first, kind = np.unique(hashed, return_index=True, return_inverse=True)
-    if not np.array_equal(words[first][kind], words):
-        _, first, kind = np.unique(words, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return first[order], rank[kind.reshape(-1)]
+    low = np.uint64(len(words).bit_length())
+    keys = np.sort(hashed >> low << low | here.astype(np.uint64))
+    row, hashed = (keys & ~(~np.uint64(0) << low)).astype(np.int64), keys >> low
+    starts = np.append(True, hashed[1:] != hashed[:-1])[: len(row)]  # of rows of one hash, the first is first
+    first = np.empty_like(here)
+    first[row] = row[starts][np.cumsum(starts) - 1]
+    if not np.array_equal(words[first], words):
+        _, least, kind = np.unique(words, axis=0, return_index=True, return_inverse=True)
+        first = least[kind.reshape(-1)]
+    is_first = first == here
+    return here[is_first], (np.cumsum(is_first) - 1)[first]
 
 
 def face_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ The readable root layer references them; arrays of more than 64 elements do not 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from magtwin.usd.urdf.collider import Solid, solids_of
 from magtwin.usd.urdf.description import Description
 from magtwin.usd.urdf.material import GREY
 from magtwin.usd.urdf.mesh import SUFFIXES, Mesh, Paint, distinct, face_normals, read_mesh
+from magtwin.usd.urdf.model import Mesh as UrdfMesh
 from magtwin.usd.urdf.options import DEFAULTS, Collision, Options
 from magtwin.usd.urdf.source import MissingFileError
 from magtwin.usd.urdf.texture import Textures
@@ -80,11 +81,11 @@ class MeshLayer:
     def __len__(self) -> int:
         return len(self._visuals) + len(self._colliders)
 
-    def visual(self, mesh: Any) -> Entry:
+    def visual(self, mesh: UrdfMesh) -> Entry:
         """The prim that shows a URDF `<mesh>`.
 
         Args:
-            mesh: yourdfpy's mesh.
+            mesh: As the URDF names it.
 
         Raises:
             MissingFileError: The file is not there.
@@ -96,7 +97,7 @@ class MeshLayer:
             self._visuals[key] = self._define_visual(self._read(path), np.array(scale))
         return self._visuals[key]
 
-    def collider(self, mesh: Any) -> tuple[Sdf.Path, ...]:
+    def collider(self, mesh: UrdfMesh) -> tuple[Sdf.Path, ...]:
         """The mesh prims that a URDF `<mesh>` collides as: one, or several of a convex decomposition.
 
         Args and refusals as for `visual`.
@@ -112,11 +113,11 @@ class MeshLayer:
             )
         return self._colliders[key]
 
-    def try_add(self, mesh: Any, add: Callable[[Any], T], label: str = "") -> T | None:
+    def try_add(self, mesh: UrdfMesh, add: Callable[[UrdfMesh], T], label: str = "") -> T | None:
         """What `visual` or `collider` gives; none, with a note, where the file is missing and that will do.
 
         Args:
-            mesh: yourdfpy's mesh.
+            mesh: As the URDF names it.
             add: `visual` or `collider`.
             label: Whose mesh it is, for the note; "" makes none.
         """
@@ -130,7 +131,7 @@ class MeshLayer:
                 self._description.note(text, lost=True)
             return None
 
-    def vertices(self, mesh: Any) -> NDArray[np.float64]:
+    def vertices(self, mesh: UrdfMesh) -> NDArray[np.float64]:
         """Vertices of a URDF `<mesh>` that was added, as its file has them, scaled [m], shape (V, 3)."""
         path, scale = self._file(mesh)
         return self._files[path].points.astype(float) * scale
@@ -139,19 +140,18 @@ class MeshLayer:
         """Write the layer."""
         self._stage.GetRootLayer().Export(str(path))
 
-    def _file(self, mesh: Any) -> tuple[Path, tuple[float, ...]]:
+    def _file(self, mesh: UrdfMesh) -> tuple[Path, tuple[float, ...]]:
         """File and scale of a URDF `<mesh>`."""
         name, urdf = mesh.filename, self._description.path
         if Path(name).suffix.lower() not in SUFFIXES:
             raise RefusedError(f"{urdf}: mesh {name!r} is of no known format ({', '.join(SUFFIXES)})")
         if name not in self._found:
             self._found[name] = self._description.find_file(name, "mesh")
-        factors = np.atleast_1d(1.0 if mesh.scale is None else np.asarray(mesh.scale, float))
-        if len(factors) not in (1, 3) or not np.isfinite(factors).all() or not factors.all():
+        if not mesh.scale.all():
             raise RefusedError(
-                f"{urdf}: mesh {name!r} has scale {factors.tolist()}; give three numbers but 0"
+                f"{urdf}: mesh {name!r} has scale {mesh.scale.tolist()}; give three numbers but 0"
             )
-        return self._found[name], tuple(float(f) for f in np.broadcast_to(factors, 3))
+        return self._found[name], tuple(float(f) for f in np.broadcast_to(mesh.scale, 3))
 
     def _read(self, path: Path) -> Mesh:
         if path not in self._files:

@@ -4,7 +4,6 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +11,10 @@ from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
-from magtwin.usd.geometry import read_shapes
+from magtwin.usd.geometry import read_vertices
 from magtwin.usd.urdf.description import Description, origin_of
 from magtwin.usd.urdf.mesh_layer import MeshLayer
+from magtwin.usd.urdf.model import Geometry, Joint, Link, Shape
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Least and greatest corner of what bounds a shape, axis-aligned in the robot's frame [m]."""
@@ -250,7 +250,7 @@ def make_report(
     )
 
 
-def _link(name: str, link: Any, stage: Usd.Stage, ledger: Ledger) -> LinkLine:
+def _link(name: str, link: Link, stage: Usd.Stage, ledger: Ledger) -> LinkLine:
     became, path = ledger.bodies.get(name, ("nothing", Sdf.Path.emptyPath))
     mass_in = None if link.inertial is None else link.inertial.mass
     mass_out = None
@@ -266,7 +266,7 @@ def _link(name: str, link: Any, stage: Usd.Stage, ledger: Ledger) -> LinkLine:
     )
 
 
-def _joint(joint: Any, stage: Usd.Stage, ledger: Ledger) -> JointLine:
+def _joint(joint: Joint, stage: Usd.Stage, ledger: Ledger) -> JointLine:
     path = ledger.joints.get(joint.name)
     if path is None:
         return JointLine(name=joint.name, type_in=joint.type, type_out="", prim="")
@@ -300,14 +300,14 @@ def _geometries(
     return tuple(lines)
 
 
-def _kind(geometry: Any) -> str:
+def _kind(geometry: Geometry) -> str:
     """What a URDF `<geometry>` is, in a word."""
     if geometry.mesh is not None:
         return str(geometry.mesh.filename).rpartition("/")[2]
-    return next((k for k in ("box", "sphere", "cylinder", "capsule") if getattr(geometry, k, None)), "none")
+    return geometry.kind
 
 
-def _box_of(shape: Any, T: NDArray[np.float64], meshes: MeshLayer) -> Box | None:
+def _box_of(shape: Shape, T: NDArray[np.float64], meshes: MeshLayer) -> Box | None:
     """What bounds a URDF visual or collision at a pose (4, 4) in the robot's frame."""
     geometry = shape.geometry
     if geometry.mesh is not None:
@@ -341,13 +341,13 @@ def _boxes(stage: Usd.Stage) -> dict[Sdf.Path, Box]:
     by_name = {p.GetName(): p for p in bodies.values()} | bodies
     cache, boxes = UsdGeom.XformCache(), {}
     tokens = UsdGeom.Tokens
-    for shape in read_shapes(stage, purposes=(tokens.default_, tokens.render, tokens.guide)):
-        points = shape.vertices.astype(float)
-        if shape.link:
-            world = cache.GetLocalToWorldTransform(by_name[shape.link]) * to_robot
-            T = np.array(world)
+    shown = read_vertices(stage, purposes=(tokens.default_, tokens.render, tokens.guide))
+    for path, (link, vertices) in shown.items():
+        points = vertices.astype(float)
+        if link:
+            T = np.array(cache.GetLocalToWorldTransform(by_name[link]) * to_robot)
             points = points @ T[:3, :3] + T[3, :3]
-        boxes[Sdf.Path(shape.prim)] = _corners(points.min(0), points.max(0))
+        boxes[path] = _corners(points.min(0), points.max(0))
     return boxes
 
 

@@ -5,8 +5,6 @@ material is worn by the parts to which the file gives none, which is all of an S
 dresses.
 """
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
@@ -18,6 +16,7 @@ from magtwin.usd.urdf.inertia import quaternion
 from magtwin.usd.urdf.material import Look, define_grip, define_look, wear
 from magtwin.usd.urdf.mesh import Paint
 from magtwin.usd.urdf.mesh_layer import MESH, Entry, MeshLayer, free_name
+from magtwin.usd.urdf.model import Shape
 from magtwin.usd.urdf.reading import Reading
 from magtwin.usd.urdf.source import MissingFileError
 from magtwin.usd.urdf.texture import Image, read_image
@@ -33,13 +32,13 @@ NEWTON_MESH_API = "NewtonMeshCollisionAPI"
 
 
 def define_visual(
-    body: Usd.Prim, visual: Any, description: Description, meshes: MeshLayer, layer: str
+    body: Usd.Prim, visual: Shape, description: Description, meshes: MeshLayer, layer: str
 ) -> list[Usd.Prim]:
     """The prim of a URDF `<visual>`: a gprim with its look, or an Xform over the mesh that it shares.
 
     Args:
         body: Prim of the link, a child of the robot's.
-        visual: yourdfpy's visual.
+        visual: The visual.
         description: Where the robot's materials stand.
         meshes: Where the mesh's triangles stand.
         layer: Asset path of the exported mesh layer.
@@ -63,7 +62,7 @@ def define_visual(
 
 
 def define_collider(
-    body: Usd.Prim, collision: Any, surface: Surface, meshes: MeshLayer, layer: str
+    body: Usd.Prim, collision: Shape, surface: Surface, meshes: MeshLayer, layer: str
 ) -> list[Usd.Prim]:
     """The colliders of a URDF `<collision>`: its primitive, or the solids that its mesh collides as.
 
@@ -90,7 +89,7 @@ def define_collider(
 
 
 def _define_mesh(
-    body: Usd.Prim, visual: Any, entry: Entry, given: Paint | None, meshes: MeshLayer, layer: str
+    body: Usd.Prim, visual: Shape, entry: Entry, given: Paint | None, meshes: MeshLayer, layer: str
 ) -> Usd.Prim:
     """An Xform that refers to a mesh, as an instance where one look covers it.
 
@@ -132,7 +131,7 @@ def _look(paint: Paint | None, meshes: MeshLayer) -> Look:
     )
 
 
-def _paint_of(visual: Any, description: Description) -> Paint | None:
+def _paint_of(visual: Shape, description: Description) -> Paint | None:
     """A visual's URDF material: its own, or the robot's of that name; none if it has none.
 
     A texture is the colour alone, as in RViz; where it is missing, the material's colour is.
@@ -171,10 +170,10 @@ def _plain(paint: Paint | None, what: str, description: Description) -> Paint | 
     return Paint(f"{paint.name}_mean", (*paint.image.mean, paint.rgba[3]))
 
 
-def _define_primitive(body: Usd.Prim, scope: str, shape: Any) -> Usd.Prim:
+def _define_primitive(body: Usd.Prim, scope: str, shape: Shape) -> Usd.Prim:
     """The gprim of a box, capsule, cylinder or sphere."""
     stage, geometry = body.GetStage(), shape.geometry
-    kind = next(k for k in ("box", "capsule", "cylinder", "sphere") if getattr(geometry, k, None) is not None)
+    kind = geometry.kind
     solid, path, scale = getattr(geometry, kind), _path(body, scope, shape.name or kind), None
     if kind == "box":
         prim = UsdGeom.Cube.Define(stage, path).GetPrim()

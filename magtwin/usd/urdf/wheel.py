@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from fnmatch import fnmatchcase
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from magtwin.usd.urdf.description import Description, origin_of
 from magtwin.usd.urdf.drive import WheelDrive
 from magtwin.usd.urdf.gazebo import Surface
 from magtwin.usd.urdf.mechanism import Mechanism
+from magtwin.usd.urdf.model import Joint, Link
 from magtwin.usd.urdf.options import DriveRule
 
 WHEEL_FRICTION, CASTER_FRICTION = 1.0, 0.05
@@ -145,29 +145,29 @@ def _radius(body: Usd.Prim, axis: NDArray) -> float:
     return 0.0 if extent.IsEmpty() else float(np.max(np.asarray(extent.GetSize())[across]) / 2)
 
 
-def _rolls(joint: Any, poses: Mapping[str, NDArray]) -> bool:
+def _rolls(joint: Joint, poses: Mapping[str, NDArray]) -> bool:
     """Whether a joint turns for ever about an axis within 30 degrees of level."""
     return joint.type == "continuous" and abs(_axis(joint, poses)[2]) < 0.5
 
 
-def _swivels(joint: Any, poses: Mapping[str, NDArray]) -> bool:
+def _swivels(joint: Joint, poses: Mapping[str, NDArray]) -> bool:
     """Whether a joint turns for ever about an axis that is not level."""
     return joint.type == "continuous" and abs(_axis(joint, poses)[2]) >= 0.5
 
 
-def _axis(joint: Any, poses: Mapping[str, NDArray]) -> NDArray[np.float64]:
+def _axis(joint: Joint, poses: Mapping[str, NDArray]) -> NDArray[np.float64]:
     """Unit axis of a joint in the root link's frame, shape (3,)."""
     return np.asarray(poses[joint.child][:3, :3] @ joint.axis / np.linalg.norm(joint.axis))
 
 
-def _above(joint: Any, description: Description) -> Iterable[Any]:
+def _above(joint: Joint, description: Description) -> Iterable[Joint]:
     """The joints between a joint and the root."""
     while joint.parent in description.joints:
         joint = description.joints[joint.parent]
         yield joint
 
 
-def _lowest(link: Any, pose: NDArray) -> float:
+def _lowest(link: Link, pose: NDArray) -> float:
     """Height of the lowest point of a link's primitive colliders in the root link's frame [m].
 
     A primitive reaches down by its support in the direction of gravity; inf where there is none.
