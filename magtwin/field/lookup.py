@@ -34,6 +34,9 @@ BLOCK = 8192
 PAYS = 20_000_000
 """Poses in numpy that take as long as opening the compiled code; whoever had as many will have more."""
 
+AS_MANY = 25
+"""Poses in numpy that take as long as one in plain Python does beyond one in compiled code."""
+
 SHARE = 65_536
 """Poses from which on a thread of compiled code is worth its start."""
 
@@ -115,15 +118,14 @@ class Lookup:
         """
         out = np.empty(len(p))
         slopes = np.empty((len(p) if gradient else 0, 3))
-        compiled = self._opened(len(p))
-        if compiled is not None:
-            self._in_threads(compiled, p, yaw, clamp, out, slopes)
-        elif len(p) <= FEW:
+        if len(p) <= FEW:
             for n, ((x, y), angle) in enumerate(zip(p.tolist(), yaw.tolist(), strict=True)):
                 if gradient:
                     out[n], *slopes[n] = self.at_with_gradient(x, y, angle, clamp=clamp)
                 else:
                     out[n] = self.at(x, y, angle, clamp=clamp)
+        elif (compiled := self._opened(len(p))) is not None:
+            self._in_threads(compiled, p, yaw, clamp, out, slopes)
         else:
             for start in range(0, len(p), BLOCK):
                 part = slice(start, start + BLOCK)
@@ -132,8 +134,9 @@ class Lookup:
 
     def at(self, x: float, y: float, yaw: float, *, clamp: bool = False) -> float:
         """Field at one pose [nT], as `lookup` gives it."""
-        if self.compiled is not None and not clamp:
-            return self.compiled.at(self.table, x, y, yaw)  # type: ignore[no-any-return]
+        compiled = self.compiled or self._opened(AS_MANY)
+        if compiled is not None and not clamp:
+            return compiled.at(self.table, x, y, yaw)  # type: ignore[no-any-return]
         place = self._place(x, y, yaw, clamp)
         if place is None:
             return math.nan
@@ -217,22 +220,17 @@ class Lookup:
         """Compiled code on equal shares of the poses; who works on a pose changes no byte."""
         q, yaw = (np.require(array, float, ["C", "A"]) for array in (p.reshape(-1), yaw))
         flat = slopes.reshape(-1)
-        shares = max(1, min(MOST_THREADS, os.cpu_count() or 1, len(yaw) // SHARE))
+        shares = len(yaw) // SHARE
+        if shares < 2:
+            compiled.lookup(self.table, q, yaw, clamp, out, flat)
+            return
+        shares = min(shares, MOST_THREADS, os.cpu_count() or 1)
         ends = [len(yaw) * n // shares for n in range(shares + 1)]
 
         def work(start: int, stop: int) -> None:
-            compiled.lookup(
-                self.table,
-                q[2 * start : 2 * stop],
-                yaw[start:stop],
-                clamp,
-                out[start:stop],
-                flat[3 * start : 3 * stop],
-            )
+            at, some, g = q[2 * start : 2 * stop], yaw[start:stop], flat[3 * start : 3 * stop]
+            compiled.lookup(self.table, at, some, clamp, out[start:stop], g)
 
-        if shares == 1:
-            work(0, len(yaw))
-            return
         with ThreadPoolExecutor(shares) as pool:
             list(pool.map(work, ends[:-1], ends[1:]))
 
@@ -281,7 +279,7 @@ class Lookup:
 
 
 class _Cells(dict[int, tuple[Corners, Corners | None]]):
-    """Cells that were looked at, by their lowest node: values of the nodes, and which are masked if any is."""
+    """Cells that were looked at, by lowest node: values of their nodes, and which are masked if any is."""
 
     def __init__(self, values: Array, holes: Array | None, columns: int, layer: int) -> None:
         self._values, self._holes = values, holes

@@ -285,11 +285,13 @@ class AnomalyMap:
         p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
         if p.ndim == 0 or p.shape[-1] != 2:
             raise RefusedError(f"p_xy must have shape (..., 2), got {p.shape}")
-        shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
-        p = np.broadcast_to(p, (*shape, 2)).reshape(-1, 2)
+        shape = yaw.shape
+        if p.shape[:-1] != shape:
+            shape = np.broadcast_shapes(p.shape[:-1], shape)
+            p, yaw = np.broadcast_to(p, (*shape, 2)), np.broadcast_to(yaw, shape)
+        p, yaw = p.reshape(-1, 2), yaw.reshape(-1)
         self._check_outside(p, outside)
-        angle = np.broadcast_to(yaw, shape).reshape(-1)
-        b, slopes = self._lookup.lookup(p, angle, clamp=outside == "clamp", gradient=gradient)
+        b, slopes = self._lookup.lookup(p, yaw, clamp=outside == "clamp", gradient=gradient)
         return b.reshape(shape), slopes.reshape(*shape, 3) if gradient else slopes
 
     def _check_outside(self, p: Array, outside: Outside) -> None:

@@ -1,0 +1,115 @@
+"""A map read at 1, 1,000 and 1,000,000 poses: scipy's RegularGridInterpolator and magtwin, one process.
+
+The map is as large as the APRILab survey, 15 x 25 nodes in four headings. scipy's interpolator is given
+the first layer once more at 360 degrees, and headings that lie between 0 and 360 degrees already, in the
+column order that it wants; magtwin takes points and headings as they come. Medians over rounds in which
+each way takes its turn, so that a busy machine slows all alike. Compiled code is opened beforehand here;
+a program that does not ask for it gets it after twenty million poses, and the same bytes before.
+
+    python benchmarks/lookup.py [rounds]
+"""
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+
+from magtwin.field.lookup import Lookup, warm_up
+from magtwin.field.map import AnomalyMap
+
+WANTED = {1: 80, 1_000: None, 1_000_000: 50}
+"""How many times faster than scipy, by number of poses."""
+
+AGREES_NT = 1e-9
+
+
+def field_map(rng: np.random.Generator) -> AnomalyMap:
+    return AnomalyMap(
+        values_nt=41_000 + 3_000 * rng.standard_normal((4, 15, 25)),
+        origin_m=(-3.0, -1.75),
+        cell_m=(0.25, 0.25),
+        headings_rad=np.radians([0, 90, 180, 270]),
+    )
+
+
+def scipys(field: AnomalyMap) -> RegularGridInterpolator:
+    headings = np.append(field.headings_rad, 2 * np.pi)
+    values = np.concatenate([field.values_nt, field.values_nt[:1]])
+    return RegularGridInterpolator((headings, field.y_m, field.x_m), values)
+
+
+def plain(look: Callable[[], object]) -> Callable[[], object]:
+    """The same without compiled code."""
+
+    def without() -> object:
+        opened, Lookup.compiled = Lookup.compiled, None
+        try:
+            return look()
+        finally:
+            Lookup.compiled = opened
+
+    return without
+
+
+def ways(field: AnomalyMap, count: int, rng: np.random.Generator) -> dict[str, Callable[[], object]]:
+    """Each way of reading the field at some poses."""
+    x0, x1, y0, y1 = field.extent
+    p = rng.uniform((x0, y0), (x1, y1), (count, 2))
+    yaw = rng.uniform(0, 2 * np.pi, count)
+    grid, rows = scipys(field), np.column_stack([yaw, p[:, 1], p[:, 0]])
+    x, y, angle = float(p[0, 0]), float(p[0, 1]), float(yaw[0])
+    at = {
+        "at(), compiled": lambda: field.at(x, y, angle),
+        "at(), plain Python": plain(lambda: field.at(x, y, angle)),
+        "at_with_gradient()": lambda: field.at_with_gradient(x, y, angle),
+    }
+    return {
+        "scipy": lambda: grid(rows),
+        **(at if count == 1 else {}),
+        "lookup(), compiled": lambda: field.lookup(p, yaw),
+        "lookup(), numpy": plain(lambda: field.lookup(p, yaw)),
+        "lookup_with_gradient()": lambda: field.lookup_with_gradient(p, yaw),
+    }
+
+
+def measure(works: dict[str, Callable[[], object]], rounds: int, calls: int) -> dict[str, list[float]]:
+    """Seconds a call of each way, one for each round."""
+    seconds: dict[str, list[float]] = {name: [] for name in works}
+    for turn in range(rounds + 1):
+        for name, work in works.items():
+            start = time.perf_counter()
+            for _ in range(calls):
+                work()
+            if turn:  # the first is warm-up
+                seconds[name].append((time.perf_counter() - start) / calls)
+    return seconds
+
+
+def main(rounds: int = 7) -> None:
+    rng = np.random.default_rng(0)
+    field = field_map(rng)
+    start = time.perf_counter()
+    warm_up()
+    print(f"compiled code opened in {time.perf_counter() - start:.2f} s; medians of {rounds} rounds")
+    for count, wanted in WANTED.items():
+        works = ways(field, count, rng)
+        took = measure(works, rounds, calls=max(1, 2_000 // count))
+        want = np.asarray(works["scipy"]())
+        print(f"{count:,} pose{'s' * (count > 1)}" + (f"; wanted: {wanted} times scipy" if wanted else ""))
+        for name, seconds in took.items():
+            got = works[name]()
+            b = np.asarray(got[0] if "gradient" in name else got).reshape(-1)
+            median = statistics.median(seconds)
+            ratios = [s / ours for s, ours in zip(took["scipy"], seconds, strict=True)]
+            print(
+                f"  {name:24}{median / count * 1e9:12,.1f} ns a pose{statistics.median(ratios):8.1f} x scipy"
+                f"   largest difference {np.abs(b - want).max():.1e} nT"
+            )
+            assert np.abs(b - want).max() <= AGREES_NT, name
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
