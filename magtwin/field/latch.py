@@ -64,8 +64,8 @@ MOST_TOGETHER = 12
 ROUNDS = 4
 """Rounds in which level, spread and share of latched readings settle."""
 
-SPIKE_ROWS = 7
-"""Readings of a drive whose median one of them is held against (Hampel's filter)."""
+SPREAD_ROWS = 51
+"""Readings of a drive from which the usual size of a jump is taken."""
 
 NAMED = 20
 """Outliers that the report names, the largest first."""
@@ -84,7 +84,7 @@ def mask_latched(readings: Readings) -> tuple[Readings, Report]:
     """
     found = find_latched(readings)
     good = readings.good & ~found.stuck & ~found.latched
-    return readings.masked(good), found.report(readings)
+    return readings.with_(good=good), found.report(readings)
 
 
 @dataclass(frozen=True)
@@ -266,7 +266,7 @@ def _cells(readings: Readings) -> tuple[Readings, Rows]:
         return readings, np.arange(len(readings))
     cell = np.empty(len(readings), np.intp)
     first = 0
-    for rows in _sequences(readings.masked(np.ones(len(readings), bool))):
+    for rows in _sequences(readings.with_(good=np.ones(len(readings), bool))):
         way = np.concatenate([[0.0], np.cumsum(_moved(readings, rows))])
         _, cell[rows] = np.unique((way / CELL_M).astype(np.intp), return_inverse=True)
         cell[rows] += first
@@ -288,7 +288,7 @@ def _cells(readings: Readings) -> tuple[Readings, Rows]:
 def _flats(readings: Readings, sound: NDArray[np.bool_]) -> list[Rows]:
     """Stretches of a drive that stay within the sensor's noise over `FLAT_M` or more."""
     flats = []
-    for rows in _sequences(readings.masked(sound)):
+    for rows in _sequences(readings.with_(good=sound)):
         b, p = readings.b_nt[rows], readings.p_xy[rows]
         if len(rows) < 8:
             continue
@@ -398,16 +398,29 @@ def _outliers(readings: Readings, cells: Readings, cell: Rows, fit: LocalFit, po
         outlier[rows[len(rows) // 2]] = residual[at]
     if readings.node is None:
         for rows in _sequences(readings):
-            if len(rows) < SPIKE_ROWS:
-                continue
-            b = readings.b_nt[rows]
-            around = np.median(np.lib.stride_tricks.sliding_window_view(b, SPIKE_ROWS), axis=1)
-            middle = slice(SPIKE_ROWS // 2, len(rows) - SPIKE_ROWS // 2)
-            off = b[middle] - around
-            limit = float(stdtrit(FREEDOM, 1 - 1 / (2 * len(readings)))) * deviation(off)
-            spikes = np.abs(off) > max(limit, 0.0)
-            outlier[rows[middle][spikes]] = off[spikes]
+            off = _spikes(readings.b_nt[rows])
+            outlier[rows[off != 0]] = off[off != 0]
     return outlier
+
+
+def _spikes(b: Array) -> Array:
+    """Difference of each spike of a drive from the mean of the readings beside it [nT], 0 for all others.
+
+    Hampel's filter: the scale is the median of such differences over `SPREAD_ROWS`, for they grow with
+    speed and with the field's curvature. Of two side by side the larger is the spike.
+    """
+    from scipy.ndimage import maximum_filter1d, median_filter
+    from scipy.special import stdtrit
+
+    if len(b) < SPREAD_ROWS:
+        return np.zeros(len(b))
+    off = np.zeros(len(b))
+    off[1:-1] = b[1:-1] - (b[:-2] + b[2:]) / 2
+    size = np.abs(off)
+    scale = 1.4826 * np.maximum(median_filter(size, SPREAD_ROWS, mode="reflect"), np.median(size))
+    limit = float(stdtrit(FREEDOM, 1 - 1 / (2 * len(b))))
+    spike = (size > limit * scale) & (size == maximum_filter1d(size, 3)) & (size > 0)
+    return np.where(spike, off, 0.0)
 
 
 def _say(readings: Readings, row: int, off_nt: float) -> str:

@@ -125,14 +125,9 @@ class Readings:
         some: dict[str, Any] = {k: None if given[k] is None else given[k][index] for k in SHAPES}
         return Readings(**{**given, **some})
 
-    def masked(self, good: ArrayLike) -> "Readings":
-        """The same readings with other flags.
-
-        Args:
-            good: Rows that are field, shape (N,).
-        """
-        given = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Readings(**{**given, "good": good})
+    def with_(self, **changes: Any) -> "Readings":
+        """The same readings with other values of some fields, such as `good`."""
+        return Readings(**{**{f.name: getattr(self, f.name) for f in fields(self)}, **changes})
 
 
 SHAPES: dict[str, tuple[int, type]] = {

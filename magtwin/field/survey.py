@@ -24,8 +24,8 @@ SUFFIX = "_map.csv"
 LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
 """Bounds of a survey's mean [nT]; the Earth's field lies in 22,000..67,000 nT, a building bends it."""
 
-NT_PER = {"T": 1e9, "G": 1e5, "uT": 1e3, "mG": 1e2}
-"""Units that a survey may be in by mistake, and the nT that each is."""
+NT_PER = {"nT": 1.0, "uT": 1e3, "T": 1e9, "mG": 1e2, "G": 1e5}
+"""Units that a field may be in, and the nT that each is."""
 
 WIDEST_DEG = 90.0
 """Headings farther apart than this are taken for an incomplete survey unless the caller names them."""
@@ -43,6 +43,7 @@ def read_grid(
     name: str | None = None,
     licence: str = "",
     headings_deg: tuple[float, ...] | None = None,
+    unit: str = "nT",
 ) -> Readings:
     """The readings of a survey folder, `0_map.csv`, `90_map.csv`, `180_map.csv`, `270_map.csv`.
 
@@ -56,6 +57,7 @@ def read_grid(
         licence: SPDX name of the survey's licence.
         headings_deg: Headings that the survey has [deg]. Unless given, the files must be evenly
             spaced on the circle and at most 90 deg apart, so that a lost file is noticed.
+        unit: Unit of the field, one of `NT_PER`.
 
     Returns:
         Readings in the order of the rows, heading after heading, one run a file, with `grid` and
@@ -63,9 +65,9 @@ def read_grid(
 
     Raises:
         RefusedError: A file or a heading is missing, a row or a value is none, the grid has a hole or
-            a node two values, the headings' grids differ, or the unit is not nT; with file and line.
+            a node two values, the headings' grids differ, or the unit cannot be; with file and line.
     """
-    return _readings(_read(folder, headings_deg), Path(folder), name, licence)
+    return _readings(_read(folder, headings_deg, unit), Path(folder), name, licence)
 
 
 def node_map(readings: Readings) -> AnomalyMap:
@@ -138,10 +140,10 @@ def read_survey(
     """
     from magtwin.field.latch import mask_latched
 
-    layers = _read(folder, headings_deg)
+    layers = _read(folder, headings_deg, "nT")
     readings, found = mask_latched(_readings(layers, Path(folder), name, licence))
     if keep_latched:
-        readings = readings.masked(np.ones(len(readings), bool))
+        readings = readings.with_(good=np.ones(len(readings), bool))
     field = node_map(readings)
     return field, _report(layers, field, folder, found)
 
@@ -174,7 +176,7 @@ class _Layer:
     sha256: str
 
 
-def _read(folder: str | os.PathLike[str], headings_deg: tuple[float, ...] | None) -> list[_Layer]:
+def _read(folder: str | os.PathLike[str], headings_deg: tuple[float, ...] | None, unit: str) -> list[_Layer]:
     folder = existing(folder, "survey folder")
     if not folder.is_dir():
         raise RefusedError(f"{folder}: not a folder; give the one that holds 0{SUFFIX}, 90{SUFFIX}, ...")
@@ -187,7 +189,7 @@ def _read(folder: str | os.PathLike[str], headings_deg: tuple[float, ...] | None
             )
         files[heading] = path
     _check_headings(folder, sorted(files), headings_deg)
-    return [_read_layer(files[heading], heading) for heading in sorted(files)]
+    return [_read_layer(files[heading], heading, unit) for heading in sorted(files)]
 
 
 def _heading(path: Path) -> float:
@@ -232,7 +234,7 @@ def _say(headings: list[float] | tuple[float, ...]) -> str:
     return ", ".join(f"{h:g}" for h in headings)
 
 
-def _read_layer(path: Path, heading_deg: float) -> _Layer:
+def _read_layer(path: Path, heading_deg: float, unit: str) -> _Layer:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (UnicodeDecodeError, OSError) as error:
@@ -247,8 +249,9 @@ def _read_layer(path: Path, heading_deg: float) -> _Layer:
         raise RefusedError(f"{path}: no rows below the header; expected one a node")
     table = np.array([_row(path, number, line) for number, line in lines])
     x, y, theta, field = table.T
+    field = NT_PER[unit] * field
     layer = _Layer(path, heading_deg, np.array([n for n, _ in lines]), x, y, theta, field, sha256(path))
-    check_unit(field, str(path), "scalar_mag")
+    check_unit(field, str(path), "scalar_mag", unit)
     return layer
 
 
@@ -276,13 +279,14 @@ def _row(path: Path, number: int, line: str) -> list[float]:
     return values
 
 
-def check_unit(b_nt: Array, where: str, column: str) -> None:
+def check_unit(b_nt: Array, where: str, column: str, unit: str = "nT") -> None:
     """Refuse readings whose mean cannot be the Earth's field in nT.
 
     Args:
         b_nt: Magnitudes of the field as taken for nT, shape (N,).
         where: File, for the refusal.
         column: Its column.
+        unit: Unit that the file was said to be in.
 
     Raises:
         RefusedError: The mean lies outside 10,000..100,000 nT; the text names the unit that would fit.
@@ -290,13 +294,14 @@ def check_unit(b_nt: Array, where: str, column: str) -> None:
     mean = float(b_nt.mean())
     if LEAST_MEAN_NT <= mean <= GREATEST_MEAN_NT:
         return
+    number = mean / NT_PER[unit]
     fits = [
-        f"were it {unit}, it would be {mean * factor:,.0f} nT, so multiply by {factor:g}"
-        for unit, factor in NT_PER.items()
-        if LEAST_MEAN_NT <= mean * factor <= GREATEST_MEAN_NT
+        f"were it {other}, it would be {number * factor:,.0f} nT, so say --unit {other}"
+        for other, factor in NT_PER.items()
+        if LEAST_MEAN_NT <= number * factor <= GREATEST_MEAN_NT
     ]
     raise RefusedError(
-        f"{where}: the mean of {column} is {mean:.6g}, outside {LEAST_MEAN_NT:,.0f}.."
+        f"{where}: the mean of {column} is {mean:.6g} nT, outside {LEAST_MEAN_NT:,.0f}.."
         f"{GREATEST_MEAN_NT:,.0f} nT; " + (" or ".join(fits) or "no usual unit makes it the Earth's field")
     )
 

@@ -67,7 +67,7 @@ def read_parquet(path: str | os.PathLike[str]) -> Run:
         RefusedError: The file is missing, is not Parquet, was cut short, or holds no run.
     """
     path = existing(path, "Parquet file")
-    _check_parquet(path)
+    check_parquet(path)
     try:
         table = pq.read_table(path)
     except (pa.ArrowException, OSError) as error:
@@ -165,7 +165,7 @@ def _metadata(name: str, part: str) -> dict[str, str]:
     return {key: text for key, text in said.items() if text}
 
 
-def _check_parquet(path: Path) -> None:
+def check_parquet(path: Path) -> None:
     """Refuse what does not begin and end as Parquet files do."""
     if path.is_dir():
         raise RefusedError(f"{path}: a folder, not a Parquet file; name the file in it")

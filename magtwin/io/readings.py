@@ -1,0 +1,418 @@
+"""Readings from files: gridded surveys, tables, runs, bags; and Readings kept as Parquet, exactly."""
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.field.grid import Grid
+from magtwin.field.readings import SHAPES, Readings
+from magtwin.field.survey import NT_PER, check_unit, read_grid
+from magtwin.files import existing, output, sha256
+from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
+from magtwin.io.columns import FIELDS, HEADINGS, Columns
+from magtwin.io.sheet import Sheet, read_csv, read_parquet_sheet
+from magtwin.names import RefusedError
+from magtwin.run import Run
+
+Array = NDArray[np.float64]
+Source = str | os.PathLike[str]
+
+BAGS = (".mcap", ".db3")
+"""Endings of rosbag2's storage files."""
+
+PARQUET = (".parquet", ".pq")
+
+LARGEST_TURN = 2 * np.pi + 0.01
+"""Headings beyond this are taken for degrees unless the caller says that they are radians."""
+
+_SURVEY = b"magtwin_readings"
+_PARTS = {"p_xy": ("x", "y"), "b_body_nt": ("x", "y", "z"), "node": ("heading", "row", "column")}
+_UNITS = {"p_xy": "m", "yaw": "rad", "b_nt": "nT", "b_body_nt": "nT", "t": "s", "good": "bool"}
+_FRAMES = {"p_xy": "world", "yaw": "world", "b_body_nt": "base_link"}
+_TEXTS = ("name", "source", "licence", "created")
+
+
+def read_readings(
+    *sources: Source,
+    columns: Columns | None = None,
+    name: str | None = None,
+    licence: str = "",
+    created: str = "",
+    height_m: float | None = None,
+    headings_deg: tuple[float, ...] | None = None,
+    pose_topic: str | None = None,
+    field_topic: str | None = None,
+) -> Readings:
+    """The readings of a survey, whatever form it is in.
+
+    A source is a folder of one CSV a heading (`magtwin.field.survey`); a table of readings, CSV or
+    Parquet; several files whose rows belong together, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`;
+    those after the first are looked for beside it); a Run's Parquet; Readings' own Parquet; or a
+    rosbag2, its folder or its storage file. Several sources are several runs of one survey.
+
+    Args:
+        sources: One or more of them.
+        columns: Which columns of a table hold what, in which units.
+        name: What the survey is called; after the first source unless given.
+        licence: SPDX name of the licence; where the source knows its own, "" keeps that.
+        created: Day of the survey, YYYY-MM-DD; likewise.
+        height_m: Height of the sensor above the floor [m]; likewise.
+        headings_deg: Headings of a folder of CSVs [deg], for one that is not whole.
+        pose_topic: Topic of a bag's poses, where there are several.
+        field_topic: Topic of a bag's field, where there are several.
+
+    Returns:
+        Readings, in the order of the sources. Rows without a value (a cell that is empty or nan) are
+        left out, and `source` tells how many.
+
+    Raises:
+        RefusedError: A source is missing, damaged, or of no known form; a column is not there (the
+            near one is named); a cell is no number, with file and line; the unit cannot be.
+    """
+    columns = Columns() if columns is None else columns
+    if not sources:
+        raise RefusedError("no source of readings given")
+    parts = []
+    for source in sources:
+        path = _first(source)
+        if path.is_dir() or path.suffix in BAGS:
+            _only_unit(path, columns)
+        if path.suffix in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
+            from magtwin.io.rosbag import read_bag_readings
+
+            parts.append(
+                read_bag_readings(path, pose_topic=pose_topic, field_topic=field_topic, unit=columns.unit)
+            )
+        elif path.is_dir():
+            parts.append(read_grid(path, headings_deg=headings_deg, unit=columns.unit or "nT"))
+        else:
+            parts.append(_of_file(str(source), path, columns))
+    readings = parts[0] if len(parts) == 1 else _together(parts)
+    own = {"licence": licence, "created": created, "height_m": height_m, "name": name}
+    return readings.with_(**{key: value for key, value in own.items() if value not in (None, "")})
+
+
+def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
+    """The readings of a Run: what its magnetometer measured where base_link truly was.
+
+    Args:
+        run: A run with p_world_base, yaw and b_measured_nt, or b_total_nt.
+        name: What the readings are called.
+        source: Where the run is from.
+
+    Returns:
+        Its readings; rows whose field is nan (off the map) are left out, and those with lock lost
+        are not good.
+
+    Raises:
+        RefusedError: A column is missing, or no row has a field.
+    """
+    field = next((c for c in ("b_measured_nt", "b_total_nt") if c in run and np.isfinite(run[c]).any()), None)
+    if field is None:
+        raise RefusedError(
+            f"{source or 'run'}: b_measured_nt and b_total_nt hold no field, only nan or nothing"
+        )
+    b, p, yaw, t = run[field], run["p_world_base"], run["yaw"], run["t"]
+    known = np.isfinite(b) & np.isfinite(p).all(axis=1) & np.isfinite(yaw) & np.isfinite(t)
+    lost = run["flag_lost_lock"] if "flag_lost_lock" in run else np.zeros(len(b), bool)
+    return Readings(
+        p_xy=p[known, :2],
+        yaw=yaw[known],
+        b_nt=b[known],
+        t=t[known],
+        good=~lost[known],
+        runs=(name,),
+        name=name,
+        source=source + _left_out(known),
+    )
+
+
+def save_readings(readings: Readings, path: Source, *, force: bool = False) -> None:
+    """Write readings as Parquet; the same readings give the same bytes.
+
+    Every Arrow field says its unit and frame; the file's metadata `magtwin_readings` holds, in JSON,
+    the runs, the grid, the height and where all of it is from.
+
+    Args:
+        readings: The readings.
+        path: The file to make.
+        force: Whether one that exists is replaced.
+
+    Raises:
+        RefusedError: The file exists and `force` was not given.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    fields, arrays = [], []
+    for key, (width, _) in SHAPES.items():
+        values = getattr(readings, key)
+        if values is None:
+            continue
+        for i, part in enumerate(_PARTS[key] if width else ("",)):
+            array = pa.array(np.ascontiguousarray(values[:, i] if width else values))
+            said = {"column": key, "part": part, "unit": _UNITS.get(key, ""), "frame": _FRAMES.get(key, "")}
+            said = {k: text for k, text in said.items() if text}
+            label = f"{key}_{part}" if part else key
+            fields.append(pa.field(label, array.type, nullable=False, metadata=said))
+            arrays.append(array)
+    about: dict[str, Any] = {key: getattr(readings, key) for key in _TEXTS}
+    about |= {"runs": readings.runs, "height_m": readings.height_m}
+    about["grid"] = None if readings.grid is None else asdict(readings.grid)
+    schema = pa.schema(fields, metadata={_SURVEY: json.dumps(about, ensure_ascii=False)})
+    split = {f.name: "BYTE_STREAM_SPLIT" for f in fields if pa.types.is_floating(f.type)}
+    with output(path, force=force) as aside:
+        pq.write_table(
+            pa.Table.from_arrays(arrays, schema=schema),
+            aside,
+            compression="zstd",
+            use_dictionary=False,
+            column_encoding=split,
+        )
+
+
+def load_readings(path: Source) -> Readings:
+    """The readings that `save_readings` wrote, to the last bit.
+
+    Raises:
+        RefusedError: The file is missing, is not Parquet, was cut short, or holds no Readings.
+    """
+    path = existing(path, "Parquet file")
+    sheet, metadata = read_parquet_sheet(path), _metadata(path)
+    if _SURVEY not in metadata:
+        raise RefusedError(f"{path}: no Readings: metadata {_SURVEY.decode()!r} is missing")
+    try:
+        about = json.loads(metadata[_SURVEY])
+        grid = about["grid"] and Grid(
+            **{**about["grid"], "headings_rad": tuple(about["grid"]["headings_rad"])}
+        )
+        given = {key: about[key] for key in (*_TEXTS, "height_m")} | {"runs": tuple(about["runs"])}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        if isinstance(error, RefusedError):
+            raise RefusedError(f"{path}: {error}") from error
+        raise RefusedError(
+            f"{path}: metadata {_SURVEY.decode()!r} is damaged ({type(error).__name__}: {error})"
+        ) from error
+    names = set(sheet.names)
+    arrays: dict[str, ArrayLike] = {}
+    for key, (width, kind) in SHAPES.items():
+        labels = [f"{key}_{part}" for part in _PARTS[key]] if width else [key]
+        if names.isdisjoint(labels) and key in ("b_body_nt", "t", "node"):
+            continue
+        cells: list[NDArray[Any]] = [sheet.numbers(label).astype(kind) for label in labels]
+        arrays[key] = np.column_stack(cells) if width else cells[0]
+    try:
+        return Readings(**arrays, grid=grid or None, **given)  # type: ignore[arg-type]
+    except RefusedError as error:
+        raise RefusedError(f"{path}: {error}") from error
+
+
+def _first(source: Source) -> Path:
+    """The path of a source, or of the first of its joined files."""
+    path = Path(source)
+    if path.exists() or "+" not in path.name:
+        return existing(path, "source of readings")
+    return existing(Path(str(source).split("+")[0]), "source of readings")
+
+
+def _only_unit(path: Path, columns: Columns) -> None:
+    """Refuse columns that are named for a source that has none to choose from."""
+    if replace(columns, unit=None) != Columns():
+        raise RefusedError(f"{path}: its columns are known; columns are named for tables of your own")
+
+
+def _of_file(source: str, path: Path, columns: Columns) -> Readings:
+    if path.suffix in PARQUET and path == Path(source):
+        metadata = _metadata(path)
+        if _SURVEY in metadata or b"magtwin_facts" in metadata:
+            _only_unit(path, replace(columns, unit=None))
+        if _SURVEY in metadata:
+            return load_readings(path)
+        if b"magtwin_facts" in metadata:
+            from magtwin.io.tables import read_parquet
+
+            return readings_of_run(read_parquet(path), name=path.stem, source=_sum(path))
+    paths = [path]
+    if path != Path(source):
+        paths += [path.parent / word for word in source.split("+")[1:]]
+    sheet = _sheet(paths[0])
+    for other in paths[1:]:
+        sheet = sheet.beside(_sheet(other))
+    return _of_sheet(sheet, paths, columns)
+
+
+def _sheet(path: Path) -> Sheet:
+    return read_parquet_sheet(path) if path.suffix in PARQUET else read_csv(path)
+
+
+def _of_sheet(sheet: Sheet, paths: list[Path], columns: Columns) -> Readings:
+    """The readings in a table."""
+    p = np.column_stack([sheet.numbers(columns.x), sheet.numbers(columns.y)])
+    turn = _turn(sheet, columns)
+    vector, b = _field(sheet, columns)
+    t = sheet.numbers(columns.time) if columns.time else None
+    some = [p, b[:, None]] + [v.reshape(len(p), -1) for v in (turn, vector, t) if v is not None]
+    known: NDArray[np.bool_] = np.all(np.isfinite(np.hstack(some)), axis=1)
+    if not known.any():
+        raise RefusedError(f"{sheet.path}: no row has all its values; {len(known)} have a cell empty or nan")
+    if turn is not None and turn.ndim == 2:
+        length = np.linalg.norm(turn, axis=1)
+        off = np.flatnonzero(known & (np.abs(length - 1) > 0.01))
+        if len(off):
+            where = sheet.column(columns.several("quaternion")[0]).where(int(off[0]))
+            raise RefusedError(f"{where}: a quaternion's length is 1, got {length[off[0]]:.4g}")
+        turn = turn / length[:, None]
+    elif turn is None:
+        if vector is None or columns.axes != "world":
+            raise RefusedError(
+                f"{sheet.path}: no heading: no column is called {', '.join(HEADINGS)}; name it with "
+                "--heading or --quaternion, for a robot's readings turn with it; only vectors in world axes "
+                "do without"
+            )
+        turn = np.zeros(len(p))
+    yaw = turn if turn.ndim == 1 else yaw_from_quat(turn)
+    nought = np.flatnonzero(known & (b <= 0))
+    if len(nought):
+        where = _magnitude(sheet, columns)
+        raise RefusedError(f"{where.where(int(nought[0]))}: a magnitude is above 0, got {b[nought[0]]:g} nT")
+    check_unit(
+        b[known],
+        str(sheet.path),
+        _magnitude(sheet, columns).name or columns.field or columns.vector,
+        columns.unit or "nT",
+    )
+    run, runs = _runs(sheet, columns, paths[0].stem, known)
+    return Readings(
+        p_xy=p[known],
+        yaw=yaw[known],
+        b_nt=b[known],
+        b_body_nt=None if vector is None else levelled(vector, turn, columns.axes)[known],
+        t=None if t is None else t[known],
+        run=run,
+        runs=runs,
+        name=paths[0].stem,
+        source="; ".join(map(_sum, paths)) + _left_out(known),
+    )
+
+
+def levelled(vector_nt: Array, turn: Array, axes: str) -> Array:
+    """Vectors in the axes of a robot that stands upright: forward, left, up.
+
+    Args:
+        vector_nt: Field in body or world axes, shape (N, 3).
+        turn: Headings [rad], shape (N,), or orientations xyzw of the body in world, shape (N, 4).
+        axes: "body" or "world", what `vector_nt` is in.
+
+    Returns:
+        Field in level axes that are turned by the heading alone, shape (N, 3).
+    """
+    if turn.ndim == 1:
+        if axes == "body":
+            return vector_nt
+        return rotate(quat_conjugate(quat_from_yaw(turn)), vector_nt)
+    world = rotate(turn, vector_nt) if axes == "body" else vector_nt
+    return rotate(quat_conjugate(quat_from_yaw(yaw_from_quat(turn))), world)
+
+
+def _turn(sheet: Sheet, columns: Columns) -> Array | None:
+    """Headings [rad], shape (N,), or quaternions xyzw, shape (N, 4); none where there is no such column."""
+    if columns.quaternion:
+        return np.column_stack([sheet.numbers(name) for name in columns.several("quaternion")])
+    name = columns.heading or next((name for name in HEADINGS if name in sheet.names), "")
+    if not name:
+        return None
+    heading = sheet.numbers(name)
+    if columns.heading_unit == "deg":
+        return np.radians(heading)
+    beyond = np.flatnonzero(np.abs(heading) > LARGEST_TURN)
+    if columns.heading_unit is None and len(beyond):
+        where = sheet.column(name).where(int(beyond[0]))
+        raise RefusedError(
+            f"{where}: heading {heading[beyond[0]]:g} is beyond a full turn in radians; "
+            "give --heading-unit deg, or rad where it counts turns"
+        )
+    return heading
+
+
+def _magnitude(sheet: Sheet, columns: Columns) -> Any:
+    """The column that a fault of the magnitude is told of."""
+    if columns.field:
+        return sheet.column(columns.field)
+    if columns.vector:
+        return sheet.column(columns.several("vector")[0])
+    return sheet.column(next((name for name in FIELDS if name in sheet.names), FIELDS[0]))
+
+
+def _field(sheet: Sheet, columns: Columns) -> tuple[Array | None, Array]:
+    """Vectors, where there are, and magnitudes [nT], shapes (N, 3) and (N,)."""
+    vector = None
+    if columns.vector:
+        names = columns.several("vector")
+        vector = NT_PER[columns.unit or "nT"] * np.column_stack([sheet.numbers(name) for name in names])
+    if columns.field or vector is None:
+        return vector, NT_PER[columns.unit or "nT"] * sheet.numbers(
+            _magnitude(sheet, columns).name or columns.field
+        )
+    return vector, np.linalg.norm(vector, axis=1)
+
+
+def _runs(sheet: Sheet, columns: Columns, stem: str, known: NDArray[np.bool_]) -> Any:
+    """Which run each of the known rows belongs to, and the runs' names."""
+    if not columns.run_column:
+        return None, (stem,)
+    words = [word for word, is_known in zip(sheet.texts(columns.run_column), known, strict=True) if is_known]
+    runs = list(dict.fromkeys(words))
+    index = {word: i for i, word in enumerate(runs)}
+    return np.array([index[word] for word in words]), tuple(f"{stem} {word}" for word in runs)
+
+
+def _together(parts: Sequence[Readings]) -> Readings:
+    """Several surveys as the runs of one."""
+    gridded = [part for part in parts if part.grid is not None]
+    if gridded:
+        raise RefusedError(
+            f"survey {gridded[0].name!r} is gridded and cannot be one of several sources; read it alone"
+        )
+    first = np.cumsum([0] + [len(part.runs) for part in parts])
+    arrays: dict[str, Any] = {"run": np.concatenate([p.run + n for p, n in zip(parts, first, strict=False)])}
+    for key in ("p_xy", "yaw", "b_nt", "b_body_nt", "t", "good"):
+        values = [getattr(part, key) for part in parts]
+        arrays[key] = None if any(v is None for v in values) else np.concatenate(values)
+    same: dict[str, Any] = {}
+    for key, unknown in (("licence", ""), ("created", ""), ("height_m", None)):
+        found = {getattr(part, key) for part in parts}
+        same[key] = found.pop() if len(found) == 1 else unknown
+    runs = tuple(run for part in parts for run in part.runs)
+    source = "; ".join(part.source for part in parts)
+    return Readings(**arrays, **same, runs=runs, name=parts[0].name, source=source)
+
+
+def _metadata(path: Path) -> dict[bytes, bytes]:
+    """The metadata of a Parquet file."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from magtwin.io.tables import check_parquet
+
+    check_parquet(path)
+    try:
+        return dict(pq.read_schema(path).metadata or {})
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise RefusedError(f"{path}: damaged Parquet ({reason}); write it again") from error
+
+
+def _sum(path: Path) -> str:
+    return f"{path.name} sha256:{sha256(path)}"
+
+
+def _left_out(known: NDArray[np.bool_]) -> str:
+    """A remark on rows without a value."""
+    missing = int(np.count_nonzero(~known))
+    return f" ({missing} of {len(known)} rows without a value left out)" if missing else ""
