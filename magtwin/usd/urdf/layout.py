@@ -134,8 +134,8 @@ def split(flat: Sdf.Layer) -> dict[str, Sdf.Layer]:
     """
     robot = flat.GetPrimAtPath(flat.rootPrims[flat.defaultPrim].path)
     parts = {name: Sdf.Layer.CreateAnonymous(f"{name}.usda") for name in ("interface", *FILES)}
-    splitter = _Splitter(flat, parts)
-    splitter.route(robot)
+    with Sdf.ChangeBlock():
+        _Splitter(flat, parts).route(robot)
     for name, layer in parts.items():
         layer.RemoveInertSceneDescription()
         _describe(layer, flat, name, robot.name)

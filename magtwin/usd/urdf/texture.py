@@ -74,7 +74,8 @@ def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
                 raise RefusedError(f"{width} x {height} pixels are too many")
             rgba = picture.convert("RGBA")
     except (OSError, RefusedError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
-        reading.lose(f"texture {name!r} is no picture that can be read and is left out ({error})")
+        reason = str(error).partition(" <")[0]  # without the address of what could not be read
+        reading.lose(f"texture {name!r} is no picture that can be read and is left out ({reason})")
         return None
     r, g, b = (c / 255 for c in rgba.convert("RGB").resize((1, 1), Pillow.Resampling.BOX).tobytes())
     if kind not in KEPT:

@@ -18,8 +18,6 @@ from typing import Any
 from xml.dom import minidom
 from xml.etree import ElementTree
 
-import yaml
-
 from magtwin.names import RefusedError, hint
 from magtwin.usd.urdf.expression import GLOBALS, LARGEST, Budget, ExpressionError, check_size, evaluate
 from magtwin.usd.urdf.markup import parse_markup
@@ -262,6 +260,8 @@ class _Expansion:
 
     def _yaml(self, filename: str) -> Any:
         """Data of a YAML file, with angles and lengths in the units that their tags name."""
+        import yaml
+
         path = self._check_inside(self._library.abs_filename_spec(str(filename)), "load_yaml")
 
         class Loader(yaml.SafeLoader):
