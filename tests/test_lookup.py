@@ -1,4 +1,4 @@
-"""Lookup: numpy, plain Python and compiled code agree to the byte; gradients are what the field changes by."""
+"""Lookup: numpy, plain Python and compiled code agree to the byte; gradients are how the field changes."""
 
 import copy
 import math

@@ -84,23 +84,33 @@ class Lookup:
     ) -> None:
         layers, rows, columns = values_nt.shape
         first = float(headings_rad[0])
-        self._knots = headings_rad - first
-        self._gaps = np.diff(np.append(headings_rad, first + TURN))
-        even = np.abs(self._gaps - TURN / layers).max() < 1e-12
+        self.knots: Array = headings_rad - first
+        """Angles of the layers above the first [rad], shape (H,)."""
+
+        self.gaps: Array = np.diff(np.append(headings_rad, first + TURN))
+        """Angles from each layer to the next [rad], the last one's to the first, shape (H,)."""
+
+        even = np.abs(self.gaps - TURN / layers).max() < 1e-12
         per_rad = 0.0 if layers == 1 else layers / TURN if even else -1.0
         grids = [np.where(valid, values_nt, 0.0)]
         if not valid.all():
             grids.append((~valid).astype(float))
         header = [*origin_m, *cell_m, first, EDGE, layers, rows, columns, per_rad]
         closed = [part.ravel() for grid in grids for part in (grid, grid[:1])]
-        self.table: Array = np.concatenate([header, self._knots, self._gaps, *closed])
+        self.table: Array = np.concatenate([header, self.knots, self.gaps, *closed])
         """The map in one array, as `compiled.lookup` describes it."""
 
         start, nodes = len(header) + 2 * layers, (layers + 1) * rows * columns
-        self._values = self.table[start : start + nodes]
-        self._holes = self.table[start + nodes :] if len(grids) > 1 else None
-        self._figures = (*origin_m, *cell_m, first, per_rad, layers, rows, columns)
-        self._cells = _Cells(self._values, self._holes, columns, rows * columns)
+        self.values: Array = self.table[start : start + nodes]
+        """Values [nT], 0 where masked, the first layer once more at the end."""
+
+        self.holes: Array | None = self.table[start + nodes :] if len(grids) > 1 else None
+        """In the same order, 1 at masked nodes and 0 elsewhere; none where no node is masked."""
+
+        self.figures = (*origin_m, *cell_m, first, per_rad, layers, rows, columns)
+        """The head of the table but for the rounding; `per_rad` is below 0 for layers unevenly apart."""
+
+        self._cells = _Cells(self.values, self.holes, columns, rows * columns)
         self._poses = 0
 
     def lookup(self, p: Array, yaw: Array, *, clamp: bool, gradient: bool) -> tuple[Array, Array]:
@@ -142,9 +152,9 @@ class Lookup:
             return math.nan
         node, wx, wy, wh = place
         values, holes = self._cells[node]
-        if holes is not None and _blend(holes, wx, wy, wh) > EDGE:
+        if holes is not None and blend(holes, wx, wy, wh) > EDGE:
             return math.nan
-        return float(_blend(values, wx, wy, wh))
+        return float(blend(values, wx, wy, wh))
 
     def at_with_gradient(
         self, x: float, y: float, yaw: float, *, clamp: bool = False
@@ -155,25 +165,25 @@ class Lookup:
             return math.nan, math.nan, math.nan, math.nan
         node, wx, wy, wh = place
         values, holes = self._cells[node]
-        if holes is not None and _blend(holes, wx, wy, wh) > EDGE:
+        if holes is not None and blend(holes, wx, wy, wh) > EDGE:
             return math.nan, math.nan, math.nan, math.nan
-        x0, y0, dx, dy, _, per_rad, _, rows, columns = self._figures
+        x0, y0, dx, dy, _, per_rad, _, rows, columns = self.figures
         rates = (
             1 / dx if -EDGE <= (x - x0) / dx <= columns - 1 + EDGE else 0.0,
             1 / dy if -EDGE <= (y - y0) / dy <= rows - 1 + EDGE else 0.0,
-            per_rad if per_rad >= 0 else 1 / float(self._gaps[node // (rows * columns)]),
+            per_rad if per_rad >= 0 else 1 / float(self.gaps[node // (rows * columns)]),
         )
-        sides = _sides(values, wx, wy, wh, -1.0)
+        sides = sides_of(values, wx, wy, wh, -1.0)
         slopes = [side * rate for side, rate in zip(sides, rates, strict=True)]
         if holes is not None:
-            for axis, hole in enumerate(_sides(holes, wx, wy, wh, 1.0)):
+            for axis, hole in enumerate(sides_of(holes, wx, wy, wh, 1.0)):
                 if rates[axis] and hole > EDGE:
                     slopes[axis] = math.nan
-        return _blend(values, wx, wy, wh), slopes[0], slopes[1], slopes[2]
+        return blend(values, wx, wy, wh), slopes[0], slopes[1], slopes[2]
 
     def _place(self, x: float, y: float, yaw: float, clamp: bool) -> tuple[int, float, float, float] | None:
         """Lowest node of a pose and the weights of the higher ones; none where no field is known."""
-        x0, y0, dx, dy, first, per_rad, layers, rows, columns = self._figures
+        x0, y0, dx, dy, first, per_rad, layers, rows, columns = self.figures
         u, v, a = (x - x0) / dx, (y - y0) / dy, yaw - first
         right, top = columns - 1.0, rows - 1.0
         if not (-EDGE <= u <= right + EDGE and -EDGE <= v <= top + EDGE) and not (
@@ -192,8 +202,8 @@ class Lookup:
         a -= TURN * math.floor(a / TURN)
         a = 0.0 if a < 0 else TURN if a > TURN else a
         if per_rad < 0:
-            h = bisect_right(self._knots, a) - 1  # type: ignore[type-var]
-            w = (a - float(self._knots[h])) / float(self._gaps[h])
+            h = bisect_right(self.knots, a) - 1  # type: ignore[type-var]
+            w = (a - float(self.knots[h])) / float(self.gaps[h])
         else:
             w = a * per_rad
             h = int(w)
@@ -204,7 +214,7 @@ class Lookup:
 
     def _opened(self, poses: int) -> ModuleType | None:
         """The compiled code where it is open, or where it pays to open it for so many more poses."""
-        if len(self._values) >= MOST_INDEXED:
+        if len(self.values) >= MOST_INDEXED:
             return None
         if self.compiled is None:
             before = self._poses
@@ -236,7 +246,7 @@ class Lookup:
 
     def _by_numpy(self, p: Array, yaw: Array, clamp: bool, out: Array, slopes: Array) -> None:
         """Numpy on a block of poses; `slopes` is empty where the gradient is not wanted."""
-        x0, y0, dx, dy, first, per_rad, layers, rows, columns = self._figures
+        x0, y0, dx, dy, first, per_rad, layers, rows, columns = self.figures
         unknown = ~np.isfinite(yaw)
         place, inside = [], []
         for axis, (origin, spacing, last) in enumerate(((x0, dx, columns - 1), (y0, dy, rows - 1))):
@@ -251,8 +261,8 @@ class Lookup:
         a -= TURN * np.floor(a / TURN)
         a = np.clip(a, 0, TURN)
         if per_rad < 0:
-            h = np.searchsorted(self._knots[1:], a, side="right")
-            wh, rate = (a - self._knots[h]) / self._gaps[h], 1 / self._gaps[h]
+            h = np.searchsorted(self.knots[1:], a, side="right")
+            wh, rate = (a - self.knots[h]) / self.gaps[h], 1 / self.gaps[h]
         else:
             u = a * per_rad
             h = np.minimum(u.astype(np.intp), layers - 1)
@@ -260,20 +270,20 @@ class Lookup:
         node = (h * rows + j) * columns + i
         layer = rows * columns
         ways = [up + along for up in (0, layer) for along in (0, 1, columns, columns + 1)]
-        values = [self._values.take(node + way) for way in ways]
-        out[:] = _blend(values, wx, wy, wh)
+        values = [self.values.take(node + way) for way in ways]
+        out[:] = blend(values, wx, wy, wh)
         holes = None
-        if self._holes is not None:
-            holes = [self._holes.take(node + way) for way in ways]
-            unknown |= _blend(holes, wx, wy, wh) > EDGE
+        if self.holes is not None:
+            holes = [self.holes.take(node + way) for way in ways]
+            unknown |= blend(holes, wx, wy, wh) > EDGE
         out[unknown] = np.nan
         if not len(slopes):
             return
         rates = (np.where(inside[0], 1 / dx, 0.0), np.where(inside[1], 1 / dy, 0.0), rate)
-        for axis, side in enumerate(_sides(values, wx, wy, wh, -1.0)):
+        for axis, side in enumerate(sides_of(values, wx, wy, wh, -1.0)):
             slopes[:, axis] = side * rates[axis]
         if holes is not None:
-            for axis, hole in enumerate(_sides(holes, wx, wy, wh, 1.0)):
+            for axis, hole in enumerate(sides_of(holes, wx, wy, wh, 1.0)):
                 slopes[(rates[axis] != 0) & (hole > EDGE), axis] = np.nan
         slopes[unknown] = np.nan
 
@@ -294,7 +304,7 @@ class _Cells(dict[int, tuple[Corners, Corners | None]]):
         return cell
 
 
-def _blend(corners: Corners, x: Any, y: Any, h: Any) -> Any:
+def blend(corners: Corners, x: Any, y: Any, h: Any) -> Any:
     """Sum of the nodes weighed by nearness; x, y and h weigh the higher ones. Exact at 0 and at 1."""
     b000, b001, b010, b011, b100, b101, b110, b111 = corners
     lx, ly = 1 - x, 1 - y
@@ -303,7 +313,7 @@ def _blend(corners: Corners, x: Any, y: Any, h: Any) -> Any:
     return low * (1 - h) + high * h
 
 
-def _sides(corners: Corners, x: Any, y: Any, h: Any, sign: float) -> tuple[Any, Any, Any]:
+def sides_of(corners: Corners, x: Any, y: Any, h: Any, sign: float) -> tuple[Any, Any, Any]:
     """High side of the cell plus `sign` times the low one, along x, y and heading."""
     b000, b001, b010, b011, b100, b101, b110, b111 = corners
     lx, ly, lh = 1 - x, 1 - y, 1 - h
