@@ -192,7 +192,7 @@ REFUSALS = {
     "tesla": ("scaled", 1e-9, r"mean of scalar_mag is 4\.105e-05 nT.*were it T, it would be 41,050 nT"),
     "uT": ("scaled", 1e-3, r"mean of scalar_mag is 41\.05.*were it uT, it would be 41,050 nT"),
     "mG": ("scaled", 1e-2, r"mean of scalar_mag is 410\.5.*were it mG, it would be 41,050 nT"),
-    "pT": ("scaled", 1e3, r"mean of scalar_mag is 4\.105e\+07, outside .* no usual unit"),
+    "pT": ("scaled", 1e3, r"mean of scalar_mag is 4\.105e\+07 nT, outside .* no usual unit"),
 }
 
 

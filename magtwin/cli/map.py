@@ -1,55 +1,220 @@
 """`magtwin map`: make and look at anomaly maps."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say
+from magtwin.cli.terminal import Force, Json, check_suffix, print_report, progress, say
+from magtwin.io.columns import Columns
+from magtwin.names import RefusedError
 
 map_app = App(name="map", help="Make and look at anomaly maps.")
 app.command(map_app)
 
+KeepLatched = Annotated[bool, Parameter(name="--keep-latched", negative="")]
+TableColumns = Annotated[Columns, Parameter(name="*")]
+NO_COLUMNS = Columns()
+
 
 @map_app.command(name="import")
 def map_import(
-    folder: Path,
-    *,
+    *sources: Path,
     out: Path,
     name: str | None = None,
     licence: str = "",
+    created: str = "",
+    height: float | None = None,
+    keep_latched: KeepLatched = False,
+    pose_topic: str | None = None,
+    field_topic: str | None = None,
+    columns: TableColumns = NO_COLUMNS,
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Read a survey, one CSV file a heading, into a map layer.
+    """Read a survey: a gridded one into a map layer or readings, any other into readings.
+
+    Readings that latched, or are stuck, are found and masked; outliers are named and left in.
 
     Parameters
     ----------
-    folder
-        Folder of 0_map.csv, 90_map.csv, ...: rows of x [m], y [m], heading [rad], field [nT].
+    sources
+        Folder of 0_map.csv, 90_map.csv, ...: rows of x [m], y [m], heading [rad], field. Or tables (CSV,
+        Parquet), Runs or rosbag2 folders, each a run of its own; files whose rows belong together are
+        joined by a plus, time.csv+place.csv+field.csv.
     out
-        Map layer to write, a .usdc file.
+        Map layer to write, a .usdc file; or readings, a .parquet file, to fit a model to.
     name
         Name of the map; the file's unless given.
     licence
         Licence of the survey, an SPDX identifier such as MIT.
+    created
+        Day of the survey, YYYY-MM-DD.
+    height
+        Height of the sensor above the floor [m].
+    keep_latched
+        Leave latched and stuck readings in.
+    pose_topic
+        Topic of a bag's poses, where it has several.
+    field_topic
+        Topic of a bag's field, where it has several.
     force
         Replace the file if it exists.
     json
         Print the summary as JSON.
     """
-    from magtwin.field.survey import read_survey
+    from magtwin.field.survey import node_map, read_survey
+    from magtwin.files import check_free
+
+    check_suffix(out, (".usdc", ".usd", ".parquet"), "a map layer, or a file of readings,")
+    check_free(out, force=force)
+    about: dict[str, Any] = {
+        "name": name or out.stem,
+        "licence": licence,
+        "created": created,
+        "height_m": height,
+    }
+    if out.suffix != ".parquet" and len(sources) == 1 and _is_survey_folder(sources[0], columns):
+        field: Any
+        field, report = read_survey(sources[0], **about, unit=columns.unit or "nT", keep_latched=keep_latched)
+    else:
+        readings, found = _read(sources, columns, about, keep_latched, pose_topic, field_topic)
+        field = None if out.suffix == ".parquet" else node_map(readings)
+        report = _joined((field or readings).report(), found)
+    if field is None:
+        from magtwin.io.readings import save_readings
+
+        save_readings(readings, out, force=force)
+    else:
+        from magtwin.usd.maps import save_map
+
+        save_map(field, out, force=force)
+    print_report(report, json)
+    if not json:
+        say(f"Wrote {out}")
+
+
+@map_app.command(name="fit")
+def map_fit(
+    *sources: Path,
+    out: Path,
+    method: Literal["trilinear", "cubic", "gp", "harmonic"] = "harmonic",
+    spacing: float | None = None,
+    headings: str | None = None,
+    name: str | None = None,
+    licence: str = "",
+    created: str = "",
+    height: float | None = None,
+    keep_latched: KeepLatched = False,
+    pose_topic: str | None = None,
+    field_topic: str | None = None,
+    columns: TableColumns = NO_COLUMNS,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Fit a model to a survey, and write its map with variance.
+
+    Parameters
+    ----------
+    sources
+        Readings of any form that `magtwin map import` takes, its .parquet files too.
+    out
+        Map layer to write, a .usdc file.
+    method
+        trilinear between nodes, cubic, a Gaussian process, or the harmonic field of equivalent dipoles
+        with the platform that the survey was made with.
+    spacing
+        Distance between the map's nodes [m]; the survey's own for trilinear, else a fifth of it.
+    headings
+        Headings of the map [deg], as 0,90,180,270; the survey's own for trilinear, else every 15 deg.
+    name
+        Name of the map; the file's unless given.
+    licence
+        Licence of the survey, an SPDX identifier such as MIT.
+    created
+        Day of the survey, YYYY-MM-DD.
+    height
+        Height of the sensor above the floor [m].
+    keep_latched
+        Leave latched and stuck readings in.
+    pose_topic
+        Topic of a bag's poses, where it has several.
+    field_topic
+        Topic of a bag's field, where it has several.
+    force
+        Replace the file if it exists.
+    json
+        Print the summary as JSON.
+    """
     from magtwin.files import check_free
     from magtwin.usd.maps import save_map
 
     check_suffix(out, (".usdc", ".usd"), "a map layer")
     check_free(out, force=force)
-    field, report = read_survey(folder, name=name or out.stem, licence=licence)
+    about: dict[str, Any] = {
+        "name": name or out.stem,
+        "licence": licence,
+        "created": created,
+        "height_m": height,
+    }
+    readings, found = _read(sources, columns, about, keep_latched, pose_topic, field_topic)
+    from magtwin.field.fit import fit, raster
+
+    angles = None if headings is None else _headings_rad(headings)
+    with progress(f"Fitting {method}") as advance:
+        model = fit(readings, method, progress=advance)
+        field = raster(model, readings, spacing_m=spacing, headings_rad=angles, progress=advance)
     save_map(field, out, force=force)
-    print_report(report, json)
+    print_report(_joined(field.report(), found), json)
     if not json:
         say(f"Wrote {out}")
+
+
+@map_app.command(name="check")
+def map_check(
+    *sources: Path,
+    method: list[Literal["trilinear", "cubic", "gp", "harmonic"]] | None = None,
+    split: Literal["checkerboard", "run", "block"] | None = None,
+    within: float | None = None,
+    keep_latched: KeepLatched = False,
+    pose_topic: str | None = None,
+    field_topic: str | None = None,
+    columns: TableColumns = NO_COLUMNS,
+    json: Json = False,
+) -> None:
+    """Say how well each method predicts readings that it was not shown.
+
+    Parameters
+    ----------
+    sources
+        Readings of any form that `magtwin map import` takes, its .parquet files too.
+    method
+        Method to check; may be given several times; all of them unless given.
+    split
+        What is left out: every other node at all its headings, one run at a time, or blocks of the floor;
+        nodes of a gridded survey, runs where there are several, else blocks, unless given.
+    within
+        Only readings this near to one that was shown count [m].
+    keep_latched
+        Leave latched and stuck readings in.
+    pose_topic
+        Topic of a bag's poses, where it has several.
+    field_topic
+        Topic of a bag's field, where it has several.
+    json
+        Print the summary as JSON.
+    """
+    readings, _ = _read(sources, columns, {}, keep_latched, pose_topic, field_topic)
+    from magtwin.field.check import check
+    from magtwin.field.fit import METHODS
+
+    if split is None:
+        split = "checkerboard" if readings.grid is not None else "run" if len(readings.runs) > 1 else "block"
+    with progress("Checking") as advance:
+        report = check(readings, list(method or METHODS), split=split, within_m=within, progress=advance)
+    print_report(report, json)
 
 
 @map_app.command(name="plot")
@@ -87,6 +252,54 @@ def map_info(file: Path, *, json: Json = False) -> None:
         Print it as JSON.
     """
     print_report(_open_map(file).report(), json)
+
+
+def _is_survey_folder(source: Path, columns: Columns) -> bool:
+    """Whether a source is a folder of one CSV a heading, whose columns need no names."""
+    bag = (source / "metadata.yaml").is_file()
+    return not bag and (source.is_dir() or not source.exists()) and replace(columns, unit=None) == Columns()
+
+
+def _read(
+    sources: tuple[Path, ...],
+    columns: Columns,
+    about: dict[str, Any],
+    keep_latched: bool,
+    pose_topic: str | None,
+    field_topic: str | None,
+) -> Any:
+    """The readings of the sources, and the report of what was found latched, stuck or outlying in them."""
+    from magtwin.field.latch import mask_latched
+    from magtwin.io.readings import read_readings
+
+    readings = read_readings(
+        *sources, columns=columns, pose_topic=pose_topic, field_topic=field_topic, **about
+    )
+    masked, found = mask_latched(readings)
+    if not (keep_latched or masked.good.any()):
+        raise RefusedError(
+            f"{sources[0]}: all {len(readings)} readings are those of a sensor that was stuck; "
+            "survey again, or give --keep-latched to take them as they are"
+        )
+    return (readings if keep_latched else masked), found
+
+
+def _headings_rad(text: str) -> list[float]:
+    """Headings as 0,90,180,270 [deg] in radians, each once, ascending."""
+    from math import radians
+
+    try:
+        degrees = sorted({float(word) % 360 for word in text.split(",")})
+    except ValueError:
+        degrees = []
+    if not degrees or any(h != h for h in degrees):
+        raise RefusedError(f"headings are degrees with commas between, such as 0,90,180,270; got {text!r}")
+    return [radians(h) for h in degrees]
+
+
+def _joined(report: Any, found: Any) -> Any:
+    """A report with the figures and facts of another below its own."""
+    return replace(report, figures=report.figures + found.figures, facts={**report.facts, **found.facts})
 
 
 def _open_map(file: Path) -> Any:

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.grid import Grid
 from magtwin.names import RefusedError
+from magtwin.report import Figure, Report
 
 Array = NDArray[np.float64]
 
@@ -124,6 +125,22 @@ class Readings:
         given = {f.name: getattr(self, f.name) for f in fields(self)}
         some: dict[str, Any] = {k: None if given[k] is None else given[k][index] for k in SHAPES}
         return Readings(**{**given, **some})
+
+    def report(self) -> Report:
+        """The figures that tell one survey from another, over its good readings."""
+        good = self.take(self.good) if self.good.any() else self
+        (x0, y0), (x1, y1) = good.p_xy.min(axis=0), good.p_xy.max(axis=0)
+        figures = [
+            Figure("readings", len(self), note="with vectors" if self.b_body_nt is not None else ""),
+            Figure("good readings", int(self.good.sum())),
+            Figure("runs", len(self.runs)),
+            Figure("extent", f"x {x0:.3f}..{x1:.3f}, y {y0:.3f}..{y1:.3f}", "m"),
+            Figure("mean", round(float(good.b_nt.mean()), 1), "nT", spread=round(float(good.b_nt.std()), 1)),
+            Figure("least", round(float(good.b_nt.min()), 1), "nT"),
+            Figure("greatest", round(float(good.b_nt.max()), 1), "nT"),
+        ]
+        facts = {"source": self.source.split("; "), "licence": self.licence, "created": self.created}
+        return Report(f"readings {self.name}", tuple(figures), {k: v for k, v in facts.items() if v})
 
     def with_(self, **changes: Any) -> "Readings":
         """The same readings with other values of some fields, such as `good`."""

@@ -4,6 +4,7 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,8 @@ def read_grid(
     *,
     name: str | None = None,
     licence: str = "",
+    created: str = "",
+    height_m: float | None = None,
     headings_deg: tuple[float, ...] | None = None,
     unit: str = "nT",
 ) -> Readings:
@@ -55,6 +58,8 @@ def read_grid(
         folder: Folder that holds the files. Other files in it are left alone.
         name: Name of the survey; that of the folder unless given.
         licence: SPDX name of the survey's licence.
+        created: Day of the survey, YYYY-MM-DD.
+        height_m: Height of the sensor above the floor [m].
         headings_deg: Headings that the survey has [deg]. Unless given, the files must be evenly
             spaced on the circle and at most 90 deg apart, so that a lost file is noticed.
         unit: Unit of the field, one of `NT_PER`.
@@ -67,7 +72,8 @@ def read_grid(
         RefusedError: A file or a heading is missing, a row or a value is none, the grid has a hole or
             a node two values, the headings' grids differ, or the unit cannot be; with file and line.
     """
-    return _readings(_read(folder, headings_deg, unit), Path(folder), name, licence)
+    readings = _readings(_read(folder, headings_deg, unit), Path(folder), name)
+    return readings.with_(licence=licence, created=created, height_m=height_m)
 
 
 def node_map(readings: Readings) -> AnomalyMap:
@@ -117,16 +123,22 @@ def read_survey(
     *,
     name: str | None = None,
     licence: str = "",
+    created: str = "",
+    height_m: float | None = None,
     headings_deg: tuple[float, ...] | None = None,
+    unit: str = "nT",
     keep_latched: bool = False,
 ) -> tuple[AnomalyMap, Report]:
     """The map of a survey folder's nodes, and its report.
 
     Args:
-        folder: As `read_grid` takes it, and so the next three.
+        folder: As `read_grid` takes it, and so all others but the last.
         name: Name of the map; that of the folder unless given.
         licence: SPDX name of the survey's licence.
+        created: Day of the survey, YYYY-MM-DD.
+        height_m: Height of the sensor above the floor [m].
         headings_deg: Headings that the survey has [deg].
+        unit: Unit of the field, one of `NT_PER`.
         keep_latched: Whether readings of a sensor that had lost lock stay valid nodes.
 
     Returns:
@@ -136,30 +148,26 @@ def read_survey(
         digit; what was found latched, stuck or outlying.
 
     Raises:
-        RefusedError: As `read_grid`, with file and line.
+        RefusedError: As `read_grid`, with file and line; or no reading is field.
     """
     from magtwin.field.latch import mask_latched
 
-    layers = _read(folder, headings_deg, "nT")
-    readings, found = mask_latched(_readings(layers, Path(folder), name, licence))
-    if keep_latched:
-        readings = readings.with_(good=np.ones(len(readings), bool))
-    field = node_map(readings)
+    layers = _read(folder, headings_deg, unit)
+    readings = _readings(layers, Path(folder), name)
+    readings = readings.with_(licence=licence, created=created, height_m=height_m)
+    masked, found = mask_latched(readings)
+    if not (keep_latched or masked.good.any()):
+        raise RefusedError(
+            f"{folder}: all {len(readings)} readings are those of a sensor that was stuck; "
+            "survey it again, or import them as they are with keep_latched (--keep-latched)"
+        )
+    field = node_map(readings if keep_latched else masked)
     return field, _report(layers, field, folder, found)
 
 
-def import_survey(
-    folder: str | os.PathLike[str],
-    *,
-    name: str | None = None,
-    licence: str = "",
-    headings_deg: tuple[float, ...] | None = None,
-    keep_latched: bool = False,
-) -> AnomalyMap:
+def import_survey(folder: str | os.PathLike[str], **options: Any) -> AnomalyMap:
     """The map alone of `read_survey`, with its arguments and refusals."""
-    return read_survey(
-        folder, name=name, licence=licence, headings_deg=headings_deg, keep_latched=keep_latched
-    )[0]
+    return read_survey(folder, **options)[0]
 
 
 @dataclass(frozen=True)
@@ -306,7 +314,7 @@ def check_unit(b_nt: Array, where: str, column: str, unit: str = "nT") -> None:
     )
 
 
-def _readings(layers: list[_Layer], folder: Path, name: str | None, licence: str) -> Readings:
+def _readings(layers: list[_Layer], folder: Path, name: str | None) -> Readings:
     axes = [(_axis(s, "x", s.x), _axis(s, "y", s.y)) for s in layers]
     for layer, own in zip(layers, axes, strict=True):
         for label, first, axis in zip("xy", axes[0], own, strict=True):
@@ -334,7 +342,6 @@ def _readings(layers: list[_Layer], folder: Path, name: str | None, licence: str
         node=np.column_stack([run, np.concatenate([_nodes(s, x, y) for s in layers])]),
         name=folder.resolve().name if name is None else name,
         source="; ".join(f"{s.path.name} sha256:{s.sha256}" for s in layers),
-        licence=licence,
     )
 
 
