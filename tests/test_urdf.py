@@ -338,7 +338,7 @@ def mesh_link(filename):
 
 
 FLAT = INERTIAL.replace('izz="1"', 'izz="9"')
-NO_MASS = '<link name="b"><inertial><mass value="0"/></inertial></link>'
+NO_MASS = '<link name="b"><inertial><origin xyz="0 0 1"/></inertial></link>'
 NO_NUMBER = '<link name="b"><visual><geometry><sphere radius="big"/></geometry></visual></link>'
 NEGATIVE = '<gazebo reference="base_link"><mu1>-1</mu1></gazebo>'
 
@@ -357,7 +357,7 @@ REFUSED = {
         "is in a package: no package 'nowhere' around it; give",
     ),
     "package above": (mesh_link("package://arms/../../a.stl"), r"mesh .* lies outside .*arms"),
-    "no mass": (NO_MASS, r":3: link 'b' has a mass of 0"),
+    "no mass": (NO_MASS, r":3: link 'b' has a mass of None"),
     "inertia": (f'<link name="b">{FLAT}</link>', r":3: link 'b' has an impossible inertia: no body has"),
     "friction": (LINK + NEGATIVE, r"arm\.urdf:3: mu1 must be a finite number not below 0, got '-1'"),
     "no number": (NO_NUMBER, r":3: link 'b': radius of <sphere> must be a finite number, got 'big'"),

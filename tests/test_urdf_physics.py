@@ -152,7 +152,7 @@ def test_without_a_density_a_link_without_inertial_is_left_to_the_engine_and_not
 @pytest.mark.parametrize(
     ("child", "message"),
     [
-        ('<inertial><mass value="0"/></inertial>', r":4: link 'hand' has a mass of 0\.0 kg"),
+        ("<inertial/>", ":4: link 'hand' has a mass of None kg"),
         (
             '<inertial><mass value="1"/>'
             '<inertia ixx="1" iyy="1" izz="9" ixy="0" ixz="0" iyz="0"/></inertial>',
@@ -164,6 +164,38 @@ def test_impossible_masses_are_refused_with_their_line_merged_or_not(tmp_path, c
     for merge in (False, True):
         with pytest.raises(RefusedError, match=message):
             convert(arm(tmp_path, "fixed|", child), merge_fixed=merge)
+
+
+ZEROS = '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
+
+
+def test_masses_and_tensors_that_are_filled_in_with_zeros_count_as_none(tmp_path):
+    text = f"""<link name="foot"><inertial><mass value="0"/>{ZEROS}</inertial></link>
+    <link name="base">{{BODY}}</link>
+    <link name="eye"><inertial><mass value="0.5"/>{ZEROS}</inertial><collision>{BALL}</collision></link>
+    <joint name="up" type="fixed"><parent link="foot"/><child link="base"/></joint>
+    <joint name="on" type="fixed"><parent link="base"/><child link="eye"/></joint>"""
+    _, robot, notes = convert(urdf(tmp_path, text))
+    assert not robot.GetPrimAtPath("foot")  # it has neither mass nor shape: a frame on the base
+    assert robot.GetPrimAtPath("base/foot")
+    eye = UsdPhysics.MassAPI(robot.GetPrimAtPath("eye"))
+    assert eye.GetMassAttr().Get() == 0.5
+    assert not eye.GetDiagonalInertiaAttr().HasAuthoredValue()  # engines take it from its collider
+    assert notes[:2] == (
+        "link 'foot': a mass of 0 counts as none",
+        "link 'eye': an <inertia> of zeros counts as none",
+    )
+
+
+def test_a_range_that_is_half_told_ends_at_0_and_one_of_an_endless_joint_is_noted(tmp_path):
+    limit = '<limit upper="1" effort="inf" velocity="2"/>'
+    stage, _, notes = convert(arm(tmp_path, f"revolute|{limit}"))
+    joint = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath("/arm/joints/j"))
+    assert (joint.GetLowerLimitAttr().Get(), joint.GetUpperLimitAttr().Get()) == (0, pytest.approx(57.29578))
+    assert UsdPhysics.DriveAPI(joint, "angular").GetMaxForceAttr().Get() == np.inf
+    assert "joint 'j' gives no lower limit: 0, as URDF has it" in notes
+    _, _, notes = convert(arm(tmp_path, f"continuous|{limit}"))
+    assert any("is continuous, which has no range: upper 1 of its <limit>" in n for n in notes)
 
 
 # --- merging --------------------------------------------------------------------------------------

@@ -99,7 +99,7 @@ def choose_drive(
         wheels: Drives of driven wheels by name of the joint.
 
     Raises:
-        RefusedError: The URDF's effort is below 0 or not a number; the text gives the line.
+        RefusedError: The URDF's effort is below 0; the text gives the line.
     """
     if joint.name in mechanism.mimics:
         return None
@@ -150,7 +150,7 @@ def define_drive(prim: Usd.Prim, axis: str, drive: Drive) -> None:
 
 
 def _effort(joint: Joint, guess: float, description: Description) -> float:
-    """The URDF's effort, or the guess with a note."""
+    """The URDF's effort, inf for as much as it takes, or the guess with a note."""
     effort = None if joint.limit is None else joint.limit.effort
     if not effort:
         description.note(
@@ -158,7 +158,7 @@ def _effort(joint: Joint, guess: float, description: Description) -> float:
             f"its drive may use {guess:g} {'N' if joint.type == 'prismatic' else 'N m'}"
         )
         return guess
-    if effort < 0 or not np.isfinite(effort):
+    if not effort > 0:
         raise description.refused("joint", joint.name, f"has an effort of {effort:g}; give one above 0")
     return float(effort)
 

@@ -124,7 +124,43 @@ def check_grammar(part: Element, where: Callable[[Element], str], note: Note) ->
         RefusedError: A number is missing, is none, is not finite or too small; there are too many or too
             few of them; a geometry has no shape, several or an unknown one.
     """
-    return _clean(part, f"{part.tag} {part.get('name')!r}", where, note)
+    label = f"{part.tag} {part.get('name')!r}"
+    clean = _clean(part, label, where, note)
+    _drop_zeros(clean, label, note)
+    _complete_limit(clean, label, note)
+    return clean
+
+
+def _drop_zeros(link: Element, label: str, note: Note) -> None:
+    """Leave out a mass of 0 and a tensor of zeros: they fill a form, and no body has them."""
+    inertial = link.find("inertial")
+    if inertial is None:
+        return
+    mass, tensor = inertial.find("mass"), inertial.find("inertia")
+    if tensor is not None and not any(map(float, tensor.attrib.values())):
+        inertial.remove(tensor)
+        if mass is None or float(mass.attrib["value"]) != 0:
+            note(f"{label}: an <inertia> of zeros counts as none")
+        tensor = None
+    if mass is not None and float(mass.attrib["value"]) == 0:
+        link.remove(inertial)
+        note(f"{label}: a mass of 0 counts as none", lost=tensor is not None)
+
+
+def _complete_limit(joint: Element, label: str, note: Note) -> None:
+    """Give the end of a range that is not told, which is 0 in URDF; leave out the range of what has none."""
+    limit, ends = joint.find("limit"), ("lower", "upper")
+    if limit is None:
+        return
+    told = {end: float(limit.attrib[end]) for end in ends if end in limit.attrib}
+    if joint.get("type") == "continuous":
+        if any(map(math.isfinite, told.values())):
+            words = ", ".join(f"{end} {value:g}" for end, value in told.items())
+            note(f"{label} is continuous, which has no range: {words} of its <limit> counts for nothing")
+    elif joint.get("type") in ("revolute", "prismatic") and len(told) == 1:
+        missing = next(end for end in ends if end not in told)
+        limit.set(missing, "0")
+        note(f"{label} gives no {missing} limit: 0, as URDF has it")
 
 
 def _clean(element: Element, label: str, where: Callable[[Element], str], note: Note) -> Element:
