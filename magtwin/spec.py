@@ -6,12 +6,17 @@ for one attribute of a prim. Lengths are metres, angles radians, fields nT. A sp
 
 import datetime
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from magtwin.frames import IDENTITY_XYZW, quat_multiply
-from magtwin.names import RefusedError
+import numpy as np
+
+from magtwin.field.bodies import SHAPES, Body, check_mesh, induced_magnetization
+from magtwin.field.earth import MODEL, SPAN
+from magtwin.frames import IDENTITY_XYZW, quat_multiply, rotate
+from magtwin.furniture import parts_of
+from magtwin.names import RefusedError, hint
 
 Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
@@ -355,7 +360,7 @@ class LabSpec(Spec):
 
 @dataclass(frozen=True, kw_only=True)
 class EarthFieldSpec(Spec):
-    """The Earth's field in the lab, uniform over it; world x is east, y north, z up."""
+    """The Earth's field in the lab, uniform over it."""
 
     b_world_nt: Vec3
     """Field in world axes [nT]."""
@@ -372,11 +377,22 @@ class EarthFieldSpec(Spec):
     date: str
     """Day for which the field holds, YYYY-MM-DD."""
 
+    north_deg: float = 0.0
+    """Where true north lies: angle from world +y about world +z, counter-clockwise from above [deg]."""
+
+    measured: bool = False
+    """Whether the field was measured; otherwise it is the IGRF's, whose span then holds the day."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         self._within("latitude_deg", -90, 90)
         self._within("longitude_deg", -180, 360)
+        self._within("north_deg", -360, 360)
         self._require("date", _is_day(self.date), "be a day as YYYY-MM-DD", self.date)
+        first, last = SPAN
+        if not self.measured:
+            within = first <= datetime.date.fromisoformat(self.date) <= last
+            self._require("date", within, f"lie in {MODEL}'s span, {first} to {last}", self.date)
 
 
 def _is_day(text: str) -> bool:
@@ -388,16 +404,162 @@ def _is_day(text: str) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceSpec(Spec):
-    """A magnetised thing, seen as a point dipole."""
+    """A magnetised thing: a point dipole, or a uniformly magnetised body of some shape."""
 
     name: str
     """Name of its prim."""
 
     p_world: Vec3
-    """Position [m]."""
+    """Where it is: the middle of all but a mesh [m]."""
 
-    m_world: Vec3
-    """Dipole moment [A m2]."""
+    m_world: Vec3 = ZERO3
+    """Dipole moment of a point, in world axes [A m2]."""
+
+    shape: str = "point"
+    """"point", "cuboid", "cylinder", "sphere" or "mesh"."""
+
+    q_world_xyzw: Quat = IDENTITY_XYZW
+    """Axes of a body in world; a cylinder's axis is its own z."""
+
+    size_m: Vec3 = ZERO3
+    """Sides of the box about a body along its own axes [m]; follows from the vertices of a mesh."""
+
+    magnetization: Vec3 = ZERO3
+    """Remanent magnetization of a body in its own axes [A/m]."""
+
+    susceptibility: float = 0.0
+    """Volume susceptibility of a body's material [1]; see `magtwin.field.bodies.induced_magnetization`."""
+
+    vertices_m: tuple[Vec3, ...] = ()
+    """Vertices of a mesh in its own axes [m], in single precision, as USD has them."""
+
+    faces: tuple[tuple[int, int, int], ...] = ()
+    """Corners of a mesh's triangles, counter-clockwise seen from outside."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        kinds = ("point", *SHAPES)
+        self._require(
+            "shape", self.shape in kinds, f"be a known shape ({hint(self.shape, kinds)})", self.shape
+        )
+        self._unit("q_world_xyzw")
+        self._not_negative("susceptibility")
+        if self.shape == "point":
+            self._check_point()
+            return
+        self._require("m_world", self.m_world == ZERO3, f"not be given for a {self.shape}", self.m_world)
+        if self.shape == "mesh":
+            vertices = np.asarray(np.asarray(self.vertices_m, np.float32), float).reshape(-1, 3)
+            check_mesh(vertices, np.asarray(self.faces, int).reshape(-1, 3), f"source {self.name!r}")
+            object.__setattr__(self, "vertices_m", tuple(map(tuple, vertices.tolist())))
+            object.__setattr__(self, "size_m", tuple(np.ptp(vertices, axis=0).tolist()))
+        else:
+            self._require("vertices_m", not (self.vertices_m or self.faces), "go with shape mesh", "some")
+            self._require(
+                "size_m", min(self.size_m) > 0, "be above 0 m each way: no volume, no field", self.size_m
+            )
+        x, y, z = self.size_m
+        if self.shape == "cylinder":
+            self._require("size_m", x == y, "be as wide in y as in x for a cylinder", self.size_m)
+        if self.shape == "sphere":
+            self._require("size_m", x == y == z, "be alike each way for a sphere", self.size_m)
+
+    def _check_point(self) -> None:
+        for name, none in {"size_m": ZERO3, "magnetization": ZERO3, "susceptibility": 0.0}.items():
+            seen = getattr(self, name)
+            self._require(
+                name, seen == none, "be given with a shape: a point has no volume, only m_world", seen
+            )
+        turned = self.q_world_xyzw != IDENTITY_XYZW
+        self._require(
+            "q_world_xyzw", not turned, "not turn a point, whose m_world is in world axes", "a turn"
+        )
+        self._require("vertices_m", not (self.vertices_m or self.faces), "go with shape mesh", "some")
+
+    def body(self, b_world_nt: Vec3 | None = None) -> Body:
+        """What is magnetised, its induced part included; of all but a point.
+
+        Args:
+            b_world_nt: The Earth's field in world axes [nT]; none where it is not known.
+
+        Raises:
+            RefusedError: It has a susceptibility, and the Earth's field is not known.
+        """
+        body = Body(
+            shape=self.shape,
+            size_m=np.array(self.size_m),
+            p_world=np.array(self.p_world),
+            q_world_xyzw=np.array(self.q_world_xyzw),
+            magnetization=np.array(self.magnetization),
+            vertices=np.array(self.vertices_m) if self.vertices_m else None,
+            faces=np.array(self.faces) if self.faces else None,
+        )
+        if not self.susceptibility:
+            return body
+        if b_world_nt is None:
+            raise RefusedError(
+                f"source {self.name!r} has susceptibility {self.susceptibility:g}, but the Earth's field, "
+                "which magnetises it, is not known; give the scene an [earth] table"
+            )
+        induced = induced_magnetization(body, self.susceptibility, b_world_nt)
+        return replace(body, magnetization=body.magnetization + induced)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FurnitureSpec(Spec):
+    """A piece of furniture or of the building; `magtwin.furniture` says what each kind consists of."""
+
+    name: str
+    """Name of its prim."""
+
+    kind: str
+    """What it is, a name of `magtwin.furniture.KINDS`."""
+
+    p_world: Vec3
+    """Where it stands: the middle of its footprint, on the floor [m]."""
+
+    q_world_xyzw: Quat = IDENTITY_XYZW
+    """Its axes in world: x is its front, z up."""
+
+    magnetization: tuple[float, ...] = ()
+    """Magnetization of its steel parts, each along its longest side, in their order [A/m]; () for none."""
+
+    susceptibility: float = 0.0
+    """Volume susceptibility of its steel parts [1]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._unit("q_world_xyzw")
+        self._not_negative("susceptibility")
+        steel = [part.name for part in parts_of(self.kind) if part.steel]
+        fits = len(self.magnetization) in (0, len(steel))
+        self._require(
+            "magnetization", fits, f"have one number for each of {', '.join(steel)}", self.magnetization
+        )
+
+    def sources(self, *, in_world: bool = True) -> tuple[SourceSpec, ...]:
+        """Its steel, a source each, named after the piece and the part.
+
+        Args:
+            in_world: Whether they stand where it does; otherwise they are in its own axes.
+        """
+        steel = [part for part in parts_of(self.kind) if part.steel]
+        turn = self.q_world_xyzw if in_world else IDENTITY_XYZW
+        sources = []
+        for part, m in zip(steel, self.magnetization or (0.0,) * len(steel), strict=True):
+            x, y, z = rotate(turn, part.p) + self.p_world if in_world else map(float, part.p)
+            sources.append(
+                SourceSpec(
+                    name=f"{self.name}_{part.name}",
+                    p_world=(float(x), float(y), float(z)),
+                    shape=part.shape,
+                    q_world_xyzw=turn,
+                    size_m=part.size_m,
+                    magnetization=tuple(m * (k == part.along) for k in range(3)),  # type: ignore[arg-type]
+                    susceptibility=self.susceptibility,
+                )
+            )
+        return tuple(sources)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -419,7 +581,15 @@ class Scene(Spec):
     """Earth's field; none where only a survey is known."""
 
     sources: tuple[SourceSpec, ...] = ()
-    """Magnetised things in the lab; with `earth` they make the exact field known."""
+    """Magnetised things in the lab; with `earth` and `furniture` they make the exact field known."""
+
+    furniture: tuple[FurnitureSpec, ...] = ()
+    """Furniture and parts of the building, whose steel is magnetised too."""
 
     start: Vec3 = ZERO3
     """Robot's first x [m], y [m] and yaw [rad] in world, where a path does not say."""
+
+    @property
+    def magnets(self) -> tuple[SourceSpec, ...]:
+        """Everything that is magnetised: the sources, and the steel of the furniture."""
+        return (*self.sources, *(source for piece in self.furniture for source in piece.sources()))

@@ -400,7 +400,7 @@ def test_a_toml_gives_room_start_earth_and_sources(own_parts):
         TOML.replace('"map.usdc"', '"map.usdc"\nstart = [1, 0.5, 0.25]')
         + "[lab]\nfloor_m = [5, 4]\n[sources]\nfile = 'sources.toml'\n"
         + "[earth]\nb_world_nt = [0, 20e3, -40e3]\nlatitude_deg = 29\nlongitude_deg = -82\nheight_m = 2\n"
-        + 'date = "2026-01-01"\n'
+        + 'date = "2026-01-01"\nmeasured = true\n'
     )
     scene = scene_from_toml(own_parts / "scene.toml")
     assert scene.start == (1.0, 0.5, 0.25)
@@ -450,13 +450,13 @@ def test_a_network_brings_its_inputs_and_its_checksum(own_parts):
             "[robot]",
             "[earth]\nb_world_nt = [0, 2e4, -4e4]\nlatitude_deg = 95\nlongitude_deg = 0\nheight_m = 0\n"
             'date = "2026-01-01"\n[robot]',
-            r"scene\.toml:7: \[earth\] latitude_deg of EarthFieldSpec must lie in -90\.\.90, got 95",
+            r"scene\.toml:7: \[earth\] latitude_deg of EarthTable must lie in -90\.\.90, got 95",
         ),
         (
             "[robot]",
             "[earth]\nb_world_nt = [0, 2e4, -4e4]\nlatitude_deg = 9\nlongitude_deg = 0\nheight_m = 0\n"
             'date = "20260101"\n[robot]',
-            r"scene\.toml:10: \[earth\] date of EarthFieldSpec must be a day as YYYY-MM-DD, got '20260101'",
+            r"scene\.toml:10: \[earth\] date of EarthTable must be a day as YYYY-MM-DD, got '20260101'",
         ),
         (
             'asset = "robot/bot.usda"',

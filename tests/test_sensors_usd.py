@@ -13,12 +13,10 @@ from magtwin.names import RefusedError
 from magtwin.spec import (
     BatterySpec,
     DriveSpec,
-    EarthFieldSpec,
     ImuSpec,
     LidarSpec,
     MagnetometerSpec,
     PlatformFieldSpec,
-    SourceSpec,
 )
 from magtwin.usd import sensors
 from magtwin.usd.figures import read_pose
@@ -140,29 +138,6 @@ def test_a_platform_field_survives_the_stage(data):
     )
     stage = stage_with_link()
     assert sensors.read_platform(sensors.define_platform(stage.GetPrimAtPath("/robot"), spec)) == spec
-
-
-@unhurried
-@given(st.builds(SourceSpec, name=name, p_world=vec3, m_world=vec3))
-def test_a_source_survives_the_stage(spec):
-    stage = stage_with_link()
-    assert sensors.read_source(sensors.define_source(stage, "/robot", spec)) == spec
-
-
-@unhurried
-@given(
-    st.builds(
-        EarthFieldSpec,
-        b_world_nt=vec3,
-        latitude_deg=st.floats(-90, 90),
-        longitude_deg=st.floats(-180, 360),
-        height_m=number,
-        date=st.dates().map(str),
-    )
-)
-def test_the_earths_field_survives_the_stage(spec):
-    stage = stage_with_link()
-    assert sensors.read_earth(sensors.define_earth(stage, "/robot/earth", spec)) == spec
 
 
 @unhurried
@@ -289,25 +264,16 @@ def test_a_figure_out_of_range_is_refused_by_prim():
     [
         ("battery", "loadW", float("nan"), "</robot/battery>: load_w of BatterySpec must be finite, got nan"),
         ("battery", "voltageFullV", 5.0, "voltage_full_v of BatterySpec must not be below voltage_empty_v"),
-        ("earth", "date", "soon", "</robot/earth>: date of EarthFieldSpec must be a day as YYYY-MM-DD"),
-        ("earth", "latitudeDeg", 90.5, r"latitude_deg of EarthFieldSpec must lie in -90\.\.90, got 90\.5"),
         ("imu", "gyroNoiseStd", float("inf"), "some_link/imu>: gyro_noise_std of ImuSpec must be finite"),
         ("lidar", "rangeMinM", 12.0, r"some_link/lidar>: range_min_m of LidarSpec must be below range_max_m"),
-        ("source", "mWorld", (0, 0, float("nan")), "</robot/beam>: m_world of SourceSpec must be finite"),
     ],
 )
 def test_a_figure_that_makes_no_sense_is_refused_by_prim(noun, attribute, value, said):
     stage = stage_with_link()
-    earth = EarthFieldSpec(
-        b_world_nt=(0, 2e4, -4e4), latitude_deg=29, longitude_deg=-82, height_m=2, date="2026-01-01"
-    )
-    beam = SourceSpec(name="beam", p_world=(0, 0, 0), m_world=(0, 0, 1))
     prim = {
         "battery": lambda: sensors.define_battery(stage, "/robot/battery", BatterySpec()),
-        "earth": lambda: sensors.define_earth(stage, "/robot/earth", earth),
         "imu": lambda: sensors.define_imu(stage, f"{LINK}/imu", ImuSpec(link="some_link")),
         "lidar": lambda: sensors.define_lidar(stage, f"{LINK}/lidar", LidarSpec(link="some_link")),
-        "source": lambda: sensors.define_source(stage, "/robot", beam),
     }[noun]()
     prim.GetAttribute(f"magtwin:{noun}:{attribute}").Set(value)
     with pytest.raises(RefusedError, match=said):
@@ -370,10 +336,3 @@ def test_a_drive_whose_joint_was_removed_is_refused():
         RefusedError, match="magtwin:drive:leftWheelJoint must point to one prim of the stage"
     ):
         sensors.read_drive(prim)
-
-
-def test_a_source_whose_name_cannot_name_a_prim_is_refused():
-    with pytest.raises(RefusedError, match="source 'steel beam' cannot name a prim"):
-        sensors.define_source(
-            stage_with_link(), "/robot", SourceSpec(name="steel beam", p_world=(0, 0, 0), m_world=(0, 0, 1))
-        )

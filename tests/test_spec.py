@@ -25,6 +25,14 @@ SPECS = (
     spec.LabSpec(),
     EARTH,
     spec.SourceSpec(name="beam", p_world=(0.0, 0.0, 0.0), m_world=(0.0, 0.0, 1.0)),
+    spec.SourceSpec(
+        name="crate",
+        p_world=(0.0, 0.0, 0.0),
+        shape="cuboid",
+        size_m=(1.0, 1.0, 1.0),
+        magnetization=(1.0, 0, 0),
+    ),
+    spec.FurnitureSpec(name="desk", kind="desk", p_world=(0.0, 0.0, 0.0), magnetization=(1e3,) * 6),
     spec.Scene(name="lab", map_layer=Path("map.usdc"), robot=ROBOT),
 )
 

@@ -1,15 +1,25 @@
 """The Earth's main field at a place and a day, by the IGRF."""
 
 import datetime
-from functools import cache
 
 import numpy as np
 
+from magtwin.frames import quat_from_yaw, rotate
 from magtwin.names import RefusedError
+
+MODEL = "the IGRF-14"
+
+SPAN = (datetime.date(1900, 1, 1), datetime.date(2030, 1, 1))
+"""First and last day of its coefficients."""
 
 
 def earth_field_nt(
-    latitude_deg: float, longitude_deg: float, height_m: float, date: str | datetime.date
+    latitude_deg: float,
+    longitude_deg: float,
+    height_m: float,
+    date: str | datetime.date,
+    *,
+    north_deg: float = 0.0,
 ) -> tuple[float, float, float]:
     """The field of the IGRF-14 (Alken et al. 2021 and its 2024 revision), to degree 13, by ppigrf.
 
@@ -18,9 +28,11 @@ def earth_field_nt(
         longitude_deg: Longitude [deg], east of Greenwich.
         height_m: Height above the WGS 84 ellipsoid [m].
         date: The day, or its name YYYY-MM-DD.
+        north_deg: Where true north lies in world: angle from world +y about world +z, counter-clockwise
+            seen from above [deg].
 
     Returns:
-        East, north and up parts [nT]: world axes of a lab whose x points east.
+        Field in world axes [nT]; with true north along +y these are its east, north and up parts.
 
     Raises:
         RefusedError: The day is none, or the model does not reach it; the place is none on Earth.
@@ -31,25 +43,19 @@ def earth_field_nt(
         day = datetime.date.fromisoformat(date) if isinstance(date, str) else date
     except ValueError as error:
         raise RefusedError(f"date must be a day YYYY-MM-DD, got {date!r}") from error
-    first, last = _span()
+    first, last = SPAN
     if not first <= day <= last:
-        raise RefusedError(f"date {day} lies beyond the IGRF-14, which holds from {first} to {last}")
+        raise RefusedError(f"date {day} lies beyond {MODEL}, which holds from {first} to {last}")
     if not (abs(latitude_deg) < 90 and np.isfinite(longitude_deg)):
         raise RefusedError(
             f"latitude must lie between -90 and 90 deg, both left out, and longitude be a number, "
             f"got {latitude_deg!r}, {longitude_deg!r}"
         )
+    if not np.isfinite(north_deg):
+        raise RefusedError(f"north_deg must be a number, got {north_deg!r}")
     if not -10e3 <= height_m <= 1000e3:
         raise RefusedError(f"height must lie in -10,000..1,000,000 m above the ellipsoid, got {height_m!r}")
     noon = datetime.datetime.combine(day, datetime.time())
     east, north, up = ppigrf.igrf(longitude_deg, latitude_deg, height_m / 1000, noon)
-    return float(east[0]), float(north[0]), float(up[0])
-
-
-@cache
-def _span() -> tuple[datetime.date, datetime.date]:
-    """First and last day of the model's coefficients."""
-    from ppigrf.ppigrf import read_shc
-
-    days = read_shc()[0].index
-    return days[0].date(), days[-1].date()
+    x, y, z = rotate(quat_from_yaw(np.radians(north_deg)), [float(east[0]), float(north[0]), float(up[0])])
+    return float(x), float(y), float(z)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +20,12 @@ SHARED = 16
 """Blocks from which on a second thread is worth its start; which thread works on a row changes no byte."""
 
 PAIRS = 32_768
-"""Point-dipole pairs worked on at a time: seven arrays of them stay in the second-level cache."""
+"""Point-dipole pairs worked on at a time: a few arrays of them stay in the second-level cache."""
+
+CLOSE = 1e-2
+"""Part of the squares of the distances from the origin below which |r|^2 is formed without cancelling."""
+
+T = TypeVar("T")
 
 
 def dipole_field_nt(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike) -> Array:
@@ -43,9 +49,9 @@ def dipole_field_nt(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: Arra
     field = np.zeros(points.shape)
 
     def work(rows: slice) -> None:
-        field[rows], _ = _dipoles(points[rows], None, place, moment)
+        field[rows], _ = dipole_block(points[rows], None, place, moment)
 
-    _in_blocks(work, len(points), len(place))
+    in_two_threads(work, in_blocks(len(points), len(place)), pairs=len(points) * len(place))
     return field.reshape(p.shape)
 
 
@@ -80,9 +86,9 @@ def dipole_field_and_rate_nt(
     field, rate = np.zeros(points.shape), np.zeros(points.shape)
 
     def work(rows: slice) -> None:
-        field[rows], rate[rows] = _dipoles(points[rows], velocities[rows], place, moment)
+        field[rows], rate[rows] = dipole_block(points[rows], velocities[rows], place, moment)
 
-    _in_blocks(work, len(points), len(place))
+    in_two_threads(work, in_blocks(len(points), len(place)), pairs=len(points) * len(place))
     return field.reshape(p.shape), rate.reshape(p.shape)
 
 
@@ -98,45 +104,79 @@ def _checked(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike) 
     return p, place, moment
 
 
-def _in_blocks(work: Callable[[slice], None], points: int, dipoles: int) -> None:
-    """Have all rows worked on, a block at a time; many blocks are shared out among two threads."""
+def in_blocks(points: int, dipoles: int) -> list[slice]:
+    """Rows of points to be worked on at a time: about `PAIRS` pairs of a point and a dipole."""
     block = max(1, PAIRS // max(1, dipoles))
-    blocks = [slice(start, start + block) for start in range(0, points, block)]
+    return [slice(start, start + block) for start in range(0, points, block)]
 
-    def several(some: list[slice]) -> None:
-        for rows in some:
-            work(rows)
 
-    if len(blocks) < SHARED:
-        several(blocks)
+def in_two_threads(work: Callable[[T], None], tasks: Sequence[T], *, pairs: int) -> None:
+    """Have tasks worked on that share no rows; by a second thread too where there are `pairs` enough."""
+
+    def several(some: Sequence[T]) -> None:
+        for task in some:
+            work(task)
+
+    if pairs < SHARED * PAIRS:
+        several(tasks)
         return
     with ThreadPoolExecutor(2) as pool:
-        list(pool.map(several, (blocks[::2], blocks[1::2])))
+        list(pool.map(several, (tasks[::2], tasks[1::2])))
 
 
-def _dipoles(p: Array, v: Array | None, place: Array, moment: Array) -> tuple[Array, Array]:
-    """Field [nT] at p (N, 3), with arrays of shape (N, D), and its rate [nT/s] for velocities v (N, 3)."""
-    r = [p[:, axis, None] - place[:, axis] for axis in range(3)]
+def dipole_block(p: Array, v: Array | None, place: Array, moment: Array) -> tuple[Array, Array]:
+    """Field and rate of dipoles at some points, as products of matrices of a few columns.
+
+    With r = p - p_d, every scalar product of a pair is a point's product with a dipole's, less that of the
+    dipole's own: |r|^2 = |p|^2 - 2 p . p_d + |p_d|^2. Sums over dipoles are products too. That loses digits
+    where r is much shorter than p, so |r|^2 of close pairs is formed again.
+
+    Args:
+        p: Points [m], shape (N, 3).
+        v: Their velocities [m/s], shape (N, 3); none where no rate is wanted.
+        place: Dipoles [m], shape (D, 3).
+        moment: Their moments [A m2], shape (D, 3).
+
+    Returns:
+        Field [nT] and its rate [nT/s], each of shape (N, 3); the rate is of zeros without `v`.
+    """
     scale = MU_0_OVER_4_PI * NT_PER_T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / _dot(r, r)
-        cubed = inverse * np.sqrt(inverse)
-        along = 3 * inverse * _dot(moment.T, r)
-        field = [((along * r[axis] - moment[:, axis]) * cubed).sum(axis=1) for axis in range(3)]
+    home = place.mean(axis=0) if len(place) else np.zeros(3)
+    p, place = p - home, place - home
+    own, size = np.square(p).sum(axis=1)[:, None], np.square(place).sum(axis=1)
+    there = np.column_stack([place, np.ones(len(place))])
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        square = p @ (-2 * place.T)
+        square += size
+        square += own
+        _mend(square, p, place, own, size)
+        inverse = np.divide(1, square, out=square)
+        cubed = np.sqrt(inverse)
+        cubed *= inverse
+        fifth = 3 * inverse
+        fifth *= cubed
+        along = p @ moment.T
+        along -= np.einsum("di,di->d", moment, place)
+        slope = along * fifth
+        sums = slope @ there
+        field = sums[:, 3:] * p - sums[:, :3] - cubed @ moment
         if v is None:
-            return scale * np.stack(field, axis=-1), np.empty((0, 3))
-        towards = _dot(v.T[:, :, None], r)
-        radial = _dot(v.T[:, :, None], moment.T) - 5 / 3 * along * towards
-        fifth = 3 * inverse * cubed
-        radial, towards = radial * fifth, towards * fifth
-        turned = [
-            np.einsum("nd,nd->n", radial, r[axis]) + np.einsum("nd,d->n", towards, moment[:, axis])
-            for axis in range(3)
-        ]
-        rate = np.array(turned) + np.einsum("nd,nd->n", along, cubed) * v.T
-    return scale * np.stack(field, axis=-1), scale * np.stack(rate, axis=-1)
+            return scale * field, np.zeros(p.shape)
+        towards = v @ -place.T
+        towards += np.einsum("ni,ni->n", v, p)[:, None]
+        along *= towards
+        along *= inverse
+        along *= -5
+        along += v @ moment.T
+        along *= fifth
+        towards *= fifth
+        turned = along @ there
+        rate = turned[:, 3:] * p - turned[:, :3] + towards @ moment + sums[:, 3:] * v
+    return scale * field, scale * rate
 
 
-def _dot(a: Sequence[Array] | Array, b: Sequence[Array] | Array) -> Array:
-    """Scalar products of vectors given axis by axis."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def _mend(square: Array, p: Array, place: Array, own: Array, size: Array) -> None:
+    """Form |r|^2 of pairs much closer than they are far from the origin without its loss of digits."""
+    if square.size and square.min() < CLOSE * (own.max() + size.max()):
+        n, d = np.nonzero(square < CLOSE * (own + size))
+        square[n, d] = np.square(p[n] - place[d]).sum(axis=1)

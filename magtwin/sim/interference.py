@@ -1,11 +1,13 @@
 """Fields at the magnetometer: the lab's, and what the robot adds to it."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.field.sources import dipole_field_and_rate_nt, dipole_field_nt
+from magtwin.field.bodies import Bodies
 from magtwin.names import RefusedError
-from magtwin.spec import BatterySpec, PlatformFieldSpec, Scene
+from magtwin.spec import BatterySpec, EarthFieldSpec, PlatformFieldSpec, Scene, SourceSpec
 
 Array = NDArray[np.float64]
 
@@ -21,10 +23,10 @@ def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
         Field in world axes [nT], shape (..., 3).
 
     Raises:
-        RefusedError: The scene has no Earth's field, so only its map is known.
+        RefusedError: The scene has no Earth's field, so only its map is known; or a shape is not as above.
     """
-    earth, place, moment = _known(scene)
-    return dipole_field_nt(p_world, place, moment) + earth
+    earth, bodies = _known(scene)
+    return bodies.field_nt(p_world) + earth
 
 
 def ambient_field_and_rate_nt(scene: Scene, p_world: ArrayLike, v_world: ArrayLike) -> tuple[Array, Array]:
@@ -41,21 +43,30 @@ def ambient_field_and_rate_nt(scene: Scene, p_world: ArrayLike, v_world: ArrayLi
     Raises:
         RefusedError: As for `ambient_field_nt`.
     """
-    earth, place, moment = _known(scene)
-    field, rate = dipole_field_and_rate_nt(p_world, v_world, place, moment)
+    earth, bodies = _known(scene)
+    field, rate = bodies.field_and_rate_nt(p_world, v_world)
     return field + earth, rate
 
 
-def _known(scene: Scene) -> tuple[Array, Array, Array]:
-    """The Earth's field [nT] (3,), positions [m] and moments [A m2] of the sources (D, 3)."""
+def _known(scene: Scene) -> tuple[Array, Bodies]:
+    """The Earth's field [nT] (3,), and everything that is magnetised."""
     if scene.earth is None:
         raise RefusedError(
             f"scene {scene.name!r} has no Earth's field, so its exact field is not known; "
             "give it an [earth] table, or read the field from its map"
         )
-    place = np.array([s.p_world for s in scene.sources], float).reshape(-1, 3)
-    moment = np.array([s.m_world for s in scene.sources], float).reshape(-1, 3)
-    return np.array(scene.earth.b_world_nt), place, moment
+    return np.array(scene.earth.b_world_nt), _bodies(scene.magnets, scene.earth)
+
+
+@lru_cache(maxsize=8)
+def _bodies(magnets: tuple[SourceSpec, ...], earth: EarthFieldSpec) -> Bodies:
+    """What is magnetised, ready to be evaluated."""
+    points = [source for source in magnets if source.shape == "point"]
+    return Bodies(
+        [source.body(earth.b_world_nt) for source in magnets if source.shape != "point"],
+        [source.p_world for source in points],
+        [source.m_world for source in points],
+    )
 
 
 def platform_field_nt(

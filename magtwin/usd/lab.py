@@ -1,18 +1,19 @@
 """The lab as a room in USD: floor, low walls, a motion-capture frame, lights, and what physics needs."""
 
 import numpy as np
-from numpy.typing import ArrayLike
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, Vt
 
 from magtwin.frames import quat_from_rpy
 from magtwin.spec import LabSpec
 from magtwin.usd.figures import read_figures, write_figures, write_pose
 from magtwin.usd.layers import WORLD
+from magtwin.usd.looks import define_box, define_looks, wear
 from magtwin.usd.schema import apply_api
 
 LAB = WORLD.AppendChild("Lab")
 PHYSICS_SCENE = WORLD.AppendChild("PhysicsScene")
 LOOKS = LAB.AppendChild("Looks")
+FLOOR, WALL, POST, CAMERA, LENS = map(LOOKS.AppendChild, ("Floor", "Wall", "Post", "Camera", "Lens"))
 
 GRAVITY_M_S2 = 9.81
 FLOOR_THICKNESS_M = 0.1
@@ -25,22 +26,6 @@ POST_WIDTH_M = 0.04
 CAMERA_SIZE_M = (0.07, 0.09, 0.09)
 LAMP_SIZE_M = (1.2, 0.3)
 LAMP_HEIGHT_M = 2.8
-
-COLOURS = {
-    "Floor": (0.33, 0.34, 0.36),
-    "Wall": (0.62, 0.53, 0.40),
-    "Post": (0.70, 0.71, 0.73),
-    "Camera": (0.03, 0.03, 0.035),
-    "Lens": (0.02, 0.08, 0.35),
-}
-"""Linear colours: dark vinyl, plywood, anodised aluminium, black cameras with a blue ring."""
-
-METALLIC = {"Post": 1.0}
-ROUGHNESS = {"Floor": 0.7, "Wall": 0.6, "Post": 0.35, "Camera": 0.5, "Lens": 0.1}
-
-FRICTION = {"Floor": 0.05, "Wall": 0.4}
-"""Coulomb friction, static and dynamic. MuJoCo and Newton take the larger of a pair and PhysX the mean:
-with a slippery floor the wheels' own friction holds, and casters slide, in both."""
 
 
 def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
@@ -57,7 +42,7 @@ def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
     """
     lab = write_figures(apply_api(UsdGeom.Xform.Define(stage, LAB).GetPrim(), "lab"), "lab", spec)
     _define_physics_scene(stage)
-    _define_looks(stage)
+    define_looks(stage, LOOKS, [look.name for look in (FLOOR, WALL, POST, CAMERA, LENS)])
     _define_floor(stage, spec)
     _define_walls(stage, spec)
     _define_frame(stage, spec)
@@ -80,31 +65,11 @@ def _define_physics_scene(stage: Usd.Stage) -> None:
     scene.CreateGravityMagnitudeAttr(GRAVITY_M_S2)
 
 
-def _define_looks(stage: Usd.Stage) -> None:
-    """One preview material a colour; those of the floor and the walls have friction too."""
-    UsdGeom.Scope.Define(stage, LOOKS)
-    for name, colour in COLOURS.items():
-        material = UsdShade.Material.Define(stage, LOOKS.AppendChild(name))
-        surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
-        surface.CreateIdAttr("UsdPreviewSurface")
-        surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*colour))
-        surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(ROUGHNESS[name])
-        surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(METALLIC.get(name, 0.0))
-        material.CreateSurfaceOutput().ConnectToSource(
-            surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
-        )
-        if name in FRICTION:
-            physics = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
-            physics.CreateStaticFrictionAttr(FRICTION[name])
-            physics.CreateDynamicFrictionAttr(FRICTION[name])
-            physics.CreateRestitutionAttr(0.0)
-
-
 def _define_floor(stage: Usd.Stage, spec: LabSpec) -> None:
     x, y = spec.floor_m
     edge = 2 * (spec.wall_thickness_m + APRON_M)  # walls and posts stand on the slab too
     size = (x + edge, y + edge, FLOOR_THICKNESS_M)
-    _box(stage, LAB.AppendChild("Floor"), (0, 0, -FLOOR_THICKNESS_M / 2), size, "Floor", collides=True)
+    define_box(stage, LAB.AppendChild("Floor"), (0, 0, -FLOOR_THICKNESS_M / 2), size, FLOOR, collides=True)
 
 
 def _define_walls(stage: Usd.Stage, spec: LabSpec) -> None:
@@ -119,7 +84,7 @@ def _define_walls(stage: Usd.Stage, spec: LabSpec) -> None:
     }
     for name, (at_x, at_y, size_x, size_y) in walls.items():
         path = UsdGeom.Xform.Define(stage, LAB.AppendChild("Walls")).GetPath().AppendChild(name)
-        _box(stage, path, (at_x, at_y, high / 2), (size_x, size_y, high), "Wall", collides=True)
+        define_box(stage, path, (at_x, at_y, high / 2), (size_x, size_y, high), WALL, collides=True)
 
 
 def _define_frame(stage: Usd.Stage, spec: LabSpec) -> None:
@@ -134,15 +99,15 @@ def _define_frame(stage: Usd.Stage, spec: LabSpec) -> None:
     high, width = spec.post_height_m, POST_WIDTH_M
     for i, (x, y) in enumerate(corners + amid):
         size = (width, width, high)
-        _box(stage, root.AppendChild(f"Post_{i}"), (x, y, high / 2), size, "Post", collides=True)
+        define_box(stage, root.AppendChild(f"Post_{i}"), (x, y, high / 2), size, POST, collides=True)
         _camera(stage, root.AppendChild(f"Camera_{i}"), np.array([x, y, high]))
     rail = high - width / 2
     for name, side in (("South", -1), ("North", 1)):
         size = (2 * half[0] - width, width, width)
-        _box(stage, root.AppendChild(f"Rail_{name}"), (0, side * half[1], rail), size, "Post")
+        define_box(stage, root.AppendChild(f"Rail_{name}"), (0, side * half[1], rail), size, POST)
     for name, side in (("West", -1), ("East", 1)):
         size = (width, 2 * half[1] - width, width)
-        _box(stage, root.AppendChild(f"Rail_{name}"), (side * half[0], 0, rail), size, "Post")
+        define_box(stage, root.AppendChild(f"Rail_{name}"), (side * half[0], 0, rail), size, POST)
 
 
 def _camera(stage: Usd.Stage, path: Sdf.Path, post_top: np.ndarray) -> None:
@@ -153,7 +118,7 @@ def _camera(stage: Usd.Stage, path: Sdf.Path, post_top: np.ndarray) -> None:
     pitch = np.arctan2(at[2], np.hypot(at[0], at[1]))  # a positive turn about y looks down
     prim = UsdGeom.Xform.Define(stage, path).GetPrim()
     write_pose(prim, tuple(at), tuple(quat_from_rpy((0.0, pitch, yaw))))  # type: ignore[arg-type]
-    _box(stage, path.AppendChild("Body"), (0, 0, 0), CAMERA_SIZE_M, "Camera")
+    define_box(stage, path.AppendChild("Body"), (0, 0, 0), CAMERA_SIZE_M, CAMERA)
     lens = UsdGeom.Cylinder.Define(stage, path.AppendChild("Lens"))
     radius, height = 0.032, 0.02
     lens.CreateAxisAttr(UsdGeom.Tokens.x)
@@ -161,7 +126,7 @@ def _camera(stage: Usd.Stage, path: Sdf.Path, post_top: np.ndarray) -> None:
     lens.CreateHeightAttr(height)
     lens.CreateExtentAttr(Vt.Vec3fArray([(-height / 2, -radius, -radius), (height / 2, radius, radius)]))
     lens.AddTranslateOp().Set(Gf.Vec3d((CAMERA_SIZE_M[0] + height) / 2, 0, 0))
-    _wear(lens, "Lens")
+    wear(lens, LENS)
 
 
 def _define_lights(stage: Usd.Stage, spec: LabSpec) -> None:
@@ -178,30 +143,3 @@ def _define_lights(stage: Usd.Stage, spec: LabSpec) -> None:
         lamp.CreateIntensityAttr(4000.0)
         lamp.CreateColorAttr(Gf.Vec3f(1.0, 0.97, 0.92))
         lamp.AddTranslateOp().Set(Gf.Vec3d(sx * quarter[0], sy * quarter[1], LAMP_HEIGHT_M))
-
-
-def _box(
-    stage: Usd.Stage,
-    path: Sdf.Path,
-    centre: ArrayLike,
-    size: ArrayLike,
-    look: str,
-    *,
-    collides: bool = False,
-) -> None:
-    """A cube scaled to `size` [m] at `centre` [m] in its parent."""
-    cube = UsdGeom.Cube.Define(stage, path)
-    cube.CreateSizeAttr(1.0)
-    cube.CreateExtentAttr(Vt.Vec3fArray([Gf.Vec3f(-0.5), Gf.Vec3f(0.5)]))
-    cube.AddTranslateOp().Set(Gf.Vec3d(*map(float, np.asarray(centre))))
-    cube.AddScaleOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*map(float, np.asarray(size))))
-    _wear(cube, look)
-    if collides:
-        UsdPhysics.CollisionAPI.Apply(cube.GetPrim())
-
-
-def _wear(gprim: UsdGeom.Gprim, look: str) -> None:
-    """Bind a material, for physics too where it has friction; its colour also stands on the prim."""
-    gprim.CreateDisplayColorAttr(Vt.Vec3fArray([Gf.Vec3f(*COLOURS[look])]))
-    material = UsdShade.Material.Get(gprim.GetPrim().GetStage(), LOOKS.AppendChild(look))
-    UsdShade.MaterialBindingAPI.Apply(gprim.GetPrim()).Bind(material)

@@ -12,8 +12,10 @@ from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 from magtwin.files import existing, from_table, output, read_toml, sha256
 from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.names import RefusedError
-from magtwin.spec import ZERO3, EarthFieldSpec, LabSpec, RobotSpec, Scene, SourceSpec, Vec3
+from magtwin.spec import ZERO3, EarthFieldSpec, FurnitureSpec, LabSpec, RobotSpec, Scene, SourceSpec, Vec3
+from magtwin.usd.earth import checked, define_earth, read_earth
 from magtwin.usd.figures import check_prim_name, plain_value, read_pose, target, write_pose
+from magtwin.usd.furniture import FURNITURE, define_furniture, read_magnets
 from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, read_lab
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, open_stage, relative_asset
 from magtwin.usd.maps import MAP, load_map, read_map
@@ -24,20 +26,16 @@ from magtwin.usd.sensors import (
     MAP_RELATIONSHIP,
     define_battery,
     define_drive,
-    define_earth,
     define_footprint,
     define_imu,
     define_lidar,
     define_magnetometer,
     define_platform,
-    define_source,
-    read_earth,
-    read_source,
 )
+from magtwin.usd.sources import LOOKS, SOURCES, define_sources
 
 EARTH = WORLD.AppendChild("Earth")
-SOURCES = WORLD.AppendChild("Sources")
-TAKEN = (LAB.name, PHYSICS_SCENE.name, MAP.name, EARTH.name, SOURCES.name)
+TAKEN = (LAB.name, PHYSICS_SCENE.name, MAP.name, EARTH.name, SOURCES.name, FURNITURE.name)
 """Children of /World that a robot's name must leave alone."""
 
 PARTS: dict[str, Callable[..., Usd.Prim]] = {
@@ -55,7 +53,8 @@ def author_scene(
     """Write a scene as a folder of layers.
 
     `<name>.usda` places the robot and says what differs from its asset; it stands over `room.usda`,
-    `magnetics.usda` (Earth's field and sources, where there are any) and the map's layer.
+    `furniture.usda` and `magnetics.usda` (the Earth's field and sources), where there are any, and the
+    map's layer.
 
     Args:
         scene: What to author.
@@ -75,7 +74,8 @@ def author_scene(
     with output(folder, force=force) as aside:
         aside.mkdir()
         placed = scene if by_reference else _with_copies(scene, aside)
-        sublayers = [_write_room(scene.lab, aside), *_write_magnetics(scene, aside), placed.map_layer]
+        sublayers = [_write_room(scene.lab, aside), *_write_furniture(scene, aside)]
+        sublayers += [*_write_magnetics(scene, aside), placed.map_layer]
         root = Sdf.Layer.CreateNew(str(aside / f"{scene.name}.usda"))
         stage = Usd.Stage.Open(root)
         describe_stage(stage, f"{scene.name}: a lab, its magnetic map and {scene.robot.name}, by magtwin")
@@ -121,7 +121,7 @@ def read_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> S
         raise RefusedError(f"{place(earths[1])}: a second Earth's field; the first is {earths[0].GetPath()}")
     p, q = read_pose(prim)
     earth = read_earth(earths[0]) if earths else None
-    sources = tuple(read_source(source) for source in prims_with(world, "source"))
+    sources, furniture = read_magnets(stage)
     try:
         scene = Scene(
             name=Path(path).stem,
@@ -131,6 +131,7 @@ def read_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> S
             lab=lab,
             earth=earth,
             sources=sources,
+            furniture=furniture,
             start=(p[0], p[1], float(yaw_from_quat(q))),
         )
     except RefusedError as error:
@@ -150,6 +151,34 @@ class _RobotTable(RobotSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class _EarthTable(EarthFieldSpec):
+    """[earth] of a scene's TOML: its field may be left out, and then follows from the rest."""
+
+    b_world_nt: Vec3 = ZERO3
+
+    @property
+    def spec(self) -> EarthFieldSpec:
+        """What it says, its field filled in or checked."""
+        return checked(EarthFieldSpec(**vars(self)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _FurnitureTable(FurnitureSpec):
+    """[[furniture]] of a scene's TOML: it stands upright, its front turned by `yaw`."""
+
+    yaw: float = 0.0
+    """Angle of its front from world x, counter-clockwise seen from above [rad]."""
+
+    @property
+    def spec(self) -> FurnitureSpec:
+        """What it says."""
+        given = {name: value for name, value in vars(self).items() if name != "yaw"}
+        if self.yaw:
+            given["q_world_xyzw"] = tuple(map(float, quat_from_yaw(self.yaw)))
+        return FurnitureSpec(**given)
+
+
+@dataclass(frozen=True, kw_only=True)
 class _SourcesTable:
     """[sources] of a scene's TOML."""
 
@@ -158,22 +187,25 @@ class _SourcesTable:
 
 @dataclass(frozen=True, kw_only=True)
 class _SceneFile:
-    """A scene's TOML; `lab` and `earth` have the keys of their specs."""
+    """A scene's TOML; its tables have the keys of their specs."""
 
     name: str
     robot: _RobotTable
     map: Path | None = None
     start: Vec3 = ZERO3
     lab: LabSpec = field(default_factory=LabSpec)
-    earth: EarthFieldSpec | None = None
+    earth: _EarthTable | None = None
     sources: _SourcesTable | None = None
+    source: tuple[SourceSpec, ...] = ()
+    furniture: tuple[_FurnitureTable, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class _SourceFile:
-    """A TOML of sources, one [[source]] each."""
+    """A TOML of what is magnetised, one [[source]] or [[furniture]] each."""
 
-    source: tuple[SourceSpec, ...]
+    source: tuple[SourceSpec, ...] = ()
+    furniture: tuple[_FurnitureTable, ...] = ()
 
 
 def scene_from_toml(
@@ -213,14 +245,19 @@ def scene_from_toml(
         )
         robot = replace(robot, magnetometer=magnetometer)
     own_map = map_layer is None
+    sources, furniture = given.source, tuple(table.spec for table in given.furniture)
+    if given.sources and own_map:
+        listed = read_sources(given.sources.file)
+        sources, furniture = (*listed[0], *sources), (*listed[1], *furniture)
     return Scene(
         name=given.name,
         map_layer=existing(layer, "map layer"),
         map_sha256=sha256(layer),
         robot=robot,
         lab=given.lab,
-        earth=given.earth if own_map else None,
-        sources=_sources(given.sources.file) if given.sources and own_map else (),
+        earth=_earth(given.earth, path) if given.earth and own_map else None,
+        sources=sources if own_map else (),
+        furniture=furniture if own_map else (),
         start=given.start,
     )
 
@@ -249,8 +286,23 @@ def _robot(
     return read_robot(asset)
 
 
-def _sources(path: Path) -> tuple[SourceSpec, ...]:
-    return from_table(_SourceFile, read_toml(path), path).source
+def _earth(table: _EarthTable, path: str | os.PathLike[str]) -> EarthFieldSpec:
+    try:
+        return table.spec
+    except RefusedError as error:
+        raise RefusedError(f"{path}: [earth] {error}") from error
+
+
+def read_sources(
+    path: str | os.PathLike[str],
+) -> tuple[tuple[SourceSpec, ...], tuple[FurnitureSpec, ...]]:
+    """The sources and the furniture of a TOML such as maps/lab/sources.toml.
+
+    Raises:
+        RefusedError: A key is misspelt or missing, or a figure is out of range; with file and line.
+    """
+    listed = from_table(_SourceFile, read_toml(path), path)
+    return listed.source, tuple(table.spec for table in listed.furniture)
 
 
 def _check(scene: Scene) -> None:
@@ -259,9 +311,15 @@ def _check(scene: Scene) -> None:
         raise RefusedError(f"scene {scene.name!r} cannot name a file; use letters, digits, - and _")
     if check_prim_name(scene.robot.name, "robot") in TAKEN:
         raise RefusedError(f"robot {scene.robot.name!r} has the name of a part of the scene; rename it")
-    names = [source.name for source in scene.sources]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise RefusedError(f"two sources are called {twice[0]!r}; give each a name of its own")
+    for what, things in (("sources", scene.sources), ("pieces of furniture", scene.furniture)):
+        names = [thing.name for thing in things]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise RefusedError(f"two {what} are called {twice[0]!r}; give each a name of its own")
+    for source in scene.sources:
+        if source.name == LOOKS:
+            raise RefusedError(f"source {LOOKS!r} has the name of the materials beside it; rename it")
+        if source.susceptibility and scene.earth is None:
+            source.body()  # refuses
     load_map(scene.map_layer)
     _check_map(scene)
     read_robot(scene.robot.asset)
@@ -332,10 +390,16 @@ def _write_magnetics(scene: Scene, folder: Path) -> list[Path]:
         if scene.earth is not None:
             define_earth(stage, EARTH, scene.earth)
         if scene.sources:
-            UsdGeom.Xform.Define(stage, SOURCES)
-        for source in scene.sources:
-            define_source(stage, SOURCES, source)
+            define_sources(stage, scene.sources)
     return [path]
+
+
+def _write_furniture(scene: Scene, folder: Path) -> list[Path]:
+    if not scene.furniture:
+        return []
+    with new_stage(folder / "furniture.usda", "Furniture and columns, and how they are magnetised") as stage:
+        define_furniture(stage, scene.furniture)
+    return [folder / "furniture.usda"]
 
 
 def _define_robot(stage: Usd.Stage, scene: Scene) -> None:

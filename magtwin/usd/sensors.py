@@ -16,7 +16,6 @@ from magtwin.names import RefusedError, hint
 from magtwin.spec import (
     BatterySpec,
     DriveSpec,
-    EarthFieldSpec,
     ImuSpec,
     LidarSpec,
     MagnetometerSpec,
@@ -24,10 +23,9 @@ from magtwin.spec import (
     PlatformFieldSpec,
     Quat,
     RobotSpec,
-    SourceSpec,
     Vec3,
 )
-from magtwin.usd.figures import check_prim_name, read_figures, read_pose, target, write_figures, write_pose
+from magtwin.usd.figures import read_figures, read_pose, target, write_figures, write_pose
 from magtwin.usd.schema import apply_api, attribute_name, only_prim_with, place, require_api
 
 S = TypeVar("S")
@@ -270,33 +268,6 @@ def _q_base(root: Usd.Prim, link: Usd.Prim) -> Quat:
         return IDENTITY_XYZW
     x, y, z, w = canonical(xyzw_from_wxyz((q.GetReal(), *q.GetImaginary()))).tolist()
     return (x, y, z, w)
-
-
-def define_source(stage: Usd.Stage, parent: str | Sdf.Path, spec: SourceSpec) -> Usd.Prim:
-    """Author a magnetised thing as the child `spec.name` of the prim at `parent`, which is at the origin.
-
-    Raises:
-        RefusedError: Its name cannot name a prim.
-    """
-    check_prim_name(spec.name, "source")
-    prim = _define_xform(stage, Sdf.Path(str(parent)).AppendChild(spec.name))
-    write_pose(prim, spec.p_world)
-    return write_figures(apply_api(prim, "source"), "source", spec, skip=("name", "p_world"))
-
-
-def read_source(prim: Usd.Prim) -> SourceSpec:
-    """The spec of an authored source; refusals as for `read_magnetometer`."""
-    return read_figures(SourceSpec, prim, "source", name=prim.GetName(), p_world=read_pose(prim)[0])
-
-
-def define_earth(stage: Usd.Stage, path: str | Sdf.Path, spec: EarthFieldSpec) -> Usd.Prim:
-    """Author the Earth's field as an Xform of its own; returns its prim."""
-    return write_figures(apply_api(_define_xform(stage, path), "earth"), "earth", spec)
-
-
-def read_earth(prim: Usd.Prim) -> EarthFieldSpec:
-    """The spec of an authored Earth's field; refusals as for `read_magnetometer`."""
-    return read_figures(EarthFieldSpec, prim, "earth")
 
 
 def _define_xform(stage: Usd.Stage, path: str | Sdf.Path) -> Usd.Prim:

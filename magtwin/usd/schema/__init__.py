@@ -20,6 +20,7 @@ NOUNS = {
     "imu": "MagtwinImuAPI",
     "lidar": "MagtwinLidarAPI",
     "source": "MagtwinMagneticSourceAPI",
+    "furniture": "MagtwinFurnitureAPI",
     "earth": "MagtwinEarthFieldAPI",
     "battery": "MagtwinBatteryAPI",
     "robot": "MagtwinRobotAPI",
@@ -73,10 +74,16 @@ def apply_api(prim: Usd.Prim, noun: str) -> Usd.Prim:
     allowed = prim.CanApplyAPI(api)
     if not allowed:
         raise RefusedError(
-            f"{place(prim)}: {api} goes on an Xform only, not on a {prim.GetTypeName() or 'def'}"
+            f"{place(prim)}: {api} goes on {_kinds(api)} only, not on a {prim.GetTypeName() or 'def'}"
         )
     prim.ApplyAPI(api)
     return prim
+
+
+def _kinds(api: str) -> str:
+    """The types of prim that a schema goes on, in words."""
+    *others, last = Usd.SchemaRegistry().GetAPISchemaCanOnlyApplyToTypeNames(api)
+    return f"an {', '.join(others)} or {last}" if others else f"an {last}"
 
 
 def require_api(prim: Usd.Prim, noun: str) -> Usd.Prim:

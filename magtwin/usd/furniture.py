@@ -1,0 +1,139 @@
+"""Furniture on a stage: what each piece looks like, what of it collides, and what of it is magnetised."""
+
+from pxr import Kind, Sdf, Usd, UsdGeom, UsdPhysics, Vt
+
+from magtwin.frames import IDENTITY_XYZW
+from magtwin.furniture import Part, parts_of
+from magtwin.names import RefusedError
+from magtwin.spec import FurnitureSpec, SourceSpec
+from magtwin.usd.figures import check_prim_name, plain_value, write_pose
+from magtwin.usd.layers import WORLD
+from magtwin.usd.looks import define_box, define_looks, wear
+from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, prims_with
+from magtwin.usd.sources import (
+    LOOKS,
+    SOURCES,
+    define_source,
+    placement,
+    read_source,
+    source_prims,
+)
+
+FURNITURE = WORLD.AppendChild("Furniture")
+KIND = attribute_name("furniture", "kind")
+
+
+def define_furniture(stage: Usd.Stage, furniture: tuple[FurnitureSpec, ...]) -> None:
+    """Author pieces of furniture under /World/Furniture, each an Xform that can be moved as one.
+
+    Args:
+        stage: Written to in its edit target.
+        furniture: The pieces.
+
+    Raises:
+        RefusedError: A name cannot name a prim.
+    """
+    UsdGeom.Xform.Define(stage, FURNITURE)
+    for spec in furniture:
+        path = FURNITURE.AppendChild(check_prim_name(spec.name, "furniture"))
+        piece = UsdGeom.Xform.Define(stage, path).GetPrim()
+        Usd.ModelAPI(piece).SetKind(Kind.Tokens.component)
+        turn = None if spec.q_world_xyzw == IDENTITY_XYZW else spec.q_world_xyzw
+        write_pose(piece, spec.p_world, turn)
+        apply_api(piece, "furniture").GetAttribute(KIND).Set(spec.kind)
+        parts = parts_of(spec.kind)
+        define_looks(stage, path.AppendChild(LOOKS), dict.fromkeys(part.look for part in parts))
+        steel = {source.name.removeprefix(f"{spec.name}_"): source for source in spec.sources(in_world=False)}
+        for part in parts:
+            prim = _define_part(stage, path, part, steel.get(part.name))
+            UsdPhysics.CollisionAPI.Apply(prim)
+
+
+def _define_part(stage: Usd.Stage, piece: Sdf.Path, part: Part, source: SourceSpec | None) -> Usd.Prim:
+    """One part, with the source that it is where it is steel."""
+    path, look = piece.AppendChild(part.name), piece.AppendChild(LOOKS).AppendChild(part.look)
+    if source is not None:
+        return define_source(stage, piece, _named(source, part.name), look=part.look)
+    if part.shape == "cuboid":
+        return define_box(stage, path, part.p, part.size_m, look)
+    cylinder = UsdGeom.Cylinder.Define(stage, path)
+    radius, half = part.size_m[0] / 2, part.size_m[2] / 2
+    cylinder.CreateRadiusAttr(radius)
+    cylinder.CreateHeightAttr(2 * half)
+    cylinder.CreateAxisAttr(UsdGeom.Tokens.z)
+    cylinder.CreateExtentAttr(Vt.Vec3fArray([(-radius, -radius, -half), (radius, radius, half)]))
+    write_pose(cylinder.GetPrim(), part.p)
+    wear(cylinder, look)
+    return cylinder.GetPrim()
+
+
+def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[FurnitureSpec, ...]]:
+    """Every magnetised thing of a stage: sources, wherever they stand, and furniture whose steel is its own.
+
+    A piece of furniture that was moved or turned is that piece at its new place. One of which a part was
+    moved, scaled, added or magnetised in its own way comes back as the sources that it consists of.
+
+    Raises:
+        RefusedError: A source is part of a robot, or as for `read_source`.
+    """
+    robots = [prim.GetPath() for prim in prims_with(stage.GetPseudoRoot(), "robot")]
+    prims = source_prims(stage)
+    pieces, taken = [], set()
+    for root in stage.Traverse(Usd.TraverseInstanceProxies()):
+        if root.HasAPI(NOUNS["furniture"]) and (piece := _whole(root, prims)):
+            pieces.append(piece)
+            taken |= {prim.GetPath() for prim in prims if prim.GetPath().HasPrefix(root.GetPath())}
+    sources: list[SourceSpec] = []
+    names: set[str] = set()
+    for prim in prims:
+        if robot := next((r for r in robots if prim.GetPath().HasPrefix(r)), None):
+            raise RefusedError(
+                f"{place(prim)}: a magnetic source on the robot {robot}, which carries it about; say it as "
+                "the robot's platform field"
+            )
+        if prim.GetPath() not in taken:
+            sources.append(read_source(prim, name=_name(prim, names)))
+            names.add(sources[-1].name)
+    return tuple(sources), tuple(pieces)
+
+
+def _whole(root: Usd.Prim, prims: list[Usd.Prim]) -> FurnitureSpec | None:
+    """The piece of furniture at a prim; none where its steel is not as that kind's."""
+    own = [prim for prim in prims if prim.GetPath().HasPrefix(root.GetPath())]
+    p, q, scale = placement(root)
+    if max(abs(s - 1) for s in scale) > 1e-9 or any(prim.GetParent() != root for prim in own):
+        return None
+    kind = plain_value(root.GetAttribute(KIND))
+    found = [read_source(prim, local=True) for prim in own]
+    along = {part.name: part.along for part in parts_of(kind) if part.steel}
+    strength = tuple(source.magnetization[along.get(source.name, 0)] for source in found)
+    try:
+        spec = FurnitureSpec(
+            name=root.GetName(),
+            kind=kind,
+            p_world=p,
+            q_world_xyzw=q,
+            magnetization=strength if any(strength) else (),
+            susceptibility=found[0].susceptibility if found else 0.0,
+        )
+    except RefusedError:  # it has more parts, or fewer
+        return None
+    wanted = [
+        _named(source, source.name.removeprefix(f"{spec.name}_")) for source in spec.sources(in_world=False)
+    ]
+    return spec if found == wanted else None
+
+
+def _named(source: SourceSpec, name: str) -> SourceSpec:
+    return SourceSpec(**{**vars(source), "name": name})
+
+
+def _name(prim: Usd.Prim, taken: set[str]) -> str:
+    """What a source is called: its prim under /World/Sources, else the prims down to it; each name once."""
+    path = prim.GetPath()
+    anchor = SOURCES if path.GetParentPath() == SOURCES else WORLD if path.HasPrefix(WORLD) else Sdf.Path("/")
+    name = path.MakeRelativePath(anchor).pathString.replace("/", "_")
+    number, free = 2, name
+    while free in taken:
+        number, free = number + 1, f"{name}_{number}"
+    return free

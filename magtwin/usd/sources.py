@@ -1,0 +1,303 @@
+"""Magnetised things on a stage: authored as what they look like, and found wherever they stand."""
+
+from typing import Any
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+from magtwin.field.bodies import mesh_moments
+from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multiply, rotate, xyzw_from_wxyz
+from magtwin.names import RefusedError
+from magtwin.spec import ZERO3, Quat, SourceSpec, Vec3
+from magtwin.usd.figures import check_prim_name, plain_value, write_pose
+from magtwin.usd.layers import WORLD
+from magtwin.usd.looks import define_looks, wear
+from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
+
+SOURCES = WORLD.AppendChild("Sources")
+LOOK = "Steel"
+"""What a body of its own wears."""
+
+LOOKS = "Looks"
+TYPES = {"point": "Xform", "cuboid": "Cube", "cylinder": "Cylinder", "sphere": "Sphere", "mesh": "Mesh"}
+SHAPES = {kind: shape for shape, kind in TYPES.items()}
+
+SQUARE = 1e-6
+"""Cosine up to which axes count as square, and relative difference up to which widths count as one."""
+
+PARALLEL = 1e-12
+"""Sine of half the angle up to which axes count as parallel."""
+
+TURNS: dict[str, Quat] = {"X": (0.5, 0.5, 0.5, 0.5), "Y": (-0.5, -0.5, -0.5, 0.5), "Z": IDENTITY_XYZW}
+"""Turns of a cylinder's own z onto its prim's axis."""
+
+POSED = (["translate"], ["translate", "orient"], ["translate", "scale"], ["translate", "orient", "scale"])
+"""Transforms that come back to the bit."""
+
+Placement = tuple[Vec3, Quat, Vec3]
+"""Position [m], turn and scale."""
+
+
+def define_source(
+    stage: Usd.Stage, parent: str | Sdf.Path, spec: SourceSpec, *, look: str = LOOK
+) -> Usd.Prim:
+    """Author a magnetised thing as the child `spec.name` of a prim; its pose is in that prim's axes.
+
+    Args:
+        stage: Written to in its edit target.
+        parent: A prim with the materials that its bodies wear under `Looks`.
+        spec: What to author: an Xform for a point, otherwise what has its shape.
+        look: Which of those materials it wears.
+
+    Raises:
+        RefusedError: Its name cannot name a prim.
+    """
+    path = Sdf.Path(str(parent)).AppendChild(check_prim_name(spec.name, "source"))
+    prim = stage.DefinePrim(path, TYPES[spec.shape])
+    figures: dict[str, Any] = {"magnetization": spec.magnetization, "susceptibility": spec.susceptibility}
+    if spec.shape == "point":
+        write_pose(prim, spec.p_world)
+        figures = {"moment": spec.m_world}
+    else:
+        _define_shape(prim, spec)
+        wear(UsdGeom.Gprim(prim), path.GetParentPath().AppendChild(LOOKS).AppendChild(look))
+    apply_api(prim, "source")
+    for name, value in figures.items():
+        prim.GetAttribute(attribute_name("source", name)).Set(value)
+    return prim
+
+
+def define_sources(stage: Usd.Stage, sources: tuple[SourceSpec, ...]) -> None:
+    """Author magnetised things under /World/Sources, which is at the origin."""
+    UsdGeom.Xform.Define(stage, SOURCES)
+    if any(source.shape != "point" for source in sources):
+        define_looks(stage, SOURCES.AppendChild(LOOKS), [LOOK])
+    for source in sources:
+        define_source(stage, SOURCES, source)
+
+
+def _define_shape(prim: Usd.Prim, spec: SourceSpec) -> None:
+    """A body's geometry, with the scale that makes a cube a box."""
+    write_pose(prim, spec.p_world, None if spec.q_world_xyzw == IDENTITY_XYZW else spec.q_world_xyzw)
+    x, y, z = spec.size_m
+    half = Gf.Vec3f(x / 2, y / 2, z / 2)
+    extent = [-half, half]
+    if spec.shape == "cuboid":
+        UsdGeom.Cube(prim).CreateSizeAttr(1.0)
+        UsdGeom.Cube(prim).AddScaleOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*spec.size_m))
+        extent = [Gf.Vec3f(-0.5), Gf.Vec3f(0.5)]
+    elif spec.shape == "cylinder":
+        UsdGeom.Cylinder(prim).CreateRadiusAttr(x / 2)
+        UsdGeom.Cylinder(prim).CreateHeightAttr(z)
+        UsdGeom.Cylinder(prim).CreateAxisAttr(UsdGeom.Tokens.z)
+    elif spec.shape == "sphere":
+        UsdGeom.Sphere(prim).CreateRadiusAttr(x / 2)
+    else:
+        points = np.array(spec.vertices_m, np.float32)
+        mesh = UsdGeom.Mesh(prim)
+        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+        mesh.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(spec.faces)))
+        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.array(spec.faces, np.int32).ravel()))
+        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        extent = [Gf.Vec3f(*map(float, corner)) for corner in (points.min(axis=0), points.max(axis=0))]
+    UsdGeom.Gprim(prim).CreateExtentAttr(Vt.Vec3fArray(extent))
+
+
+def source_prims(stage: Usd.Stage) -> list[Usd.Prim]:
+    """Every prim that is a source, in order: invisible ones and those in instances too, inactive ones not."""
+    return [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.HasAPI(NOUNS["source"])]
+
+
+def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False) -> SourceSpec:
+    """The spec of a source as it stands in world.
+
+    Args:
+        prim: Has the schema.
+        name: What to call it; the prim's name unless given.
+        local: Whether its pose is wanted in its parent's axes in place of world's.
+
+    Raises:
+        RefusedError: It is no source, is of a type that none can be, is sheared or mirrored, its mesh is
+            open, or a figure is out of range.
+    """
+    require_api(prim, "source")
+    shape = SHAPES.get(prim.GetTypeName())
+    if shape is None:
+        raise RefusedError(
+            f"{place(prim)}: a {prim.GetTypeName() or 'prim without type'} cannot be a magnetic source; "
+            f"put MagtwinMagneticSourceAPI on {', '.join(SHAPES)}"
+        )
+    if any(above.IsA(UsdGeom.PointInstancer) for above in _above(prim)):
+        raise RefusedError(
+            f"{place(prim)}: a magnetic source below a PointInstancer stands in no one place; reference it "
+            "where it stands, as an instance if need be"
+        )
+    figures = {
+        key: plain_value(prim.GetAttribute(attribute_name("source", key)))
+        for key in ("moment", "magnetization", "susceptibility")
+    }
+    p, q, scale = placement(prim, local=local)
+    try:
+        spec: dict[str, Any] = {"name": name or prim.GetName(), "p_world": p, "shape": shape}
+        if shape == "point":
+            return _point(spec, q, **figures)
+        geometry, turn = _geometry(prim, shape, scale)
+        own = {key: _vec3(rotate(quat_conjugate(turn), figures[key])) for key in ("moment", "magnetization")}
+        spec |= geometry | {"q_world_xyzw": q if turn == IDENTITY_XYZW else _product(q, turn)}
+        if own["moment"] != ZERO3:
+            if own["magnetization"] != ZERO3:
+                raise RefusedError("has both a moment and a magnetization; give one of them")
+            own["magnetization"] = _over(own["moment"], SourceSpec(**spec).body().volume_m3)
+        return SourceSpec(
+            **spec, magnetization=own["magnetization"], susceptibility=figures["susceptibility"]
+        )
+    except RefusedError as error:
+        raise RefusedError(f"{place(prim)}: {error}") from error
+
+
+def _point(
+    spec: dict[str, Any], q: Quat, *, moment: Vec3, magnetization: Vec3, susceptibility: float
+) -> SourceSpec:
+    """An Xform's dipole, its moment turned into world axes."""
+    if magnetization != ZERO3 or susceptibility:
+        raise RefusedError(
+            "an Xform has no volume to be magnetised; give it a moment, or put the schema on its Cube, "
+            "Cylinder, Sphere or Mesh"
+        )
+    return SourceSpec(**spec, m_world=moment if q == IDENTITY_XYZW else _vec3(rotate(q, moment)))
+
+
+def _geometry(prim: Usd.Prim, shape: str, scale: Vec3) -> tuple[dict[str, Any], Quat]:
+    """Size, or vertices and faces, in own axes, and the turn from those to the prim's."""
+    if shape == "mesh":
+        points, faces = _triangles(UsdGeom.Mesh(prim), scale)
+        if len(faces) and mesh_moments(points, faces)[0] < 0:
+            faces = faces[:, ::-1]
+        return {
+            "vertices_m": tuple(map(tuple, points.tolist())),
+            "faces": tuple(map(tuple, faces.tolist())),
+        }, (IDENTITY_XYZW)
+    if shape == "cuboid":
+        size = UsdGeom.Cube(prim).GetSizeAttr().Get()
+        return {"size_m": (size * scale[0], size * scale[1], size * scale[2])}, IDENTITY_XYZW
+    if shape == "sphere":
+        wide = 2 * UsdGeom.Sphere(prim).GetRadiusAttr().Get()
+        _check_round(scale, "a sphere's scale")
+        return {"size_m": (wide * scale[0],) * 3}, IDENTITY_XYZW
+    cylinder = UsdGeom.Cylinder(prim)
+    axis = str(cylinder.GetAxisAttr().Get())
+    along = "XYZ".index(axis)
+    across = [scale[k] for k in range(3) if k != along]
+    _check_round(across, "a cylinder's scale across its axis")
+    wide = 2 * cylinder.GetRadiusAttr().Get() * across[0]
+    return {"size_m": (wide, wide, cylinder.GetHeightAttr().Get() * scale[along])}, TURNS[axis]
+
+
+def _triangles(mesh: UsdGeom.Mesh, scale: Vec3) -> tuple[Any, Any]:
+    """A mesh's vertices, those at one place as one, and its polygons cut into fans of triangles."""
+    points = np.array(mesh.GetPointsAttr().Get() or np.empty((0, 3)), float)
+    counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [], int)
+    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], int)
+    if counts.sum() != len(corners) or (
+        len(corners) and not 0 <= corners.min() <= corners.max() < len(points)
+    ):
+        raise RefusedError(
+            f"its {counts.sum()} corners, {len(corners)} indices and {len(points)} points do not fit together"
+        )
+    first = np.cumsum(counts) - counts
+    fans = [
+        (corners[f], corners[f + k], corners[f + k + 1])
+        for f, n in zip(first, counts, strict=True)
+        for k in range(1, n - 1)
+    ]
+    faces = np.array(fans, int).reshape(-1, 3)
+    if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
+        faces = faces[:, ::-1]
+    points = np.asarray(points * scale, np.float32).astype(float)
+    places, index = np.unique(points[faces.ravel()], axis=0, return_inverse=True)
+    if len(places) < len(points):  # doubled, as at seams, or of no face
+        points, faces = places, index.reshape(-1, 3)
+        flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+        faces = faces[~flat]
+    return points, faces
+
+
+def _check_round(scales: Any, what: str) -> None:
+    if max(scales) - min(scales) > SQUARE * max(scales):
+        seen = ", ".join(f"{s:g}" for s in scales)
+        raise RefusedError(
+            f"{what} must be the same each way, got {seen}; use a Mesh for an ellipsoid or oval"
+        )
+
+
+def placement(prim: Usd.Prim, *, local: bool = False) -> Placement:
+    """Position [m], turn and scale of a prim in world, or in its parent.
+
+    What magtwin wrote at the origin comes back to the bit, any other transform as it composes.
+
+    Raises:
+        RefusedError: It is mirrored, sheared, flattened or not finite.
+    """
+    xformable = UsdGeom.Xformable(prim)
+    ops = xformable.GetOrderedXformOps()
+    cache = UsdGeom.XformCache()
+    plain = local or cache.GetParentToWorldTransform(prim) == Gf.Matrix4d(1)
+    if plain and [op.GetOpName().removeprefix("xformOp:") for op in ops] in (*POSED, []):
+        values = {op.GetOpName(): op.Get() for op in ops}
+        turn = values.get("xformOp:orient", Gf.Quatd(1))
+        turn = turn if isinstance(turn, Gf.Quatd) else Gf.Quatd(turn).GetNormalized()
+        p, scale = (values.get(f"xformOp:{n}", Gf.Vec3d(d)) for n, d in (("translate", 0), ("scale", 1)))
+        if min(scale) > 0:
+            return _vec3(p), _quat(turn), _vec3(scale)
+    matrix = xformable.GetLocalTransformation() if local else cache.GetLocalToWorldTransform(prim)
+    rows = np.array(matrix)[:3, :3]
+    lengths = np.sqrt(np.square(rows).sum(axis=1))
+    if not (np.isfinite(np.array(matrix)).all() and lengths.min() > 0):
+        raise RefusedError(
+            f"{place(prim)}: its transform flattens it or is not finite; a source needs its size"
+        )
+    rows = rows / lengths[:, None]
+    if np.abs(rows @ rows.T - np.eye(3)).max() > SQUARE:
+        raise RefusedError(
+            f"{place(prim)}: it is sheared, by a scale above a turn; scale it along its own axes, or bake "
+            "the transform into a mesh"
+        )
+    if np.linalg.det(rows) < 0:
+        raise RefusedError(
+            f"{place(prim)}: it is mirrored by a negative scale, and a magnetization in mirrored axes has no "
+            "one meaning; turn it instead"
+        )
+    turned = Gf.Matrix4d(1)
+    turned.SetRotateOnly(Gf.Matrix3d(*rows.ravel().tolist()))
+    x, y, z = matrix.ExtractTranslation()
+    q = turned.ExtractRotationQuat().GetNormalized()
+    straight = q.GetImaginary().GetLength() <= PARALLEL
+    return (x, y, z), IDENTITY_XYZW if straight else _quat(q), _vec3(lengths)
+
+
+def _above(prim: Usd.Prim) -> list[Usd.Prim]:
+    """The prims above one."""
+    above = []
+    while (prim := prim.GetParent()) and not prim.IsPseudoRoot():
+        above.append(prim)
+    return above
+
+
+def _quat(turn: Gf.Quatd) -> Quat:
+    """A turn as xyzw."""
+    x, y, z, w = xyzw_from_wxyz((turn.GetReal(), *turn.GetImaginary())).tolist()
+    return (x, y, z, w)
+
+
+def _product(a: Quat, b: Quat) -> Quat:
+    x, y, z, w = canonical(quat_multiply(a, b)).tolist()
+    return (x, y, z, w)
+
+
+def _vec3(v: Any) -> Vec3:
+    x, y, z = (float(c) + 0.0 for c in v)
+    return (x, y, z)
+
+
+def _over(moment: Vec3, volume_m3: float) -> Vec3:
+    return (moment[0] / volume_m3, moment[1] / volume_m3, moment[2] / volume_m3)
