@@ -1,0 +1,86 @@
+"""Roughness: how far interpolation is from readings that were left out, and so from the field elsewhere."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+FOLDS = 5
+"""Parts that are left out in turn: cell (i, j) is in part (i + 2 j) mod 5, so that none of the eight
+cells around it is left out with it."""
+
+NEIGHBOURS = 16
+"""Residuals that make the local mean square."""
+
+PRIOR = 4
+"""Residuals that the mean square of the whole survey counts as, beside the local ones."""
+
+
+@dataclass(frozen=True, eq=False)
+class Roughness:
+    """Squared residuals of readings that were left out, where, and how far from the readings that were kept.
+
+    Between readings a distance a apart, linear interpolation errs by f'' a^2 / 8 at most: the error grows as
+    the squared distance, its variance as the fourth power. So the variance at a point is the mean square of
+    the residuals around it, times (distance to the nearest reading / distance when left out)^4.
+    """
+
+    tree: Any
+    """Places of the readings, a scipy cKDTree."""
+
+    left_out: Any
+    """Places of the residuals, a scipy cKDTree."""
+
+    scaled: Array
+    """Squared residual over the fourth power of the distance [nT^2 / m^4], shape (R,)."""
+
+    @classmethod
+    def of(
+        cls, p_xy: Array, b_nt: Array, cell_m: float, interpolate: Callable[[Array, Array, Array], Array]
+    ) -> "Roughness":
+        """Leave out each fifth of the places in turn, and see how well the rest tells it.
+
+        Args:
+            p_xy: Places of readings [m], shape (N, 2).
+            b_nt: What was read there [nT], shape (N,).
+            cell_m: Side of the cells that are left out [m].
+            interpolate: Gives values at places (third) from places (first) and values (second); nan outside.
+        """
+        from scipy.spatial import cKDTree
+
+        cell = np.floor((p_xy - p_xy.min(axis=0)) / cell_m + 0.5).astype(np.int64)
+        part = (cell[:, 0] + 2 * cell[:, 1]) % FOLDS
+        scaled = np.full(len(p_xy), np.nan)
+        for k in range(FOLDS):
+            out, kept = part == k, part != k
+            if not out.any() or np.count_nonzero(kept) < 3:
+                continue
+            residual = b_nt[out] - interpolate(p_xy[kept], b_nt[kept], p_xy[out])
+            distance = np.maximum(cKDTree(p_xy[kept]).query(p_xy[out])[0], cell_m / 2)
+            scaled[out] = residual**2 / distance**4
+        known = np.isfinite(scaled)
+        return cls(cKDTree(p_xy), cKDTree(p_xy[known]) if known.any() else None, scaled[known])
+
+    @classmethod
+    def joined(cls, parts: "Sequence[Roughness]") -> "Roughness":
+        """That of several layers over one floor."""
+        from scipy.spatial import cKDTree
+
+        known = [part for part in parts if part.left_out is not None]
+        left_out = cKDTree(np.vstack([part.left_out.data for part in known])) if known else None
+        scaled = np.concatenate([part.scaled for part in parts])
+        return cls(cKDTree(np.vstack([part.tree.data for part in parts])), left_out, scaled)
+
+    def variance_nt2(self, p_xy: ArrayLike) -> Array:
+        """Variance of the interpolation at points [nT^2], shape (...); nan where none could be left out."""
+        p = np.asarray(p_xy, float)
+        if self.left_out is None:
+            return np.full(p.shape[:-1], np.nan)
+        count = min(NEIGHBOURS, len(self.scaled))
+        _, near = self.left_out.query(p, k=[*range(1, count + 1)])
+        local = (self.scaled[near].sum(axis=-1) + PRIOR * self.scaled.mean()) / (count + PRIOR)
+        return np.asarray(local * self.tree.query(p)[0] ** 4)
