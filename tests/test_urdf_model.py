@@ -1,6 +1,8 @@
 """The model of a URDF: every value of every link, joint and material is the one that yourdfpy reads."""
 
 import io
+import subprocess
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -131,3 +133,13 @@ def test_poses_are_yourdfpys_to_the_last_bit(xyz, rpy):
     origin = ElementTree.SubElement(joint, "origin", words)
     peer = yourdfpy.URDF._parse_origin(origin)
     assert_array_equal(read_joint(joint).origin, peer)
+
+
+def test_a_conversion_without_hulls_imports_neither_yourdfpy_nor_what_it_brings(tmp_path):
+    script = (
+        "import sys; from magtwin.usd.urdf import convert_urdf\n"
+        f"convert_urdf({str(DATA / 'input_joints.urdf')!r}, {str(tmp_path / 'j.usda')!r})\n"
+        "print(*{'lxml', 'networkx', 'scipy', 'trimesh', 'yaml', 'yourdfpy'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.names import RefusedError
 from magtwin.usd.urdf.description import Description, origin_of
+from magtwin.usd.urdf.mesh import bounds
 from magtwin.usd.urdf.model import Geometry, Mesh, Shape
 
 Array = NDArray[np.float64]
@@ -207,7 +208,7 @@ def _box_of(part: Shape, vertices: Vertices | None) -> list[Array]:
         points = _read(geometry.mesh, vertices)
         if points is None:
             return []
-        low, high = points.min(0), points.max(0)
+        low, high = bounds(points)
     else:
         high = _half(geometry)
         low = -high
@@ -234,7 +235,10 @@ def _volume(parts: Iterable[Shape], vertices: Vertices | None) -> float:
         geometry = part.geometry
         if geometry.mesh is not None:
             points = _read(geometry.mesh, vertices)
-            total += np.inf if points is None else float(np.prod(np.ptp(points, axis=0)))
+            if points is None:
+                return np.inf
+            low, high = bounds(points)
+            total += float(np.prod(high - low))
         elif geometry.box is not None:
             total += float(np.prod(geometry.box.size))
         elif geometry.sphere is not None:

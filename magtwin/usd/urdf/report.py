@@ -13,6 +13,7 @@ from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
 from magtwin.usd.geometry import read_vertices
 from magtwin.usd.urdf.description import Description, origin_of
+from magtwin.usd.urdf.mesh import bounds
 from magtwin.usd.urdf.mesh_layer import MeshLayer
 from magtwin.usd.urdf.model import Geometry, Joint, Link, Shape
 
@@ -316,7 +317,7 @@ def _box_of(shape: Shape, T: NDArray[np.float64], meshes: MeshLayer) -> Box | No
         except (RefusedError, KeyError):
             return None  # missing, and noted as that
         placed = points @ T[:3, :3].T + T[:3, 3]
-        return _corners(placed.min(0), placed.max(0))
+        return _corners(*bounds(placed))
     R, p = T[:3, :3], T[:3, 3]
     if geometry.box is not None:
         half = np.abs(R) @ (np.asarray(geometry.box.size, float) / 2)
@@ -347,7 +348,7 @@ def _boxes(stage: Usd.Stage) -> dict[Sdf.Path, Box]:
         if link:
             T = np.array(cache.GetLocalToWorldTransform(by_name[link]) * to_robot)
             points = points @ T[:3, :3] + T[3, :3]
-        boxes[path] = _corners(points.min(0), points.max(0))
+        boxes[path] = _corners(*bounds(points))
     return boxes
 
 
