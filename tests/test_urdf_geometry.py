@@ -732,6 +732,18 @@ def test_a_robot_wide_material_is_found_by_its_name(tmp_path):
     assert_allclose(read_shapes(stage)[0].colour, [0, 1, 0, 1], atol=1e-5)
 
 
+def test_a_material_that_one_visual_tells_of_holds_for_others_that_name_it_and_else_is_noted(tmp_path):
+    trimesh.Trimesh(POINTS, FACES, process=False).export(tmp_path / "t.stl")
+    told = '<material name="green"><color rgba="0 1 0 1"/></material>'
+    looks = (told, '<material name="green"/>', '<material name="geren"/>')
+    stage = robot(tmp_path, "".join(visual("t.stl", look) for look in looks))
+    colours = [shape.colour for shape in read_shapes(stage)]
+    assert_allclose(colours[:2], [[0, 1, 0, 1]] * 2, atol=1e-5)
+    assert_allclose(colours[2][:3], np.full(3, colours[2][0]))
+    notes = read_notes(stage.GetRootLayer().realPath)
+    assert "material 'geren' is named, but nothing says its colour: shown without it" in notes
+
+
 SKIN = '<material name="skin"><texture filename="{}"/></material>'
 
 

@@ -188,6 +188,18 @@ def test_a_conversion_that_loses_nothing_passes_strict(tmp_path):
     assert not convert(urdf(tmp_path, ARM), strict=True).losses
 
 
+def test_a_follower_that_rests_beside_0_is_where_it_belongs(tmp_path):
+    text = ARM.replace('<link name="tip"/>', '<link name="tip">{BODY}</link>').replace(
+        'name="t" type="fixed">',
+        'name="t" type="prismatic"><mimic joint="j" offset="0.05"/>'
+        '<limit lower="0" upper="0.1" effort="1" velocity="1"/>',
+    )
+    report = convert(urdf(tmp_path, text), strict=True)
+    tip = next(line for line in report.geometries if line.link == "tip")
+    assert tip.box_in is not None
+    assert_allclose(tip.box_in[0], [0.25, -0.1, 0.1], atol=1e-9)  # the slide along x is 0.05 m out
+
+
 def test_the_json_of_a_report_holds_all_of_it(tmp_path):
     report = convert(urdf(tmp_path, f'{ARM}<gazebo reference="hand"><maxVel>1</maxVel></gazebo>'))
     facts = json.loads(report.to_json())

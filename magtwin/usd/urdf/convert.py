@@ -211,6 +211,7 @@ def _author_all(
         ledger,
         name=out.name,
         sha256=checksum,
+        poses=read_mechanism(description, options).poses(),
         lint=lint(description, mass=options.mass, vertices=meshes.vertices),
     )
     if options.strict:

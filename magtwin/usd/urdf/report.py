@@ -198,6 +198,7 @@ def make_report(
     *,
     name: str,
     sha256: str,
+    poses: Mapping[str, NDArray[np.float64]] | None = None,
     lint: tuple[str, ...] = (),
 ) -> ConversionReport:
     """Compare a description with the stage that was made of it.
@@ -212,9 +213,10 @@ def make_report(
         ledger: Which prim stands for what.
         name: Name of the root layer.
         sha256: Checksum of the description's file.
+        poses: T_root_link of each link as the robot is authored, (4, 4); each joint at 0 unless given.
         lint: Lines of `lint.lint`.
     """
-    lines = _geometries(description, meshes, stage, ledger)
+    lines = _geometries(description, meshes, stage, ledger, poses or description.poses())
     links = tuple(_link(name_, link, stage, ledger) for name_, link in description.links.items())
     joints = tuple(_joint(joint, stage, ledger) for joint in description.joints.values())
     visuals = [line for line in lines if line.role == "visual"]
@@ -276,11 +278,14 @@ def _joint(joint: Joint, stage: Usd.Stage, ledger: Ledger) -> JointLine:
 
 
 def _geometries(
-    description: Description, meshes: MeshLayer, stage: Usd.Stage, ledger: Ledger
+    description: Description,
+    meshes: MeshLayer,
+    stage: Usd.Stage,
+    ledger: Ledger,
+    poses: Mapping[str, NDArray],
 ) -> tuple[GeometryLine, ...]:
     """A line for each visual and collider."""
-    poses, boxes = description.poses(), _boxes(stage)
-    lines = []
+    boxes, lines = _boxes(stage), []
     for name, link in description.links.items():
         for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for index, shape in enumerate(shapes):

@@ -134,19 +134,31 @@ def _look(paint: Paint | None, meshes: MeshLayer) -> Look:
 def _paint_of(visual: Shape, description: Description) -> Paint | None:
     """A visual's URDF material: its own, or the robot's of that name; none if it has none.
 
-    A texture is the colour alone, as in RViz; where it is missing, the material's colour is.
+    As urdfdom has it, what a visual says of a material holds for others that only name it. A texture is
+    the colour alone, as in RViz; where it is missing, the material's colour is.
     """
     material = visual.material
     if material is None:
         return None
-    shared, name = description.materials.get(material.name), material.name or ""
+    name = material.name or ""
+    shared = description.materials.get(name)
+    if not (material.color or material.texture or shared):
+        shared = _told_by_another(name, description)
     colour = material.color or (shared.color if shared else None)
     texture = material.texture or (shared.texture if shared else None)
     image = None if texture is None else _image(texture.filename, name, description)
     if image is None and colour is None:
+        if texture is None and name:
+            description.note(f"material {name!r} is named, but nothing says its colour: shown without it")
         return None
     r, g, b, a = (1.0, 1.0, 1.0, 1.0) if colour is None else (float(c) for c in colour.rgba)
     return Paint(name, (r, g, b, a)) if image is None else Paint(name, (1.0, 1.0, 1.0, a), image)
+
+
+def _told_by_another(name: str, description: Description) -> Any:
+    """The first material of a name that a visual says more of than that; none if none does."""
+    given = (v.material for link in description.links.values() for v in link.visuals if v.material)
+    return next((m for m in given if name and m.name == name and (m.color or m.texture)), None)
 
 
 def _image(filename: str, material: str, description: Description) -> Image | None:
