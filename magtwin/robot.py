@@ -64,7 +64,7 @@ def from_urdf(
     if settings is not None and not isinstance(settings, RobotSettings):
         settings = read_settings(settings)
     options = dataclasses.replace(settings.conversion if settings else DEFAULTS, **choices)
-    name = f"{urdf.name.split('.')[0]}.usda"
+    name = f"{urdf.name.lstrip('.').split('.')[0] or 'robot'}.usda"
     with output(out, force=force) as folder:
         folder.mkdir()
         if settings is None:

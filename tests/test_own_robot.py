@@ -119,6 +119,11 @@ def test_settings_name_links_and_joints_as_the_urdf_does_though_usd_calls_them_o
     assert made.spec.magnetometer.link == "mast_top"
 
 
+def test_a_description_in_a_hidden_file_makes_an_asset_that_is_seen(tmp_path):
+    (tmp_path / ".cart.urdf").write_text(CART.read_text())
+    assert from_urdf(tmp_path / ".cart.urdf", tmp_path / "cart").asset.name == "cart.usda"
+
+
 def test_options_of_the_command_reach_the_conversion(tmp_path, capsys):
     report = tmp_path / "report.json"
     main(
@@ -150,6 +155,7 @@ def test_options_of_the_command_reach_the_conversion(tmp_path, capsys):
         (["--drive", "left:velocity:damping=much"], "PATTERN:TYPE"),
         (["--package", "mine"], "NAME=VALUE is wanted"),
         (["--density", "-1"], "density must be above 0"),
+        (["--density", "inf"], "density must be above 0, got inf"),
         (["--report", "report.txt"], "a report ends in .json"),
     ],
 )

@@ -79,6 +79,23 @@ def test_friction_bounce_and_compliance_reach_the_collider(tmp_path):
     assert_valid(tmp_path / "cart.usda", tmp_path)
 
 
+def test_a_figure_may_stand_in_an_attribute_called_value(tmp_path):
+    _, robot, report = cart(tmp_path, on("left_wheel", '<mu1 value="0.7"/><selfCollide value="true"/>'))
+    collider = robot.GetPrimAtPath("left_wheel/collisions").GetChildren()[0]
+    grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0].GetPrim()
+    assert_allclose(grip.GetAttribute("physics:staticFriction").Get(), 0.7, rtol=1e-6)
+    assert robot.GetAttribute("newton:selfCollisionEnabled").Get() is True
+    assert not report.unknown_tags
+
+
+def test_tags_about_nothing_that_is_there_are_a_loss_that_names_it(tmp_path):
+    _, _, report = cart(tmp_path, on("left_weel", "<mu1>1</mu1>"))
+    (loss,) = report.losses
+    assert loss.startswith(
+        "cart.urdf:10: <gazebo> is about 'left_weel', which is no link or joint; did you mean"
+    )
+
+
 def test_friction_that_differs_across_is_a_loss(tmp_path):
     _, _, report = cart(tmp_path, on("left_wheel", "<mu1>1</mu1><mu2>0.2</mu2>"))
     assert report.losses == ("link 'left_wheel': friction 1 is taken for that across it too, mu2 0.2",)
@@ -433,11 +450,21 @@ def test_a_bad_tag_is_refused_with_its_line_and_nothing_is_written(tmp_path, nam
     assert [p.name for p in tmp_path.iterdir()] == ["cart.urdf"]
 
 
+MERGES = "a0: &a0 {a: 1, b: 2}\n" + "".join(
+    f"a{i}: &a{i} {{<<: [*a{i - 1}, *a{i - 1}]}}\n" for i in range(1, 60)
+)
+"""Tables that each merge the one before twice: 2**60 entries."""
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("a: [", r"control\.yaml:1: not YAML"),
         ("!!python/object/apply:os.getcwd []", r"control\.yaml:1: not YAML"),
+        ("a: 2001-99-99", r"control\.yaml: not YAML: month must be in 1\.\.12"),
+        ("a: " + "9" * 5000, r"control\.yaml: not YAML: .*digits"),
+        ("a: " + "[" * 5000, r"control\.yaml: not YAML"),
+        (MERGES, r"control\.yaml:\d+: not YAML: a table of over 10000 entries"),
         (YAML.replace("0.04", "round"), r"control\.yaml: wheel_radius must be a number above 0, got 'round'"),
         (YAML.replace("[left]", "[lefft]"), r"left_wheel_names: no joint 'lefft'; did you mean 'left'"),
     ],

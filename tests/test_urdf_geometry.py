@@ -858,16 +858,30 @@ def stl(path):
     trimesh.Trimesh(POINTS, FACES, process=False).export(path)
 
 
+ZEROS = json.dumps(
+    {
+        "asset": {"version": "2.0"},
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"componentType": 5126, "type": "VEC3", "count": 10**12}],
+    }
+)
+DOUBLES = "".join(
+    f'<node id="n{i}"><instance_node url="#n{i + 1}"/><instance_node url="#n{i + 1}"/></node>'
+    for i in range(60)
+)
+
 DAMAGED = {
     "m.stl": (nan_stl, r"m\.stl: has vertices that are not finite numbers; export it again"),
     "cut.stl": (
         lambda p: cut(p, stl),
-        r"cut\.stl: (cannot be read as a mesh: .+; export it again|holds no tri)",
+        r"cut\.stl: is of \d+ bytes, though its \d+ triangles need \d+; export it again",
     ),
-    "empty.stl": (
-        lambda p: p.write_bytes(b""),
-        r"empty\.stl: (cannot be read as a mesh: .+|holds no triangle)",
+    "cut_text.stl": (
+        lambda p: p.write_text("solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1"),
+        r"cut_text\.stl: (holds no triangle, or is cut short|cannot be read as a mesh)",
     ),
+    "empty.stl": (lambda p: p.write_bytes(b""), r"empty\.stl: holds no triangle, or is cut short"),
     "none.obj": (
         lambda p: p.write_text("v 0 0 0\n"),
         r"none\.obj: holds no triangle; export it again, or use",
@@ -899,7 +913,15 @@ DAMAGED = {
         lambda p: gltf(p, index=[0, 1, 9]),
         r"index\.glb: a face names vertex 9 of 4; export it again",
     ),
+    "zeros.gltf": (
+        lambda p: p.write_text(ZEROS),
+        r"zeros\.gltf: accessor 0 is of 10+ zeros, over \d+; export anew",
+    ),
     "json.gltf": (lambda p: p.write_text("{"), r"json\.gltf: cannot be read as a mesh: .+; export it again"),
+    "doubles.dae": (
+        lambda p: dae(p, DOUBLES),
+        r"doubles\.dae:\d+: shows over 50000 nodes; export it again",
+    ),
     "cut.dae": (
         lambda p: cut(dae(p, "<node>{mesh}</node>"), lambda _: None),
         r"cut\.dae:\d+: not XML: .+",

@@ -213,6 +213,8 @@ SLIPS = {
     '<xacro:property name="a" value="${b}"/><xacro:property name="b" value="${a}"/><l x="${a}"/>': "circ",
     '<l x="${1 / 0}"/>': r"ZeroDivisionError: division by zero \(in expression '1 / 0'\)",
     '<l x="${xacro.fatal(1, 2)}"/>': "1 2",
+    """<l x="${xacro.load_yaml('merges.yaml')}"/>""": "is not YAML: a table of over 10000 entries",
+    """<l x="${xacro.load_yaml('deep.yaml')}"/>""": "deep.yaml nests too deep",
     '<l x="${xacro}"/>': "a method is no value",
     '<l x="$(cwd)"/>': r"\$\(cwd\) is not known; known: arg, dirname, env, eval, find, optenv",
 }
@@ -220,6 +222,9 @@ SLIPS = {
 
 @pytest.mark.parametrize("slip", SLIPS)
 def test_a_slip_in_a_xacro_is_told_with_its_line(tmp_path, slip):
+    lines = (f"a{i}: &a{i} {{<<: [*a{i - 1}, *a{i - 1}]}}" for i in range(1, 60))
+    (tmp_path / "merges.yaml").write_text("\n".join(["a0: &a0 {a: 1, b: 2}", *lines]))
+    (tmp_path / "deep.yaml").write_text("[" * 5000)
     with pytest.raises(RefusedError, match=r"arm\.xacro:2: .*" + SLIPS[slip]):
         read_source(write_xacro(tmp_path, slip))
 

@@ -31,6 +31,9 @@ SHADERS = ("phong", "lambert", "blinn", "constant")
 POLYGONS = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 """Primitives that have faces; lines have none."""
 
+NODES = 50_000
+"""Nodes that a scene may show, each as often as it is: nodes of two nodes of two nodes grow without end."""
+
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 """Of linear red, green and blue, as COLLADA has it."""
 
@@ -67,6 +70,7 @@ class _Collada:
                 f"{reading.path}: begins with <{self._root.tag}>, a COLLADA file with <COLLADA>"
             )
         self._ids = {e.get("id"): e for e in markup.lines if e.get("id")}
+        self._visited = 0
         self._sources: dict[str, NDArray] = {}
         self._paints: dict[Element, Paint | None] = {}
 
@@ -98,6 +102,9 @@ class _Collada:
         self, node: Element, T: NDArray, above: tuple[Element, ...]
     ) -> Iterator[tuple[Element, Element, NDArray]]:
         """Geometries below a node, the elements that place them, and the transforms to metres in the file."""
+        self._visited += 1
+        if self._visited > NODES:
+            raise self._refused(node, f"shows over {NODES} nodes")
         if node in above:
             raise self._refused(node, f"node {node.get('id')!r} is within itself")
         T = T @ self._transform(node)

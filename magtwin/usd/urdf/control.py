@@ -193,14 +193,16 @@ def _load(path: Path) -> Any:
     """A YAML file, without tags that make objects."""
     import yaml
 
+    from magtwin.usd.urdf.settings import Loader
+
     if path.stat().st_size > SETTINGS_SIZE:
         raise RefusedError(f"{path}: over {SETTINGS_SIZE} bytes, too big for settings")
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        return yaml.load(path.read_text(encoding="utf-8"), Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a day of no month is a ValueError
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark is not None else ""
-        reason = getattr(error, "problem", None) or "cannot be read"
+        reason = getattr(error, "problem", None) or str(error).partition(";")[0] or "cannot be read"
         raise RefusedError(f"{path}{line}: not YAML: {reason}") from error
 
 

@@ -10,6 +10,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 from pxr import Sdf, Usd, UsdPhysics
 
+from magtwin.names import hint
 from magtwin.usd.urdf.options import Options
 from magtwin.usd.urdf.tag import Tags
 
@@ -55,8 +56,16 @@ def read_surfaces(tags: Tags) -> dict[str, Surface]:
         RefusedError: A figure is not a number, or below 0; the text gives the line.
     """
     surfaces: dict[str, Surface] = {}
+    known = {*tags.description.links, *(joint.name for joint in tags.description.joints.values())}
     for block in tags.blocks("gazebo"):
         link = block.get("reference", "")
+        if link and link not in known:
+            where = tags.description.where(block).rpartition("/")[2]
+            tags.description.note(
+                f"{where}: <gazebo> is about {link!r}, which is no link or joint; {hint(link, known)}; "
+                "kept as text",
+                lost=True,
+            )
         if link not in tags.description.links:
             continue
         friction = tags.number(block, *FRICTION, least=0.0)

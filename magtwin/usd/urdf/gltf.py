@@ -35,6 +35,9 @@ TRIANGLES, STRIP, FAN = 4, 5, 6
 SUPPORTED = ("KHR_materials_unlit", "KHR_mesh_quantization", "KHR_materials_emissive_strength")
 """Extensions without which a file would be read wrongly, and that are understood or change no shape."""
 
+EMPTY = 2**22
+"""Zeros that a file may have without a buffer that holds them."""
+
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
@@ -190,6 +193,10 @@ class _Gltf:
                 )
             values = np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
         else:
+            if count > EMPTY:
+                raise RefusedError(
+                    f"{self._reading.path}: accessor {index} is of {count} zeros, over {EMPTY}; export anew"
+                )
             values = np.zeros((count, width), dtype)
         if "sparse" in accessor:
             values = self._replaced(np.array(values), accessor["sparse"])

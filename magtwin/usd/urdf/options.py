@@ -116,7 +116,7 @@ class Options:
     def __post_init__(self) -> None:
         for name in ("density", "mass"):
             value = getattr(self, name)
-            if value is not None and not value > 0:
+            if value is not None and not 0 < value < math.inf:
                 raise RefusedError(f"{name} must be above 0, got {value!r}")
 
 

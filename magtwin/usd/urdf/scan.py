@@ -1,10 +1,12 @@
 """Scan: STL and PLY, triangles without materials, read by trimesh."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.names import RefusedError
 from magtwin.usd.geometry import linear_from_srgb
 from magtwin.usd.urdf.mesh import Piece
 from magtwin.usd.urdf.reading import Reading
@@ -25,7 +27,25 @@ def read_scan(file: Reading) -> list[Piece]:
             from trimesh.exchange.ply import load_ply
 
             read = load_ply(stream)
-    return [_piece(part) for part in _parts(read)]
+    parts = _parts(read)
+    if not parts and file.path.suffix.lower() == ".stl":
+        raise RefusedError(f"{file.path}: {_why_empty(file.path)}; export it again, or use a primitive")
+    return [_piece(part) for part in parts]
+
+
+def _why_empty(path: Path) -> str:
+    """Why an STL gave no triangle: a binary one has a header of 84 bytes, and 50 for each."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        head = stream.read(84)
+    if head.lstrip()[:5].lower() == b"solid" or len(head) < 84:
+        return "holds no triangle, or is cut short"
+    count = int.from_bytes(head[80:], "little")
+    return (
+        f"is of {size} bytes, though its {count} triangles need {84 + 50 * count}"
+        if count
+        else "holds no triangle"
+    )
 
 
 def _parts(read: dict[str, Any]) -> list[dict[str, Any]]:

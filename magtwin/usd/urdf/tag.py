@@ -69,7 +69,7 @@ class Tags:
     def text(self, element: Element | None, *paths: str) -> str:
         """Text of the first element at one of the paths; "" where there is none."""
         found = self.find(element, *paths)
-        return "" if found is None else (found.text or "").strip()
+        return "" if found is None else _said(found)
 
     def number(
         self,
@@ -87,7 +87,7 @@ class Tags:
         if found is None:
             return None
         try:
-            value = float(found.text or "")
+            value = float(_said(found))
         except ValueError:
             value = np.nan
         if not np.isfinite(value) or value < least or not (value > above or above == -np.inf):
@@ -95,7 +95,7 @@ class Tags:
             want = want if max(least, above) > -np.inf else ""
             raise RefusedError(
                 f"{self.description.where(found)}: {found.tag} must be a finite number{want}, "
-                f"got {(found.text or '').strip()!r}"
+                f"got {_said(found)!r}"
             )
         return value
 
@@ -115,7 +115,7 @@ class Tags:
         found = self.find(element, *paths)
         if found is None:
             return None
-        word = (found.text or "").strip().lower()
+        word = _said(found).lower()
         if word not in ("true", "false", "1", "0"):
             where = self.description.where(found)
             raise RefusedError(f"{where}: {found.tag} must be true or false, got {word!r}")
@@ -163,6 +163,11 @@ class Tags:
             return
         for child in element:
             yield from self._unread(child, (*way, element))
+
+
+def _said(element: Element) -> str:
+    """What an element says: its text, or its `value`, as `<mu1 value="1"/>` and SDFormat have it."""
+    return (element.text or "").strip() or element.get("value", "").strip()
 
 
 def _is_zero(text: str | None) -> bool:

@@ -22,6 +22,7 @@ from magtwin.names import RefusedError, hint
 from magtwin.usd.urdf.expression import GLOBALS, LARGEST, Budget, ExpressionError, check_size, evaluate
 from magtwin.usd.urdf.markup import parse_markup
 from magtwin.usd.urdf.package import Packages
+from magtwin.usd.urdf.settings import Loader
 
 UNITS, ELEMENT = 20_000_000, 100
 """What an expansion may cost, see `Budget`, and the part of it that each element costs."""
@@ -264,7 +265,7 @@ class _Expansion:
 
         path = self._check_inside(self._library.abs_filename_spec(str(filename)), "load_yaml")
 
-        class Loader(yaml.SafeLoader):
+        class UnitLoader(Loader):
             """YAML's safe types, and our units."""
 
         def number(factor: float) -> Callable[[Any, Any], float]:
@@ -273,15 +274,17 @@ class _Expansion:
             )
 
         for tag, factor in UNIT_TAGS.items():
-            Loader.add_constructor(tag, number(factor))
+            UnitLoader.add_constructor(tag, number(factor))
         try:
             content = path.read_bytes()
             self._budget.spend(len(content))
-            return check_size(yaml.load(content, Loader), self._budget)
+            return check_size(yaml.load(content, UnitLoader), self._budget)
         except OSError as error:
             raise ExpressionError(f"load_yaml: {path} cannot be read ({error.strerror})") from error
         except yaml.YAMLError as error:
             raise ExpressionError(f"load_yaml: {path} is not YAML: {' '.join(str(error).split())}") from error
+        except RecursionError as error:
+            raise ExpressionError(f"load_yaml: {path} nests too deep") from error
 
     def _note(self, *words: Any, **_: Any) -> str:
         text = f"{self._at[0].name}:{self._at[1]}: " + " ".join(map(str, words))
