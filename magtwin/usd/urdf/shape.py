@@ -16,7 +16,7 @@ from magtwin.usd.urdf.inertia import quaternion
 from magtwin.usd.urdf.material import Look, define_grip, define_look, wear
 from magtwin.usd.urdf.mesh import Paint
 from magtwin.usd.urdf.mesh_layer import MESH, Entry, MeshLayer, free_name
-from magtwin.usd.urdf.model import Shape
+from magtwin.usd.urdf.model import Material, Shape
 from magtwin.usd.urdf.reading import Reading
 from magtwin.usd.urdf.source import MissingFileError
 from magtwin.usd.urdf.texture import Image, read_image
@@ -155,7 +155,7 @@ def _paint_of(visual: Shape, description: Description) -> Paint | None:
     return Paint(name, (r, g, b, a)) if image is None else Paint(name, (1.0, 1.0, 1.0, a), image)
 
 
-def _told_by_another(name: str, description: Description) -> Any:
+def _told_by_another(name: str, description: Description) -> Material | None:
     """The first material of a name that a visual says more of than that; none if none does."""
     given = (v.material for link in description.links.values() for v in link.visuals if v.material)
     return next((m for m in given if name and m.name == name and (m.color or m.texture)), None)

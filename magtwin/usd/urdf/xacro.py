@@ -22,7 +22,6 @@ from magtwin.names import RefusedError, hint
 from magtwin.usd.urdf.expression import GLOBALS, LARGEST, Budget, ExpressionError, check_size, evaluate
 from magtwin.usd.urdf.markup import parse_markup
 from magtwin.usd.urdf.package import Packages
-from magtwin.usd.urdf.settings import Loader
 
 UNITS, ELEMENT = 20_000_000, 100
 """What an expansion may cost, see `Budget`, and the part of it that each element costs."""
@@ -262,6 +261,8 @@ class _Expansion:
     def _yaml(self, filename: str) -> Any:
         """Data of a YAML file, with angles and lengths in the units that their tags name."""
         import yaml
+
+        from magtwin.usd.urdf.settings import Loader
 
         path = self._check_inside(self._library.abs_filename_spec(str(filename)), "load_yaml")
 
