@@ -1,12 +1,15 @@
+import dataclasses
 import struct
 import subprocess
 import sys
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
+from magtwin.field.difference import difference
 from magtwin.field.map import AnomalyMap
-from magtwin.io.plots import plot_map, plot_run
+from magtwin.io.plots import plot_difference, plot_map, plot_run
 from magtwin.names import RefusedError
 from magtwin.run import Run
 
@@ -73,7 +76,7 @@ def test_turning_the_layers_by_a_quarter_turns_the_panels(tmp_path):
     plot_map(field, tmp_path / "a.png", headings=[0.0])
     plot_map(turned, tmp_path / "b.png", headings=[np.pi / 2])
     a, b = pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png")
-    below_the_title = slice(len(a) // 4, None)
+    below_the_title = slice(len(a) // 3, None)
     assert np.array_equal(a[below_the_title], b[below_the_title])
 
 
@@ -104,6 +107,199 @@ def chunks(data):
         names.append(data[at + 4 : at + 8])
         at += 12 + length
     return names
+
+
+def texts(file):
+    """Texts of an SVG, joined."""
+    root = ElementTree.parse(file).getroot()
+    return " | ".join("".join(e.itertext()).strip() for e in root.iter("{http://www.w3.org/2000/svg}text"))
+
+
+def a_peak(**more):
+    """One heading with a peak of 50 uT at (1.5, 0.7), on 42 uT."""
+    x, y = np.meshgrid(np.linspace(-3, 3, 25), np.linspace(-1.75, 1.75, 15))
+    values = 42_000 + 8_000 * np.exp(-((x - 1.5) ** 2 + (y - 0.7) ** 2))
+    return AnomalyMap(
+        values_nt=values[None], origin_m=(-3.0, -1.75), cell_m=(0.25, 0.25), headings_rad=[0.0], **more
+    )
+
+
+def pixel_at(picture, x, y):
+    """Colour of the panel at a point of a floor of 6 x 3.5 m; the panel is what most of the picture is."""
+    ink = np.any(picture[..., :3] < 0.99, axis=-1)
+    rows, columns = np.flatnonzero(ink.mean(axis=1) > 0.5), np.flatnonzero(ink.mean(axis=0) > 0.5)
+    columns = columns[: np.flatnonzero(np.diff(columns, append=1e6) > 1)[0] + 1]  # without the bar's
+    j = rows[-1] + (rows[0] - rows[-1]) * (y + 1.75) / 3.5
+    i = columns[0] + (columns[-1] - columns[0]) * (x + 3) / 6
+    return picture[round(j), round(i), :3]
+
+
+def test_the_peak_is_bright_where_it_lies_and_the_rest_dark(tmp_path):
+    from matplotlib import colormaps
+
+    plot_map(a_peak(), tmp_path / "a.png")
+    picture = pixels(tmp_path / "a.png")
+    assert np.allclose(pixel_at(picture, 1.5, 0.7), colormaps["viridis"](1.0)[:3], atol=0.12)
+    for x, y in ((-2.9, -1.6), (-1.5, 0.7), (1.5, -1.7)):
+        assert np.allclose(pixel_at(picture, x, y), colormaps["viridis"](0.0)[:3], atol=0.06)
+
+
+def test_the_slope_of_a_peak_is_a_ring_about_it(tmp_path):
+    plot_map(a_peak(), tmp_path / "a.png", what="gradient")
+    picture = pixels(tmp_path / "a.png")
+    side, top, far = (pixel_at(picture, *p).sum() for p in ((0.8, 0.7), (1.5, 0.7), (-2.5, 0.0)))
+    assert side > 2 * top
+    assert side > 2 * far
+
+
+def test_a_masked_node_is_grey_over_its_cell_and_no_farther(tmp_path):
+    valid = np.ones((1, 15, 25), bool)
+    valid[0, 4:7, 5:8] = False  # x from -1.75 to -1.25, y from -0.75 to -0.25, and half a cell about it
+    plot_map(a_peak(valid=valid), tmp_path / "a.png")
+    picture = pixels(tmp_path / "a.png")
+
+    def grey(x, y):
+        red, green, blue = pixel_at(picture, x, y)
+        return abs(red - green) < 0.02 and abs(red - blue) < 0.02
+
+    assert all(grey(x, y) for x in (-1.8, -1.5, -1.2) for y in (-0.8, -0.5, -0.2))
+    assert not any(grey(x, -0.5) for x in (-2.0, -1.0))
+    assert not any(grey(-1.5, y) for y in (-1.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("field", "total field [µT]"),
+        ("gradient", "gradient along the floor [µT/m]"),
+        ("variance", "standard deviation [nT]"),
+        ("headings", "difference from the mean over headings [nT]"),
+    ],
+)
+def test_a_drawing_says_what_where_and_in_which_unit(tmp_path, what, said):
+    field = field_map(variance_nt2=np.full((4, 6, 9), 25.0), height_m=0.35, created="2026-01-02")
+    plot_map(field, tmp_path / "a.svg", what=what)
+    words = texts(tmp_path / "a.svg")
+    for part in (
+        said,
+        "hall",
+        "heading 0°",
+        "heading 270°",
+        "x [m], east",
+        "y [m], north",
+        "sensor at 0.35 m",
+        "2026-01-02",
+    ):
+        assert part in words
+    assert "masked" not in words
+
+
+def test_the_legend_says_what_hatched_nodes_are(tmp_path):
+    valid = np.ones((4, 6, 9), bool)
+    valid[1, 2, 3] = False
+    for what, said in (
+        ("field", "masked: no field is known there"),
+        ("gradient", "masked, or beside a masked node"),
+        ("headings", "masked in some heading"),
+        ("mask", "masked: no field is known there"),
+    ):
+        plot_map(field_map(valid=valid), tmp_path / f"{what}.svg", what=what)
+        assert said in texts(tmp_path / f"{what}.svg")
+    words = texts(tmp_path / "mask.svg")
+    assert "holds field" in words
+    assert "heading 90°, 1 masked" in words
+    assert "heading 0°, 0 masked" in words
+
+
+def test_the_bar_of_the_standard_deviation_is_about_its_value(tmp_path):
+    plot_map(a_peak(variance_nt2=np.full((1, 15, 25), 25.0)), tmp_path / "a.svg", what="variance")
+    ticks = [float(w) for w in texts(tmp_path / "a.svg").split(" | ") if w.replace(".", "").isdigit()]
+    assert {4.5, 5.0, 5.5} <= set(ticks)
+
+
+def test_one_map_gives_one_svg_to_the_byte_without_a_date(tmp_path):
+    valid = np.ones((4, 6, 9), bool)
+    valid[:, 2, 3] = False
+    for name in ("a.svg", "b.svg"):
+        plot_map(field_map(valid=valid), tmp_path / name)
+    data = (tmp_path / "a.svg").read_bytes()
+    assert data == (tmp_path / "b.svg").read_bytes()
+    assert b"<dc:date>" not in data
+    assert b"Matplotlib v" not in data
+
+
+def test_a_map_of_millions_of_nodes_gives_a_small_drawing(tmp_path):
+    values = 42_000 + np.add.outer(np.arange(1500.0), np.arange(1500.0))[None]
+    field = AnomalyMap(values_nt=values, origin_m=(0, 0), cell_m=(0.01, 0.01), headings_rad=[0.0])
+    plot_map(field, tmp_path / "a.svg")
+    assert (tmp_path / "a.svg").stat().st_size < 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("variance", "nothing is known of the variance of map ''"),
+        ("headings", "map '' has one heading only"),
+        ("feild", "no quantity 'feild'; did you mean 'field'"),
+    ],
+)
+def test_what_a_map_does_not_know_is_not_drawn(tmp_path, what, said):
+    with pytest.raises(RefusedError, match=said):
+        plot_map(a_peak(), tmp_path / "a.png", what=what)
+    with pytest.raises(RefusedError, match=r"a\.jpg: a picture ends in \.png or \.svg"):
+        plot_map(a_peak(), tmp_path / "a.jpg")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_real_survey_shows_its_peak_and_its_latched_band(tmp_path, real_data):
+    from magtwin.field.survey import import_survey
+
+    plot_map(import_survey(real_data / "aprilab" / "maps"), tmp_path / "a.png", headings=[0.0])
+    picture = pixels(tmp_path / "a.png")
+    red, green, blue = pixel_at(picture, 0.0, 0.75)
+    assert red > 0.8 > 0.3 > blue  # yellow
+    assert green > 0.8
+    for y in (1.25, 0.75, -0.25):  # hatched, so of grey
+        assert np.ptp(pixel_at(picture, -1.25, y)) < 0.02
+
+
+def a_difference(**more):
+    changed = a_peak().values_nt.copy()
+    changed[0, 10, 6] += 500.0  # at (-1.5, 0.75)
+    noise = np.random.default_rng(1).normal(0, 5, changed.shape)
+    after = a_peak(name="after", created="2026-02-01", **more)
+    after = dataclasses.replace(after, values_nt=changed + 80.0 + noise)
+    return difference(a_peak(name="before", created="2026-01-01", **more), after)
+
+
+def test_a_difference_is_red_where_the_field_rose_and_says_how_much_and_when(tmp_path):
+    found = a_difference(variance_nt2=np.full((1, 15, 25), 12.5))
+    plot_difference(found, tmp_path / "a.svg")
+    plot_difference(found, tmp_path / "b.svg")
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+    words = texts(tmp_path / "a.svg")
+    for part in (
+        "before 2026-01-01 to after 2026-02-01",
+        "common bias +79.7 nT",
+        "1 of 375 nodes changed, in 1 region,",
+        "local change [nT]",
+        "changed region",
+    ):
+        assert part in words
+    assert "robust spread" not in words
+    plot_difference(found, tmp_path / "a.png")
+    picture = pixels(tmp_path / "a.png")[:, : 1240 // 2]
+    reds = (picture[..., 0] > 0.3) & (picture[..., 1] < 0.1) & (picture[..., 2] < 0.2)
+    assert reds.any()
+
+
+def test_a_difference_without_variance_says_so_and_hatches_what_is_not_known_to_both(tmp_path):
+    valid = np.ones((1, 15, 25), bool)
+    valid[0, 3, 4] = False
+    plot_difference(a_difference(valid=valid), tmp_path / "a.svg")
+    words = texts(tmp_path / "a.svg").replace(" | ", " ")  # its lines may break anywhere
+    assert "no variance is known: z by the robust spread" in words
+    assert "not known to both surveys" in words
 
 
 @pytest.mark.parametrize("field", [field_map(), None], ids=["map", "bare floor"])

@@ -269,15 +269,13 @@ def _robust_sd(values: Array) -> float:
 
 
 def _threshold(size: Array) -> float:
-    """Least |z| among those that Benjamini and Hochberg call changed, or what a single one would need."""
+    """|z| whose two-sided p-value is q k / m, k how many Benjamini and Hochberg call changed, or 1 for none."""
     from scipy.special import erfc, erfcinv
 
-    size = np.sort(size)[::-1]
-    p = erfc(size / np.sqrt(2))
+    p = np.sort(erfc(size / np.sqrt(2)))
     called = np.flatnonzero(p <= FALSE_SHARE * np.arange(1, len(p) + 1) / len(p))
-    if len(called):
-        return float(size[called[-1]])
-    return float(np.sqrt(2) * erfcinv(FALSE_SHARE / len(p)))
+    count = called[-1] + 1 if len(called) else 1
+    return float(np.sqrt(2) * erfcinv(FALSE_SHARE * count / len(p)))
 
 
 def _regions(grid: Grid, local: Array, z: Array, threshold: float) -> tuple[Region, ...]:
