@@ -423,6 +423,14 @@ REFUSED = {
         on("eye", CAMERA.format(type="camera").replace(">8<", ">0.01<")),
         r"far 0\.01 m not beyond near",
     ),
+    "rays": (
+        on("eye", LIDAR.format(type="ray", tag="ray", samples="1e300", least=0, most=1, lines="1e12")),
+        r":10: sensor 'scan' of link 'eye': it has \d+ x \d+ rays, over \d+",
+    ),
+    "pixels": (
+        on("eye", CAMERA.format(type="camera").replace("<width>640", "<width>9e30")),
+        r"its image of 9.*e\+\d+ x \d+ is none; give sides from 1 to 65536",
+    ),
     "flag": (
         on("base_link", "<selfCollide>maybe</selfCollide>"),
         r"selfCollide must be true or false, got 'maybe'",

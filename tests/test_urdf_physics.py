@@ -551,6 +551,26 @@ def test_diff_drive_drives_the_wheels_frees_the_casters_and_welds_the_dead_suspe
     assert "link 'skid' is a caster and gives no friction: 0.05" in notes
 
 
+def test_all_wheels_that_a_plugin_names_are_driven_not_the_first_of_each_side(tmp_path):
+    wheel = INERTIAL + '<collision><geometry><cylinder radius="0.05" length="0.04"/></geometry></collision>'
+    parts, tags = ['<link name="base"><inertial><mass value="1"/></inertial></link>'], ""
+    for i, side in enumerate(("left", "right", "left", "right")):
+        place = f"{0.2 - i // 2 * 0.4} {0.15 - i % 2 * 0.3} 0"
+        parts.append(
+            f'<link name="w{i}">{wheel}</link><joint name="j{i}" type="continuous"><parent link="base"/>'
+            f'<child link="w{i}"/><origin xyz="{place}" rpy="-1.5708 0 0"/><axis xyz="0 0 1"/></joint>'
+        )
+        tags += f"<{side}_joint>j{i}</{side}_joint>"
+    plugin = f'<gazebo><plugin name="DiffDrive" filename="gz-sim-diff-drive-system">{tags}</plugin></gazebo>'
+    path = urdf(tmp_path, "".join(parts) + plugin)
+    stage, _, notes = convert(path, profile="diff-drive")
+    joints = [p for p in stage.Traverse() if p.IsA(UsdPhysics.RevoluteJoint)]
+    assert len(joints) == 4
+    assert all(UsdPhysics.DriveAPI(joint, "angular").GetDampingAttr().Get() > 0 for joint in joints)
+    assert not any("caster" in note or "freely" in note for note in notes)
+    assert "drive plugin: of 2 <left_joint> the first is the drive's" in notes
+
+
 def test_what_the_urdf_says_of_its_wheels_wins_over_the_profile(tmp_path):
     path = rover(tmp_path, wheel='<limit effort="1.5" velocity="8"/>')
     tag = '<gazebo reference="skid"><mu1>0.3</mu1></gazebo></robot>'

@@ -40,26 +40,30 @@ SETTINGS_SIZE, SETTINGS_NODES = 1_000_000, 10_000
 """Most bytes and entries of a controller's settings: more is no settings file."""
 
 
-def read_drive(tags: Tags, mechanism: Mechanism) -> DriveSpec | None:
+def read_drive(tags: Tags, mechanism: Mechanism) -> tuple[DriveSpec | None, tuple[str, ...]]:
     """The differential drive that a plugin or controller of the description tells of; none if none does.
+
+    Returns:
+        The drive, of one wheel a side; and all joints that it turns, of which there may be more.
 
     Raises:
         RefusedError: It names a joint that is not there, or a figure is none; the text gives the line.
     """
+    driven = list[str]()
     for block in tags.blocks("gazebo"):
         for plugin in block.findall("plugin"):
             words = f"{plugin.get('name', '')} {plugin.get('filename', '')}".lower()
             if any(word in words for word in PLUGINS):
                 tags.read(plugin)
-                return _of_plugin(tags, plugin, mechanism)
+                return _of_plugin(tags, plugin, mechanism, driven), tuple(driven)
     for block in tags.blocks("gazebo"):
         for plugin in block.findall("plugin"):
             if "ros2_control" in f"{plugin.get('name', '')} {plugin.get('filename', '')}":
                 tags.read(plugin)
-                spec = _of_settings(tags, plugin, mechanism)
+                spec = _of_settings(tags, plugin, mechanism, driven)
                 if spec is not None:
-                    return spec
-    return None
+                    return spec, tuple(driven)
+    return None, ()
 
 
 def read_commands(tags: Tags, mechanism: Mechanism) -> tuple[DriveRule, ...]:
@@ -139,9 +143,9 @@ def _commands(tags: Tags) -> Iterator[tuple[str, str]]:
                 yield name, COMMANDS[wanted]
 
 
-def _of_plugin(tags: Tags, plugin: Element, mechanism: Mechanism) -> DriveSpec:
+def _of_plugin(tags: Tags, plugin: Element, mechanism: Mechanism, driven: list[str]) -> DriveSpec:
     """The drive of a Gazebo plugin."""
-    left, right = (_joint(tags, plugin, names) for names in (LEFT, RIGHT))
+    left, right = (_joint(tags, plugin, names, driven) for names in (LEFT, RIGHT))
     diameter = tags.number(plugin, *DIAMETER, above=0.0)
     radius = tags.number(plugin, *RADIUS, above=0.0)
     return _spec(
@@ -159,18 +163,19 @@ def _of_plugin(tags: Tags, plugin: Element, mechanism: Mechanism) -> DriveSpec:
     )
 
 
-def _joint(tags: Tags, plugin: Element, names: tuple[str, ...]) -> str:
-    """The wheel's joint on one side; the first of several."""
+def _joint(tags: Tags, plugin: Element, names: tuple[str, ...], driven: list[str]) -> str:
+    """The wheel's joint on one side, the first of several; all of them join those that are driven."""
     found = [e for name in names for e in tags.findall(plugin, name)]
     where = tags.description.where(plugin)
     if not found:
         raise RefusedError(f"{where}: the drive plugin has no <{names[0]}>")
     if len(found) > 1:
         tags.description.note(f"drive plugin: of {len(found)} <{found[0].tag}> the first is the drive's")
-    return _known(tags, (found[0].text or "").strip(), found[0])
+    driven += (known := [_known(tags, (e.text or "").strip(), e) for e in found])
+    return known[0]
 
 
-def _of_settings(tags: Tags, plugin: Element, mechanism: Mechanism) -> DriveSpec | None:
+def _of_settings(tags: Tags, plugin: Element, mechanism: Mechanism, driven: list[str]) -> DriveSpec | None:
     """The drive of a diff_drive_controller in the settings that a plugin names; none if it has none."""
     for element in plugin.findall("parameters"):
         named = (element.text or "").strip()
@@ -185,7 +190,7 @@ def _of_settings(tags: Tags, plugin: Element, mechanism: Mechanism) -> DriveSpec
         tags.read(element)
         for table in _tables(_load(path)):
             if "left_wheel_names" in table and "right_wheel_names" in table:
-                return _of_controller(tags, table, mechanism, path)
+                return _of_controller(tags, table, mechanism, path, driven)
     return None
 
 
@@ -227,7 +232,9 @@ def _dotted(table: dict[Any, Any], prefix: str, depth: int) -> Iterator[tuple[st
             yield f"{prefix}{key}", value
 
 
-def _of_controller(tags: Tags, table: dict[str, Any], mechanism: Mechanism, path: Path) -> DriveSpec:
+def _of_controller(
+    tags: Tags, table: dict[str, Any], mechanism: Mechanism, path: Path, driven: list[str]
+) -> DriveSpec:
     """The drive of a diff_drive_controller's settings."""
 
     def number(key: str) -> float | None:
@@ -244,9 +251,13 @@ def _of_controller(tags: Tags, table: dict[str, Any], mechanism: Mechanism, path
         if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
             raise RefusedError(f"{path}: {side}_wheel_names must be a list of joints, got {names!r}")
         known = [joint.name for joint in tags.description.joints.values()]
-        if names[0] not in known:
-            raise RefusedError(f"{path}: {side}_wheel_names: no joint {names[0]!r}; {hint(names[0], known)}")
+        missing = next((name for name in names if name not in known), None)
+        if missing is not None:
+            raise RefusedError(f"{path}: {side}_wheel_names: no joint {missing!r}; {hint(missing, known)}")
+        if len(names) > 1:
+            tags.description.note(f"drive: of {len(names)} {side}_wheel_names the first is the drive's")
         sides.append(names[0])
+        driven += names
     separation, radius = number("wheel_separation"), number("wheel_radius")
     if separation is not None:
         separation *= number("wheel_separation_multiplier") or 1.0

@@ -241,11 +241,10 @@ def _author(
     names = _prim_names(description)
     mechanism, tags = read_mechanism(description, options), Tags(description)
     check_rules(mechanism, options)
-    drive, commands = read_drive(tags, mechanism), read_commands(tags, mechanism)
+    (drive, named), commands = read_drive(tags, mechanism), read_commands(tags, mechanism)
     surfaces = read_surfaces(tags)
     driven: tuple[str, ...] = ()
     if options.profile == "diff-drive":
-        named = () if drive is None else (drive.left_wheel_joint, drive.right_wheel_joint)
         driven = find_wheels(mechanism, named)
         surfaces = grip(mechanism, driven, surfaces)
         commands = not_on(driven, commands)

@@ -41,6 +41,9 @@ SCANNER = np.pi
 APERTURE_MM = 20.955
 """Width of a camera's aperture, UsdGeom's own default [mm]; the field of view is what counts."""
 
+RAYS, PIXELS = 2_000_000, 65_536
+"""Most rays of a LiDAR, and most pixels along a side of a camera's image."""
+
 X_FORWARD: NDArray[np.float64] = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """Axes of USD's camera in Gazebo's sensor, as columns."""
 
@@ -171,6 +174,8 @@ def _define_lidar(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> U
     far = tags.number(scan, "range/max", above=0.0)
     if far is None or not far > near:
         raise RefusedError(f"its farthest range {far} m is not above its nearest {near:g} m; give both")
+    if across.count * up.count > RAYS:
+        raise RefusedError(f"it has {across.count} x {up.count} rays, over {RAYS}")
     rate = _rate(tags, sensor, LidarSpec.scan_rate_hz)
     noise, step = _noise(tags, scan), tags.number(scan, "range/resolution", least=0.0) or 0.0
     spins = across.most - across.least >= SCANNER
@@ -250,6 +255,8 @@ def _define_camera(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> 
         raise RefusedError(f"its horizontal_fov of {fov:g} rad is no perspective's; give one below pi")
     size = [tags.number(lens, f"image/{side}", above=0.0) for side in ("width", "height")]
     width, height = (int(n or default) for n, default in zip(size, (320, 240), strict=True))
+    if not 1 <= min(width, height) <= max(width, height) <= PIXELS:
+        raise RefusedError(f"its image of {width:g} x {height:g} is none; give sides from 1 to {PIXELS}")
     near = tags.number(lens, "clip/near", "depth_camera/clip/near", above=0.0) or 0.1
     far = tags.number(lens, "clip/far", "depth_camera/clip/far", above=0.0) or 100.0
     if not far > near:
