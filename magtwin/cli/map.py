@@ -218,40 +218,164 @@ def map_check(
 
 
 @map_app.command(name="plot")
-def map_plot(file: Path, *, out: Path, force: Force = False) -> None:
-    """Draw a map, a panel a heading.
+def map_plot(
+    file: Path,
+    *,
+    out: Path,
+    what: Literal["field", "gradient", "variance", "mask", "headings"] = "field",
+    headings: str | None = None,
+    date: str | None = None,
+    force: Force = False,
+) -> None:
+    """Draw a map as filled contours, a panel a heading.
 
     Parameters
     ----------
     file
-        Map layer (.usdc), or a folder of survey CSVs.
+        Map layer or stage (.usd, .usda, .usdc), or a folder of survey CSVs.
     out
-        Picture to write, a .png file.
+        Picture to write, a .png or .svg file.
+    what
+        The field; its gradient along the floor; its standard deviation; which nodes are masked; or each
+        heading minus the mean over all of them.
+    headings
+        Headings to show [deg], as 0,90,180,270; the map's own unless given, of more than eight four.
+    date
+        Day to show, YYYY-MM-DD, between the map's epochs; the latest unless given.
     force
         Replace the picture if it exists.
     """
-    from magtwin.files import output
+    from magtwin.files import check_free
     from magtwin.io.plots import plot_map
 
-    check_suffix(out, (".png",), "a picture")
-    field = _open_map(file)
-    with output(out, force=force) as aside:
-        plot_map(field, aside)
+    check_suffix(out, (".png", ".svg"), "a picture")
+    check_free(out, force=force)
+    angles = None if headings is None else _headings_rad(headings)
+    plot_map(_open_map(file, date), out, what=what, headings=angles, force=force)
     say(f"Wrote {out}")
 
 
 @map_app.command(name="info")
-def map_info(file: Path, *, json: Json = False) -> None:
-    """Say what a map holds and where it comes from.
+def map_info(file: Path, *, date: str | None = None, json: Json = False) -> None:
+    """Say everything that a map knows: its field, how sure it is, how it came about and from what.
 
     Parameters
     ----------
     file
-        Map layer (.usdc), or a folder of survey CSVs.
+        Map layer or stage (.usd, .usda, .usdc), or a folder of survey CSVs.
+    date
+        Day to tell of, YYYY-MM-DD, between the map's epochs; the latest unless given.
     json
         Print it as JSON.
     """
-    print_report(_open_map(file).report(), json)
+    from magtwin.field.card import map_card
+
+    if file.is_dir():
+        card = map_card(_open_map(file, date))
+    else:
+        from magtwin.field.epochs import at_date
+
+        epochs = _open_epochs(file)
+        card = map_card(epochs[-1] if date is None else at_date(epochs, date), epochs)
+    print_report(card, json)
+
+
+@map_app.command(name="diff")
+def map_diff(
+    before: Path, after: Path, *, out: Path | None = None, force: Force = False, json: Json = False
+) -> None:
+    """Say what changed from one survey to another, where, and how much against the variance.
+
+    Parameters
+    ----------
+    before
+        The earlier map: a layer or stage, or a folder of survey CSVs.
+    after
+        The later map.
+    out
+        Picture to write, a .png or .svg file; none unless given.
+    force
+        Replace the picture if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.field.difference import difference
+    from magtwin.files import check_free
+
+    if out is not None:
+        check_suffix(out, (".png", ".svg"), "a picture")
+        check_free(out, force=force)
+    found = difference(_open_map(before), _open_map(after))
+    if out is not None:
+        from magtwin.io.plots import plot_difference
+
+        plot_difference(found, out, force=force)
+    print_report(found.report(), json)
+    if out is not None and not json:
+        say(f"Wrote {out}")
+
+
+@map_app.command(name="continue")
+def map_continue(
+    file: Path, *, height: float, out: Path, date: str | None = None, force: Force = False, json: Json = False
+) -> None:
+    """Take a map to another height: exactly by its harmonic field, else upwards by the waves of its grid.
+
+    Parameters
+    ----------
+    file
+        Map layer or stage (.usd, .usda, .usdc), or a folder of survey CSVs.
+    height
+        Height of the sensor above the floor there [m].
+    out
+        Map layer to write, a .usdc file.
+    date
+        Day to take, YYYY-MM-DD, between the map's epochs; the latest unless given.
+    force
+        Replace the file if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.field.card import map_card
+    from magtwin.field.continuation import at_height
+    from magtwin.files import check_free
+    from magtwin.usd.maps import save_map
+
+    check_suffix(out, (".usdc", ".usd"), "a map layer")
+    check_free(out, force=force)
+    field = at_height(_open_map(file, date), height)
+    save_map(field, out, force=force)
+    print_report(map_card(field), json)
+    if not json:
+        say(f"Wrote {out}")
+
+
+@map_app.command(name="epochs")
+def map_epochs(*files: Path, out: Path, force: Force = False, json: Json = False) -> None:
+    """Join maps of several days into one layer that knows how the field drifts.
+
+    Parameters
+    ----------
+    files
+        Map layers of one grid, each with the day of its survey, in any order.
+    out
+        Map layer to write, a .usdc file: a time sample a day, the time code days since 2000-01-01.
+    force
+        Replace the file if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.field.epochs import drift, in_order
+    from magtwin.files import check_free
+    from magtwin.usd.maps import save_map_series
+
+    check_suffix(out, (".usdc", ".usd"), "a map layer")
+    check_free(out, force=force)
+    maps = in_order([epoch for file in files for epoch in _open_epochs(file)])
+    save_map_series(maps, out, force=force)
+    print_report(drift(maps), json)
+    if not json:
+        say(f"Wrote {out}")
 
 
 def _is_survey_folder(source: Path, columns: Columns) -> bool:
@@ -302,12 +426,21 @@ def _joined(report: Any, found: Any) -> Any:
     return replace(report, figures=report.figures + found.figures, facts={**report.facts, **found.facts})
 
 
-def _open_map(file: Path) -> Any:
-    """The map of a layer, or of a folder of survey CSVs."""
+def _open_map(file: Path, date: str | None = None) -> Any:
+    """The map of a layer or stage, of a day where one is given, or of a folder of survey CSVs."""
     if file.is_dir():
         from magtwin.field.survey import import_survey
 
+        if date is not None:
+            raise RefusedError(f"{file}: a folder of CSVs is one survey without a day; leave out --date")
         return import_survey(file)
     from magtwin.usd.maps import load_map
 
-    return load_map(file)
+    return load_map(file, date)
+
+
+def _open_epochs(file: Path) -> Any:
+    """Every epoch of a layer's or stage's map."""
+    from magtwin.usd.maps import load_epochs
+
+    return load_epochs(file)

@@ -269,7 +269,7 @@ def _robust_sd(values: Array) -> float:
 
 
 def _threshold(size: Array) -> float:
-    """|z| whose two-sided p-value is q k / m, k how many Benjamini and Hochberg call changed, or 1 for none."""
+    """|z| whose two-sided p-value is q k / m, k as many as Benjamini and Hochberg call, or 1."""
     from scipy.special import erfc, erfcinv
 
     p = np.sort(erfc(size / np.sqrt(2)))

@@ -36,6 +36,9 @@ DPI = 110
 MOST_NODES_A_SIDE = 600
 """Nodes of a map that are drawn along a side: a panel has no more pixels."""
 
+MOST_PANELS = 8
+"""Headings that are drawn unasked; of a map with more four are, evenly spaced where its own are."""
+
 MOST_SHAPES = 10_000
 """Cells beyond which an SVG holds them as a picture: as shapes they would fill megabytes."""
 
@@ -69,7 +72,8 @@ def plot_map(
         what: "field"; "gradient", the slope of the magnitude along the floor by central differences;
             "variance", its root, the standard deviation; "mask", which nodes hold field; "headings",
             each heading minus the mean over all of them.
-        headings: Headings to show [rad], interpolated between layers; the map's own unless given.
+        headings: Headings to show [rad], interpolated between layers; the map's own unless given, of more
+            than eight four.
         force: Whether a file that exists is replaced.
 
     Raises:
@@ -79,13 +83,16 @@ def plot_map(
     from matplotlib.colors import ListedColormap
 
     quantity = find("quantity", what, QUANTITIES)
-    shown = field.headings_rad if headings is None else np.asarray(headings, float)
-    if len(shown) == 0:
+    if headings is not None and len(headings) == 0:
         raise RefusedError("headings must name one heading at least, got none")
     if what != "mask" and not field.valid.any():
         raise RefusedError(f"map {field.name!r} has no valid node to draw")
     layers = quantity.layers(field)
-    if headings is not None:
+    if headings is None:
+        every = -(-len(layers) // 4) if len(layers) > MOST_PANELS else 1
+        shown, layers = field.headings_rad[::every], layers[::every]
+    else:
+        shown = np.asarray(headings, float)
         layers = _between_headings(field, layers, shown)
     if what != "mask" and not np.isfinite(layers).any():
         raise RefusedError(f"map {field.name!r} has no node whose {what} is known")
