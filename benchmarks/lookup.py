@@ -67,6 +67,7 @@ def ways(field: AnomalyMap, count: int, rng: np.random.Generator) -> dict[str, C
         "at(), compiled": lambda: field.at(x, y, angle),
         "at(), plain Python": plain(lambda: field.at(x, y, angle)),
         "at_with_gradient()": lambda: field.at_with_gradient(x, y, angle),
+        "the same, plain Python": plain(lambda: field.at_with_gradient(x, y, angle)),
     }
     return {
         "scipy": lambda: grid(rows),
@@ -107,7 +108,7 @@ def main(rounds: int = 7) -> None:
         print(f"\n{size:24}{'median, ns a pose':>20}{'least':>10}{'x scipy':>10}{'least':>8}{aim}")
         for name, seconds in took.items():
             got = works[name]()
-            b = np.asarray(got[0] if "gradient" in name else got).reshape(-1)
+            b = np.asarray(got[0] if isinstance(got, tuple) else got).reshape(-1)
             off = np.abs(b - want).max()
             median, least = statistics.median(seconds), min(seconds)
             ratios = statistics.median(took["scipy"]) / median, min(took["scipy"]) / least

@@ -65,15 +65,10 @@ def by_each_way(field, p, yaw, outside):
     warm_up()
     compiled = field.lookup_with_gradient(p, yaw, outside=outside)
     compiled_alone = np.array([field.at(*row, outside=outside) for row in rows])
-    fields = [
-        in_numpy[0],
-        python[:, 0],
-        alone,
-        compiled[0],
-        compiled_alone,
-        field.lookup(p, yaw, outside=outside),
-    ]
-    return fields, [in_numpy[1], python[:, 1:], compiled[1]]
+    compiled_one = np.array([field.at_with_gradient(*row, outside=outside) for row in rows])
+    fields = [in_numpy[0], python[:, 0], alone, compiled[0], compiled_alone, compiled_one[:, 0]]
+    fields.append(field.lookup(p, yaw, outside=outside))
+    return fields, [in_numpy[1], python[:, 1:], compiled[1], compiled_one[:, 1:]]
 
 
 maps = st.builds(

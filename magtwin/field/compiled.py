@@ -115,6 +115,25 @@ def _blend(
 
 
 @njit(**OPTIONS)
+def _sides_of_one(
+    t: Array, k: np.uint64, row: np.uint64, layer: np.uint64, x: float, y: float, h: float, sign: float
+) -> tuple[float, float, float]:
+    """High side of the cell plus `sign` times the low one, along x, y and heading."""
+    m, lx, ly, lh = k + layer, 1 - x, 1 - y, 1 - h
+    b000, b001, b010, b011 = t[k], t[k + _NEXT], t[k + row], t[k + row + _NEXT]
+    b100, b101, b110, b111 = t[m], t[m + _NEXT], t[m + row], t[m + row + _NEXT]
+    b00, b01 = b000 * lx + b001 * x, b010 * lx + b011 * x
+    b10, b11 = b100 * lx + b101 * x, b110 * lx + b111 * x
+    x0 = (b001 + sign * b000) * ly + (b011 + sign * b010) * y
+    x1 = (b101 + sign * b100) * ly + (b111 + sign * b110) * y
+    return (
+        x0 * lh + x1 * h,
+        (b01 + sign * b00) * lh + (b11 + sign * b10) * h,
+        (b10 * ly + b11 * y) + sign * (b00 * ly + b01 * y),
+    )
+
+
+@njit(**OPTIONS)
 def _sides(
     t: Array,
     row: np.uint64,
@@ -126,20 +145,10 @@ def _sides(
     sign: float,
     out: Array,
 ) -> None:
-    """High side of the cell plus `sign` times the low one, along x, y and heading, shape (3 N,)."""
+    """The same of many poses, shape (3 N,)."""
     for n in range(wx.shape[0]):
-        k = np.uint64(node[n])
-        m = k + layer
-        x, y, h = wx[n], wy[n], wh[n]
-        b000, b001, b010, b011 = t[k], t[k + _NEXT], t[k + row], t[k + row + _NEXT]
-        b100, b101, b110, b111 = t[m], t[m + _NEXT], t[m + row], t[m + row + _NEXT]
-        b00, b01 = b000 * (1 - x) + b001 * x, b010 * (1 - x) + b011 * x
-        b10, b11 = b100 * (1 - x) + b101 * x, b110 * (1 - x) + b111 * x
-        x0 = (b001 + sign * b000) * (1 - y) + (b011 + sign * b010) * y
-        x1 = (b101 + sign * b100) * (1 - y) + (b111 + sign * b110) * y
-        out[3 * n] = x0 * (1 - h) + x1 * h
-        out[3 * n + 1] = (b01 + sign * b00) * (1 - h) + (b11 + sign * b10) * h
-        out[3 * n + 2] = (b10 * (1 - y) + b11 * y) + sign * (b00 * (1 - y) + b01 * y)
+        along = _sides_of_one(t, np.uint64(node[n]), row, layer, wx[n], wy[n], wh[n], sign)
+        out[3 * n], out[3 * n + 1], out[3 * n + 2] = along
 
 
 @compiled(_IN, _IN, _IN, types.boolean, _OUT, _OUT)
@@ -201,36 +210,72 @@ def lookup(table: Array, q: Array, yaw: Array, clamp: bool, out: Array, gradient
             g[3 * n + 2] = g[3 * n + 2] * sh if known & ((sh == 0) | (sides[3 * n + 2] <= edge)) else np.nan
 
 
-@compiled(_IN, types.float64, types.float64, types.float64)
-def at(table: Array, x: float, y: float, yaw: float) -> float:
-    """Field at one pose [nT], nan off the grid; arguments as those of `lookup`."""
-    edge, layers, rows, columns = table[5], table[6], table[7], table[8]
+@njit(**OPTIONS)
+def _find(table: Array, x: float, y: float, yaw: float) -> tuple[float, float, float, float, float]:
+    """Lowest node of a pose, below 0 off the grid, weights of the higher ones, slope of the heading's."""
+    edge, layers, rows, columns, per_rad = table[5], table[6], table[7], table[8], table[9]
     u, v, a = (x - table[0]) / table[2], (y - table[1]) / table[3], yaw - table[4]
     known = (u >= -edge) & (u <= columns - 1 + edge) & (v >= -edge) & (v <= rows - 1 + edge)
     if not (known & (a - a == 0)):
-        return np.nan
+        return -1.0, 0.0, 0.0, 0.0, 0.0
     u, v = min(max(u, 0.0), columns - 1), min(max(v, 0.0), rows - 1)
     i, j = min(np.floor(u), columns - 2), min(np.floor(v), rows - 2)
     a -= TURN * np.floor(a / TURN)
     a = min(max(a, 0.0), TURN)
-    if table[9] >= 0:
-        h = min(np.floor(a * table[9]), layers - 1)
-        weight = a * table[9] - h
-    else:
-        count = int(layers)
-        low, high = 0, count
-        while high - low > 1:
-            middle = (low + high) // 2
-            if a >= table[HEADER + middle]:
-                low = middle
-            else:
-                high = middle
-        h, weight = float(low), (a - table[HEADER + low]) / table[HEADER + count + low]
-    row, layer = np.uint64(columns), np.uint64(rows * columns)
-    start = np.uint64(HEADER + 2 * layers)
-    node = np.uint64((h * rows + j) * columns + i)
-    if table.shape[0] > HEADER + 2 * layers + (layers + 1) * rows * columns:
-        masked = start + np.uint64(layers + 1) * layer
-        if _one(table, masked + node, row, layer, u - i, v - j, weight) > edge:
-            return np.nan
-    return _one(table, start + node, row, layer, u - i, v - j, weight)
+    if per_rad >= 0:
+        h = min(np.floor(a * per_rad), layers - 1)
+        return (h * rows + j) * columns + i, u - i, v - j, a * per_rad - h, per_rad
+    count = int(layers)
+    low, high = 0, count
+    while high - low > 1:
+        middle = (low + high) // 2
+        if a >= table[HEADER + middle]:
+            low = middle
+        else:
+            high = middle
+    gap = table[HEADER + count + low]
+    return (low * rows + j) * columns + i, u - i, v - j, (a - table[HEADER + low]) / gap, 1 / gap
+
+
+@njit(**OPTIONS)
+def _planes(table: Array) -> tuple[int, int, int, int, bool]:
+    """Where values begin in a table, and masks if there are any; nodes of a row and of a layer."""
+    row, layer = int(table[8]), int(table[7] * table[8])
+    values = HEADER + 2 * int(table[6])
+    masked = values + (int(table[6]) + 1) * layer
+    return values, masked, row, layer, table.shape[0] > masked
+
+
+@compiled(_IN, types.float64, types.float64, types.float64)
+def at(table: Array, x: float, y: float, yaw: float) -> float:
+    """Field at one pose [nT], nan off the grid; arguments as those of `lookup`."""
+    node, wx, wy, wh, _ = _find(table, x, y, yaw)
+    if node < 0:
+        return np.nan
+    values, masked, row, layer, holes = _planes(table)
+    n, r, up = int(node), np.uint64(row), np.uint64(layer)
+    if holes and _one(table, np.uint64(masked + n), r, up, wx, wy, wh) > table[5]:
+        return np.nan
+    return _one(table, np.uint64(values + n), r, up, wx, wy, wh)
+
+
+@compiled(_IN, types.float64, types.float64, types.float64)
+def at_with_gradient(table: Array, x: float, y: float, yaw: float) -> tuple[float, float, float, float]:
+    """Field at one pose [nT], dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad]; all else as for `at`."""
+    node, wx, wy, wh, sh = _find(table, x, y, yaw)
+    if node < 0:
+        return np.nan, np.nan, np.nan, np.nan
+    values, masked, row, layer, holes = _planes(table)
+    n, r, up = int(node), np.uint64(row), np.uint64(layer)
+    bx, by, bh = _sides_of_one(table, np.uint64(values + n), r, up, wx, wy, wh, -1.0)
+    sx, sy = 1 / table[2], 1 / table[3]
+    bx, by, bh = bx * sx, by * sy, bh * sh
+    if holes:
+        k = np.uint64(masked + n)
+        if _one(table, k, r, up, wx, wy, wh) > table[5]:
+            return np.nan, np.nan, np.nan, np.nan
+        hx, hy, hh = _sides_of_one(table, k, r, up, wx, wy, wh, 1.0)
+        bx = np.nan if hx > table[5] else bx
+        by = np.nan if hy > table[5] else by
+        bh = np.nan if (hh > table[5]) & (sh != 0) else bh
+    return _one(table, np.uint64(values + n), r, up, wx, wy, wh), bx, by, bh

@@ -160,6 +160,9 @@ class Lookup:
         self, x: float, y: float, yaw: float, *, clamp: bool = False
     ) -> tuple[float, float, float, float]:
         """Field at one pose [nT], dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad], as `lookup` gives them."""
+        compiled = self.compiled or self._opened(AS_MANY)
+        if compiled is not None and not clamp:
+            return compiled.at_with_gradient(self.table, x, y, yaw)  # type: ignore[no-any-return]
         place = self._place(x, y, yaw, clamp)
         if place is None:
             return math.nan, math.nan, math.nan, math.nan
