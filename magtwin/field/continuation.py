@@ -115,7 +115,7 @@ def _of_the_grid(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap
         parameters={
             **field.parameters,
             "continued_from_m": start,
-            "second_order_nt": float(known.var() / (2 * known.mean())),
+            "second_order_nt": round(float(known.var() / (2 * known.mean())), 3),
         },
     )
 
