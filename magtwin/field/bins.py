@@ -36,6 +36,9 @@ class Bins:
     count: NDArray[np.intp]
     """Readings in each, shape (M,)."""
 
+    run: NDArray[np.intp]
+    """Run that each is of, shape (M,); 0 where runs were not kept apart."""
+
 
 def bin_readings(
     readings: Readings, cell_m: float, *, sectors: int = 1, by_run: bool = False
@@ -56,13 +59,13 @@ def bin_readings(
     column, row = np.floor(p / cell_m).astype(np.int64).T
     sector = np.floor(yaw / (2 * np.pi) * sectors).astype(np.int64) % sectors
     run = readings.run[rows] if by_run else np.zeros(len(rows), np.intp)
-    _, index, count = np.unique(
+    keys, index, count = np.unique(
         np.column_stack([run, sector, row, column]), axis=0, return_inverse=True, return_counts=True
     )
     index = index.ravel()
     mean = lambda values: np.bincount(index, values) / count  # noqa: E731
     turned = np.arctan2(mean(np.sin(yaw)), mean(np.cos(yaw)))
-    return Bins(np.column_stack([mean(p[:, 0]), mean(p[:, 1])]), turned, mean(b), count), index
+    return Bins(np.column_stack([mean(p[:, 0]), mean(p[:, 1])]), turned, mean(b), count, keys[:, 0]), index
 
 
 def spacing_m(readings: Readings) -> float:

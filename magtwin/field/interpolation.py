@@ -6,7 +6,7 @@ everywhere, the second is interpolated over the triangles of its places.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -357,7 +357,7 @@ def _binned(readings: Readings, still: Array, cell_m: float) -> tuple[Bins, floa
     mean = np.bincount(index, still[rows]) / bins.count
     freedom = len(rows) - len(mean)
     within = float(np.sum((still[rows] - mean[index]) ** 2) / freedom) if freedom else 0.0
-    return Bins(bins.p_xy, bins.yaw, mean, bins.count), within
+    return replace(bins, b_nt=mean), within
 
 
 def _wave(readings: Readings, cell_m: float) -> Array:

@@ -1,0 +1,174 @@
+"""Covariance of a field over place and heading, and how likely readings are under it."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Kernel = Literal["matern52", "poisson"]
+
+ROOT5 = np.sqrt(5.0)
+
+ARM_M = 1 / 30
+"""Length that a figure of 1 stands for in the sensor's place [m]: the scale that its learning has."""
+
+DOUBT = 3.0
+"""Standard deviation of the prior of every logarithm about its first guess: a factor of 20 either way."""
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """What two readings have in common, by where they were taken, how the robot was turned, and in which run.
+
+        k = sum over h of cos(h (yaw - yaw')) (s_h^2 k_h(|x - x'|) + u_h^2) + r^2 [same run],
+        x = p + R(yaw) l,
+
+    with h = 0, 1, 2 (0 alone where no heading differs): the field; what a hard iron adds to its
+    magnitude; what a soft iron does. Each has a part that changes over the floor and one that does not.
+    x is where the sensor is, l beside base_link; r is how far whole runs disagree. k_h is Matern's
+    function of order 5/2 (Rasmussen & Williams 2006, eq. 4.17), or the Poisson kernel
+    (1 + (d / reach)^2)^(-3/2): the covariance that a harmonic field has above uncorrelated sources at a
+    depth of half its reach (as the upward continuation of white noise; Blakely 1995, eq. 12.6).
+    """
+
+    kernel: Kernel
+    """The function of distance."""
+
+    harmonics: int
+    """Number of terms in h: 3, or 1 where no heading differs."""
+
+    runs: bool
+    """Whether runs may disagree."""
+
+    @property
+    def size(self) -> int:
+        """Number of figures: log s_h, reach_h, u_h and noise; then log r, and the arm's x and y, if any."""
+        return 3 * self.harmonics + 1 + self.runs + 2 * (self.harmonics > 1)
+
+    def noise_nt2(self, figures: Array) -> float:
+        """Variance of a reading beside the field and its run [nT^2]."""
+        return float(np.exp(2 * figures[3 * self.harmonics]))
+
+    def run_nt2(self, figures: Array) -> float:
+        """Variance of whole runs [nT^2]."""
+        return float(np.exp(2 * figures[3 * self.harmonics + 1])) if self.runs else 0.0
+
+    def arm_m(self, figures: Array) -> Array:
+        """The sensor's place beside base_link, forward and left [m], shape (2,)."""
+        return np.asarray(ARM_M * figures[-2:] if self.harmonics > 1 else np.zeros(2))
+
+    def variance_nt2(self, figures: Array) -> float:
+        """Variance of the field anywhere [nT^2]."""
+        h = self.harmonics
+        return float(np.exp(2 * figures[:h]).sum() + np.exp(2 * figures[2 * h : 3 * h]).sum())
+
+    def places(self, figures: Array, p_xy: Array, yaw: Array) -> Array:
+        """Where the sensor is [m], shape (N, 2)."""
+        x, y = self.arm_m(figures)
+        c, s = np.cos(yaw), np.sin(yaw)
+        return p_xy + np.column_stack([c * x - s * y, s * x + c * y])
+
+    def between(self, figures: Array, a: tuple[Array, Array], b: tuple[Array, Array]) -> Array:
+        """Covariance of the field at poses `a` and `b`, each places and headings [nT^2], shape (A, B)."""
+        h = self.harmonics
+        place_a, place_b = (self.places(figures, *pose) for pose in (a, b))
+        r = _distance(place_a, place_b)
+        turned = a[1][:, None] - b[1][None, :]
+        out = np.zeros_like(r)
+        for k in range(h):
+            part = np.exp(2 * figures[k]) * _value(self.kernel, r, float(np.exp(figures[h + k])))
+            part += np.exp(2 * figures[2 * h + k])
+            out += part if k == 0 else part * np.cos(k * turned)
+        return out
+
+    def loss(
+        self, figures: Array, guess: Array, p_xy: Array, yaw: Array, run: NDArray[np.intp], b_nt: Array
+    ) -> tuple[float, Array]:
+        """Minus the logarithm of marginal likelihood and prior, and its gradient.
+
+        b K^-1 b / 2 + log |K| / 2 (Rasmussen & Williams 2006, eq. 5.8, 5.9, a constant left out), and
+        (figure - guess)^2 / (2 DOUBT^2) for every logarithm.
+
+        Args:
+            figures: Where to evaluate, shape (size,).
+            guess: First guess of the figures, shape (size,).
+            p_xy: Places of base_link [m], shape (N, 2).
+            yaw: Headings [rad], shape (N,).
+            run: Run of each reading, shape (N,).
+            b_nt: Readings less a constant [nT], shape (N,).
+
+        Returns:
+            The value, infinite where the covariance is not positive definite; its gradient, shape (size,).
+        """
+        from scipy.linalg import cho_solve
+        from scipy.linalg.lapack import dpotrf, dpotri
+
+        h = self.harmonics
+        place = self.places(figures, p_xy, yaw)
+        r = _distance(place, place)
+        turned = yaw[:, None] - yaw[None, :]
+        waves = [np.cos(k * turned) for k in range(h)]
+        total, slope, parts = np.zeros_like(r), np.zeros_like(r), []
+        for k in range(h):
+            value, by_reach, by_r = _with_slopes(self.kernel, r, float(np.exp(figures[h + k])))
+            scale = np.exp(2 * figures[k]) * waves[k]
+            for array in (value, by_reach, by_r):
+                array *= scale
+            total += value + np.exp(2 * figures[2 * h + k]) * waves[k]
+            slope += by_r
+            parts.append((value, by_reach))
+        same = (run[:, None] == run[None, :]).astype(float) if self.runs else None
+        if same is not None:
+            total += self.run_nt2(figures) * same
+        total[np.diag_indices_from(total)] += self.noise_nt2(figures)
+        lower, failed = dpotrf(total, lower=1)
+        if failed:
+            return np.inf, np.zeros(self.size)
+        alpha = cho_solve((lower, True), b_nt)
+        inverse = np.tril(dpotri(lower, lower=1)[0])
+        inverse += np.tril(inverse, -1).T
+        weight = inverse - np.outer(alpha, alpha)  # d loss / d K, twice
+        gradient = [np.vdot(weight, value) for value, _ in parts]
+        gradient += [np.vdot(weight, by_reach) / 2 for _, by_reach in parts]
+        gradient += [np.exp(2 * figures[2 * h + k]) * np.vdot(weight, waves[k]) for k in range(h)]
+        gradient.append(self.noise_nt2(figures) * np.trace(weight))
+        if same is not None:
+            gradient.append(self.run_nt2(figures) * np.vdot(weight, same))
+        if h > 1:
+            weight *= slope
+            c, s = np.cos(yaw), np.sin(yaw)
+            for column in (np.column_stack([c, s]), np.column_stack([-s, c])):
+                # sum over pairs of weight (x - x') . (column - column'), without making the N x N x 2 array
+                moved = 2 * np.vdot(weight.sum(axis=1), np.sum(place * column, axis=1))
+                moved -= 2 * np.vdot(weight @ column, place)
+                gradient.append(ARM_M * moved / 2)
+        value = b_nt @ alpha / 2 + np.log(np.diag(lower)).sum()
+        slopes = np.array(gradient, float)
+        logs = self.size - 2 * (h > 1)
+        off = figures[:logs] - guess[:logs]
+        slopes[:logs] += off / DOUBT**2
+        return float(value + off @ off / (2 * DOUBT**2)), slopes
+
+
+def _distance(a: Array, b: Array) -> Array:
+    dx, dy = a[:, :1] - b[:, 0], a[:, 1:] - b[:, 1]
+    return np.asarray(np.sqrt(dx * dx + dy * dy))
+
+
+def _value(kernel: Kernel, r: Array, reach: float) -> Array:
+    return _with_slopes(kernel, r, reach)[0]
+
+
+def _with_slopes(kernel: Kernel, r: Array, reach: float) -> tuple[Array, Array, Array]:
+    """The function of distance, its derivative by log reach, and that by r over r."""
+    if kernel == "matern52":
+        a = ROOT5 / reach * r
+        fall = np.exp(-a)
+        slope = (1 + a) * fall / 3
+        return (1 + a + a * a / 3) * fall, a * a * slope, -5 / reach**2 * slope
+    q = 1 + (r / reach) ** 2
+    value = q**-1.5
+    slope = 3 * value / q
+    return value, (q - 1) * slope, -slope / reach**2

@@ -1,0 +1,198 @@
+"""From readings to a map: a method by its name, and the raster of what it fitted."""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.field.bins import distance_m, spacing_m
+from magtwin.field.gp import fit_gp
+from magtwin.field.grid import TURN, Grid
+from magtwin.field.interpolation import fit_cubic, fit_trilinear
+from magtwin.field.map import AnomalyMap
+from magtwin.field.model import FieldModel
+from magtwin.field.readings import Readings
+from magtwin.names import RefusedError, find, hint
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int, str], Any]
+
+FINER = 5
+"""Nodes of a smooth method's raster along one spacing of the readings."""
+
+STEP_RAD = np.radians(15.0)
+"""Headings of a smooth method's raster: linear interpolation of cos 2 yaw between them errs by 3.4 %."""
+
+MOST_DOUBT = 0.5
+"""Part of the readings' standard deviation from which a method's own counts as not knowing."""
+
+
+def fit_harmonic(readings: Readings, **options: Any) -> FieldModel:
+    """Equivalent dipoles and the platform: `magtwin.field.inversion.fit_harmonic`, loaded when asked for."""
+    from magtwin.field import inversion
+
+    return inversion.fit_harmonic(readings, **options)
+
+
+METHODS: dict[str, Callable[..., FieldModel]] = {
+    "trilinear": fit_trilinear,
+    "cubic": fit_cubic,
+    "gp": fit_gp,
+    "harmonic": fit_harmonic,
+}
+"""What fits readings, by name; options are those of each function."""
+
+ON_NODES = ("trilinear",)
+"""Methods whose raster of a gridded survey is the survey's own nodes."""
+
+
+def fit(
+    readings: Readings, method: str = "harmonic", *, progress: Progress | None = None, **options: Any
+) -> FieldModel:
+    """Fit a method to the good readings of a survey.
+
+    Args:
+        readings: A survey.
+        method: One of `METHODS`.
+        progress: Called as progress(done, total, what) by the methods that take their time.
+        **options: Options of the method.
+
+    Raises:
+        RefusedError: There is no such method or option; or as the method refuses.
+    """
+    function = find("method", method, METHODS)
+    known = _options(method)
+    for name in options:
+        if name not in known:
+            ends = hint(name, known) if known else "it has none"
+            raise RefusedError(f"method {method!r} has no option {name!r}; {ends}")
+    if progress is not None and "progress" in known:
+        options["progress"] = progress
+    return function(readings, **options)
+
+
+def _options(method: str) -> list[str]:
+    """Names of a method's options."""
+    function: Callable[..., FieldModel] = METHODS[method]
+    if function is fit_harmonic:
+        from magtwin.field import inversion
+
+        function = inversion.fit_harmonic
+    kinds = inspect.signature(function).parameters.values()
+    return [p.name for p in kinds if p.kind is p.KEYWORD_ONLY]
+
+
+def raster(
+    model: FieldModel,
+    readings: Readings,
+    *,
+    spacing_m: float | None = None,
+    headings_rad: ArrayLike | None = None,
+    extent: ArrayLike | None = None,
+    progress: Progress | None = None,
+) -> AnomalyMap:
+    """The map of a model over the floor of its readings.
+
+    A node is valid where the model gives a value, where a good reading lies within one spacing of the
+    readings, and where the model's standard deviation is below half that of the readings; trilinear and
+    cubic maps know by themselves where they end.
+
+    Args:
+        model: What was fitted.
+        readings: What it was fitted to.
+        spacing_m: Distance between nodes [m]. Unless given, for "trilinear" on a gridded survey its
+            own nodes, else a fifth of the readings' spacing (`magtwin.field.bins.spacing_m`).
+        headings_rad: Headings of the layers [rad], ascending in [0, 2 pi). Unless given, for "trilinear" on
+            a gridded survey its own, else every 15 deg; the one heading of a survey that has one only.
+        extent: Least x, greatest x, least y, greatest y [m]; that of the readings unless given.
+        progress: Called as progress(done, total, what), once a heading.
+
+    Returns:
+        The map, with values, variance, method, parameters and the survey's name, source, licence, day
+        and height; and with the harmonic field where the model has one.
+
+    Raises:
+        RefusedError: The spacing leaves no cell, the headings do not ascend, or no node is valid.
+    """
+    grid = _grid(model, readings, spacing_m, headings_rad, extent)
+    p, _ = grid.poses()
+    values, variance = np.empty(grid.shape), np.empty(grid.shape)
+    for h, heading in enumerate(grid.headings_rad):
+        if progress is not None:
+            progress(h, len(grid.headings_rad), "headings")
+        values[h], variance[h] = model.predict(p[h], heading)
+    if progress is not None:
+        progress(len(grid.headings_rad), len(grid.headings_rad), "headings")
+    valid = np.isfinite(values) & np.isfinite(variance) & _known(model, readings, p[0], variance)
+    if not valid.any():
+        x0, x1, y0, y1 = grid.extent
+        raise RefusedError(
+            f"no node of x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m is known to the {model.method} fit of "
+            f"{readings.name!r}; keep the extent within the readings"
+        )
+    harmonic = getattr(model, "field", None)
+    height = readings.height_m
+    return AnomalyMap(
+        values_nt=values,
+        valid=valid,
+        variance_nt2=variance,
+        origin_m=grid.origin_m,
+        cell_m=grid.cell_m,
+        headings_rad=np.asarray(grid.headings_rad),
+        name=readings.name,
+        method=model.method,
+        parameters=dict(model.parameters),
+        source=readings.source,
+        licence=readings.licence,
+        created=readings.created,
+        height_m=harmonic.height_m if height is None and harmonic is not None else height,
+        harmonic=harmonic,
+    )
+
+
+def _grid(
+    model: FieldModel,
+    readings: Readings,
+    spacing: float | None,
+    headings_rad: ArrayLike | None,
+    extent: ArrayLike | None,
+) -> Grid:
+    own = readings.grid if model.method in ON_NODES else None
+    if own is not None and spacing is None and extent is None:
+        if headings_rad is None:
+            return own
+        return replace(own, headings_rad=tuple(np.asarray(headings_rad, float).ravel().tolist()))
+    if headings_rad is None:
+        headings_rad = own.headings_rad if own is not None else _headings(readings)
+    if extent is None:
+        extent = readings.grid.extent if readings.grid is not None else _box(readings)
+    return Grid.over(extent, spacing_m(readings) / FINER if spacing is None else spacing, headings_rad)
+
+
+def _headings(readings: Readings) -> tuple[float, ...]:
+    """Every 15 deg; or the only heading that there is."""
+    if readings.grid is not None:
+        only = readings.grid.headings_rad
+    else:
+        yaw = readings.yaw[readings.good]
+        only = (float(yaw[0] % TURN),) if np.ptp(yaw) == 0 else ()
+    return only if len(only) == 1 else tuple(STEP_RAD * np.arange(round(TURN / STEP_RAD)))
+
+
+def _box(readings: Readings) -> tuple[float, float, float, float]:
+    low, high = (f(readings.p_xy[readings.good], axis=0) for f in (np.min, np.max))
+    return float(low[0]), float(high[0]), float(low[1]), float(high[1])
+
+
+def _known(model: FieldModel, readings: Readings, p_xy: Array, variance: Array) -> NDArray[np.bool_]:
+    """Nodes that the readings reach, and that the model is sure enough of."""
+    from scipy.spatial import cKDTree
+
+    if readings.grid is not None and model.method in ("trilinear", "cubic"):
+        return np.ones(variance.shape, bool)
+    far = distance_m(cKDTree(readings.p_xy[readings.good]), p_xy)
+    doubt = np.sqrt(variance) / readings.b_nt[readings.good].std()
+    return (far <= spacing_m(readings) * (1 + 1e-9)) & (doubt <= MOST_DOUBT)
