@@ -9,7 +9,7 @@ import pytest
 
 from magtwin.cli import main
 
-HEAVY = ("torch", "pxr", "rerun", "scipy", "pyarrow", "pyvista", "matplotlib")
+HEAVY = ("torch", "pxr", "rerun", "scipy", "numba", "pyarrow", "pyvista", "matplotlib")
 
 
 def heavy_modules_after(code: str) -> set[str]:
