@@ -187,6 +187,18 @@ def test_masses_and_tensors_that_are_filled_in_with_zeros_count_as_none(tmp_path
     )
 
 
+def test_the_zeros_that_an_exporter_fills_in_weld_no_wheel(tmp_path):
+    zeros = '<limit lower="0" upper="0" effort="0" velocity="0"/>'
+    look = (
+        '<visual><geometry><sphere radius="1"/></geometry><material name=""><texture filename=""/></material>'
+    )
+    stage, _, notes = convert(arm(tmp_path, f"continuous|{zeros}", f"{{BODY}}{look}</visual>"))
+    drive = UsdPhysics.DriveAPI(stage.GetPrimAtPath("/arm/joints/j"), "angular")
+    assert drive.GetMaxForceAttr().Get() == 10
+    assert "joint 'j' gives an effort of 0: its drive may use 10 N m" in notes
+    assert "link 'hand': a <texture> of no file is left out" in notes
+
+
 def test_a_range_that_is_half_told_ends_at_0_and_one_of_an_endless_joint_is_noted(tmp_path):
     limit = '<limit upper="1" effort="inf" velocity="2"/>'
     stage, _, notes = convert(arm(tmp_path, f"revolute|{limit}"))

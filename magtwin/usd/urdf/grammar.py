@@ -184,6 +184,9 @@ def _clean(element: Element, label: str, where: Callable[[Element], str], note: 
         if child.tag in seen and child.tag not in MANY:
             note(f"{label}: a second <{child.tag}> in <{element.tag}> is left out", lost=True)
             continue
+        if child.tag == "texture" and child.get("filename") == "":
+            note(f"{label}: a <texture> of no file is left out")
+            continue
         seen.add(child.tag)
         clean.append(_clean(child, label, where, note))
     if element.tag == "geometry" and len(clean) != 1:

@@ -60,8 +60,9 @@ def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mec
     """Find out which joints move.
 
     A joint is welded that is fixed, that has no room between its limits, or that its limits give neither
-    effort nor speed; with the profile diff-drive also a slide without one of the two, which stands for a
-    suspension whose spring the URDF cannot hold. What follows a welded joint is welded too.
+    effort nor speed, but for one that turns for ever, whose zeros exporters fill in; with the profile
+    diff-drive also a slide without one of the two, which stands for a suspension whose spring the URDF
+    cannot hold. What follows a welded joint is welded too.
 
     Raises:
         RefusedError: A joint that mimics another has several axes, or the ratio 0; the text gives the line.
@@ -120,7 +121,7 @@ def _welded(joint: Joint, options: Options) -> str | None:
         return ""
     if limit is None:
         return None
-    if limit.effort == 0 and limit.velocity == 0:
+    if limit.effort == 0 and limit.velocity == 0 and joint.type != "continuous":
         return "cannot move by its own limits"
     if joint.type in ("revolute", "prismatic") and limit.lower is not None and limit.lower == limit.upper:
         return "cannot move by its own limits"
