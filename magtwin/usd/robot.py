@@ -158,7 +158,7 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
     if settings.drive is not None or not prims_with(robot, "drive"):
         define_drive(robot, settings.drive or DriveSpec())
     define_platform(robot, settings.platform)
-    define_battery(stage, _base(robot).AppendChild("battery"), settings.battery)
+    define_battery(stage, _free(links, _base(robot), "battery"), settings.battery)
     told: tuple[tuple[str, Any, Any, Any], ...] = (
         ("imu", settings.imu, ImuSpec(), define_imu),
         ("lidar", settings.lidar, LidarSpec(), define_lidar),
@@ -169,7 +169,7 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
         if given is None and spec.link not in links:
             base = _base(robot)
             notes.append(f"no {name} is told of: one is thought to sit at {base.name}'s origin")
-            define(stage, base.AppendChild(name), replace(spec, link=base.name))
+            define(stage, _free(links, base, name), replace(spec, link=base.name))
         else:
             path = _mount(links, name, given or spec)
             notes += _make_way(robot, name, path)
@@ -224,4 +224,10 @@ def _mount(links: dict[str, Sdf.Path], name: str, spec: MountSpec) -> Sdf.Path:
     """Path of a sensor on its link."""
     if spec.link not in links:
         raise RefusedError(f"[{name}] link: the URDF has no link {spec.link!r}; {hint(spec.link, links)}")
-    return links[spec.link].AppendChild(name)
+    return _free(links, links[spec.link], name)
+
+
+def _free(links: dict[str, Sdf.Path], link: Sdf.Path, name: str) -> Sdf.Path:
+    """Path of a sensor on a link, called `name` unless a frame on that link is, which must not move."""
+    names = (name, *(f"{name}_{i}" for i in range(2, len(links) + 3)))
+    return next(path for n in names if (path := link.AppendChild(n)) not in links.values())
