@@ -3,10 +3,10 @@
 Three tests, each with its rate of false alarms:
 
 - **Stuck.** A sensor that is stuck gives the same number to the last digit while the robot moves; a
-  field seldom does. Two readings a distance d apart are equal by chance with probability q f / d, with
-  q the sensor's resolution and f the density of the field's slopes at 0; over `REACH_M` and more the
-  slopes count as independent. Stretches are found whose probability, times the number of
-  readings, is below `FALSE_STUCK`: fewer than one survey in a hundred has a false one.
+  field seldom does. Over a way d it stays within the sensor's resolution q by chance with probability
+  q f / d, with f the density at 0 of the field's slopes thereabouts; ways of `REACH_M` count as
+  independent. Of the stretches found one in a hundred is false, and one sound survey in a hundred
+  shows any (Benjamini & Hochberg 1995, at `FALSE_STUCK`).
 - **Latched.** A sensor that lost lock reads about one level wherever it is and however it is turned.
   Where stretches that are stuck agree on a level, every node (every stretch of a drive) near that
   level is asked which is likelier: that its readings are the level's, or that they are the field that
@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 FALSE_STUCK = 0.01
-"""Stuck stretches that a survey of a sound sensor is expected to show."""
+"""Share of stuck stretches that are false, and of sound surveys that show any."""
 
 FALSE_FLAT = 0.01
 """Flat stretches refuted by their neighbours that a drive with a sound sensor is expected to show."""
@@ -49,11 +49,17 @@ SURE = 0.95
 REACH_M = 0.1
 """Distance over which the slope of the field is taken to stay the same."""
 
+BESIDE = 48
+"""Slopes nearest to a stretch that tell how rough the field is there; those of 0 tell nothing."""
+
 WIDTH = 12.0
 """How far from the level latched readings are looked for, in sds of the stuck stretches' levels."""
 
 CELL_M = 0.05
 """Length of a drive whose readings count as one where the field is fitted."""
+
+LEAST_SLOPES = 8
+"""With fewer slopes nothing is known of the field's roughness, and no stretch is called stuck."""
 
 FLAT_M = 0.25
 """Length from which a stretch of a drive without change is suspect."""
@@ -218,16 +224,12 @@ def _moved(readings: Readings, rows: Rows) -> Array:
 def _stuck(readings: Readings) -> list[Rows]:
     """Rows of each stretch that repeats to the last digit too long for chance."""
     b = readings.b_nt
-    sequences = _sequences(readings)
-    moved = [_moved(readings, rows) for rows in sequences]
-    steps, changes = np.concatenate(moved), np.concatenate([np.abs(np.diff(b[rows])) for rows in sequences])
-    differ = (steps > 0) & (changes > 0)
     gaps = np.diff(np.unique(b[readings.good]))
-    if not differ.any() or not gaps.size:
+    if not gaps.size:
         return []
-    slope = float(np.quantile(changes[differ] / steps[differ], 0.25))
-    chance = float(gaps.min()) * 0.25 / (2 * slope)  # q f: a quarter of the slopes lie within +-slope
-    allowed = np.log(FALSE_STUCK / len(steps))
+    resolution = float(gaps.min())
+    sequences = _sequences(readings)
+    place, slope = _slopes(readings, sequences)
     found = []
     for rows in sequences:
         same = np.diff(b[rows]) == 0
@@ -235,12 +237,39 @@ def _stuck(readings: Readings) -> list[Rows]:
             same &= np.all(np.diff(readings.b_body_nt[rows], axis=0) == 0, axis=1)
         for part in _stretches(same):
             held = rows[part.start : part.stop + 1]
-            yaw = np.unwrap(readings.yaw[held])
-            way = float(np.linalg.norm(np.ptp(readings.p_xy[held], axis=0)) + REACH_M * np.ptp(yaw))
+            p = readings.p_xy[held]
+            way = float(np.linalg.norm(np.ptp(p, axis=0)) + REACH_M * np.ptp(np.unwrap(readings.yaw[held])))
+            if way == 0 or len(slope) < LEAST_SLOPES:
+                continue
+            near = np.argsort(np.linalg.norm(place - p.mean(axis=0), axis=1), kind="stable")[:BESIDE]
+            usual = float(np.quantile(slope[near], 0.25))
             trials = max(1, min(len(held) - 1, int(way / REACH_M)))
-            if way > 0 and trials * np.log(min(1.0, chance * trials / way)) <= allowed:
-                found.append(held)
-    return found
+            if usual * way / trials < 3 * resolution:
+                continue  # the sensor is too coarse for this place to tell
+            chance = resolution * 0.25 / (2 * usual) * trials / way  # a quarter of slopes lie within +-usual
+            found.append((trials * np.log(min(1.0, chance)), held))
+    found.sort(key=lambda one: one[0])
+    tests = sum(len(rows) - 1 for rows in sequences)
+    allowed = np.log(FALSE_STUCK / max(tests, 1) * np.arange(1, len(found) + 1))
+    passed = [k for k, (chance, _) in enumerate(found) if chance <= allowed[k]]
+    return [held for _, held in found[: passed[-1] + 1]] if passed else []
+
+
+def _slopes(readings: Readings, sequences: list[Rows]) -> tuple[Array, Array]:
+    """Places (N, 2) and sizes [nT/m] of the field's slopes along the way, over `REACH_M` or more."""
+    places, slopes = [], []
+    for rows in sequences:
+        moved = _moved(readings, rows)
+        if len(moved) and moved.min() < REACH_M:  # a drive
+            way = np.concatenate([[0.0], np.cumsum(moved)])
+            _, first = np.unique((way / REACH_M).astype(np.intp), return_index=True)
+            rows = rows[first]
+            moved = _moved(readings, rows)
+        change = np.abs(np.diff(readings.b_nt[rows]))
+        kept = (moved > 0) & (change > 0)
+        places.append((readings.p_xy[rows][1:] + readings.p_xy[rows][:-1])[kept] / 2)
+        slopes.append(change[kept] / moved[kept])
+    return np.concatenate(places), np.concatenate(slopes)
 
 
 def _stretches(flags: NDArray[np.bool_]) -> list[slice]:

@@ -17,7 +17,7 @@ LEAST = 48
 """Fewer readings than this are too few to learn the field's spread and reach from."""
 
 TRIED = 512
-"""Readings on which the figures are learnt, evenly through the survey."""
+"""Readings on which the figures are learnt, evenly through the survey; fewer of larger neighbourhoods."""
 
 WIDEST = np.log(50)
 """How far the figures may lie from their first guess, as a logarithm."""
@@ -68,7 +68,8 @@ class LocalFit:
         headings = 1 if readings.grid is None else len(readings.grid.headings_rad)
         count = min(max(24, 6 * headings), 96, len(rows) - 1)
         start = np.log([extent / 6, spread, spread / 8, spread / 16, spread / 50])
-        tried = np.unique(np.linspace(0, len(rows) - 1, min(TRIED, len(rows))).astype(np.intp))
+        some = min(TRIED * 24 // count, len(rows))
+        tried = np.unique(np.linspace(0, len(rows) - 1, some).astype(np.intp))
         near = cls(p, yaw, residual, start, count)._neighbours(tried, np.arange(len(rows)))
 
         def unlikeliness(figures: Array) -> float:

@@ -23,7 +23,7 @@ LONGEST_LINE = 65_536
 SAID = 60
 """Characters of a file's own text that a refusal quotes."""
 
-_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
+_NUMBER = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 _NOTHING = {"", "nan", "na", "null", "none"}
 
 
