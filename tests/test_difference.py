@@ -188,7 +188,11 @@ def test_the_report_tells_where_when_and_what_is_doubtful_and_is_json():
     assert report.title == "difference a to b"
     assert report.facts["from"] == "a 2026-01-01"
     assert report.facts["to"] == "b 2026-02-01"
-    assert report.facts["region 1"]["peak_at_m"] == [1.0, -0.5]
+    told = {f.name: f for f in report.figures}["region 1"]
+    assert told.value == pytest.approx(933, abs=100)
+    assert told.spread == pytest.approx(NOISE_NT * np.sqrt(2))
+    assert "about (1.0" in told.note
+    assert told.note.endswith(" nodes")
     assert report.facts["caution"] == [
         "the frame is 'world' in one map and 'map' in the other",
         "the height of one map is unknown",

@@ -221,8 +221,13 @@ def test_diff_tells_and_draws_what_changed(tmp_path, layer, capsys):
     said = told(capsys, "map", "diff", layer, tmp_path / "b.usdc", "--out", tmp_path / "d.svg")
     assert said["figures"]["common bias"]["value"] == pytest.approx(30, abs=0.01)
     assert said["figures"]["changed nodes"]["value"] == 4
-    assert said["facts"]["region 1"]["centre_m"] == [-0.5, -0.5]
-    assert said["facts"]["region 1"]["peak_nt"] == pytest.approx(400, abs=0.01)
+    (region,) = said["facts"]["regions"]
+    assert region["centre_m"] == [-0.5, -0.5]
+    assert region["peak_nt"] == pytest.approx(400, abs=0.01)
+    assert (
+        said["figures"]["region 1"]["note"]
+        == "z 56.6, about (-0.50, -0.50) m, x -0.5..-0.5, y -0.5..-0.5 m, 1 node"
+    )
     words = "".join(ElementTree.parse(tmp_path / "d.svg").getroot().itertext())
     assert "hall 2026-01-01 to hall 2026-02-01" in words
     assert "exists already" in refused(

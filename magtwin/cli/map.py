@@ -1,6 +1,6 @@
 """`magtwin map`: make and look at anomaly maps."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -310,7 +310,10 @@ def map_diff(
         from magtwin.io.plots import plot_difference
 
         plot_difference(found, out, force=force)
-    print_report(found.report(), json)
+    report = found.report()
+    if json:  # every region, in numbers
+        report = replace(report, facts={**report.facts, "regions": [asdict(r) for r in found.regions]})
+    print_report(report, json)
     if out is not None and not json:
         say(f"Wrote {out}")
 

@@ -43,6 +43,9 @@ class Region:
     peak_nt: float
     """Local change where z is greatest [nT]."""
 
+    peak_sd_nt: float
+    """Standard deviation of that change where the field kept still [nT]."""
+
     peak_z: float
     """z there: that change in standard deviations."""
 
@@ -51,6 +54,14 @@ class Region:
 
     peak_heading_rad: float
     """Heading there [rad]."""
+
+    def said(self) -> str:
+        """Where it is and how sure, in words."""
+        (x, y), (x0, x1, y0, y1) = self.centre_m, self.extent_m
+        return (
+            f"z {self.peak_z:.3g}, about ({x:.2f}, {y:.2f}) m, x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m, "
+            f"{self.nodes} node{'s' * (self.nodes > 1)}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,19 +152,11 @@ class MapDifference:
             Figure("changed nodes", changed, note=f"{changed / count:.1%} of those compared"),
             Figure("regions", len(self.regions)),
         ]
+        for number, region in enumerate(self.regions[:TOLD], 1):
+            figures.append(Figure(f"region {number}", region.peak_nt, "nT", region.peak_sd_nt, region.said()))
         facts: dict[str, Any] = {}
         for label, name, day in zip(("from", "to"), self.names, self.days, strict=True):
             facts[label] = " ".join(text for text in (name, day) if text)
-        for number, region in enumerate(self.regions[:TOLD], 1):
-            facts[f"region {number}"] = {
-                "centre_m": _rounded(*region.centre_m),
-                "extent_m": _rounded(*region.extent_m),
-                "nodes": region.nodes,
-                "peak_nt": round(region.peak_nt, 3),
-                "peak_z": round(region.peak_z, 2),
-                "peak_at_m": _rounded(*region.peak_m),
-                "peak_heading_deg": round(float(np.degrees(region.peak_heading_rad)), 3),
-            }
         if self.cautions:
             facts["caution"] = list(self.cautions)
         return Report(f"difference {self.names[0]} to {self.names[1]}", tuple(figures), facts)
@@ -303,14 +306,10 @@ def _regions(grid: Grid, local: Array, z: Array, threshold: float) -> tuple[Regi
                 ),
                 nodes=len(j),
                 peak_nt=float(local[h, j[k], i[k]]),
+                peak_sd_nt=float(local[h, j[k], i[k]] / z[h, j[k], i[k]]),
                 peak_z=float(z[h, j[k], i[k]]),
                 peak_m=(float(x[k]), float(y[k])),
                 peak_heading_rad=float(grid.headings_rad[h]),
             )
         )
     return tuple(sorted(regions, key=lambda r: -abs(r.peak_z)))
-
-
-def _rounded(*lengths_m: float) -> list[float]:
-    """Lengths to a millimetre."""
-    return [round(length, 3) + 0.0 for length in lengths_m]
