@@ -360,6 +360,10 @@ REFUSED = {
     "no mass": (NO_MASS, r":3: link 'b' has a mass of None"),
     "inertia": (f'<link name="b">{FLAT}</link>', r":3: link 'b' has an impossible inertia: no body has"),
     "friction": (LINK + NEGATIVE, r"arm\.urdf:3: mu1 must be a finite number not below 0, got '-1'"),
+    "too large": (
+        NO_NUMBER.replace("big", "1e200"),
+        r":3: link 'b': radius of <sphere> must be a finite number, got '1e200'",
+    ),
     "no number": (NO_NUMBER, r":3: link 'b': radius of <sphere> must be a finite number, got 'big'"),
 }
 

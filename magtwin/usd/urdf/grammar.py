@@ -43,6 +43,9 @@ class Number:
     """What completes the least count to the greatest."""
 
 
+LARGEST = 1e30
+"""Numbers beyond count as infinite: USD's are of single precision, and volumes are cubes."""
+
 XYZ = Number(counts=(3,))
 SIZE = Number(required=True, least=0.0)
 AMOUNT = Number(least=0.0)
@@ -228,7 +231,7 @@ def _numbers(given: str, kind: Number, place: str, label: str, note: Note) -> st
             value = float(word)
         except ValueError:
             value = math.nan
-        if "_" in word or math.isnan(value) or (math.isinf(value) and not kind.endless):
+        if "_" in word or math.isnan(value) or (abs(value) > LARGEST and not kind.endless):
             raise RefusedError(f"{start} must be {wanted}, got {given!r}")
         if value < kind.least:
             raise RefusedError(f"{start} must not be below {kind.least:g}, got {given!r}")
