@@ -10,6 +10,7 @@ from magtwin.field.bins import spacing_m
 from magtwin.field.fit import METHODS, fit
 from magtwin.field.interpolation import check_readings
 from magtwin.field.readings import Readings
+from magtwin.field.roughness import NINETY
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
 
@@ -19,9 +20,6 @@ Progress = Callable[[int, int, str], Any]
 
 FILLED: Mapping[str, Mapping[str, Any]] = {"trilinear": {"fill": True}, "cubic": {"fill": True}}
 """Options of methods in a check: nodes that were left out are bridged, or every cell would be unknown."""
-
-NINETY = 1.6448536269514722
-"""Half the width of a normal distribution's 90 % interval, in standard deviations."""
 
 BLOCK_SPACINGS = 3
 """Side of a block that is left out, in spacings of the readings."""

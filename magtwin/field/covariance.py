@@ -22,12 +22,12 @@ DOUBT = 3.0
 class Covariance:
     """What two readings have in common, by where they were taken, how the robot was turned, and in which run.
 
-        k = sum over h of cos(h (yaw - yaw')) (s_h^2 k_h(|x - x'|) + u_h^2) + r^2 [same run],
+        k = sum over h of cos(h (yaw - yaw')) (s_h^2 k_h(|x - x'|) + u_h^2) + r^2 k_r(|x - x'|) [same run],
         x = p + R(yaw) l,
 
     with h = 0, 1, 2 (0 alone where no heading differs): the field; what a hard iron adds to its
     magnitude; what a soft iron does. Each has a part that changes over the floor and one that does not.
-    x is where the sensor is, l beside base_link; r is how far whole runs disagree. k_h is Matern's
+    x is where the sensor is, l beside base_link; r is how far runs disagree about one place. k_h is Matern's
     function of order 5/2 (Rasmussen & Williams 2006, eq. 4.17), or the Poisson kernel
     (1 + (d / reach)^2)^(-3/2): the covariance that a harmonic field has above uncorrelated sources at a
     depth of half its reach (as the upward continuation of white noise; Blakely 1995, eq. 12.6).
@@ -44,15 +44,15 @@ class Covariance:
 
     @property
     def size(self) -> int:
-        """Number of figures: log s_h, reach_h, u_h and noise; then log r, and the arm's x and y, if any."""
-        return 3 * self.harmonics + 1 + self.runs + 2 * (self.harmonics > 1)
+        """Number of figures: log s_h, reach_h, u_h, noise; if any, log r and its reach, the arm's x and y."""
+        return 3 * self.harmonics + 1 + 2 * self.runs + 2 * (self.harmonics > 1)
 
     def noise_nt2(self, figures: Array) -> float:
         """Variance of a reading beside the field and its run [nT^2]."""
         return float(np.exp(2 * figures[3 * self.harmonics]))
 
     def run_nt2(self, figures: Array) -> float:
-        """Variance of whole runs [nT^2]."""
+        """Variance of a run about the field [nT^2]."""
         return float(np.exp(2 * figures[3 * self.harmonics + 1])) if self.runs else 0.0
 
     def arm_m(self, figures: Array) -> Array:
@@ -69,6 +69,12 @@ class Covariance:
         x, y = self.arm_m(figures)
         c, s = np.cos(yaw), np.sin(yaw)
         return p_xy + np.column_stack([c * x - s * y, s * x + c * y])
+
+    def within_runs(self, figures: Array, place: Array, run: NDArray[np.intp]) -> Array:
+        """What readings of one run have in common beside the field [nT^2], shape (N, N)."""
+        reach = float(np.exp(figures[3 * self.harmonics + 2]))
+        same = run[:, None] == run[None, :]
+        return self.run_nt2(figures) * _value(self.kernel, _distance(place, place), reach) * same
 
     def between(self, figures: Array, a: tuple[Array, Array], b: tuple[Array, Array]) -> Array:
         """Covariance of the field at poses `a` and `b`, each places and headings [nT^2], shape (A, B)."""
@@ -119,9 +125,14 @@ class Covariance:
             total += value + np.exp(2 * figures[2 * h + k]) * waves[k]
             slope += by_r
             parts.append((value, by_reach))
-        same = (run[:, None] == run[None, :]).astype(float) if self.runs else None
-        if same is not None:
-            total += self.run_nt2(figures) * same
+        apart: tuple[Array, ...] = ()
+        if self.runs:
+            apart = _with_slopes(self.kernel, r, float(np.exp(figures[3 * h + 2])))
+            same = self.run_nt2(figures) * (run[:, None] == run[None, :])
+            for array in apart:
+                array *= same
+            total += apart[0]
+            slope += apart[2]
         total[np.diag_indices_from(total)] += self.noise_nt2(figures)
         lower, failed = dpotrf(total, lower=1)
         if failed:
@@ -134,8 +145,8 @@ class Covariance:
         gradient += [np.vdot(weight, by_reach) / 2 for _, by_reach in parts]
         gradient += [np.exp(2 * figures[2 * h + k]) * np.vdot(weight, waves[k]) for k in range(h)]
         gradient.append(self.noise_nt2(figures) * np.trace(weight))
-        if same is not None:
-            gradient.append(self.run_nt2(figures) * np.vdot(weight, same))
+        if apart:
+            gradient += [np.vdot(weight, apart[0]), np.vdot(weight, apart[1]) / 2]
         if h > 1:
             weight *= slope
             c, s = np.cos(yaw), np.sin(yaw)

@@ -11,6 +11,7 @@ from magtwin.field.bins import GRAIN_M, Bins, bin_readings, spacing_m
 from magtwin.field.covariance import Covariance, Kernel
 from magtwin.field.interpolation import check_readings, flat_poses
 from magtwin.field.readings import Readings
+from magtwin.field.roughness import local_mean, tail
 from magtwin.names import RefusedError
 
 Array = NDArray[np.float64]
@@ -36,12 +37,6 @@ SECTORS = 24
 
 FINEST = 8
 """Cells along a spacing in which the readings of a drive are averaged at least."""
-
-NEIGHBOURS = 16
-"""Places left out whose misses make the local scale of the variance."""
-
-PRIOR = 4
-"""Places that the misses of the whole survey count as, beside the local ones."""
 
 BLOCK = 1024
 """Poses predicted at a time."""
@@ -85,8 +80,8 @@ class GpModel:
         """Field [nT] and its variance [nT^2] at poses; nan where a pose is nan.
 
         The variance is the process's own (Rasmussen & Williams 2006, eq. 2.26), scaled by how far places
-        around that were left out were missed: real fields are rougher here than there. See
-        `FieldModel.predict`.
+        around that were left out were missed, for real fields are rougher here than there, and so that
+        nine in ten of all readings left out lie in their 90 % intervals. See `FieldModel.predict`.
         """
         from scipy.linalg import solve_triangular
 
@@ -105,9 +100,7 @@ class GpModel:
 
     def _scale(self, p_xy: Array) -> Array:
         tree, squares = self.missed
-        count = min(NEIGHBOURS, len(squares))
-        _, near = tree.query(p_xy, k=[*range(1, count + 1)])
-        return np.asarray((squares[near].sum(axis=1) + PRIOR * squares.mean()) / (count + PRIOR))
+        return local_mean(tree, squares, p_xy)
 
 
 def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress | None = None) -> GpModel:
@@ -213,7 +206,7 @@ def _guess(covariance: Covariance, bins: Bins, b: Array) -> Array:
     waves = [np.log(spread)] + [np.log(spread / 20)] * (h - 1)
     even = [np.log(spread)] + [np.log(spread / 10)] * (h - 1)
     guess = [*waves, *[np.log(extent / 8)] * h, *even, np.log(spread / 50)]
-    guess += [np.log(spread / 20)] * covariance.runs + [0.0, 0.0] * (h > 1)
+    guess += [np.log(spread / 20), np.log(extent / 16)] * covariance.runs + [0.0, 0.0] * (h > 1)
     return np.array(guess)
 
 
@@ -222,7 +215,7 @@ def _matrix(covariance: Covariance, figures: Array, bins: Bins, rows: Any = slic
     poses, run = (bins.p_xy[rows], bins.yaw[rows]), bins.run[rows]
     matrix = covariance.between(figures, poses, poses)
     if covariance.runs:
-        matrix += covariance.run_nt2(figures) * (run[:, None] == run[None, :])
+        matrix += covariance.within_runs(figures, covariance.places(figures, *poses), run)
     matrix[np.diag_indices_from(matrix)] += covariance.noise_nt2(figures)
     return matrix
 
@@ -262,12 +255,17 @@ def _missed(
     cell = np.floor((bins.p_xy[rows] - bins.p_xy.min(axis=0)) / side_m + 0.5).astype(np.int64)
     _, block = np.unique(cell, axis=0, return_inverse=True)
     block = block.ravel()
-    places, squares = [], []
+    places, squares, each, place = [], [], [], []
     for members in np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1]):
         own = inverse[np.ix_(members, members)]
-        squares.append(float(pull[members] @ np.linalg.solve(own, pull[members])) / len(members))
+        spread = np.linalg.inv(own)
+        miss = spread @ pull[members]
+        squares.append(float(miss @ pull[members]) / len(members))
+        each.append(miss**2 / np.diag(spread))
+        place.append(np.full(len(members), len(places)))
         places.append(bins.p_xy[rows][members].mean(axis=0))
-    return cKDTree(np.array(places)), np.array(squares)
+    tree, squared = cKDTree(np.array(places)), np.array(squares)
+    return tree, squared * tail(tree, squared, np.concatenate(each), np.concatenate(place))
 
 
 def _parameters(
@@ -286,6 +284,7 @@ def _parameters(
     }
     if covariance.runs:
         told["run_sd_nt"] = round(float(np.sqrt(covariance.run_nt2(figures))), 3)
+        told["run_reach_m"] = round(float(np.exp(figures[3 * h + 2])), 5)
     if h > 1:
         told["p_base_sensor_m"] = [round(float(v), 5) for v in covariance.arm_m(figures)]
     return told

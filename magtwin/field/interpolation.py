@@ -164,7 +164,7 @@ class ScatterInterpolation:
     """Figures of the fit."""
 
     noise_nt2: float
-    """Variance of the readings that were averaged, about their mean [nT^2]."""
+    """Variance of a run's readings at one place, and of runs about each other there [nT^2]."""
 
     p_xy: Array
     """Places that the surface goes through [m], shape (M, 2)."""
@@ -351,13 +351,21 @@ def _fit_scattered(readings: Readings, order: Order) -> ScatterInterpolation:
 
 
 def _binned(readings: Readings, still: Array, cell_m: float) -> tuple[Bins, float]:
-    """Bins of what depends on the place, and the variance of a reading within its bin [nT^2]."""
+    """Bins of what depends on the place; variance of readings of a run in a bin, and of runs [nT^2]."""
     bins, index = bin_readings(readings, cell_m)
     rows = np.flatnonzero(readings.good)
     mean = np.bincount(index, still[rows]) / bins.count
-    freedom = len(rows) - len(mean)
-    within = float(np.sum((still[rows] - mean[index]) ** 2) / freedom) if freedom else 0.0
-    return replace(bins, b_nt=mean), within
+    apart, own = bin_readings(readings, cell_m, by_run=True)
+    means = np.bincount(own, still[rows]) / apart.count
+    freedom = len(rows) - len(means)
+    within = float(np.sum((still[rows] - means[own]) ** 2) / freedom) if freedom else 0.0
+    place = np.zeros(len(means), np.intp)
+    place[own] = index
+    visits = np.bincount(place)
+    middle = np.bincount(place, means) / visits
+    freedom = len(means) - len(visits)
+    between = float(np.sum((means - middle[place]) ** 2) / freedom) if freedom else 0.0
+    return replace(bins, b_nt=mean), within + between
 
 
 def _wave(readings: Readings, cell_m: float) -> Array:
