@@ -89,11 +89,10 @@ def _cabinet() -> Iterator[Part]:
 
 
 def _column() -> Iterator[Part]:
-    """A column of the building, 3 m of HEB 300: two flanges and the web between (149 cm2)."""
-    wide, high, flange, web = 0.3, 3.0, 0.019, 0.011
-    for k, sx in enumerate((1, -1)):
-        yield Part(f"flange_{k}", (sx * (wide - flange) / 2, 0, high / 2), (flange, wide, high), "Steel")
-    yield Part("web", (0, 0, high / 2), (wide - 2 * flange, web, high), "Steel")
+    """A column of the building, 3 m of square tube, 0.25 m wide, on a foot plate."""
+    wide, high, plate = 0.25, 3.0, 0.025
+    yield Part("shaft", (0, 0, (high + plate) / 2), (wide, wide, high - plate), "Steel")
+    yield Part("plate", (0, 0, plate / 2), (0.4, 0.4, plate), "Concrete")
 
 
 KINDS: Mapping[str, Callable[[], Iterator[Part]]] = MappingProxyType(

@@ -351,10 +351,13 @@ class LabSpec(Spec):
     post_height_m: float = 2.2
     """Height of the motion-capture posts, one at each corner and amid each long wall [m]; 0 for none."""
 
+    apron_m: float = 0.2
+    """Width of the slab outside of the walls, which furniture may stand on [m]."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require("floor_m", min(self.floor_m) > 0, "be above 0 m each way", self.floor_m)
-        self._not_negative("wall_height_m", "post_height_m")
+        self._not_negative("wall_height_m", "post_height_m", "apron_m")
         self._above_zero("wall_thickness_m")
 
 

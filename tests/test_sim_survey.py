@@ -139,9 +139,9 @@ def test_heights_and_shapes_are_broadcast():
     [
         ({"spacing_m": 0.0}, "spacing_m must be above 0 m"),
         ({"spacing_m": np.nan}, "spacing_m must be above 0 m"),
-        ({"readings": 0}, "readings at least 1"),
-        ({"spacing_m": 4.0}, r"spacing_m 4 leaves no cell on a floor of \(6.0, 3.5\) m"),
-        ({"headings_rad": (0.0, 7.0)}, "headings_rad of AnomalyMap must ascend"),
+        ({"readings": 0}, "readings must be at least 1, got 0"),
+        ({"spacing_m": 4.0}, r"spacing_m 4 leaves no cell on 6 x 3\.5 m"),
+        ({"headings_rad": (0.0, 7.0)}, "headings_rad of Grid must ascend"),
     ],
 )
 def test_a_survey_that_cannot_be_made_is_refused(options, message):

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, print_report, progress, say
+from magtwin.cli.terminal import Force, Json, Seed, check_suffix, print_report, progress, say
 from magtwin.io.columns import Columns
 from magtwin.names import RefusedError
 
@@ -215,6 +215,107 @@ def map_check(
     with progress("Checking") as advance:
         report = check(readings, list(method or METHODS), split=split, within_m=within, progress=advance)
     print_report(report, json)
+
+
+@map_app.command(name="survey")
+def map_survey(
+    scene: Path,
+    *,
+    out: Path,
+    spacing: float = 0.25,
+    headings: str = "0,90,180,270",
+    readings: int = 135,
+    height: float | None = None,
+    heading_error: float = 0.0,
+    position_error: float = 0.0,
+    seed: Seed = 0,
+    name: str | None = None,
+    licence: str = "",
+    created: str | None = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Survey a scene as its robot would, from node to node, with its sensor's noise.
+
+    What the stage holds now makes the field: move a desk in it, survey again, and the map changes.
+
+    Parameters
+    ----------
+    scene
+        USD stage whose Earth's field is known.
+    out
+        Map layer to write, a .usdc file; or readings, a .parquet file, to fit a model to.
+    spacing
+        Distance between nodes [m].
+    headings
+        Headings in which the robot stands at each node [deg], ascending.
+    readings
+        Readings whose mean a node gives; the lab's own map has 135, a second's.
+    height
+        Height of the sensor above the floor [m]; the robot's own unless given.
+    heading_error
+        Standard deviation of the robot's heading about the node's, which is recorded as it is [deg].
+    position_error
+        Standard deviation of where the robot stands about the node, which is recorded [m].
+    seed
+        Seed of the noise and of the errors.
+    name
+        Name of the map; the file's unless given.
+    licence
+        Licence of the map, an SPDX identifier.
+    created
+        Day of the survey, YYYY-MM-DD; that of the Earth's field unless given.
+    force
+        Replace the file if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from math import radians
+
+    import numpy as np
+
+    from magtwin.files import check_free, sha256
+    from magtwin.sim.survey import survey, survey_readings
+    from magtwin.usd.layers import layer_files
+    from magtwin.usd.scene import read_scene
+
+    check_suffix(out, (".usdc", ".usd", ".parquet"), "a map layer, or a file of readings,")
+    check_free(out, force=force)
+    if seed < 0:
+        raise RefusedError(f"seed must be a whole number from 0 up, got {seed}")
+    twin = read_scene(scene, check_network=False)
+    day = twin.earth.date if twin.earth is not None else ""
+    files = [file for file in layer_files(scene) if file.resolve() != twin.map_layer.resolve()]
+    about: dict[str, Any] = {
+        "rng": np.random.default_rng(seed),
+        "spacing_m": spacing,
+        "headings_rad": _headings_rad(headings),
+        "readings": readings,
+        "height_m": height,
+        "heading_error_rad": radians(heading_error),
+        "position_error_m": position_error,
+        "source": "; ".join(f"{file.name} sha256:{sha256(file)}" for file in files),
+        "licence": licence,
+        "created": day if created is None else created,
+    }
+    with progress(f"Surveying {twin.name}") as advance:
+        if out.suffix == ".parquet":
+            read = survey_readings(twin, **about, progress=advance)
+        else:
+            field = survey(twin, **about, name=name or out.stem, progress=advance)
+    if out.suffix == ".parquet":
+        from magtwin.io.readings import save_readings
+
+        save_readings(replace(read, name=name or out.stem), out, force=force)
+        print_report(read.report(), json)
+    else:
+        from magtwin.usd.maps import save_map
+
+        field = replace(field, parameters={**field.parameters, "seed": seed})
+        save_map(field, out, force=force)
+        print_report(field.report(), json)
+    if not json:
+        say(f"Wrote {out}")
 
 
 @map_app.command(name="plot")

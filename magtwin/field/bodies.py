@@ -3,7 +3,8 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -20,19 +21,19 @@ Rows = NDArray[np.intp]
 MU_0 = 4 * math.pi * MU_0_OVER_4_PI
 """Magnetic constant [T m/A]."""
 
-TOLERANCE = 1e-5
-"""Error of the dipoles that stand for a box or a cylinder, of the greatest field that the body makes at that
-distance; what a test holds them to is three times this."""
+TOLERANCE = 1e-3
+"""Error of the dipoles that stand for a box or a cylinder, over the greatest field that it makes at that
+distance from its box."""
 
 MESH_SIZES = 3.0
-"""Longest sides of its box within which a mesh's field is exact; beyond, six dipoles stand for it, within
+"""Longest sides of its box within which a mesh's field is exact; beyond, four dipoles stand for it, within
 0.2 % for meshes that are not far from convex."""
 
 MOST_DIPOLES = 64
 """Dipoles that a box or a cylinder is cut into at most; nearer than they hold, its field is exact."""
 
-LADDER = 1.25
-"""Ratio of the distances at which a body is cut anew."""
+LADDER, RUNGS = 1.25, 48
+"""Ratio of the distances at which a body is cut anew, and how often it is: to 45,000 times as far."""
 
 CELL_M = 0.25
 """Side of the cells of space in which one set of dipoles is used [m]."""
@@ -82,12 +83,12 @@ class Body:
             * {"cuboid": 1, "cylinder": np.pi / 4, "sphere": np.pi / 6}[self.shape]
         )
 
-    @property
+    @cached_property
     def rotation(self) -> Array:
         """Matrix from its own axes to world's, shape (3, 3)."""
         return matrix_from_quat(self.q_world_xyzw)
 
-    @property
+    @cached_property
     def middle(self) -> Array:
         """Middle of its box in its own axes [m], shape (3,)."""
         if self.vertices is None:
@@ -128,8 +129,8 @@ def _magnet(body: Body) -> Any:
         vertices=body.vertices,
         faces=body.faces,
         polarization=polarization,
-        check_open="skip",  # check_mesh did
-        check_disconnected="skip",
+        check_open="ignore",  # check_mesh did
+        check_disconnected="ignore",
         check_selfintersecting="skip",
         reorient_faces="skip",
     )
@@ -249,37 +250,52 @@ def _along_c(a: float, b: float, c: float) -> float:
 
 
 @cache
-def _gauss(count: int) -> tuple[Array, Array]:
-    """Nodes in -1..1 and weights, of sum 1, of the Gauss-Legendre rule."""
+def _gauss(count: int) -> tuple[Array, Array, Array]:
+    """Nodes in -1..1 and weights, of sum 1, of the Gauss-Legendre rule; and weights for (f'(1) - f'(-1)) / 2.
+
+    The latter are the slopes of the polynomial through the nodes, sum_k (2k + 1) / 2 <f, P_k> P_k.
+    """
     nodes, weights = np.polynomial.legendre.leggauss(count)
-    return nodes, weights / 2
+    even = np.arange(0, count, 2)
+    rises = np.zeros(count)
+    rises[even] = (2 * even + 1) / 2 * even * (even + 1) / 2  # P_k'(1) = k (k + 1) / 2
+    return nodes, weights / 2, weights * np.polynomial.legendre.legval(nodes, rises)
 
 
 def _count(half: float, distance: float) -> int:
-    """Nodes that a rule over -half..half needs for a field whose sources are `distance` aside.
+    """Nodes that a rule over -half..half needs for the field of what lies `distance` aside.
 
-    The error of n nodes falls as rho^-2n, rho = d / a + sqrt(1 + (d / a)^2) the Bernstein ellipse through the
-    nearest singularity (Trefethen 2013, Approximation Theory and Practice, theorem 19.3).
+    One does where the second moment that it leaves out is small. The error of n nodes falls as rho^-2n, with
+    rho = d / a + sqrt(1 + (d / a)^2) the Bernstein ellipse through the nearest singularity (Trefethen 2013,
+    Approximation Theory and Practice, theorem 19.3), and grows as n^3/2 as that of a dipole is steep.
     """
-    if half == 0:
+    if SECOND * (half / distance) ** 2 <= TOLERANCE:
         return 1
-    return max(1, math.ceil(math.log(AMPLIFIED / TOLERANCE) / (2 * math.asinh(distance / half))))
+    count, rate = 2, 2 * math.asinh(distance / half)
+    while AMPLIFIED * (2 * count) ** 1.5 * math.exp(-rate * count) > TOLERANCE:
+        count += 1
+    return count
 
 
-AMPLIFIED = 6.0
-"""Error of such a rule for a dipole's field, over rho^-2n: measured, and held by a test."""
+SECOND, AMPLIFIED, FOURTH = 4.0, 16.0, 40.0
+"""Errors over (a / d)^2, (2 n)^3/2 rho^-2n and (b / d)^4, above those measured; a test holds them to it."""
 
-FOURTH = 6.0
-"""Error of one dipole for what is as thick as it is wide, over the fourth power of half its width by its
-distance: measured, and held by a test."""
+
+def _line(half: float, thin: float, distance: float) -> tuple[Array, Array]:
+    """Nodes and weights for the mean of f - thin^2 / 6 f'' over -half..half."""
+    count = _count(math.sqrt(max(half**2 - thin**2, 0.0)), distance)
+    nodes, weights, slopes = _gauss(count)
+    if count == 2:
+        return math.sqrt((half**2 - thin**2) / 3) * np.array([-1.0, 1.0]), weights
+    return half * nodes, weights - thin**2 / (6 * half**2) * slopes
 
 
 def _dipoles_of(body: Body, distance: float) -> tuple[Array, Array]:
     """Places in the body's axes (K, 3) and shares (K,) of dipoles that stand for it from `distance` on.
 
-    A harmonic function's mean over a body knows nothing of the isotropic part of its second moments. So where
-    the thinnest side is thin enough to be one node, each other side is shortened by as much: a cube is one
-    dipole, a rod a row of them, a plate a sheet, all right to the fourth order.
+    The field's Laplacian is nought, so the second derivative across the thinnest side, c, whose mean over it
+    is c^2 / 6 of that, is less the sum of those along the others: these take it over, and one node does
+    across. A cube is one dipole, a rod a row of them, a plate a sheet, all right to the fourth order in c.
     """
     half = body.size_m / 2
     if body.shape == "sphere":  # exactly a dipole
@@ -288,33 +304,33 @@ def _dipoles_of(body: Body, distance: float) -> tuple[Array, Array]:
         return _of_a_cylinder(half[0], half[2], distance)
     if body.vertices is not None and body.faces is not None:
         return _of_a_mesh(body.vertices, body.faces)
-    if FOURTH * (half.min() / distance) ** 4 <= TOLERANCE:
-        half = np.sqrt(half**2 - half.min() ** 2)
-    rules = [_gauss(_count(h, distance)) for h in half]
-    nodes = np.stack(np.meshgrid(*[h * x for h, (x, _) in zip(half, rules, strict=True)], indexing="ij"), -1)
+    thin = float(half.min()) if _is_thin(half.min(), distance) else 0.0
+    rules = [_line(h, thin, distance) for h in half]
+    nodes = np.stack(np.meshgrid(*[x for x, _ in rules], indexing="ij"), -1)
     shares = np.einsum("i,j,k->ijk", *[w for _, w in rules])
     return nodes.reshape(-1, 3), shares.ravel()
 
 
+def _is_thin(half: float, distance: float) -> bool:
+    """Whether one node does across a side, its second moment taken over by the others."""
+    return FOURTH * (half / distance) ** 4 <= TOLERANCE
+
+
 def _of_a_cylinder(radius: float, half: float, distance: float) -> tuple[Array, Array]:
-    """A Gauss rule along the axis, times one in the square of the radius with evenly spaced angles."""
-    if (
-        FOURTH * (min(radius, half) / distance) ** 4 <= TOLERANCE
-    ):  # second moments are half^2 / 3, radius^2 / 4
-        long, wide = half**2 / 3 - radius**2 / 4, radius**2 / 4 - half**2 / 3
-        half, radius = math.sqrt(3 * max(long, 0.0)), math.sqrt(4 * max(wide, 0.0))
-    along, share = _gauss(_count(half, distance))
-    rings = _count(radius, distance)
-    if rings == 1 and radius == 0:
-        disc, part = np.zeros((1, 2)), np.ones(1)
+    """A rule along the axis, times one in the square of the radius with evenly spaced angles."""
+    disc, part = np.zeros((1, 2)), np.ones(1)
+    if _is_thin(radius, distance) and half > radius:  # second moments are half^2 / 3 and radius^2 / 4
+        along, share = _line(half, math.sqrt(0.75) * radius, distance)
     else:
-        square, weight = _gauss(rings)
-        spokes = 2 * rings + 2
-        angle = 2 * np.pi * np.arange(spokes) / spokes
-        r = radius * np.sqrt((1 + square) / 2)
-        disc = (r[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)).reshape(-1, 2)
-        part = np.repeat(weight / spokes, spokes)
-    places = np.column_stack([np.tile(disc, (len(along), 1)), np.repeat(half * along, len(disc))])
+        along, share = _line(half, 0.0, distance)
+        if (rings := _count(radius, distance)) > 1:
+            square, weight, _ = _gauss(rings)
+            spokes = 2 * rings + 2
+            angle = 2 * np.pi * np.arange(spokes) / spokes
+            r = radius * np.sqrt((1 + square) / 2)
+            disc = (r[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)).reshape(-1, 2)
+            part = np.repeat(weight / spokes, spokes)
+    places = np.column_stack([np.tile(disc, (len(along), 1)), np.repeat(along, len(disc))])
     return places, np.outer(share, part).ravel()
 
 
@@ -337,17 +353,12 @@ class _Cut:
         if body.shape == "mesh":
             self.near = MESH_SIZES * float(body.size_m.max())
         elif body.shape != "sphere":
-            distance = float(body.size_m.max()) * LADDER**24
+            distance = float(body.size_m.max()) * LADDER**16
             while len(_dipoles_of(body, distance)[0]) <= MOST_DIPOLES:
                 self.near, distance = distance, distance / LADDER
 
-    def dipoles(self, distance: float) -> tuple[Array, Array]:
-        """Places [m] and moments [A m2] in world that stand for it from `distance` of its box on."""
-        rung = 0
-        if self.near and self.body.shape != "mesh":
-            rung = max(
-                0, min(48, math.floor(math.log(max(distance, self.near) / self.near) / math.log(LADDER)))
-            )
+    def dipoles(self, rung: int) -> tuple[Array, Array]:
+        """Places [m] and moments [A m2] in world that stand for it from near * LADDER^rung of its box on."""
         if rung not in self._sets:
             places, shares = _dipoles_of(self.body, self.near * LADDER**rung)
             self._sets[rung] = (
@@ -379,6 +390,7 @@ class Bodies:
         )
         solid = [cut.body for cut in self._cuts]
         self._near = np.array([cut.near for cut in self._cuts])
+        self._laddered = np.array([cut.body.shape in ("cuboid", "cylinder") for cut in self._cuts], bool)
         self._rotation = np.array([b.rotation for b in solid]).reshape(-1, 3, 3)
         self._half = np.array([b.size_m / 2 for b in solid]).reshape(-1, 3)
         self._middle = np.array([b.p_world + b.rotation @ b.middle for b in solid]).reshape(-1, 3)
@@ -450,17 +462,24 @@ class Bodies:
         turned = np.einsum("bij,bi->bj", self._rotation, centre - self._middle)
         beyond = np.maximum(np.abs(turned) - self._half, 0)
         apart = np.sqrt(np.square(beyond).sum(axis=1)) - math.sqrt(0.75) * CELL_M
-        work, whole = [], [self._dipoles]
-        for k, cut in enumerate(self._cuts):
-            if apart[k] >= cut.near and apart[k] > 0:
-                whole.append(cut.dipoles(apart[k]))
-                continue
+        far = (apart >= self._near) & (apart > 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rungs = np.log(apart / self._near) / math.log(LADDER)
+        rungs = np.where(self._laddered & far, np.clip(rungs, 0, RUNGS), 0).astype(int)
+        whole = [
+            cut.dipoles(rung)
+            for cut, rung in zip(compress(self._cuts, far), rungs[far].tolist(), strict=True)
+        ]
+        whole.append(self._dipoles)
+        work = []
+        for k in np.flatnonzero(~far):
+            cut = self._cuts[k]
             clearance = cut.body.clearance(p[rows])
             near = clearance < cut.near if cut.near else clearance == 0
             if near.any():
                 exact[k].append(rows[near])
             if not near.all():
-                work.append((rows[~near], *cut.dipoles(cut.near)))
+                work.append((rows[~near], *cut.dipoles(0)))
         places, moments = (np.concatenate(part) for part in zip(*whole, strict=True))
         return [(rows, places, moments), *work]
 

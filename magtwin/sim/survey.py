@@ -1,11 +1,14 @@
-"""Survey of the twin: the map that the robot itself would make of the lab."""
+"""Survey of the twin: what the robot itself would read of the lab, and the map that it would make."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.field.grid import Grid
 from magtwin.field.map import AnomalyMap
+from magtwin.field.readings import Readings
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.names import RefusedError
 from magtwin.sim.interference import ambient_field_nt, platform_field_nt
@@ -16,7 +19,9 @@ Array = NDArray[np.float64]
 QUARTERS = (0.0, np.pi / 2, np.pi, 3 * np.pi / 2)
 
 
-def field_at_rest_nt(scene: Scene, p_world_base: ArrayLike, yaw: ArrayLike) -> Array:
+def field_at_rest_nt(
+    scene: Scene, p_world_base: ArrayLike, yaw: ArrayLike, *, height_m: float | None = None
+) -> Array:
     """Exact field magnitude at the magnetometer of a robot that stands with its LiDAR off.
 
     |(1 + S) R(yaw)^T B(p_base + R(yaw) p_lever) + h|: the map's field without its grid, so a run's
@@ -26,6 +31,7 @@ def field_at_rest_nt(scene: Scene, p_world_base: ArrayLike, yaw: ArrayLike) -> A
         scene: A scene whose Earth's field is known.
         p_world_base: Positions of base_link [m], shape (..., 3), or (..., 2) for a robot on the floor.
         yaw: Headings [rad], shape (...); the two shapes are broadcast.
+        height_m: Height of the magnetometer above the floor [m]; the robot's own unless given.
 
     Returns:
         Field magnitude [nT], shape (...).
@@ -36,6 +42,8 @@ def field_at_rest_nt(scene: Scene, p_world_base: ArrayLike, yaw: ArrayLike) -> A
     shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
     turn = quat_from_yaw(np.broadcast_to(yaw, shape))
     p_world = p + rotate(turn, np.broadcast_to(scene.robot.p_base_magnetometer, (*shape, 3)))
+    if height_m is not None:
+        p_world[..., 2] = height_m
     b_body = rotate(quat_conjugate(turn), ambient_field_nt(scene, p_world)).reshape(-1, 3)
     still = np.zeros(len(b_body))
     field = platform_field_nt(
@@ -49,68 +57,164 @@ def field_at_rest_nt(scene: Scene, p_world_base: ArrayLike, yaw: ArrayLike) -> A
     return np.asarray(np.linalg.norm(field, axis=-1)).reshape(shape)
 
 
-def survey(
+def sensor_height_m(scene: Scene) -> float:
+    """Height of the magnetometer above the floor, the robot standing on it [m]."""
+    return scene.robot.base_height_m + scene.robot.p_base_magnetometer[2]
+
+
+def survey_readings(
     scene: Scene,
     *,
     rng: np.random.Generator,
     spacing_m: float = 0.25,
     headings_rad: Sequence[float] = QUARTERS,
     readings: int = 1,
-    name: str | None = None,
+    height_m: float | None = None,
+    heading_error_rad: float = 0.0,
+    position_error_m: float = 0.0,
     source: str = "",
     licence: str = "",
     created: str = "",
-) -> AnomalyMap:
-    """Map the lab as the robot would: it stands at each node in each heading and reads the field.
+    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
+) -> Readings:
+    """What the robot reads that stands at each node of a grid in each heading.
 
     base_link is on the node, so the magnetometer is beside it by its lever arm, turned with the
     heading; the motors rest, the LiDAR is off and the battery is full.
 
     Args:
         scene: A scene whose Earth's field is known; its map is not read.
-        rng: Where the sensor's noise is drawn from.
+        rng: Where the sensor's noise and the robot's errors are drawn from.
         spacing_m: Distance between nodes [m]; the grid is centred on the floor and stays on it.
         headings_rad: Headings, ascending in [0, 2 pi) [rad].
-        readings: Readings whose mean is a node's value; each has the sensor's noise and resolution.
-        name: Name of the map; that of the scene unless given.
+        readings: Readings whose mean a node gives; each has the sensor's noise and resolution.
+        height_m: Height of the magnetometer above the floor [m]; the robot's own unless given.
+        heading_error_rad: Standard deviation of the robot's heading about the node's [rad]. What is
+            recorded is the heading that it has.
+        position_error_m: Standard deviation of where the robot stands about the node, along x and y [m].
+            What is recorded is the node.
         source: What the scene was made from.
-        licence: SPDX name of the map's licence.
+        licence: SPDX name of the survey's licence.
         created: Day of the survey, YYYY-MM-DD.
+        progress: Called with headings done, headings in all, and what is being done.
 
     Returns:
-        The map, with the variance that the sensor's noise and resolution leave.
+        A row a node, in the order of `Grid.poses`, with magnitudes.
 
     Raises:
-        RefusedError: The Earth's field is unknown, or the grid has no cell.
+        RefusedError: The Earth's field is unknown, the grid has no cell, or a figure is out of range.
     """
-    if not spacing_m > 0 or readings < 1:
-        raise RefusedError(
-            f"spacing_m must be above 0 m and readings at least 1, got {spacing_m!r} and {readings!r}"
-        )
-    columns, rows = (int(np.floor(length / spacing_m + 1e-9)) + 1 for length in scene.lab.floor_m)
-    if min(columns, rows) < 2:
-        raise RefusedError(f"spacing_m {spacing_m:g} leaves no cell on a floor of {scene.lab.floor_m} m")
-    origin = (-(columns - 1) * spacing_m / 2, -(rows - 1) * spacing_m / 2)
-    x, y = np.meshgrid(origin[0] + spacing_m * np.arange(columns), origin[1] + spacing_m * np.arange(rows))
-    headings = np.asarray(headings_rad, float)
-    exact = field_at_rest_nt(scene, np.stack([x, y], axis=-1)[None], headings[:, None, None])
+    if readings < 1:
+        raise RefusedError(f"readings must be at least 1, got {readings!r}")
+    for name, sd in {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}.items():
+        if not 0 <= sd < np.inf:
+            raise RefusedError(f"{name} must not be below 0, got {sd!r}")
+    height = sensor_height_m(scene) if height_m is None else height_m
+    if not np.isfinite(height):
+        raise RefusedError(f"height_m must be a number, got {height!r}")
+    x, y = scene.lab.floor_m
+    grid = Grid.over((-x / 2, x / 2, -y / 2, y / 2), spacing_m, np.asarray(headings_rad, float))
+    node, nominal = grid.poses()
+    stands, yaw = node, nominal
+    if position_error_m:
+        stands = node + position_error_m * rng.standard_normal(node.shape)
+    if heading_error_rad:
+        yaw = nominal + heading_error_rad * rng.standard_normal(nominal.shape)
+    exact = np.empty(grid.shape)
+    for k in range(len(grid.headings_rad)):
+        progress(k, len(grid.headings_rad), "surveying")
+        exact[k] = field_at_rest_nt(scene, stands[k], yaw[k], height_m=height_m)
+    progress(len(grid.headings_rad), len(grid.headings_rad), "surveying")
     sensor = scene.robot.magnetometer
     total = np.zeros_like(exact)
     for _ in range(readings):
         total += _read(exact, sensor.noise_std_nt, sensor.resolution_nt, rng)
-    variance = (sensor.noise_std_nt**2 + sensor.resolution_nt**2 / 12) / readings
-    return AnomalyMap(
-        values_nt=total / readings,
-        origin_m=origin,
-        cell_m=(spacing_m, spacing_m),
-        headings_rad=headings,
-        variance_nt2=np.full(exact.shape, variance),
-        name=scene.name if name is None else name,
-        method=f"survey of the twin, {readings} reading{'s' * (readings > 1)} a node and heading, at rest",
+    return Readings(
+        p_xy=node.reshape(-1, 2),
+        yaw=yaw.ravel(),
+        b_nt=(total / readings).ravel(),
+        grid=grid,
+        node=np.stack(np.indices(grid.shape), axis=-1).reshape(-1, 3),
+        height_m=height,
+        name=scene.name,
         source=source,
         licence=licence,
         created=created,
     )
+
+
+def survey(
+    scene: Scene,
+    *,
+    rng: np.random.Generator,
+    readings: int = 1,
+    heading_error_rad: float = 0.0,
+    position_error_m: float = 0.0,
+    name: str | None = None,
+    **options: Any,
+) -> AnomalyMap:
+    """Map the lab as the robot would, by `survey_readings`: the values at the nodes are its readings.
+
+    Args:
+        scene: As there.
+        rng: As there.
+        readings: As there.
+        heading_error_rad: As there; the map takes each heading for the node's own.
+        position_error_m: As there.
+        name: Name of the map; that of the scene unless given.
+        options: The others of `survey_readings`.
+
+    Returns:
+        The map, with the variance that the sensor's noise and resolution leave; what the errors of the
+        poses add is not in it.
+
+    Raises:
+        RefusedError: As for `survey_readings`.
+    """
+    errors = {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
+    read = survey_readings(scene, rng=rng, readings=readings, **errors, **options)
+    assert read.grid is not None
+    sensor, grid = scene.robot.magnetometer, read.grid
+    variance = (sensor.noise_std_nt**2 + sensor.resolution_nt**2 / 12) / readings
+    return AnomalyMap(
+        values_nt=read.b_nt.reshape(grid.shape),
+        origin_m=grid.origin_m,
+        cell_m=grid.cell_m,
+        headings_rad=np.array(grid.headings_rad),
+        variance_nt2=np.full(grid.shape, variance),
+        name=scene.name if name is None else name,
+        method=f"survey of the twin, {readings} reading{'s' * (readings > 1)} a node and heading, at rest",
+        source=read.source,
+        licence=read.licence,
+        created=read.created,
+        frame=_frame(scene),
+        datum=_datum(scene),
+        height_m=read.height_m,
+        parameters={
+            "readings": readings,
+            "noise_std_nt": sensor.noise_std_nt,
+            "resolution_nt": sensor.resolution_nt,
+            **{name: error for name, error in errors.items() if error},
+        },
+    )
+
+
+def _frame(scene: Scene) -> str:
+    """The axes of a scene's world, in words."""
+    north = scene.earth.north_deg if scene.earth is not None else 0.0
+    if north == 0:
+        return "world: x east, y north, z up"
+    return f"world: z up, true north {north:g} deg from y towards -x"
+
+
+def _datum(scene: Scene) -> str:
+    """Where a scene's world lies, in words."""
+    where = "origin amid the floor, heights above it"
+    if scene.earth is None:
+        return where
+    earth = scene.earth
+    degrees = f"{earth.latitude_deg:g} deg N, {earth.longitude_deg:g} deg E"
+    return f"{where}; {degrees}, {earth.height_m:g} m above the WGS 84 ellipsoid"
 
 
 def _read(exact: Array, noise_std_nt: float, resolution_nt: float, rng: np.random.Generator) -> Array:

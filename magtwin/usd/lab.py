@@ -17,9 +17,6 @@ FLOOR, WALL, POST, CAMERA, LENS = map(LOOKS.AppendChild, ("Floor", "Wall", "Post
 
 GRAVITY_M_S2 = 9.81
 FLOOR_THICKNESS_M = 0.1
-APRON_M = 0.2
-"""Slab that shows outside of the walls."""
-
 POST_WIDTH_M = 0.04
 """Width of the aluminium profile of the motion-capture frame."""
 
@@ -67,7 +64,7 @@ def _define_physics_scene(stage: Usd.Stage) -> None:
 
 def _define_floor(stage: Usd.Stage, spec: LabSpec) -> None:
     x, y = spec.floor_m
-    edge = 2 * (spec.wall_thickness_m + APRON_M)  # walls and posts stand on the slab too
+    edge = 2 * (spec.wall_thickness_m + spec.apron_m)  # walls and posts stand on the slab too
     size = (x + edge, y + edge, FLOOR_THICKNESS_M)
     define_box(stage, LAB.AppendChild("Floor"), (0, 0, -FLOOR_THICKNESS_M / 2), size, FLOOR, collides=True)
 

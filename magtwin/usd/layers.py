@@ -78,6 +78,16 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
     return stage
 
 
+def layer_files(path: str | os.PathLike[str]) -> list[Path]:
+    """The files of a stage's root layer and its sublayers, strongest first; references are not among them.
+
+    Raises:
+        RefusedError: As for `open_stage`.
+    """
+    layers = open_stage(path).GetLayerStack(includeSessionLayers=False)
+    return [Path(layer.realPath) for layer in layers if layer.realPath]
+
+
 def _reason(error: Tf.ErrorException) -> str:
     """What USD said first, without where in its sources it said so; what it says later follows from that."""
     said = getattr(error.args[0], "commentary", str(error)) if error.args else str(error)

@@ -38,6 +38,7 @@ LOOKS: Mapping[str, Look] = MappingProxyType(
         "Door": Look((0.45, 0.49, 0.50), 0.45),  # a lighter one
         "Chrome": Look((0.55, 0.56, 0.57), 0.2, 1.0),
         "Wood": Look((0.50, 0.33, 0.17), 0.55),  # beech
+        "Concrete": Look((0.42, 0.41, 0.39), 0.85),
         "Plastic": Look((0.02, 0.02, 0.02), 0.6),
     }
 )
