@@ -5,7 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.field import survey
-from magtwin.field.survey import import_survey, read_survey
+from magtwin.field.readings import Readings
+from magtwin.field.survey import import_survey, node_map, read_grid, read_survey
 from magtwin.files import sha256
 from magtwin.names import RefusedError
 
@@ -124,6 +125,57 @@ def test_the_real_survey_has_the_published_figures(real_data):
     assert got["largest heading deviation"].value == pytest.approx(53, abs=0.5)
     assert got["largest heading deviation"].note.startswith("90_map.csv:")
     assert got["repeated readings"].value > 10
+
+
+def test_a_surveys_latched_nodes_are_not_valid_unless_they_are_to_be_kept(real_data):
+    folder = real_data / "aprilab/maps"
+    field, report = read_survey(folder)
+    assert np.count_nonzero(~field.valid.any(axis=0)) == 17
+    assert np.isnan(field.lookup([-1.25, 1.5], [0, np.pi / 2, np.pi])).all()
+    kept, again = read_survey(folder, keep_latched=True)
+    assert kept.valid.all()
+    assert_array_equal(kept.values_nt, field.values_nt)
+    assert figures(report)["latched readings"] == figures(again)["latched readings"]
+
+
+def test_readings_of_a_grid_stand_on_its_nodes_with_recorded_headings_one_run_a_file(tmp_path):
+    turned = layer_text(90).replace(str(np.radians(90)), "1.5")
+    readings = read_grid(write_survey(tmp_path, h90=turned), created="2024-05-01", height_m=0.3)
+    assert readings.runs == ("0_map.csv", "90_map.csv", "180_map.csv", "270_map.csv")
+    assert_array_equal(readings.yaw[readings.run == 1], 1.5)
+    assert_array_equal(readings.node[5], [1, 0, 1])
+    assert_array_equal(readings.p_xy[5], [0.5, 0.0])
+    assert (readings.created, readings.height_m) == ("2024-05-01", 0.3)
+    assert readings.good.all()
+    field = node_map(readings)
+    assert (field.created, field.height_m, field.source) == ("2024-05-01", 0.3, readings.source)
+
+
+def test_a_node_is_the_mean_of_its_good_readings_and_not_valid_without_any(tmp_path):
+    readings = read_grid(write_survey(tmp_path))
+    twice = readings.take([*range(16), 0, 1]).with_(b_nt=[*readings.b_nt, 41_100, 43_000])
+    good = np.ones(18, bool)
+    good[[17, 3]] = False
+    field = node_map(twice.with_(good=good))
+    assert field.values_nt[0, 0].tolist() == [41_050, 41_200]
+    assert np.flatnonzero(~field.valid.ravel()).tolist() == [3]
+    assert field.values_nt[0, 1, 1] == 41_100
+    gone = node_map(readings.take(np.arange(16) != 3))
+    assert np.flatnonzero(~gone.valid.ravel()).tolist() == [3]
+
+
+def test_readings_that_stand_on_no_grid_make_no_nodes():
+    with pytest.raises(RefusedError, match=r"survey 'mow' is not gridded.*magtwin map fit"):
+        node_map(Readings(p_xy=[[0, 0]], yaw=[0], b_nt=[41_000], name="mow"))
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("uT", 1e-3), ("T", 1e-9)])
+def test_a_survey_in_another_unit_is_read_when_it_is_said(tmp_path, unit, scale):
+    values = [v * scale for v in (41_000, 41_200, 40_900, 41_100)]
+    folder = write_survey(tmp_path, **{f"h{h}": layer_text(h, values) for h in (0, 90, 180, 270)})
+    assert_allclose(read_grid(folder, unit=unit).b_nt[:2], [41_000, 41_200])
+    with pytest.raises(RefusedError, match=f"were it {unit}, it would be 41,050 nT, so say --unit {unit}"):
+        read_grid(folder)
 
 
 ROW2 = "0.5,0.0,1.5707963267948966,41200\n"  # line 3 of 90_map.csv

@@ -153,6 +153,7 @@ def map_fit(
 
     check_suffix(out, (".usdc", ".usd"), "a map layer")
     check_free(out, force=force)
+    angles = None if headings is None else _headings_rad(headings)
     about: dict[str, Any] = {
         "name": name or out.stem,
         "licence": licence,
@@ -162,7 +163,6 @@ def map_fit(
     readings, found = _read(sources, columns, about, keep_latched, pose_topic, field_topic)
     from magtwin.field.fit import fit, raster
 
-    angles = None if headings is None else _headings_rad(headings)
     with progress(f"Fitting {method}") as advance:
         model = fit(readings, method, progress=advance)
         field = raster(model, readings, spacing_m=spacing, headings_rad=angles, progress=advance)

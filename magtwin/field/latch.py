@@ -18,6 +18,9 @@ Three tests, each with its rate of false alarms:
 - **Outlying.** A reading that differs from what the others say more than one in a whole survey does by
   chance is named, with its size, and left in: it may be iron.
 
+Not seen are a sensor that clips on a drive without repeating itself, for its neighbours are clipped as it
+is, and more levels than one.
+
 Chance is Student's t with 4 degrees of freedom about a Gaussian process on the nearest readings
 (`magtwin.field.local`).
 """
@@ -225,10 +228,11 @@ def _stuck(readings: Readings) -> list[Rows]:
     """Rows of each stretch that repeats to the last digit too long for chance."""
     b = readings.b_nt
     gaps = np.diff(np.unique(b[readings.good]))
-    if not gaps.size:
-        return []
-    resolution = float(gaps.min())
     sequences = _sequences(readings)
+    if not gaps.size:  # one number everywhere
+        still = len(sequences) == 0 or np.ptp(readings.p_xy[readings.good], axis=0).max() == 0
+        return [] if still or readings.good.sum() <= LEAST_SLOPES else [np.flatnonzero(readings.good)]
+    resolution = float(gaps.min())
     place, slope = _slopes(readings, sequences)
     found = []
     for rows in sequences:

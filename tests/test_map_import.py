@@ -1,0 +1,155 @@
+"""`magtwin map import`, `fit` and `check`: any survey in, what is broken in it said and masked."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from test_cli import refused
+from test_latch import gridded
+from test_rosbag import at_middle, drive, write_bag
+
+from magtwin.cli import main
+from magtwin.field.survey import import_survey
+from magtwin.io.readings import load_readings, save_readings
+from magtwin.usd.maps import load_map
+
+
+def run(*arguments):
+    main([str(a) for a in arguments])
+
+
+def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, capsys, real_data):
+    maps = real_data / "aprilab/maps"
+    run("map", "import", maps, "--out", tmp_path / "a.usdc", "--licence", "MIT", "--json")
+    report = json.loads(capsys.readouterr().out)
+    field = load_map(tmp_path / "a.usdc")
+    assert report["figures"]["latched at every heading"]["value"] == 17
+    assert report["figures"]["masked nodes"]["value"] == np.count_nonzero(~field.valid) > 68
+    assert np.isnan(field.lookup([-1.25, 0.75], 0.0))
+    assert_array_equal(field.valid, import_survey(maps).valid)
+    run("map", "import", maps, "--out", tmp_path / "b.usdc", "--keep-latched", "--json")
+    whole = load_map(tmp_path / "b.usdc")
+    assert whole.valid.all()
+    assert whole.lookup([-1.25, 0.75], 0.0) == pytest.approx(35_602.1, abs=0.1)
+    report = json.loads(capsys.readouterr().out)
+    assert report["figures"]["latched at every heading"]["value"] == 17
+
+
+def test_readings_kept_as_parquet_make_the_same_layer_as_the_folder(tmp_path, capsys, real_data):
+    maps = real_data / "aprilab/maps"
+    about = ("--name", "lab", "--created", "2024-05-01", "--height", "0.35", "--licence", "MIT")
+    run("map", "import", maps, "--out", tmp_path / "a.parquet", *about)
+    run("map", "import", tmp_path / "a.parquet", "--out", tmp_path / "b.usdc", "--name", "lab")
+    run("map", "import", maps, "--out", tmp_path / "c.usdc", *about)
+    capsys.readouterr()
+    assert load_readings(tmp_path / "a.parquet").good.sum() == np.count_nonzero(
+        load_map(tmp_path / "c.usdc").valid
+    )
+    assert load_map(tmp_path / "b.usdc") == load_map(tmp_path / "c.usdc")
+    assert load_map(tmp_path / "b.usdc").height_m == pytest.approx(0.35)
+
+
+def test_a_table_becomes_a_file_of_readings_by_its_column_names(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("px,py,deg,b\n0,0,10,41\n1,0,20,42\n")
+    columns = (
+        "--x",
+        "px",
+        "--y",
+        "py",
+        "--heading",
+        "deg",
+        "--heading-unit",
+        "deg",
+        "--field",
+        "b",
+        "--unit",
+        "uT",
+    )
+    run("map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.parquet", *columns, "--json")
+    figures = json.loads(capsys.readouterr().out)["figures"]
+    assert figures["readings"]["value"] == 2
+    readings = load_readings(tmp_path / "a.parquet")
+    assert_array_equal(readings.b_nt, [41_000, 42_000])
+    assert_allclose(readings.yaw, np.radians([10, 20]))
+
+
+def test_a_bag_becomes_readings_by_the_command(tmp_path, capsys):
+    bag = write_bag(tmp_path / "bag", {"/pose": drive(), "/mag": at_middle(41_000 + np.arange(40.0))}, "mcap")
+    run("map", "import", bag, "--out", tmp_path / "a.parquet", "--pose-topic", "/pose")
+    assert "told by its size" in "".join(capsys.readouterr().out.split("\n")).replace("  ", "")
+    assert len(load_readings(tmp_path / "a.parquet")) == 40
+
+
+def test_scattered_readings_make_no_nodes_and_the_way_on_is_told(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n")
+    line = refused(capsys, "map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.usdc")
+    assert "survey 'a' is not gridded" in line
+    assert "magtwin map fit" in line
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        (("a.csv", "--x", "px"), "no column 'px'; did you mean 'x'"),
+        (("a.csv", "--vector", "a,b"), "vector takes 3 columns"),
+        (("a.csv", "--unit", "uT"), "say --unit nT"),
+        (("b.csv",), "b.csv: no such source of readings; did you mean 'a.csv'"),
+        (("a.csv+b.csv",), "b.csv: no such file of readings"),
+        ((), "no source of readings given"),
+        (("a.csv", "--out", "a.txt"), "ends in .usdc or .usd or .parquet"),
+    ],
+)
+def test_what_cannot_be_imported_is_refused_in_one_line_and_nothing_is_written(
+    tmp_path, monkeypatch, capsys, arguments, what
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.csv").write_text("x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n")
+    out = () if "--out" in arguments else ("--out", "a.parquet")
+    assert what in refused(capsys, "map", "import", *arguments, *out)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv"]
+
+
+def test_an_import_never_replaces_a_file_unasked(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n")
+    (tmp_path / "a.parquet").write_text("mine")
+    arguments = ("map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.parquet")
+    assert "exists already; give --force" in refused(capsys, *arguments)
+    assert (tmp_path / "a.parquet").read_text() == "mine"
+    run(*arguments, "--force")
+    assert len(load_readings(tmp_path / "a.parquet")) == 2
+
+
+def test_a_survey_whose_sensor_was_stuck_throughout_is_refused_unless_it_is_to_be_kept(tmp_path, capsys):
+    readings = gridded(0)
+    save_readings(readings.with_(b_nt=np.full(len(readings), 41_000.0)), tmp_path / "a.parquet")
+    arguments = ("map", "import", tmp_path / "a.parquet", "--out", tmp_path / "a.usdc")
+    line = refused(capsys, *arguments)
+    assert f"all {len(readings)} readings are those of a sensor that was stuck" in line
+    assert "--keep-latched" in line
+    run(*arguments, "--keep-latched")
+    assert load_map(tmp_path / "a.usdc").valid.all()
+
+
+def test_a_fit_and_a_check_run_from_readings_with_latched_ones_out(tmp_path, capsys):
+    def latch(b, rng):
+        b[:, 3:6, 4:8] = np.round(31_000 + 15 * rng.standard_normal((4, 3, 1)), 2)
+        return b
+
+    save_readings(gridded(0, change=latch), tmp_path / "a.parquet")
+    run("map", "fit", tmp_path / "a.parquet", "--method", "trilinear", "--out", tmp_path / "a.usdc", "--json")
+    report = json.loads(capsys.readouterr().out)
+    assert report["figures"]["latched at every heading"]["value"] == 12
+    field = load_map(tmp_path / "a.usdc")
+    assert field.values_nt[field.valid].min() > 32_000
+    run("map", "check", tmp_path / "a.parquet", "--method", "trilinear", "--json")
+    report = json.loads(capsys.readouterr().out)
+    assert report["figures"]["readings predicted"]["value"] == 4 * 11 * 17 - 48
+
+
+@pytest.mark.parametrize("headings", ["", "north", "0,nan", "0;90"])
+def test_headings_that_are_none_are_refused(tmp_path, capsys, headings):
+    save_readings(gridded(0), tmp_path / "a.parquet")
+    arguments = ("map", "fit", tmp_path / "a.parquet", "--out", tmp_path / "a.usdc", "--headings", headings)
+    assert "headings are degrees with commas between" in refused(capsys, *arguments)
