@@ -88,7 +88,7 @@ def test_a_small_step_down_is_the_closed_form_too():
 def test_a_harmonic_field_gives_every_height_exactly_and_leads_back():
     sheet = a_sheet(3.0)
     field = a_map(sheet, harmonic=sheet)
-    for height in (0.0, 0.1, 2.0):
+    for height in (0.0, 0.1, 2.0):  # the dipoles lie 0.6 m below the floor
         there = at_height(field, height)
         assert_array_equal(there.values_nt, sheet.magnitude_nt(*field.grid.poses(), height_m=height))
         assert there.height_m == there.harmonic.height_m == height
@@ -175,10 +175,17 @@ def test_heights_that_a_grid_cannot_give_are_refused(change, height, said):
         at_height(a_map(a_sheet(1.0), **change), height)
 
 
-def test_a_height_below_the_floor_or_at_the_dipoles_is_refused():
+def test_a_height_below_the_floor_or_among_the_dipoles_is_refused():
     sheet = a_sheet(1.0)
-    with pytest.raises(RefusedError, match="below the floor, or at the dipoles of map 'sheet'"):
+    with pytest.raises(RefusedError, match="too low for map 'sheet': below 0 m is the floor"):
         at_height(a_map(sheet, harmonic=sheet), -0.1)
-    raised = replace(sheet, p_world_dipole=sheet.p_world_dipole + np.array([0, 0, 0.75]))
-    with pytest.raises(RefusedError, match=r"whose highest is at 0\.15 m"):
-        at_height(a_map(sheet, harmonic=raised), 0.1)
+    x, y = np.meshgrid(np.arange(-3, 3.1, 0.25), np.arange(-3, 3.1, 0.25))
+    layer = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -0.05)])
+    near = replace(sheet, p_world_dipole=layer, m_world=np.tile([0, 0, 0.1], (x.size, 1)))
+    with pytest.raises(RefusedError, match=r"below 0\.2 m is the floor, or its dipoles are so near"):
+        at_height(a_map(sheet, harmonic=near), 0.19)
+    assert at_height(a_map(sheet, harmonic=near), 0.21).height_m == 0.21
+    low = replace(near, p_base_sensor=(0.0, 0.0, 0.1))
+    assert (
+        at_height(a_map(low, harmonic=low, height_m=0.1), 0.15).height_m == 0.15
+    )  # up from where it was fitted

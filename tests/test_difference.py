@@ -197,6 +197,6 @@ def test_the_report_tells_where_when_and_what_is_doubtful_and_is_json():
         "the frame is 'world' in one map and 'map' in the other",
         "the height of one map is unknown",
     ]
-    told = json.loads(report.to_json())["figures"]["greatest local change"]
+    told = json.loads(report.to_json())["figures"]["surest local change"]
     assert "at (1, -0.5) m, heading" in told["note"]
     assert told["spread"] == pytest.approx(NOISE_NT * np.sqrt(2))

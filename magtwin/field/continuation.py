@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.field.harmonic import HarmonicField
 from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError
 
@@ -44,8 +45,8 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
     Args:
         field: The map; its height must be known, or its harmonic field.
         height_m: Height of the sensor above the floor [m]. A grid goes down by a quarter of a cell at
-            most, for its noise grows as exp(dz |k|); a harmonic field down to the floor, and not to its
-            own dipoles.
+            most, for its noise grows as exp(dz |k|); a harmonic field down to the floor, and not nearer to a
+            layer of dipoles than these are to each other.
 
     Returns:
         The map there, with `method` and `parameters` that say how; valid where the map is. Its variance
@@ -73,11 +74,11 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
 def _of_the_dipoles(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap:
     harmonic = field.harmonic
     assert harmonic is not None
-    top = float(harmonic.p_world_dipole[:, 2].max(initial=-np.inf))
-    if height_m < 0 or height_m <= top:
+    lowest = _lowest_m(harmonic)
+    if height_m < min(lowest, start):
         raise RefusedError(
-            f"height_m {height_m:g} lies below the floor, or at the dipoles of map {field.name!r}, whose "
-            f"highest is at {top:g} m; a field is known above both"
+            f"height_m {height_m:g} lies too low for map {field.name!r}: below {lowest:.4g} m is the floor, "
+            "or its dipoles are so near that each shows by itself"
         )
     variance = None
     if field.variance_nt2 is not None and height_m - start >= -LARGEST_STEP_DOWN * min(field.cell_m):
@@ -91,6 +92,23 @@ def _of_the_dipoles(field: AnomalyMap, start: float, height_m: float) -> Anomaly
         parameters={**field.parameters, "continued_from_m": start},
         harmonic=replace(harmonic, p_base_sensor=np.append(harmonic.p_base_sensor[:2], height_m)),
     )
+
+
+def _lowest_m(harmonic: HarmonicField) -> float:
+    """Height that a harmonic field holds down to: the floor, or the dipoles' own spacing above them [m].
+
+    A layer of equivalent dipoles s apart is a smooth field but for ripples of about exp(-2 pi d / s) at a
+    distance d, two parts in a thousand at d = s. Dipoles at heights of their own have no such spacing.
+    """
+    from scipy.spatial import cKDTree
+
+    places = harmonic.p_world_dipole
+    if not len(places):
+        return 0.0
+    top = float(places[:, 2].max())
+    layer = places[places[:, 2] > top - GRAIN_M]
+    spacing = float(np.median(cKDTree(layer).query(layer, 2)[0][:, 1])) if len(layer) > 1 else GRAIN_M
+    return max(0.0, top + spacing)
 
 
 def _of_the_grid(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap:

@@ -140,7 +140,7 @@ class MapDifference:
             figures.append(Figure("spread of z", _robust_sd(self.z[known]), note=note))
         figures += [
             Figure(
-                "greatest local change",
+                "surest local change",
                 float(self.local_nt[h, j, i]),
                 "nT",
                 float(self.sd_nt[h, j, i]),
