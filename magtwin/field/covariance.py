@@ -14,6 +14,9 @@ ROOT5 = np.sqrt(5.0)
 ARM_M = 1 / 30
 """Length that a figure of 1 stands for in the sensor's place [m]: the scale that its learning has."""
 
+UNLIKELY = 1e25
+"""Loss where there is none: finite, so that a line search steps back from it."""
+
 DOUBT = 3.0
 """Standard deviation of the prior of every logarithm about its first guess: a factor of 20 either way."""
 
@@ -106,7 +109,7 @@ class Covariance:
             b_nt: Readings less a constant [nT], shape (N,).
 
         Returns:
-            The value, infinite where the covariance is not positive definite; its gradient, shape (size,).
+            The value, `UNLIKELY` where the covariance is not positive definite; its gradient, shape (size,).
         """
         from scipy.linalg import cho_solve
         from scipy.linalg.lapack import dpotrf, dpotri
@@ -136,7 +139,7 @@ class Covariance:
         total[np.diag_indices_from(total)] += self.noise_nt2(figures)
         lower, failed = dpotrf(total, lower=1)
         if failed:
-            return np.inf, np.zeros(self.size)
+            return UNLIKELY, np.zeros(self.size)
         alpha = cho_solve((lower, True), b_nt)
         inverse = np.tril(dpotri(lower, lower=1)[0])
         inverse += np.tril(inverse, -1).T

@@ -32,6 +32,9 @@ STARTS = (1.0, 0.4, 2.5)
 STEPS = 60
 """Steps of L-BFGS, once the best start is known."""
 
+WIDEST = 6.0
+"""How far a figure may go from its first guess: a logarithm by a factor of 400, the arm by 0.2 m."""
+
 SECTORS = 24
 """Sectors of heading in which readings that lie together are averaged apart."""
 
@@ -135,14 +138,15 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
     turned = np.ptp(np.abs(np.angle(np.exp(1j * (bins.yaw - bins.yaw[0]))))) > 1e-6
     covariance = Covariance(kernel, 3 if turned else 1, several)
     order = np.random.default_rng(0).permutation(len(b))  # a fixed draw: which rows are learnt from
-    figures = _learn(covariance, bins, b, order, lambda done, what: say(done, total, what))
+    spacing = spacing_m(readings)
+    figures = _learn(covariance, bins, b, order, spacing, lambda done, what: say(done, total, what))
     say(total - 2, total, "conditioning")
     lower = _factor(covariance, figures, bins)
     from scipy.linalg import cho_solve
 
     alpha = cho_solve((lower, True), b)
     say(total - 1, total, "leaving out")
-    missed = _missed(covariance, figures, bins, b, order, lower, spacing_m(readings))
+    missed = _missed(covariance, figures, bins, b, order, lower, spacing)
     noise = covariance.noise_nt2(figures) + covariance.run_nt2(figures) + within
     say(total, total, "done")
     return GpModel(
@@ -173,21 +177,39 @@ def _data(readings: Readings) -> tuple[Bins, float]:
 
 
 def _learn(
-    covariance: Covariance, bins: Bins, b: Array, order: NDArray[np.intp], say: Callable[[int, str], Any]
+    covariance: Covariance,
+    bins: Bins,
+    b: Array,
+    order: NDArray[np.intp],
+    least_m: float,
+    say: Callable[[int, str], Any],
 ) -> Array:
-    """The likeliest figures: the best of several starts on few readings, then on more."""
+    """The likeliest figures: the best of several starts on few readings, then on more.
+
+    No reach is shorter than the readings' spacing: such a part could not be told from noise.
+    """
     from scipy.optimize import minimize
 
-    guess = _guess(covariance, bins, b)
+    guess, h = _guess(covariance, bins, b), covariance.harmonics
+    least = guess - WIDEST
+    reaches = [*range(h, 2 * h), *([3 * h + 2] * covariance.runs)]
+    least[reaches] = np.minimum(np.log(least_m), guess[reaches])
+    bounds = list(zip(least, guess + WIDEST, strict=True))
 
     def descend(start: Array, rows: NDArray[np.intp], steps: int) -> tuple[float, Array]:
         data = (bins.p_xy[rows], bins.yaw[rows], bins.run[rows], b[rows])
         found = minimize(
-            covariance.loss, start, (guess, *data), "L-BFGS-B", jac=True, options={"maxiter": steps}
+            covariance.loss,
+            np.maximum(start, least),
+            (guess, *data),
+            "L-BFGS-B",
+            jac=True,
+            bounds=bounds,
+            options={"maxiter": steps},
         )
         return float(found.fun), np.asarray(found.x)
 
-    tried, h = np.sort(order[:MOST_TRIED]), covariance.harmonics
+    tried = np.sort(order[:MOST_TRIED])
     starts = []
     for k, factor in enumerate(STARTS):
         say(k, "starts")
@@ -255,7 +277,8 @@ def _missed(
     cell = np.floor((bins.p_xy[rows] - bins.p_xy.min(axis=0)) / side_m + 0.5).astype(np.int64)
     _, block = np.unique(cell, axis=0, return_inverse=True)
     block = block.ravel()
-    places, squares, each, place = [], [], [], []
+    places: list[Array] = []
+    squares, each, place = [], [], []
     for members in np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1]):
         own = inverse[np.ix_(members, members)]
         spread = np.linalg.inv(own)

@@ -140,7 +140,8 @@ class GridInterpolation:
                 mean += weights[:, h] * _bilinear(layer, low, part)
             else:
                 mean += weights[:, h] * splines[h].ev(u[:, 1], u[:, 0])
-        variance = self.roughness.variance_nt2(p) + (between * (1 - between)) ** 2 * self.turned_nt2
+        at = np.where(inside[:, None], p, self.grid.origin_m)
+        variance = self.roughness.variance_nt2(at) + (between * (1 - between)) ** 2 * self.turned_nt2
         hole = ~inside | (unknown > EDGE)
         mean[hole] = variance[hole] = np.nan
         return mean.reshape(shape), variance.reshape(shape)

@@ -27,10 +27,11 @@ PRIOR = 4
 class Roughness:
     """Squared residuals of readings that were left out, where, and how far from the readings that were kept.
 
-    Between readings a distance a apart, linear interpolation errs by f'' a^2 / 8 at most: the error grows as
-    the squared distance, its variance as the fourth power. So the variance at a point is the mean square of
-    the residuals around it, times (distance to the nearest reading / distance when left out)^4. Residuals
-    have tails, so that the whole is scaled until nine in ten of them lie in their own 90 % intervals.
+    At distances d and g from the readings on either side, linear interpolation errs by f'' d g / 2
+    (de Boor 1978, chapter 3). So the variance at a point is the mean square of the residuals around it,
+    times (d g)^2 there over (d g)^2 where they were left out, with d the distance to the nearest
+    reading and g = max(cell - d, d) the way on to the next. Residuals have tails, so that the
+    whole is scaled until nine in ten of them lie in their own 90 % intervals.
     """
 
     tree: Any
@@ -40,7 +41,10 @@ class Roughness:
     """Places of the residuals, a scipy cKDTree."""
 
     scaled: Array
-    """Squared residual over the fourth power of the distance [nT^2 / m^4], shape (R,)."""
+    """Squared residual over (d g)^2 [nT^2 / m^4], shape (R,)."""
+
+    cell_m: float
+    """Distance between readings, as a rule [m]."""
 
     @classmethod
     def of(
@@ -65,12 +69,12 @@ class Roughness:
                 continue
             residual = b_nt[out] - interpolate(p_xy[kept], b_nt[kept], p_xy[out])
             distance = np.maximum(cKDTree(p_xy[kept]).query(p_xy[out])[0], cell_m / 2)
-            scaled[out] = residual**2 / distance**4
+            scaled[out] = residual**2 / _between(distance, cell_m)
         known = np.isfinite(scaled)
         if not known.any():
-            return cls(cKDTree(p_xy), None, scaled[known])
+            return cls(cKDTree(p_xy), None, scaled[known], cell_m)
         left_out, scaled = cKDTree(p_xy[known]), scaled[known]
-        return cls(cKDTree(p_xy), left_out, scaled * tail(left_out, scaled, scaled))
+        return cls(cKDTree(p_xy), left_out, scaled * tail(left_out, scaled, scaled), cell_m)
 
     @classmethod
     def joined(cls, parts: "Sequence[Roughness]") -> "Roughness":
@@ -80,14 +84,20 @@ class Roughness:
         known = [part for part in parts if part.left_out is not None]
         left_out = cKDTree(np.vstack([part.left_out.data for part in known])) if known else None
         scaled = np.concatenate([part.scaled for part in parts])
-        return cls(cKDTree(np.vstack([part.tree.data for part in parts])), left_out, scaled)
+        return cls(cKDTree(np.vstack([part.tree.data for part in parts])), left_out, scaled, parts[0].cell_m)
 
     def variance_nt2(self, p_xy: ArrayLike) -> Array:
         """Variance of the interpolation at points [nT^2], shape (...); nan where none could be left out."""
         p = np.asarray(p_xy, float)
         if self.left_out is None:
             return np.full(p.shape[:-1], np.nan)
-        return np.asarray(local_mean(self.left_out, self.scaled, p) * self.tree.query(p)[0] ** 4)
+        away = _between(self.tree.query(p)[0], self.cell_m)
+        return np.asarray(local_mean(self.left_out, self.scaled, p) * away)
+
+
+def _between(d: Array, cell_m: float) -> Array:
+    """(d g)^2 at distances d from the nearest reading [m^4]."""
+    return np.asarray((d * np.maximum(cell_m - d, d)) ** 2)
 
 
 def local_mean(tree: Any, squares: Array, p_xy: Array, *, skip: int = 0) -> Array:

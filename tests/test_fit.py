@@ -1,0 +1,102 @@
+"""The front door of all methods, and the maps that come out of it."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from test_gp import survey, truth
+
+from magtwin.field.fit import METHODS, fit, raster
+from magtwin.field.readings import Readings
+from magtwin.names import RefusedError
+
+QUICK = ("trilinear", "cubic", "gp")
+
+
+def drive(count=700, seed=0):
+    rng = np.random.default_rng(seed)
+    p = rng.uniform((-1.0, -0.8), (1.0, 0.8), (count, 2))
+    yaw = rng.uniform(0, 2 * np.pi, count)
+    return Readings(
+        p_xy=p, yaw=yaw, b_nt=truth(p, yaw) + rng.normal(0, 10, count), name="drive", height_m=0.35
+    )
+
+
+def test_a_trilinear_raster_of_a_grid_is_the_survey_to_the_last_digit():
+    good = np.ones(224, bool)
+    good[[5, 60, 61]] = False
+    readings = survey().with_(
+        good=good, source="a.csv sha256:0", licence="MIT", created="2026-01-02", height_m=0.3
+    )
+    field = raster(fit(readings, "trilinear"), readings)
+    assert field.grid == readings.grid
+    assert_array_equal(field.values_nt[tuple(readings.node[good].T)], readings.b_nt[good])
+    assert_array_equal(field.valid[tuple(readings.node.T)], good)
+    assert (field.method, field.name, field.source) == ("trilinear", "made", "a.csv sha256:0")
+    assert (field.licence, field.created, field.height_m) == ("MIT", "2026-01-02", 0.3)
+    assert field.variance_nt2 is not None
+
+
+@pytest.mark.parametrize("method", ["cubic", "gp"])
+def test_a_smooth_raster_has_a_fifth_of_the_spacing_and_24_headings(method):
+    readings = survey()
+    field = raster(fit(readings, method), readings)
+    assert_allclose(field.cell_m, (0.05, 0.05))
+    assert_allclose(field.headings_rad, np.radians(np.arange(0, 360, 15)))
+    assert_allclose(field.extent, readings.grid.extent)
+    p, yaw = field.grid.poses()
+    known = field.valid
+    assert known.mean() > 0.95
+    assert np.sqrt(np.mean((field.values_nt[known] - truth(p, yaw)[known]) ** 2)) < 60
+
+
+@pytest.mark.parametrize("method", QUICK)
+def test_a_drive_becomes_a_map_that_ends_where_the_readings_do(method):
+    readings = drive()
+    field = raster(
+        fit(readings, method), readings, spacing_m=0.1, headings_rad=[0.0, np.pi], extent=(-3, 3, -3, 3)
+    )
+    p, yaw = field.grid.poses()
+    assert field.values_nt.shape[0] == 2
+    assert not field.valid[np.abs(p).max(axis=-1).repeat(1, 0) > 1.5].any()
+    middle = np.broadcast_to(np.abs(p).max(axis=-1) < 0.7, field.valid.shape)
+    assert field.valid[middle].all()
+    assert np.sqrt(np.mean((field.values_nt[middle] - truth(p, yaw)[middle]) ** 2)) < 60
+
+
+def test_a_survey_of_one_heading_makes_a_map_of_one_layer():
+    readings = drive().with_(yaw=np.full(700, 0.5))
+    field = raster(fit(readings, "cubic"), readings, spacing_m=0.2)
+    assert_allclose(field.headings_rad, [0.5])
+
+
+def test_progress_counts_up_to_its_total():
+    said = []
+    readings = survey(rows=4, columns=4)
+    model = fit(readings, "gp", progress=lambda *step: said.append(step))
+    assert said[0][0] == 0
+    assert said[-1][0] == said[-1][1]
+    assert [s[0] for s in said] == sorted(s[0] for s in said)
+    said.clear()
+    raster(model, readings, progress=lambda *step: said.append(step))
+    assert said[-1] == (24, 24, "headings")
+
+
+def test_an_unknown_method_or_option_is_refused_with_the_near_one():
+    readings = survey(rows=4, columns=4)
+    with pytest.raises(RefusedError, match="no method 'cubik'; did you mean 'cubic'"):
+        fit(readings, "cubik")
+    with pytest.raises(RefusedError, match="no option 'fil'; did you mean 'fill'"):
+        fit(readings, "trilinear", fil=True)
+
+
+def test_a_raster_off_the_readings_is_refused():
+    readings = survey(rows=4, columns=4)
+    with pytest.raises(RefusedError, match="keep the extent within the readings"):
+        raster(fit(readings, "cubic"), readings, extent=(50, 52, 50, 52))
+
+
+def test_every_method_has_its_own_name():
+    readings = survey(rows=4, columns=4)
+    for method in QUICK:
+        assert fit(readings, method).method == method
+    assert set(QUICK) < set(METHODS)
