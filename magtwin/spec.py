@@ -225,6 +225,24 @@ class DriveSpec(Spec):
     alpha_max: float = 7.725
     """Highest yaw acceleration [rad/s2]."""
 
+    wheel_rate_max: float = 12.87
+    """Highest rate of a wheel [rad/s]: a Create 3's rim at 0.46 m/s, its top speed with safety off."""
+
+    motor_lag_s: float = 0.04
+    """Time constant of the motors' first-order lag [s]; 0 for none. Ours: that of small geared motors."""
+
+    slip_s2_m: float = 0.011
+    """Slip of the wheels along their way, for each m/s2 of acceleration [s2/m]; ours: 1 % at 0.9 m/s2."""
+
+    yaw_slip: float = 0.01
+    """Share of a yaw rate that the wheels' scrubbing takes [1]; ours."""
+
+    wheel_radius_error_std: float = 0.002
+    """Relative standard deviation of the wheels' radius about the nominal one, drawn once a run; ours."""
+
+    wheel_separation_error_std: float = 0.003
+    """Relative standard deviation of their separation about the nominal one, drawn once a run; ours."""
+
     command_timeout_s: float = 0.5
     """The robot stops when no command came for this long [s]."""
 
@@ -243,10 +261,20 @@ class DriveSpec(Spec):
             "w_max",
             "a_max",
             "alpha_max",
+            "wheel_rate_max",
             "command_timeout_s",
             "odometry_rate_hz",
         )
-        self._not_negative("odometry_noise_std")
+        self._not_negative(
+            "odometry_noise_std",
+            "motor_lag_s",
+            "slip_s2_m",
+            "wheel_radius_error_std",
+            "wheel_separation_error_std",
+        )
+        self._require("yaw_slip", 0 <= self.yaw_slip < 1, "be at least 0 and below 1", self.yaw_slip)
+        whole = f"be below 1 at a_max {self.a_max!r}, where all of the way would be slip"
+        self._require("slip_s2_m", self.slip_s2_m * self.a_max < 1, whole, self.slip_s2_m)
         left, right = self.left_wheel_joint, self.right_wheel_joint
         self._require("right_wheel_joint", left != right, "be another joint than the left wheel's", right)
 

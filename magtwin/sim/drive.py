@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.names import RefusedError
+from magtwin.sim.loop import limited
 from magtwin.spec import DriveSpec
 
 Array = NDArray[np.float64]
@@ -72,30 +74,34 @@ def twist_from_wheels(rates: ArrayLike, drive: DriveSpec) -> tuple[Array, Array]
     return (left + right) / 2, (right - left) / drive.wheel_separation_m
 
 
+def limits(drive: DriveSpec, dt: float) -> tuple[float, float, float, float, float, float]:
+    """A drive's limits as `magtwin.sim.loop.limited` takes them, for steps of `dt` [s]."""
+    rim = drive.wheel_rate_max * drive.wheel_radius_m
+    return (
+        drive.v_max,
+        drive.w_max,
+        drive.a_max * dt,
+        drive.alpha_max * dt,
+        rim,
+        drive.wheel_separation_m / 2,
+    )
+
+
 def limiter(drive: DriveSpec, dt: float) -> Callable[[float, float, float, float], tuple[float, float]]:
     """What a drive makes of a command: a function of scalars, to be called at each control step.
 
     Returns:
         `limit(v_wanted, w_wanted, v, w) -> (v, w)`: the twist nearest to the wanted one that keeps
-        v_max and w_max and differs from the last one by at most a_max dt and alpha_max dt.
+        v_max, w_max and the highest rate of a wheel, and differs from the last one by at most a_max dt and
+        alpha_max dt; see `magtwin.sim.loop.limited`.
     """
-    v_max, w_max, dv, dw = drive.v_max, drive.w_max, drive.a_max * dt, drive.alpha_max * dt
+    return partial(limited, limits(drive, dt))
 
-    def limit(v_wanted: float, w_wanted: float, v: float, w: float) -> tuple[float, float]:
-        low, high = v - dv, v + dv
-        if low < -v_max:
-            low = -v_max
-        if high > v_max:
-            high = v_max
-        v = low if v_wanted < low else high if v_wanted > high else v_wanted
-        low, high = w - dw, w + dw
-        if low < -w_max:
-            low = -w_max
-        if high > w_max:
-            high = w_max
-        return v, low if w_wanted < low else high if w_wanted > high else w_wanted
 
-    return limit
+def draw_wheel_errors(drive: DriveSpec, rng: np.random.Generator) -> tuple[float, float]:
+    """How far the wheels are from their nominal size in one session: of radius and separation, relative."""
+    radius, separation = rng.standard_normal(2).tolist()
+    return drive.wheel_radius_error_std * radius, drive.wheel_separation_error_std * separation
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +123,23 @@ class Moment:
     wheel_angle: Array
     """Angle turned by the left and the right wheel since the start [rad], shape (N, 2)."""
 
+    v_cmd: Array
+    """Commanded forward speed [m/s]; nan where it is not known."""
+
+    w_cmd: Array
+    """Commanded yaw rate [rad/s]; nan where it is not known."""
+
+    bump: NDArray[np.bool_]
+    """Whether the robot touches what stopped it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What a differential drive did: a twist for each control step, from rest at `pose0`."""
+    """What a differential drive did: a twist for each control step, from rest at `pose0`.
+
+    Of a drive that is ideal no more need be said. Columns that are not given follow from the others: the
+    wheels roll without slip, what was done was commanded, and nothing was touched.
+    """
 
     drive: DriveSpec
 
@@ -136,8 +155,26 @@ class Motion:
     pose0: Pose = (0.0, 0.0, 0.0)
     """First x [m], y [m], yaw [rad] in world."""
 
-    poses: Array = field(init=False, repr=False)
+    wheel_v: Array | None = field(default=None, kw_only=True, repr=False)
+    """Forward speed that the wheels would give at their nominal size without slip [m/s], shape (K,)."""
+
+    wheel_w: Array | None = field(default=None, kw_only=True, repr=False)
+    """Yaw rate that they would give [rad/s], shape (K,)."""
+
+    v_cmd: Array | None = field(default=None, kw_only=True, repr=False)
+    """Forward speed that was commanded in each step [m/s], shape (K,)."""
+
+    w_cmd: Array | None = field(default=None, kw_only=True, repr=False)
+    """Yaw rate that was commanded [rad/s], shape (K,)."""
+
+    bump: NDArray[np.bool_] | None = field(default=None, kw_only=True, repr=False)
+    """Whether an obstacle shortened the step, or the robot has not left it since, shape (K,)."""
+
+    poses: Array | None = field(default=None, kw_only=True, repr=False)
     """x, y, yaw at the start and after each step, shape (K + 1, 3); yaw goes on beyond pi."""
+
+    wheel_rates: Array = field(init=False, repr=False)
+    """Rates of the left and the right wheel in each step [rad/s], shape (K, 2)."""
 
     acceleration: Array = field(init=False, repr=False)
     """Change of speed that begins each step, over the step [m/s2], shape (K,)."""
@@ -150,15 +187,33 @@ class Motion:
         if v.ndim != 1 or v.shape != w.shape or not len(v):
             raise RefusedError(f"v and w of a Motion must have one shape (K,), got {v.shape} and {w.shape}")
         if not (np.isfinite(v).all() and np.isfinite(w).all()):
-            raise RefusedError("a commanded speed or yaw rate is not finite")
-        rates = np.cumsum(wheel_rates(v, w, self.drive), axis=0) * self.dt
-        for name, array in (
-            ("v", v),
-            ("w", w),
-            ("poses", integrate_twist(v, w, self.dt, self.pose0)),
-            ("wheel_angles", np.vstack([[0.0, 0.0], rates])),
-            ("acceleration", np.diff(v, prepend=0.0) / self.dt),
-        ):
+            raise RefusedError("a speed or yaw rate of a Motion is not finite")
+        known = {
+            "v": v,
+            "w": w,
+            "wheel_v": v,
+            "wheel_w": w,
+            "v_cmd": v,
+            "w_cmd": w,
+            "bump": np.zeros(len(v), bool),
+        }
+        for name, default in known.items():
+            given = getattr(self, name)
+            array = default if given is None else np.asarray(given, default.dtype)
+            if array.shape != v.shape:
+                raise RefusedError(f"{name} of a Motion must have shape {v.shape}, got {array.shape}")
+            known[name] = array
+        poses = integrate_twist(v, w, self.dt, self.pose0) if self.poses is None else np.asarray(self.poses)
+        if poses.shape != (len(v) + 1, 3):
+            raise RefusedError(f"poses of a Motion must have shape {(len(v) + 1, 3)}, got {poses.shape}")
+        rates = wheel_rates(known["wheel_v"], known["wheel_w"], self.drive)
+        known |= {
+            "poses": poses,
+            "wheel_rates": rates,
+            "wheel_angles": np.vstack([[0.0, 0.0], np.cumsum(rates, axis=0) * self.dt]),
+            "acceleration": np.diff(v, prepend=0.0) / self.dt,
+        }
+        for name, array in known.items():
             object.__setattr__(self, name, array)
 
     @property
@@ -172,12 +227,25 @@ class Motion:
         Args:
             t: Times since the start, from 0 [s], shape (N,).
         """
+        assert self.poses is not None
+        assert self.v_cmd is not None
+        assert self.w_cmd is not None
+        assert self.bump is not None
         t = np.asarray(t, float)
         starts = np.arange(len(self.v)) * self.dt
         k = np.searchsorted(starts, t, side="right") - 1
         into = np.clip(t - starts[k], 0.0, self.dt)
         v, w = self.v[k], self.w[k]
         pose = advance(self.poses[k], v, w, into)
-        turned = self.wheel_angles[k] + wheel_rates(v, w, self.drive) * into[..., None]
+        turned = self.wheel_angles[k] + self.wheel_rates[k] * into[..., None]
         moving = t < self.duration_s
-        return Moment(pose, v * moving, w * moving, self.acceleration[k] * moving, turned)
+        return Moment(
+            pose=pose,
+            v=v * moving,
+            w=w * moving,
+            a=self.acceleration[k] * moving,
+            wheel_angle=turned,
+            v_cmd=self.v_cmd[k] * moving,
+            w_cmd=self.w_cmd[k] * moving,
+            bump=self.bump[k],
+        )

@@ -1,0 +1,581 @@
+"""The closed loop of a robot: what it is commanded, what its drive makes of it, and where obstacles stop it.
+
+One source, run in two ways to the same bits: as plain Python on lists, which is at work at once, and
+compiled on arrays (`compiled.py`), which takes half a second to open and then a ten-millionth of one for a
+step. So there is nothing here but numbers, sequences of them, and operations that round alike in both: no
+`hypot`, no power, no sum of many. `course.py` prepares what goes in and names what comes out.
+
+A step of the drive, of length dt: the command is limited (`limited`); the motors follow it with a first-order
+lag, v(t) = v1 + (v0 - v1) exp(-t / lag), of which the step has the mean, so that ways and turns are exact at
+its end; the tyres slip by slip * dv/dt, as a linear tyre does under the force that speeds the robot up, and
+by a share of the yaw rate; wheels that differ from their nominal size scale the rest. The twist that remains
+holds for the step: an arc, whose chord is integrated without Euler's error. Where the chord would bring the
+round footprint into an obstacle, the robot stops at it and its wheels stall; it can turn on the spot there,
+and drive away. It does not slide along: a bumper of rubber grips.
+"""
+
+import math
+from collections.abc import MutableSequence, Sequence
+from typing import Any
+
+Numbers = Sequence[float]
+Columns = Sequence[Numbers]
+
+COMMANDS, RELEASE, FOLLOWER, STANLEY, PURE_PURSUIT = range(5)
+"""Numbers of the controllers that can be compiled; `controllers.py` says what each does."""
+
+FIGURES = 22
+"""Figures of a robot and its controller: see `drive_on`."""
+
+TABLE = 6
+"""Columns of a controller's table."""
+
+STATE = 12
+"""x, y, yaw; limited command v, w; wheels' v, w; mean v of the last step; way that is surely free; bump; node
+that is next; way driven since that changed.
+"""
+
+RECORD = 10
+"""Columns of what happened in each step: x, y, yaw at its end; v, w of the body; v, w of the wheels at their
+nominal size; commanded v, w; whether an obstacle was touched.
+"""
+
+TURN = 2 * math.pi
+
+REST_M_S = 1e-3
+"""Speed of the wheels' rims at which friction brings a robot to rest that is told to stand [m/s]."""
+
+GRAZE = 1e-6
+"""Way that a touching robot may come nearer to an obstacle per way driven, so that rounding holds none."""
+
+SHORT = 4e-4
+"""Square of half a turn below which four terms of the series of sin(x)/x are all of it."""
+
+LATE_S = 1e-9
+"""Rounding of a time that is forgiven [s]."""
+
+STUCK_M = 0.03
+"""Way driven without getting abreast of the next node after which it counts as passed [m]."""
+
+ARRIVED_M = 0.0005
+"""A piece has been driven when this much of it is left [m]."""
+
+SETTLE_M = 0.15
+"""Way in which an error in position dies out, twice the time constant of the feedback [m]."""
+
+TURN_GAIN = 3.9
+"""Gain of turning on the spot [1/s]: below alpha_max / w_max = 4.1, so that it need not overshoot."""
+
+GAIN = 4.0 / SETTLE_M
+V_TURN = TURN_GAIN / GAIN
+
+ALIGN = 0.1
+"""Heading error at which driving slows, and above which a standing robot turns first [rad]."""
+
+ASTRAY = 0.35
+"""Heading error at which driving stops until the robot has turned [rad]."""
+
+STANLEY_GAIN = 2.5
+"""Gain k of Stanley's controller [1/s], as published."""
+
+STANLEY_SOFT = 0.1
+"""Speed k_s that keeps it calm at low speed [m/s]; ours."""
+
+STANLEY_MOST = 1.2
+"""Angle to which its wheel is steered at most [rad]; ours."""
+
+NOWHERE_M2 = 1e-12
+"""Added to a square that pure pursuit divides by, as the goal may be where the robot is [m2]."""
+
+RELEASE_NEAR_M = 0.25
+"""Distance from a point at which the released follower goes on to the next [m], as published."""
+
+
+def wrapped(angle: float) -> float:
+    """An angle brought into [-pi, pi) [rad]."""
+    if -math.pi <= angle < math.pi:
+        return angle
+    return angle - TURN * math.floor((angle + math.pi) / TURN)
+
+
+def limited(
+    limits: tuple[float, float, float, float, float, float],
+    v_wanted: float,
+    w_wanted: float,
+    v: float,
+    w: float,
+) -> tuple[float, float]:
+    """The twist that a drive makes of a wanted one: nearest to it within every limit.
+
+    Where a wheel would turn too fast, speed gives way to turning as quickly as it may be changed.
+
+    Args:
+        limits: Highest speed [m/s], yaw rate [rad/s], change of either in a step, speed of a wheel's rim
+            [m/s], and half the distance between wheels [m].
+        v_wanted: Forward speed [m/s].
+        w_wanted: Yaw rate [rad/s].
+        v: Last forward speed, within the limits [m/s].
+        w: Last yaw rate, within the limits [rad/s].
+    """
+    v_max, w_max, dv, dw, rim, half = limits
+    slowest = abs(v) - dv
+    low, high = v - dv, v + dv
+    if low < -v_max:
+        low = -v_max
+    if high > v_max:
+        high = v_max
+    v = low if v_wanted < low else high if v_wanted > high else v_wanted
+    low, high = w - dw, w + dw
+    if low < -w_max:
+        low = -w_max
+    if high > w_max:
+        high = w_max
+    w = low if w_wanted < low else high if w_wanted > high else w_wanted
+    room = rim - abs(w) * half
+    if abs(v) > room:
+        if slowest < 0.0:
+            slowest = 0.0
+        if room < slowest:
+            room = slowest
+            w = math.copysign((rim - room) / half, w)
+        v = math.copysign(room, v)
+    return v, w
+
+
+def towards_point(
+    xs: Numbers, ys: Numbers, speed: float, gain: float, node: int, x: float, y: float, yaw: float
+) -> tuple[float, float, int]:
+    """Command of the released follower, and the point that it pursues next.
+
+    w = (angle to the point - yaw) + atan(k d / v) for a point at distance d, v constant; a point nearer
+    than 0.25 m is passed. The second term is above 0 on either side of a path, so it drives to the left of
+    its points: as published, and as the real robot does.
+    """
+    ex, ey = xs[node] - x, ys[node] - y
+    away = math.sqrt(ex * ex + ey * ey)
+    w = wrapped(math.atan2(ey, ex) - yaw) + math.atan2(gain * away, speed)
+    return speed, w, node + 1 if away < RELEASE_NEAR_M else node
+
+
+def along_path(
+    law: int,
+    table: Columns,
+    gains: tuple[float, float, float, float, float, float, float, float],
+    node: int,
+    driven: float,
+    x: float,
+    y: float,
+    yaw: float,
+    v: float,
+    w: float,
+) -> tuple[float, float, int, float]:
+    """Command of a controller that drives along planned nodes, the node that is next, and the way since.
+
+    Where on the path the robot is, and the planned speed there, is one for all; how it is steered is not.
+    The follower's wanted heading leans towards the path, by atan(d / L) for a distance d from it, and
+    w = v k + (4 / L) max(v, v_turn) (wanted - actual), which for small errors is critically damped, with
+    both poles at -2 / L per metre driven. Stanley's (Hoffmann et al., ACC 2007, eq. 5): a point b ahead of
+    the axle is a steered wheel, turned by the path's heading there less the robot's and by
+    atan(-k e / (k_s + v)) for its distance e from the path; w = v tan(that) / b. Pure pursuit (Coulter,
+    CMU-RI-TR-92-01): the arc through a goal on the path some way ahead, w = v 2 y / D^2 for a goal at
+    distance D that is y to the left.
+
+    Each stops and turns on the spot where its heading is far off, so corners are turned standing. A robot
+    that was carried away drives straight back to where it left the path.
+
+    Args:
+        law: FOLLOWER, STANLEY or PURE_PURSUIT.
+        table: x, y [m], heading [rad], curvature [1/m], squared planned speed [m2/s2], and way left in its
+            piece [m] of each node, which is 0 at the last node of a piece.
+        gains: dt [s]; time after which a command has its effect [s]; wanted and least speed [m/s]; twice
+            the planned deceleration [m/s2]; square of the distance at which the robot is lost [m2]; yaw
+            rate that the path's own may reach [rad/s]; distance that Stanley or pure pursuit looks ahead [m].
+        node: Node that begins the segment that the robot was abreast of.
+        driven: Way since then [m].
+        x: Position in world [m].
+        y: Position in world [m].
+        yaw: Heading in world [rad].
+        v: Forward speed [m/s].
+        w: Yaw rate [rad/s].
+    """
+    xs, ys, headings, curvatures, squares, lefts = table
+    dt, delay, speed, creep, brake, lost2, w_path, look = gains
+    i = node
+    ex, ey = x - xs[i], y - ys[i]
+    away2 = ex * ex + ey * ey
+    if away2 > lost2:
+        planned = math.sqrt(brake * math.sqrt(away2))
+        if planned > speed:
+            planned = speed
+        error = wrapped(math.atan2(-ey, -ex) - yaw)
+        off = abs(error)
+        if off > ALIGN:
+            planned *= (ASTRAY - off) / (ASTRAY - ALIGN) if off < ASTRAY else 0.0
+        return planned, GAIN * (v if v > V_TURN else V_TURN) * error, i, driven
+    driven += v * dt
+    if driven > STUCK_M and lefts[i + 1] > 0.0:  # a knot, in which nodes lie behind each other
+        i += 1
+        driven = 0.0
+        ex, ey = x - xs[i], y - ys[i]
+    while True:  # the segment that the robot is abreast of, never going back
+        dx, dy = xs[i + 1] - xs[i], ys[i + 1] - ys[i]
+        length2 = dx * dx + dy * dy
+        along = (ex * dx + ey * dy) / length2
+        if along < 1.0 or lefts[i + 1] <= 0.0:
+            break
+        i += 1
+        driven = 0.0
+        ex, ey = x - xs[i], y - ys[i]
+    left = lefts[i]
+    spacing = left - lefts[i + 1]
+    last = i + int(left / spacing + 0.5) - 1
+    left -= along * spacing
+    if left < ARRIVED_M:
+        return 0.0, 0.0, last + 2, 0.0
+    if along < 0.0:
+        along = 0.0
+    # The plan is read where the robot will be when the motors have done what they are told.
+    ahead = along + (v * delay / spacing if v > 0.0 else 0.0)
+    j = int(ahead)
+    part = ahead - j
+    j += i
+    if j > last:
+        j, part = last, 1.0
+    planned = math.sqrt(squares[j] + part * (squares[j + 1] - squares[j]))
+    if planned < creep:
+        planned = creep
+    if planned * dt > left:
+        planned = left / dt
+    if law == FOLLOWER:
+        bend = v * (curvatures[j] + part * (curvatures[j + 1] - curvatures[j]))
+        if bend > w_path:
+            bend = w_path
+        elif bend < -w_path:
+            bend = -w_path
+        offset = (dx * ey - dy * ex) / math.sqrt(length2)
+        wanted = headings[j] + part * (headings[j + 1] - headings[j]) - math.atan(offset / SETTLE_M)
+        error = wrapped(wanted - (yaw + w * delay))
+        off = abs(error)
+        if off > ALIGN:
+            planned *= (ASTRAY - off) / (ASTRAY - ALIGN) if off < ASTRAY else 0.0
+        return planned, bend + GAIN * (v if v > V_TURN else V_TURN) * error, i, driven
+    ahead = along + look / spacing
+    j = int(ahead)
+    part = ahead - j
+    j += i
+    beyond = 0.0  # past its end a piece goes on straight
+    if j > last:
+        beyond = (ahead - (last + 1 - i)) * spacing
+        j, part = last, 1.0
+    heading = headings[j] + part * (headings[j + 1] - headings[j])
+    gx = xs[j] + part * (xs[j + 1] - xs[j]) + beyond * math.cos(heading) - x
+    gy = ys[j] + part * (ys[j + 1] - ys[j]) + beyond * math.sin(heading) - y
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    if law == STANLEY:
+        error = wrapped(heading - yaw)
+        fx, fy = gx - look * cos, gy - look * sin  # from the steered wheel to the path beside it
+        beside = math.cos(heading) * fy - math.sin(heading) * fx
+        steer = error + math.atan(STANLEY_GAIN * beside / (STANLEY_SOFT + (v if v > 0.0 else 0.0)))
+        if steer > STANLEY_MOST:
+            steer = STANLEY_MOST
+        elif steer < -STANLEY_MOST:
+            steer = -STANLEY_MOST
+        bent = math.tan(steer) / look
+    else:
+        error = wrapped(math.atan2(gy, gx) - yaw)
+        bent = 2.0 * (cos * gy - sin * gx) / (gx * gx + gy * gy + NOWHERE_M2)
+    off = abs(error)
+    if off > ASTRAY or (off > ALIGN and v <= 2.0 * creep):
+        return 0.0, TURN_GAIN * error, i, driven
+    return planned, v * bent, i, driven
+
+
+def commanded(
+    law: int,
+    table: Columns,
+    gains: tuple[float, float, float, float, float, float, float, float],
+    timeout: float,
+    node: int,
+    driven: float,
+    t: float,
+    x: float,
+    y: float,
+    yaw: float,
+    v: float,
+    w: float,
+) -> tuple[float, float, int, float]:
+    """Command of any controller at a time t [s], the node that is next, and the way since.
+
+    A controller is done when that is the number of its nodes; it then commands a stand. Of scripted
+    commands the latest holds, until it is older than `timeout` [s]. All else as for `along_path`; the
+    released follower takes its gain in the place of the distance to look ahead.
+    """
+    times = table[0]
+    count = len(times)
+    if node >= count:
+        return 0.0, 0.0, node, driven
+    if law >= FOLLOWER:
+        return along_path(law, table, gains, node, driven, x, y, yaw, v, w)
+    if law == RELEASE:
+        v_cmd, w_cmd, node = towards_point(times, table[1], gains[2], gains[7], node, x, y, yaw)
+        return v_cmd, w_cmd, node, driven
+    t += LATE_S
+    while node + 1 < count and times[node + 1] <= t:
+        node += 1
+    age = t - times[node]
+    if age < 0.0:
+        return 0.0, 0.0, node, driven
+    if age > timeout + 2.0 * LATE_S:
+        return 0.0, 0.0, count if node + 1 == count else node, driven
+    return table[1][node], table[2][node], node, driven
+
+
+def clearance(fence: Columns, spans: Sequence[int], x: float, y: float, most: float) -> float:
+    """Distance of a point that lies in no obstacle from the nearest of them, or `most` [m].
+
+    Args:
+        fence: Edges of all outlines x0, y0, x1, y1 [m], of E numbers each; then the box about each outline,
+            x and y of its lower and of its upper corner [m], of O numbers each.
+        spans: Edge that begins each outline, and E, of O + 1 numbers.
+        x: Position in world [m].
+        y: Position in world [m].
+        most: Distance beyond which nothing counts [m].
+    """
+    x0s, y0s, x1s, y1s, low_x, low_y, high_x, high_y = fence
+    best = most * most
+    for o in range(len(low_x)):
+        dx = low_x[o] - x if x < low_x[o] else x - high_x[o] if x > high_x[o] else 0.0
+        dy = low_y[o] - y if y < low_y[o] else y - high_y[o] if y > high_y[o] else 0.0
+        if dx * dx + dy * dy >= best:
+            continue
+        for e in range(spans[o], spans[o + 1]):
+            sx, sy = x1s[e] - x0s[e], y1s[e] - y0s[e]
+            px, py = x - x0s[e], y - y0s[e]
+            along = (px * sx + py * sy) / (sx * sx + sy * sy)
+            if along > 1.0:
+                along = 1.0
+            if along > 0.0:
+                px, py = px - along * sx, py - along * sy
+            away2 = px * px + py * py
+            if away2 < best:
+                best = away2
+    return math.sqrt(best)
+
+
+def free_way(
+    fence: Columns, spans: Sequence[int], radius: float, x: float, y: float, ux: float, uy: float, way: float
+) -> float:
+    """How far a round footprint can go in a direction until it touches an obstacle, at most `way` [m].
+
+    The footprint's centre is followed as it meets the outlines, each grown by the radius: sides pushed
+    out, with a circle about every corner. Obstacles that it touches count only if it comes nearer.
+
+    Args:
+        fence: As for `clearance`.
+        spans: As for `clearance`.
+        radius: That of the footprint [m].
+        x: Position of its centre in world [m].
+        y: Position of its centre in world [m].
+        ux: Direction, a unit vector.
+        uy: Direction, a unit vector.
+        way: How far it wants to go [m].
+    """
+    x0s, y0s, x1s, y1s, low_x, low_y, high_x, high_y = fence
+    reach = radius + way
+    for o in range(len(low_x)):
+        if x < low_x[o] - reach or x > high_x[o] + reach or y < low_y[o] - reach or y > high_y[o] + reach:
+            continue
+        for e in range(spans[o], spans[o + 1]):
+            px, py = x - x0s[e], y - y0s[e]
+            nearing = px * ux + py * uy
+            if nearing < -GRAZE * radius:
+                beyond = px * px + py * py - radius * radius
+                within = nearing * nearing - beyond
+                if beyond <= 0.0:
+                    way = 0.0
+                elif within > 0.0:
+                    until = -nearing - math.sqrt(within)
+                    if until < way:
+                        way = until
+            sx, sy = x1s[e] - x0s[e], y1s[e] - y0s[e]
+            length = math.sqrt(sx * sx + sy * sy)
+            nearing = (ux * sy - uy * sx) / length  # outward, as outlines are anticlockwise
+            height = (px * sy - py * sx) / length
+            if nearing < -GRAZE and height > 0.0:
+                until = (height - radius) / -nearing
+                if until < 0.0:
+                    until = 0.0
+                if until < way:
+                    along = (px + until * ux) * sx + (py + until * uy) * sy
+                    if 0.0 <= along <= length * length:
+                        way = until
+    return way
+
+
+def drive_on(
+    law: int,
+    figures: Numbers,
+    table: Columns,
+    fence: Columns,
+    spans: Sequence[int],
+    state: MutableSequence[float],
+    first: int,
+    steps: int,
+    record: Sequence[Any],
+) -> int:
+    """Drive a robot on from a state, until its controller is done and it stands.
+
+    Args:
+        law: Number of its controller.
+        figures: dt [s]; the six limits of `limited`; share of the last speed that is left at the end of a
+            step, and share of it in the step's mean; slip per change of speed in a step [s/m]; scales of v
+            and w; age at which a command is void [s]; radius of the footprint [m]; the eight
+            `gains` of `along_path`.
+        table: For COMMANDS time [s], v [m/s], w [rad/s] of each; for RELEASE x, y of each point [m]; for
+            the others as in `along_path`. Columns that are not named are not read.
+        fence: As for `clearance`.
+        spans: As for `clearance`.
+        state: STATE numbers, which are changed.
+        first: Number of the first step since the start.
+        steps: Most steps.
+        record: RECORD columns of at least `steps` numbers each, which are filled.
+
+    Returns:
+        How many steps were made.
+    """
+    dt = figures[0]
+    limits = (figures[1], figures[2], figures[3], figures[4], figures[5], figures[6])
+    left_at_end, left_in_mean, slip, scale_v, scale_w = (
+        figures[7],
+        figures[8],
+        figures[9],
+        figures[10],
+        figures[11],
+    )
+    timeout, radius, rest_w = figures[12], figures[13], REST_M_S / figures[6]
+    gains = (
+        figures[14],
+        figures[15],
+        figures[16],
+        figures[17],
+        figures[18],
+        figures[19],
+        figures[20],
+        figures[21],
+    )
+    count = len(table[0])
+    x, y, yaw = state[0], state[1], state[2]
+    v_told, w_told, v, w, v_mean, free = state[3], state[4], state[5], state[6], state[7], state[8]
+    bump, node, driven = state[9], int(state[10]), state[11]
+    to_x, to_y, to_yaw, to_v, to_w, to_wheel_v, to_wheel_w, to_v_cmd, to_w_cmd, to_bump = record
+    half_dt = dt / 2
+    made = steps
+    for k in range(steps):
+        v_cmd, w_cmd, node, driven = commanded(
+            law, table, gains, timeout, node, driven, (first + k) * dt, x, y, yaw, v, w
+        )
+        v_told, w_told = limited(limits, v_cmd, w_cmd, v_told, w_told)
+        was = v_mean
+        v_mean = v_told + left_in_mean * (v - v_told)
+        w_mean = w_told + left_in_mean * (w - w_told)
+        v = v_told + left_at_end * (v - v_told)
+        w = w_told + left_at_end * (w - w_told)
+        if v_told == 0.0 and w_told == 0.0 and abs(v) < REST_M_S and abs(w) < rest_w:
+            v = w = 0.0
+        v_body = v_mean * (1.0 - slip * (v_mean - was)) * scale_v
+        w_body = w_mean * scale_w
+        half = w_body * half_dt
+        square = half * half
+        if square < SHORT:
+            chord = v_body * dt * (1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0)))
+        else:
+            chord = v_body * dt * (math.sin(half) / half)
+        yaw += half
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        free -= abs(chord)
+        if free < 0.0:
+            way = abs(chord)
+            free = clearance(fence, spans, x, y, radius + 1.0 + way) - radius - way
+            bump = 0.0
+            if free < 0.0:
+                sign = 1.0 if chord > 0.0 else -1.0
+                until = free_way(fence, spans, radius, x, y, sign * cos, sign * sin, way)
+                free = 0.0
+                if until < way:
+                    part = until / way
+                    chord *= part
+                    v_body *= part
+                    v_mean *= part
+                    v = v_told = 0.0
+                    bump = 1.0
+        x += chord * cos
+        y += chord * sin
+        yaw += half
+        to_x[k], to_y[k], to_yaw[k] = x, y, yaw
+        to_v[k], to_w[k] = v_body, w_body
+        to_wheel_v[k], to_wheel_w[k] = v_mean, w_mean
+        to_v_cmd[k], to_w_cmd[k] = v_cmd, w_cmd
+        to_bump[k] = bump
+        if node >= count and v == 0.0 and w == 0.0:
+            made = k + 1
+            break
+    state[0], state[1], state[2] = x, y, yaw
+    state[3], state[4], state[5], state[6], state[7], state[8] = v_told, w_told, v, w, v_mean, free
+    state[9], state[10], state[11] = bump, float(node), driven
+    return made
+
+
+def robots(
+    laws: Any,
+    figures: Any,
+    tables: Any,
+    begins: Any,
+    fence: Any,
+    boxes: Any,
+    spans: Any,
+    state: Any,
+    first: int,
+    steps: int,
+    record: Any,
+    made: Any,
+) -> None:
+    """`drive_on` for many robots in one room, on arrays; each is driven as it would be alone.
+
+    Args:
+        laws: Number of each one's controller, shape (N,).
+        figures: Those of each, shape (N, FIGURES).
+        tables: Those of all, one after the other, shape (TABLE, M).
+        begins: Where the table of each begins, and M, shape (N + 1,).
+        fence: x0, y0, x1, y1 of the obstacles' edges, shape (4, E).
+        boxes: Lower and upper corners about each obstacle, shape (4, O).
+        spans: Edge that begins each obstacle, and E, shape (O + 1,).
+        state: Each one's, changed, shape (N, STATE).
+        first: Number of the first step since the start.
+        steps: Most steps.
+        record: Takes what happened, shape (N, RECORD, steps).
+        made: Takes how many steps each made, shape (N,).
+    """
+    walls = (fence[0], fence[1], fence[2], fence[3], boxes[0], boxes[1], boxes[2], boxes[3])
+    for n in range(len(laws)):
+        a, b = begins[n], begins[n + 1]
+        table = (
+            tables[0, a:b],
+            tables[1, a:b],
+            tables[2, a:b],
+            tables[3, a:b],
+            tables[4, a:b],
+            tables[5, a:b],
+        )
+        to = (
+            record[n, 0],
+            record[n, 1],
+            record[n, 2],
+            record[n, 3],
+            record[n, 4],
+            record[n, 5],
+            record[n, 6],
+            record[n, 7],
+            record[n, 8],
+            record[n, 9],
+        )
+        made[n] = drive_on(laws[n], figures[n], table, walls, spans, state[n], first, steps, to)
