@@ -52,7 +52,10 @@ COLUMNS: Mapping[str, Column] = MappingProxyType(
         "imu_q_xyzw": Column("", "imu_link", "IMU's orientation, w >= 0", 4, _XYZW),
         "imu_w": Column("rad/s", "imu_link", "gyroscope", 3, _XYZ),
         "imu_a": Column("m/s2", "imu_link", "accelerometer, gravity removed", 3, _XYZ),
+        "mocap_p": Column("m", "world", "motion capture's position of base_link", 3, _XYZ),
+        "mocap_q_xyzw": Column("", "world", "motion capture's orientation of base_link, w >= 0", 4, _XYZW),
         "battery_v": Column("V", "", "battery voltage"),
+        "battery_a": Column("A", "", "battery current, above 0 when it is discharged"),
         "battery_fraction": Column("", "", "charge left, 0 to 1"),
         "lidar_on": Column("bool", "", "whether the LiDAR spins"),
         "b_map_nt": Column("nT", "", "anomaly map at the true pose"),
@@ -64,6 +67,7 @@ COLUMNS: Mapping[str, Column] = MappingProxyType(
         "b_truth_nt": Column("nT", "", "exact field magnitude at the sensor; nan where unknown"),
         "flag_bump": Column("bool", "", "the footprint touched an obstacle"),
         "flag_outside_map": Column("bool", "", "the pose lies outside the map, or on masked nodes"),
+        "flag_pose_lost": Column("bool", "", "motion capture had lost the robot; its last pose is held"),
         "flag_out_of_distribution": Column("bool", "", "an input left the network's training range"),
         "flag_lost_lock": Column("bool", "", "the magnetometer lost lock"),
     }

@@ -8,7 +8,7 @@ import datetime
 import math
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from magtwin.frames import IDENTITY_XYZW, quat_multiply, rotate
 from magtwin.furniture import parts_of
 from magtwin.names import RefusedError, hint
 
+Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
 Matrix3 = tuple[float, float, float, float, float, float, float, float, float]
@@ -26,6 +27,9 @@ Matrix3 = tuple[float, float, float, float, float, float, float, float, float]
 ZERO3: Vec3 = (0.0, 0.0, 0.0)
 ZERO9: Matrix3 = (0.0,) * 9  # type: ignore[assignment]
 
+
+MOST_RAYS = 100_000
+"""Most rays of a scan."""
 
 UNIT_TOLERANCE = 1e-6
 """How far the square of a unit quaternion's length may be from 1: single precision passes."""
@@ -48,11 +52,13 @@ class Spec:
 
     def _above_zero(self, *names: str) -> None:
         for name in names:
-            self._require(name, getattr(self, name) > 0, "be above 0", getattr(self, name))
+            value = getattr(self, name)
+            self._require(name, _least(value) > 0, "be above 0", value)
 
     def _not_negative(self, *names: str) -> None:
         for name in names:
-            self._require(name, getattr(self, name) >= 0, "not be below 0", getattr(self, name))
+            value = getattr(self, name)
+            self._require(name, _least(value) >= 0, "not be below 0", value)
 
     def _within(self, name: str, least: float, most: float) -> None:
         value = getattr(self, name)
@@ -63,6 +69,10 @@ class Spec:
             q = getattr(self, name)
             off = abs(sum(c * c for c in q) - 1)
             self._require(name, off <= UNIT_TOLERANCE, "be a unit quaternion", q)
+
+
+def _least(value: float | tuple[float, ...]) -> float:
+    return min(value) if isinstance(value, tuple) else value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,19 +132,60 @@ class ImuSpec(MountSpec):
     rate_hz: float = 62.0
     """Samples a second [Hz]."""
 
-    orientation_noise_std: float = 0.002
+    latency_s: float = 0.008
+    """Time that a sample takes to arrive [s]."""
+
+    jitter_s: float = 0.002
+    """Mean of the further delay of each sample, exponentially distributed [s]."""
+
+    yaw_zero: float = 0.0
+    """World heading of base_link at which the orientation's yaw is 0 [rad]: where it was switched on."""
+
+    tilt: Vec2 = (-0.0042, -0.0033)
+    """Roll and pitch by which the orientation is off, as the sensor is not quite level [rad]."""
+
+    tilt_std: float = 0.011
+    """Standard deviation of the roll and pitch that wander, by floor and casters [rad]."""
+
+    tilt_time_s: float = 20.0
+    """Time in which the wandering tilt forgets itself [s]."""
+
+    orientation_noise_std: float = 0.001
     """Standard deviation of each small angle of the orientation [rad]."""
 
-    gyro_noise_std: float = 0.012
-    """Standard deviation of a rate sample, each axis [rad/s]."""
+    gyro_noise_std: float = 0.002
+    """Standard deviation of a rate sample, each axis, of a robot that stands [rad/s]."""
 
-    accel_noise_std: float = 0.27
-    """Standard deviation of an acceleration sample, each axis [m/s2]."""
+    gyro_bias: Vec3 = ZERO3
+    """Bias of the rates at the start of a run [rad/s]."""
+
+    gyro_bias_walk: float = 2e-5
+    """How fast the bias walks: its standard deviation after 1 s [rad/s]."""
+
+    gyro_vibration: Vec3 = (0.052, 0.16, 0.05)
+    """Standard deviation of the rates by vibration, for each m/s of speed [rad/m]."""
+
+    accel_noise_std: float = 0.02
+    """Standard deviation of an acceleration sample, each axis, of a robot that stands [m/s2]."""
+
+    accel_vibration: Vec3 = (1.7, 1.1, 4.1)
+    """Standard deviation of the acceleration by vibration, for each m/s of speed [1/s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._above_zero("rate_hz")
-        self._not_negative("orientation_noise_std", "gyro_noise_std", "accel_noise_std")
+        self._not_negative(
+            "latency_s",
+            "jitter_s",
+            "tilt_std",
+            "tilt_time_s",
+            "orientation_noise_std",
+            "gyro_noise_std",
+            "gyro_bias_walk",
+            "gyro_vibration",
+            "accel_noise_std",
+            "accel_vibration",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,29 +212,52 @@ class LidarSpec(MountSpec):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._above_zero("scan_rate_hz", "range_max_m")
-        self._not_negative("range_min_m", "on_s", "off_s")
+        self._not_negative("range_min_m", "range_noise_std_m", "latency_s", "jitter_s")
+        self._not_negative("on_s", "off_s", "phase_s")
+        self._within("rays", 1, MOST_RAYS)
         low, high = self.range_min_m, self.range_max_m
         self._require("range_min_m", low < high, f"be below range_max_m {high!r}", low)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatterySpec(Spec):
-    """A battery: its charge falls linearly, its voltage follows the charge, with Gaussian noise."""
+    """A battery and what it feeds; `magtwin.sim.battery.discharge` says what becomes of it."""
+
+    model: Literal["power", "linear"] = "power"
+    """"power": it gives what electronics, LiDAR and motors draw, and sags; "linear": it falls evenly."""
 
     capacity_wh: float = 26.0
     """Energy of a full pack [Wh]."""
 
     load_w: float = 15.0
-    """Mean power drawn [W]; the charge falls by load_w / capacity_wh an hour."""
+    """Power of the electronics [W]; of the linear model all power."""
+
+    lidar_w: float = 2.3
+    """Power of the LiDAR while it is on [W]."""
+
+    drag_n: float = 2.0
+    """Force that the robot drives against [N]."""
+
+    mass_kg: float = 3.945
+    """Mass that its wheels accelerate [kg]."""
+
+    motor_efficiency: float = 0.4
+    """Work of the wheels for each joule that the motors draw, above 0 to 1."""
 
     initial_fraction: float = 1.0
     """Charge at the start of a run, 0 to 1."""
 
     voltage_empty_v: float = 12.44
-    """Voltage at charge 0 [V]."""
+    """Voltage at charge 0, no load on it [V]."""
 
     voltage_full_v: float = 16.24
-    """Voltage at charge 1 [V]."""
+    """Voltage at charge 1, no load on it [V]."""
+
+    discharge: tuple[float, ...] = (0.0, 0.28, 0.4, 0.47, 0.52, 0.57, 0.63, 0.71, 0.8, 0.9, 1.0)
+    """Voltage at evenly spaced charges from 0 to 1, as a share of the way from empty to full."""
+
+    resistance_ohm: float = 0.12
+    """Inner resistance [ohm], which makes the voltage sag under load."""
 
     voltage_noise_std_v: float = 0.02
     """Standard deviation of a voltage sample [V]."""
@@ -193,10 +267,13 @@ class BatterySpec(Spec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._above_zero("capacity_wh", "voltage_empty_v", "voltage_full_v", "rate_hz")
-        self._not_negative("load_w", "voltage_noise_std_v")
+        self._require("model", self.model in ("power", "linear"), 'be "power" or "linear"', self.model)
+        self._above_zero("capacity_wh", "motor_efficiency", "voltage_empty_v", "voltage_full_v", "rate_hz")
+        self._not_negative("load_w", "lidar_w", "drag_n", "mass_kg", "resistance_ohm")
+        self._not_negative("voltage_noise_std_v", "latency_s", "jitter_s")
         self._within("initial_fraction", 0, 1)
-        low, high = self.voltage_empty_v, self.voltage_full_v
+        self._within("motor_efficiency", 0, 1)
+        low, high, curve = self.voltage_empty_v, self.voltage_full_v, self.discharge
         self._require("voltage_full_v", high >= low, f"not be below voltage_empty_v {low!r}", high)
 
 
@@ -221,18 +298,33 @@ class DriveSpec(Spec):
 
     a_max: float = 0.9
     """Highest forward acceleration [m/s2]."""
+    rays: int = 720
+    """Rays of a scan, evenly all the way round."""
+
 
     alpha_max: float = 7.725
     """Highest yaw acceleration [rad/s2]."""
 
     wheel_rate_max: float = 12.87
     """Highest rate of a wheel [rad/s]: a Create 3's rim at 0.46 m/s, its top speed with safety off."""
+    range_noise_std_m: float = 0.01
+    """Standard deviation of a range [m]."""
+
+    latency_s: float = 0.14
+    """Time that a scan takes to arrive [s]: a whole turn, and what comes after it."""
+
+    jitter_s: float = 0.005
+    """Mean of the further delay of each scan, exponentially distributed [s]."""
+
 
     motor_lag_s: float = 0.04
     """Time constant of the motors' first-order lag [s]; 0 for none. Ours: that of small geared motors."""
 
     slip_s2_m: float = 0.011
     """Slip of the wheels along their way, for each m/s2 of acceleration [s2/m]; ours: 1 % at 0.9 m/s2."""
+    phase_s: float = 0.0
+    """How far into a cycle a run begins [s]."""
+
 
     yaw_slip: float = 0.01
     """Share of a yaw rate that the wheels' scrubbing takes [1]; ours."""
@@ -266,6 +358,12 @@ class DriveSpec(Spec):
             "odometry_rate_hz",
         )
         self._not_negative(
+    latency_s: float = 0.05
+    """Time that a sample takes to arrive [s]."""
+
+    jitter_s: float = 0.01
+    """Mean of the further delay of each sample, exponentially distributed [s]."""
+
             "odometry_noise_std",
             "motor_lag_s",
             "slip_s2_m",
@@ -273,6 +371,40 @@ class DriveSpec(Spec):
             "wheel_separation_error_std",
         )
         self._require("yaw_slip", 0 <= self.yaw_slip < 1, "be at least 0 and below 1", self.yaw_slip)
+        rises = len(curve) > 1 and curve[0] == 0 and curve[-1] == 1 and list(curve) == sorted(curve)
+        self._require("discharge", rises, "rise from 0 to 1 in two numbers or more", curve)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MocapSpec(Spec):
+    """How the lab's motion capture sees a robot."""
+
+    rate_hz: float = 120.0
+    """Poses a second [Hz]."""
+
+    latency_s: float = 0.01
+    """Time that a pose takes to arrive [s]."""
+
+    jitter_s: float = 0.001
+    """Mean of the further delay of each pose, exponentially distributed [s]."""
+
+    p_noise_std_m: float = 0.0005
+    """Standard deviation of a position, each axis [m]."""
+
+    angle_noise_std: float = 0.003
+    """Standard deviation of each small angle of an orientation [rad]."""
+
+    dropout_every_s: float = 60.0
+    """Mean time in which the markers are seen, between two dropouts [s]; 0 for no dropouts."""
+
+    dropout_s: float = 0.2
+    """Mean length of a dropout [s]; 0 for no dropouts."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._above_zero("rate_hz")
+        self._not_negative("latency_s", "jitter_s", "p_noise_std_m", "angle_noise_std")
+        self._not_negative("dropout_every_s", "dropout_s")
         whole = f"be below 1 at a_max {self.a_max!r}, where all of the way would be slip"
         self._require("slip_s2_m", self.slip_s2_m * self.a_max < 1, whole, self.slip_s2_m)
         left, right = self.left_wheel_joint, self.right_wheel_joint
@@ -283,9 +415,9 @@ class DriveSpec(Spec):
 class PlatformFieldSpec(Spec):
     """The robot's own magnetic field at its magnetometer, in base_link axes.
 
-    B = (1 + S) b + h + E db/dt + (terms of motors, LiDAR and electronics), b the ambient field in
-    base_link axes: the permanent, induced and eddy parts of Tolles and Lawson (1950), then the
-    currents that an aircraft need not mind.
+    B = (1 + S) b + h + E db/dt + (terms of motors, LiDAR, electronics and iron that turns), b the ambient
+    field in base_link axes: the permanent, induced and eddy parts of Tolles and Lawson (1950), then what an
+    aircraft need not mind. `magtwin.sim.interference` says how each enters.
     """
 
     hard_iron_nt: Vec3 = ZERO3
@@ -297,17 +429,64 @@ class PlatformFieldSpec(Spec):
     eddy_s: Matrix3 = ZERO9
     """Eddy-current part E, by rows [nT per nT/s]."""
 
-    left_motor_nt_s: Vec3 = ZERO3
-    """Field of the left motor for each rad/s of its wheel [nT s]."""
+    left_motor_nt_nm: Vec3 = ZERO3
+    """Field of the left motor for each N m of torque at its wheel, which its current is in proportion to
+    [nT/(N m)]."""
 
-    right_motor_nt_s: Vec3 = ZERO3
-    """Field of the right motor for each rad/s of its wheel [nT s]."""
+    right_motor_nt_nm: Vec3 = ZERO3
+    """Field of the right motor for each N m of torque at its wheel [nT/(N m)]."""
 
     lidar_nt: Vec3 = ZERO3
-    """Field of the LiDAR's supply while it is on [nT]."""
+    """Steady field of the LiDAR and its supply while it is on [nT]."""
+
+    lidar_cos_nt: Vec3 = ZERO3
+    """Field of the LiDAR's turning motor when its angle is 0 [nT]; at angle a it is cos(a) of this."""
+
+    lidar_sin_nt: Vec3 = ZERO3
+    """Field of the LiDAR's turning motor a quarter turn on [nT]; at angle a it is sin(a) of this."""
+
+    lidar_phase: float = 0.0
+    """Angle of the LiDAR's motor at the start of a run [rad]."""
 
     battery_nt: Vec3 = ZERO3
-    """Field of the supply current, for each ampere above that at full charge [nT/A]."""
+    """Field of the supply current, for each ampere above that at rest with a full pack [nT/A]."""
+
+    left_wheel_moment: float = 0.0
+    """Magnetic moment of the left wheel's iron across its axle [A m2]: it turns with the wheel."""
+
+    left_wheel_phase: float = 0.0
+    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
+
+    right_wheel_moment: float = 0.0
+    """Magnetic moment of the right wheel's iron across its axle [A m2]."""
+
+    right_wheel_phase: float = 0.0
+    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
+
+    caster_moment: float = 0.0
+    """Magnetic moment of the caster's iron across the way [A m2]; it rolls as the robot drives."""
+
+    caster_phase: float = 0.0
+    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
+
+    p_base_caster: Vec3 = ZERO3
+    """Middle of the caster in base_link [m]."""
+
+    caster_radius_m: float = 0.01
+    """Radius that the caster rolls on [m]."""
+
+    hard_iron_std_nt: float = 0.0
+    """Standard deviation of each part of h from one day to another [nT]: what handling, docking and tools
+    magnetise or demagnetise."""
+
+    current_std: float = 0.0
+    """Relative standard deviation of what motors, LiDAR and battery add, from one day to another: wires lie
+    otherwise."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._above_zero("caster_radius_m")
+        self._not_negative("hard_iron_std_nt", "current_std")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -324,9 +503,24 @@ class RobotSpec(Spec):
     """Radius of the circle that must stay clear of walls [m]."""
 
     base_height_m: float = 0.0
+    odometry_latency_s: float = 0.012
+    """Time that a sample of odometry takes to arrive [s]."""
+
+    odometry_jitter_s: float = 0.003
+    """Mean of the further delay of each sample, exponentially distributed [s]."""
+
+    odometry_scale: Vec2 = (1.0, 1.0)
+    """Factor by which odometry mistakes the travel of the left and the right wheel."""
+
     """Height of base_link above the floor that the robot stands on [m]; read from the asset."""
 
     p_base_magnetometer: Vec3 = ZERO3
+    odometry_v_noise_std: Vec3 = (0.003, 0.00275, 0.000135)
+    """Standard deviation of the noise of the linear velocity, each axis [m/s]."""
+
+    odometry_w_noise_std: Vec3 = (0.011, 0.028, 0.01)
+    """Standard deviation of the noise of the angular velocity, each axis [rad/s]."""
+
     """Magnetometer's origin in base_link at rest, through the links between [m]; read from the asset."""
 
     q_base_magnetometer_link_xyzw: Quat = IDENTITY_XYZW
@@ -345,7 +539,7 @@ class RobotSpec(Spec):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._above_zero("footprint_radius_m")
-        self._unit("q_base_magnetometer_link_xyzw", "q_base_imu_link_xyzw")
+        self._unit("q_base_magnetometer_link_xyzw", "q_base_imu_link_xyzw", "q_base_lidar_link_xyzw")
 
     @property
     def q_base_magnetometer_xyzw(self) -> Quat:
@@ -410,12 +604,19 @@ class EarthFieldSpec(Spec):
 
     north_deg: float = 0.0
     """Where true north lies: angle from world +y about world +z, counter-clockwise from above [deg]."""
+    p_base_lidar: Vec3 = ZERO3
+    """LiDAR's origin in base_link at rest [m]; read from the asset."""
+
+    q_base_lidar_link_xyzw: Quat = IDENTITY_XYZW
+    """Axes of the link that carries the LiDAR, in base_link; read from the asset."""
+
 
     measured: bool = False
     """Whether the field was measured; otherwise it is the IGRF's, whose span then holds the day."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+    mocap: MocapSpec = field(default_factory=MocapSpec)
         self._within("latitude_deg", -90, 90)
         self._within("longitude_deg", -180, 360)
         self._within("north_deg", -360, 360)
@@ -431,6 +632,11 @@ def _is_day(text: str) -> bool:
         return datetime.date.fromisoformat(text).isoformat() == text
     except ValueError:
         return False
+
+    @property
+    def q_base_lidar_xyzw(self) -> Quat:
+        """LiDAR's axes in base_link."""
+        return _product(self.q_base_lidar_link_xyzw, self.lidar.q_link_sensor_xyzw)
 
 
 @dataclass(frozen=True, kw_only=True)

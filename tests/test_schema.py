@@ -25,6 +25,7 @@ SPECS = {
     "source": spec.SourceSpec,
     "earth": spec.EarthFieldSpec,
     "battery": spec.BatterySpec,
+    "mocap": spec.MocapSpec,
     "drive": spec.DriveSpec,
     "platform": spec.PlatformFieldSpec,
     "lab": spec.LabSpec,
@@ -89,6 +90,7 @@ def other_value(attribute: Usd.Attribute):
         "float[]": Vt.FloatArray([1.5]),
         "double[]": Vt.DoubleArray([1.5]),
         "double3[]": Vt.Vec3dArray([Gf.Vec3d(1, 2, 3)]),
+        "int": 7,
         "double": 1.5,  # one without a fallback: unknown unless authored
     }[str(attribute.GetTypeName())]
 

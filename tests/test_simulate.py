@@ -217,7 +217,17 @@ def test_the_vector_is_in_the_sensors_axes_and_the_magnitude_is_not_changed_by_i
 def test_columns_turn_with_the_links_that_carry_the_sensors():
     # imu_link is yawed by a quarter to the left: base_link's x is its -y, base_link's y its x.
     # magnetometer_link lies on its back: y and z are turned over.
-    quiet = dataclasses.replace(ROBOT.imu, orientation_noise_std=0.0, gyro_noise_std=0.0, accel_noise_std=0.0)
+    none = (0.0, 0.0, 0.0)
+    quiet = ImuSpec(
+        tilt=(0.0, 0.0),
+        tilt_std=0.0,
+        orientation_noise_std=0.0,
+        gyro_noise_std=0.0,
+        gyro_bias_walk=0.0,
+        gyro_vibration=none,
+        accel_noise_std=0.0,
+        accel_vibration=none,
+    )
     plain = with_robot(KNOWN, imu=quiet)
     turned = with_robot(
         plain,

@@ -19,6 +19,7 @@ SPECS = (
     spec.ImuSpec(),
     spec.LidarSpec(),
     spec.BatterySpec(),
+    spec.MocapSpec(),
     spec.DriveSpec(),
     spec.PlatformFieldSpec(),
     ROBOT,

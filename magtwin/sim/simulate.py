@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -10,21 +11,19 @@ from numpy.typing import NDArray
 from magtwin.field.map import AnomalyMap
 from magtwin.frames import quat_from_yaw, wrap_angle
 from magtwin.names import RefusedError
+from magtwin.obstacles import Obstacles
 from magtwin.path import Path, check_on_floor
 from magtwin.run import COLUMNS, Run
-from magtwin.sim.drive import Moment, wheel_rates
+from magtwin.sim.battery import discharge, sense_battery
+from magtwin.sim.controllers import Controller
+from magtwin.sim.drive import Moment, draw_wheel_errors, wheel_rates
 from magtwin.sim.follow import follow
+from magtwin.sim.imu import sense_imu
 from magtwin.sim.interference import ambient_field_and_rate_nt, excess_current_a, platform_field_nt
-from magtwin.sim.sensors import (
-    charge,
-    into_sensor,
-    lidar_on,
-    open_voltage,
-    sense_battery,
-    sense_imu,
-    sense_magnetometer,
-    sense_odometry,
-)
+from magtwin.sim.lidar import lidar_on
+from magtwin.sim.mocap import sense_mocap
+from magtwin.sim.odometry import sense_odometry
+from magtwin.sim.sensors import into_sensor, sense_magnetometer
 from magtwin.spec import Scene
 
 Array = NDArray[np.float64]
@@ -32,8 +31,13 @@ Array = NDArray[np.float64]
 MOST_READINGS = 20_000_000
 """Most readings of a run: about 8 GB of columns."""
 
-_STREAMS = ("odometry", "imu", "battery", "magnetometer")
+_STREAMS = ("odometry", "imu", "battery", "magnetometer", "mocap", "lidar", "drive")
 """Who draws random numbers, each from a child generator of its own; append only: the order is the seed."""
+
+
+def streams(rng: np.random.Generator) -> dict[str, np.random.Generator]:
+    """A generator for each who draws, children of the one that `simulate` is given."""
+    return dict(zip(_STREAMS, rng.spawn(len(_STREAMS)), strict=True))
 
 
 def simulate(
@@ -45,6 +49,8 @@ def simulate(
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
+    obstacles: Obstacles | None = None,
+    controller: str | Controller = "follower",
     disturbance_nt: Callable[[Run], NDArray[Any]] | None = None,
     outside: Literal["nan", "clamp", "raise"] = "nan",
     lidar: Literal["schedule", "on", "off"] = "schedule",
@@ -65,6 +71,8 @@ def simulate(
         duration_s: How long to drive [s]; None is once along the path. Longer gives further laps of
             a closed path, and takes an open one back and forth.
         rate_hz: Magnetometer readings a second, at t = k / rate_hz [Hz]; None takes the scene's.
+        obstacles: What the path must be clear of, and what stops the robot if it leaves its path.
+        controller: A name of `magtwin.sim.controllers.CONTROLLERS`, or a controller of one's own.
         disturbance_nt: From a Run whose columns up to `lidar_on` and `b_map_nt` are filled to the
             disturbance of each reading [nT], shape (N,). Called once.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
@@ -75,7 +83,7 @@ def simulate(
         `flag_out_of_distribution` false: both are for the caller who knows a network.
 
     Raises:
-        RefusedError: The path leaves the floor, an option is out of range, or nothing gives the
+        RefusedError: The path leaves the floor or touches an obstacle, an option is out of range, or nothing gives the
             disturbance. Nothing has been computed then.
     """
     robot = scene.robot
@@ -92,24 +100,36 @@ def simulate(
     if duration_s is not None:
         _check_readings(duration_s, rate)
 
-    motion = follow(path, robot.drive, speed=speed, duration_s=duration_s)
+    draws = streams(rng)
+    motion = follow(
+        path,
+        robot.drive,
+        speed=speed,
+        duration_s=duration_s,
+        controller=controller,
+        obstacles=obstacles,
+        footprint_radius_m=robot.footprint_radius_m,
+        wheel_errors=draw_wheel_errors(robot.drive, draws["drive"]),
+    )
     end = motion.duration_s if duration_s is None else duration_s
     _check_readings(end, rate)
     t = np.arange(max(1, math.ceil(end * rate - 1e-9))) / rate
-    streams = dict(zip(_STREAMS, rng.spawn(len(_STREAMS)), strict=True))
     true = motion.at(t)
     columns = _truth(true, t, robot.base_height_m)
-    columns |= sense_odometry(motion, t, streams["odometry"])
-    columns |= sense_imu(robot.imu, robot.q_base_imu_xyzw, motion, t, streams["imu"])
-    columns |= sense_battery(robot.battery, t, streams["battery"])
+    columns |= sense_odometry(robot.drive, motion, t, draws["odometry"])
+    columns |= sense_imu(robot.imu, robot.q_base_imu_xyzw, motion, t, draws["imu"])
+    columns |= sense_mocap(robot.mocap, robot.base_height_m, motion, t, draws["mocap"])
+    pack = discharge(robot.battery, robot.drive, motion, partial(lidar_on, robot.lidar, mode=lidar), end)
+    columns |= sense_battery(robot.battery, pack, t, draws["battery"])
     columns["lidar_on"] = lidar_on(robot.lidar, t, lidar)
     columns |= _map(anomaly_map, true.pose[:, :2], columns["yaw"], outside)
-    columns |= _exact_field(scene, true, columns["lidar_on"], t)
+    columns |= _exact_field(scene, true, columns["lidar_on"], pack.voltage_v[pack.index(t)])
     columns |= _flags(scene, true)
     columns["b_sd_nt"] = np.full(len(t), np.nan)
     facts: dict[str, str | int | float | bool] = {
         "scene": scene.name,
         "path": path.name,
+        "controller": controller if isinstance(controller, str) else type(controller).__name__,
         "speed_m_s": float(speed),
         "rate_hz": float(rate),
         "duration_s": round(float(end), 9),
@@ -124,7 +144,7 @@ def simulate(
             raise RefusedError(f"disturbance_nt must give shape {t.shape}, got {disturbance.shape}")
     columns["b_disturbance_nt"] = disturbance
     columns["b_total_nt"] = columns["b_map_nt"] + disturbance
-    columns |= sense_magnetometer(robot.magnetometer, columns["b_total_nt"], streams["magnetometer"])
+    columns |= sense_magnetometer(robot.magnetometer, columns["b_total_nt"], draws["magnetometer"])
     return Run({name: columns[name] for name in COLUMNS}, facts)
 
 
@@ -139,7 +159,7 @@ def _check_readings(duration_s: float, rate_hz: float) -> None:
 
 
 def _truth(true: Moment, t: Array, height_m: float) -> dict[str, NDArray[Any]]:
-    """The columns of what the robot did and was told: a kinematic drive does what it is told."""
+    """The columns of what the robot did and was told."""
     zero, yaw = np.zeros(len(t)), wrap_angle(true.pose[:, 2])
     return {
         "t": t,
@@ -148,8 +168,8 @@ def _truth(true: Moment, t: Array, height_m: float) -> dict[str, NDArray[Any]]:
         "yaw": yaw,
         "v_base": np.column_stack([true.v, zero, zero]),
         "w_base": np.column_stack([zero, zero, true.w]),
-        "v_cmd": true.v,
-        "w_cmd": true.w,
+        "v_cmd": true.v_cmd,
+        "w_cmd": true.w_cmd,
         "wheel_angle": true.wheel_angle,
     }
 
@@ -165,7 +185,9 @@ def _map(
     return {"b_map_nt": b, "flag_outside_map": off}
 
 
-def _exact_field(scene: Scene, true: Moment, on: NDArray[np.bool_], t: Array) -> dict[str, NDArray[Any]]:
+def _exact_field(
+    scene: Scene, true: Moment, on: NDArray[np.bool_], voltage_v: Array
+) -> dict[str, NDArray[Any]]:
     """Field at the magnetometer, vector in its axes and magnitude; nan where the Earth's is not known.
 
     The rate in base_link axes is d/dt (R^T B) = R^T dB/dt - w x R^T B, with dB/dt = (u . grad) B for
@@ -173,18 +195,18 @@ def _exact_field(scene: Scene, true: Moment, on: NDArray[np.bool_], t: Array) ->
     """
     robot = scene.robot
     if scene.earth is None:
-        return {"b_vector_nt": np.full((len(t), 3), np.nan), "b_truth_nt": np.full(len(t), np.nan)}
+        return {"b_vector_nt": np.full((len(on), 3), np.nan), "b_truth_nt": np.full(len(on), np.nan)}
     x, y, yaw = true.pose.T
     cos, sin = np.cos(yaw), np.sin(yaw)
     px, py, pz = robot.p_base_magnetometer
     p_world = np.column_stack(
-        [x + px * cos - py * sin, y + px * sin + py * cos, np.full(len(t), robot.base_height_m + pz)]
+        [x + px * cos - py * sin, y + px * sin + py * cos, np.full(len(on), robot.base_height_m + pz)]
     )
     v_world = np.column_stack(
         [
             true.v * cos - true.w * (p_world[:, 1] - y),
             true.v * sin + true.w * (p_world[:, 0] - x),
-            np.zeros(len(t)),
+            np.zeros(len(on)),
         ]
     )
     b_world, change = ambient_field_and_rate_nt(scene, p_world, v_world)
@@ -192,14 +214,13 @@ def _exact_field(scene: Scene, true: Moment, on: NDArray[np.bool_], t: Array) ->
     b_rate = _into_base(change, cos, sin)
     b_rate[:, 0] += true.w * b_base[:, 1]
     b_rate[:, 1] -= true.w * b_base[:, 0]
-    voltage = open_voltage(robot.battery, charge(robot.battery, t))
     vector = platform_field_nt(
         robot.platform,
         b_base,
         b_rate=b_rate,
         wheel_rate=wheel_rates(true.v, true.w, robot.drive),
         lidar_on=on,
-        battery_a=excess_current_a(robot.battery, voltage),
+        battery_a=excess_current_a(robot.battery, voltage_v),
     )
     return {
         "b_vector_nt": into_sensor(vector, robot.q_base_magnetometer_xyzw),
@@ -214,12 +235,12 @@ def _into_base(b_world: Array, cos: Array, sin: Array) -> Array:
 
 
 def _flags(scene: Scene, true: Moment) -> dict[str, NDArray[Any]]:
-    """Touching a wall; and what this simulator does not bring about, never set."""
+    """Touching an obstacle, or the floor's border; and what this simulator does not bring about, never set."""
     half = np.array(scene.lab.floor_m) / 2
     reach = np.abs(true.pose[:, :2]) + scene.robot.footprint_radius_m
     never = np.zeros(len(true.v), bool)
     return {
-        "flag_bump": np.any(reach > half + 1e-9, axis=1),
+        "flag_bump": true.bump | np.any(reach > half + 1e-9, axis=1),
         "flag_out_of_distribution": never,
         "flag_lost_lock": never,
     }

@@ -128,6 +128,8 @@ def _usd_value(attribute: Usd.Attribute, value: Any) -> Any:
         return Gf.Matrix3d(*value)
     if kind == Sdf.ValueTypeNames.StringArray:
         return Vt.StringArray(value)
+    if kind == Sdf.ValueTypeNames.DoubleArray:
+        return Vt.DoubleArray(value)
     return tuple(value) if isinstance(value, tuple) else value
 
 
@@ -148,7 +150,7 @@ def plain_value(attribute: Usd.Attribute) -> Any:
         return tuple(float(x) for row in value for x in row)
     if isinstance(value, Gf.Vec3d | Gf.Vec2d):
         return tuple(map(float, value))
-    return tuple(value) if isinstance(value, Vt.StringArray) else value
+    return tuple(value) if isinstance(value, Vt.StringArray | Vt.DoubleArray) else value
 
 
 def _anchored(attribute: Usd.Attribute, value: Sdf.AssetPath) -> Path:

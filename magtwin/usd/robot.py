@@ -16,6 +16,7 @@ from magtwin.spec import (
     ImuSpec,
     LidarSpec,
     MagnetometerSpec,
+    MocapSpec,
     MountSpec,
     PlatformFieldSpec,
     RobotSpec,
@@ -30,6 +31,7 @@ from magtwin.usd.sensors import (
     define_imu,
     define_lidar,
     define_magnetometer,
+    define_mocap,
     define_platform,
     read_robot_prim,
 )
@@ -60,6 +62,7 @@ class RobotSettings(Spec):
     magnetometer: MagnetometerSpec | None = None
     imu: ImuSpec | None = None
     lidar: LidarSpec | None = None
+    mocap: MocapSpec = field(default_factory=MocapSpec)
 
     conversion: Options = DEFAULTS
     """How the URDF is converted."""
@@ -158,6 +161,7 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
     if settings.drive is not None or not prims_with(robot, "drive"):
         define_drive(robot, settings.drive or DriveSpec())
     define_platform(robot, settings.platform)
+    define_mocap(robot, settings.mocap)
     define_battery(stage, _free(links, _base(robot), "battery"), settings.battery)
     told: tuple[tuple[str, Any, Any, Any], ...] = (
         ("imu", settings.imu, ImuSpec(), define_imu),

@@ -30,6 +30,7 @@ from magtwin.usd.sensors import (
     define_imu,
     define_lidar,
     define_magnetometer,
+    define_mocap,
     define_platform,
 )
 from magtwin.usd.sources import LOOKS, SOURCES, define_sources
@@ -412,6 +413,7 @@ def _define_robot(stage: Usd.Stage, scene: Scene) -> None:
     define_footprint(prim, robot.footprint_radius_m)
     define_drive(prim, robot.drive)
     define_platform(prim, robot.platform)
+    define_mocap(prim, robot.mocap)
     for part, define in PARTS.items():
         define(stage, only_prim_with(prim, part).GetPath(), getattr(robot, part))
     magnetometer = only_prim_with(prim, "magnetometer")

@@ -19,6 +19,7 @@ from magtwin.spec import (
     ImuSpec,
     LidarSpec,
     MagnetometerSpec,
+    MocapSpec,
     MountSpec,
     PlatformFieldSpec,
     Quat,
@@ -26,7 +27,7 @@ from magtwin.spec import (
     Vec3,
 )
 from magtwin.usd.figures import read_figures, read_pose, target, write_figures, write_pose
-from magtwin.usd.schema import apply_api, attribute_name, only_prim_with, place, require_api
+from magtwin.usd.schema import NOUNS, apply_api, attribute_name, only_prim_with, place, require_api
 
 S = TypeVar("S")
 
@@ -207,6 +208,18 @@ def read_platform(prim: Usd.Prim) -> PlatformFieldSpec:
     return read_figures(PlatformFieldSpec, prim, "platform")
 
 
+def define_mocap(prim: Usd.Prim, spec: MocapSpec) -> Usd.Prim:
+    """Apply to a robot's root prim how motion capture sees it."""
+    return write_figures(apply_api(prim, "mocap"), "mocap", spec)
+
+
+def read_mocap(prim: Usd.Prim) -> MocapSpec:
+    """How motion capture sees the robot rooted at `prim`: the default where no layer says it."""
+    if not prim.HasAPI(NOUNS["mocap"]):
+        return MocapSpec()
+    return read_figures(MocapSpec, prim, "mocap")
+
+
 def read_robot_prim(prim: Usd.Prim, asset: Path) -> RobotSpec:
     """The spec of the robot rooted at `prim`, in its own asset or in a scene that refers to it.
 
@@ -217,14 +230,15 @@ def read_robot_prim(prim: Usd.Prim, asset: Path) -> RobotSpec:
     Raises:
         RefusedError: A part is missing or there twice, or a figure is out of range; names the prim.
     """
-    magnetometer, imu = only_prim_with(prim, "magnetometer"), only_prim_with(prim, "imu")
+    magnetometer, imu, lidar = (only_prim_with(prim, noun) for noun in ("magnetometer", "imu", "lidar"))
     parts: dict[str, Any] = {
         "drive": read_drive(prim),
         "battery": read_battery(only_prim_with(prim, "battery")),
         "platform": read_platform(prim),
         "magnetometer": read_magnetometer(magnetometer),
         "imu": read_imu(imu),
-        "lidar": read_lidar(only_prim_with(prim, "lidar")),
+        "lidar": read_lidar(lidar),
+        "mocap": read_mocap(prim),
     }
     try:
         return RobotSpec(
@@ -235,6 +249,8 @@ def read_robot_prim(prim: Usd.Prim, asset: Path) -> RobotSpec:
             p_base_magnetometer=_p_base(prim, magnetometer),
             q_base_magnetometer_link_xyzw=_q_base(prim, magnetometer.GetParent()),
             q_base_imu_link_xyzw=_q_base(prim, imu.GetParent()),
+            p_base_lidar=_p_base(prim, lidar),
+            q_base_lidar_link_xyzw=_q_base(prim, lidar.GetParent()),
             **parts,
         )
     except RefusedError as error:

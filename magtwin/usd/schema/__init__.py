@@ -23,6 +23,7 @@ NOUNS = {
     "furniture": "MagtwinFurnitureAPI",
     "earth": "MagtwinEarthFieldAPI",
     "battery": "MagtwinBatteryAPI",
+    "mocap": "MagtwinMotionCaptureAPI",
     "robot": "MagtwinRobotAPI",
     "drive": "MagtwinDifferentialDriveAPI",
     "platform": "MagtwinPlatformFieldAPI",

@@ -292,7 +292,8 @@ def _spec(
     """A drive of what was told; what was not is measured on the robot, or guessed with a note."""
     joints = {joint.name: joint for joint in tags.description.joints.values()}
     left, right = (joints[name] for name in sides)
-    poses, given = mechanism.poses(), {k: v for k, v in figures.items() if v is not None}
+    poses = mechanism.poses()
+    given: dict[str, Any] = {k: v for k, v in figures.items() if v is not None}
     if "wheel_separation_m" not in given:
         gap = float(np.linalg.norm(poses[left.child][:3, 3] - poses[right.child][:3, 3]))
         if gap > 0:

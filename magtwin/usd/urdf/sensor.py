@@ -14,7 +14,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdRender, Vt
 
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.names import RefusedError, hint
-from magtwin.spec import ImuSpec, LidarSpec, MagnetometerSpec
+from magtwin.spec import ZERO3, ImuSpec, LidarSpec, MagnetometerSpec
 from magtwin.usd.schema import prims_with
 from magtwin.usd.sensors import (
     define_imu,
@@ -139,7 +139,12 @@ def _define_imu(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd
     spec = ImuSpec(
         **site.mount,
         rate_hz=rate,
-        orientation_noise_std=0.0,  # Gazebo gives the true one
+        tilt=(0.0, 0.0),  # Gazebo gives the true orientation, and shakes nothing
+        tilt_std=0.0,
+        orientation_noise_std=0.0,
+        gyro_bias_walk=0.0,
+        gyro_vibration=ZERO3,
+        accel_vibration=ZERO3,
         gyro_noise_std=_noise(tags, tags.find(sensor, "imu/angular_velocity", "imu/noise/rate")),
         accel_noise_std=_noise(tags, tags.find(sensor, "imu/linear_acceleration", "imu/noise/accel")),
     )
@@ -180,7 +185,15 @@ def _define_lidar(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> U
     noise, step = _noise(tags, scan), tags.number(scan, "range/resolution", least=0.0) or 0.0
     spins = across.most - across.least >= SCANNER
     if spins and not prims_with(robot, "lidar"):
-        spec = LidarSpec(**site.mount, scan_rate_hz=rate, range_min_m=near, range_max_m=far, off_s=0.0)
+        spec = LidarSpec(
+            **site.mount,
+            scan_rate_hz=rate,
+            rays=across.count,
+            range_min_m=near,
+            range_max_m=far,
+            range_noise_std_m=noise,
+            off_s=0.0,
+        )
         prim = define_lidar(site.stage, site.path, spec)
     else:
         prim = site.define()

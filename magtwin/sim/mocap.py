@@ -1,0 +1,62 @@
+"""Motion capture: the pose that cameras about the room make of a robot's markers."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.frames import canonical, quat_from_rpy, quat_from_yaw, quat_multiply
+from magtwin.sim.sensors import Moving, held, moment_at
+from magtwin.spec import MocapSpec
+
+_ROUND = 64
+"""Dropouts drawn at a time."""
+
+
+def sense_mocap(
+    spec: MocapSpec, height_m: float, motion: Moving, t: ArrayLike, rng: np.random.Generator
+) -> dict[str, NDArray]:
+    """Pose of base_link in world, with white noise, and dropouts in which the last pose is held.
+
+    Args:
+        spec: Rate, delays, noise, and how often and how long the markers are not seen.
+        height_m: Height of base_link above the floor [m].
+        motion: What the robot did.
+        t: Times of the readings [s], shape (N,).
+        rng: Source of delays, noise and dropouts.
+
+    Returns:
+        mocap_p, mocap_q_xyzw (w >= 0) at `rate_hz`, held; flag_pose_lost, whether the newest sample that
+        should have arrived was lost.
+    """
+    delays, noise, gaps = rng.spawn(3)
+    stamps, latest = held(t, spec.rate_hz, latency_s=spec.latency_s, jitter_s=spec.jitter_s, rng=delays)
+    pose = moment_at(motion, stamps).pose
+    p = np.column_stack([pose[:, :2], np.full(len(stamps), height_m)])
+    white = noise.standard_normal((len(stamps), 6))
+    q = quat_multiply(quat_from_yaw(pose[:, 2]), quat_from_rpy(spec.angle_noise_std * white[:, 3:]))
+    lost = dropouts(spec, stamps, gaps)
+    seen = np.maximum.accumulate(np.where(lost, 0, np.arange(len(stamps))))[latest]
+    return {
+        "mocap_p": (p + spec.p_noise_std_m * white[:, :3])[seen],
+        "mocap_q_xyzw": canonical(q)[seen],
+        "flag_pose_lost": lost[latest],
+    }
+
+
+def dropouts(spec: MocapSpec, stamps: ArrayLike, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Which samples are lost: times of sight and dropouts in turn, each exponentially distributed.
+
+    Args:
+        spec: Mean length of a dropout, and of the time between two.
+        stamps: Times of the samples [s], shape (N,); the first is seen.
+        rng: Source of the lengths, as many as it takes.
+    """
+    stamps = np.asarray(stamps, float)
+    if not (spec.dropout_every_s and spec.dropout_s):
+        return np.zeros(len(stamps), bool)
+    edges = stamps[:1]
+    while edges[-1] <= stamps[-1]:
+        lengths = rng.exponential((spec.dropout_every_s, spec.dropout_s), (_ROUND, 2))
+        edges = np.concatenate([edges, edges[-1] + np.cumsum(lengths)])
+    lost = np.searchsorted(edges, stamps, side="right") % 2 == 0
+    lost[0] = False
+    return lost
