@@ -197,17 +197,32 @@ class LidarSpec(MountSpec):
     scan_rate_hz: float = 7.5
     """Turns a second [Hz]."""
 
+    rays: int = 720
+    """Rays of a scan, evenly all the way round."""
+
     range_min_m: float = 0.15
     """Nearest range [m]."""
 
     range_max_m: float = 12.0
     """Farthest range [m]."""
 
+    range_noise_std_m: float = 0.01
+    """Standard deviation of a range [m]."""
+
+    latency_s: float = 0.14
+    """Time that a scan takes to arrive [s]: a whole turn, and what comes after it."""
+
+    jitter_s: float = 0.005
+    """Mean of the further delay of each scan, exponentially distributed [s]."""
+
     on_s: float = 20.0
     """Time on in each cycle of the schedule, which begins off [s]; 0 means always off."""
 
     off_s: float = 40.0
     """Time off in each cycle of the schedule [s]; 0 means always on."""
+
+    phase_s: float = 0.0
+    """How far into a cycle a run begins [s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -265,6 +280,12 @@ class BatterySpec(Spec):
     rate_hz: float = 0.5
     """Samples a second [Hz]."""
 
+    latency_s: float = 0.05
+    """Time that a sample takes to arrive [s]."""
+
+    jitter_s: float = 0.01
+    """Mean of the further delay of each sample, exponentially distributed [s]."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require("model", self.model in ("power", "linear"), 'be "power" or "linear"', self.model)
@@ -275,102 +296,6 @@ class BatterySpec(Spec):
         self._within("motor_efficiency", 0, 1)
         low, high, curve = self.voltage_empty_v, self.voltage_full_v, self.discharge
         self._require("voltage_full_v", high >= low, f"not be below voltage_empty_v {low!r}", high)
-
-
-@dataclass(frozen=True, kw_only=True)
-class DriveSpec(Spec):
-    """A differential drive: its size, its limits and its odometry."""
-
-    left_wheel_joint: str = "left_wheel_joint"
-    right_wheel_joint: str = "right_wheel_joint"
-
-    wheel_separation_m: float = 0.233
-    """Distance between the wheels' contact points [m]."""
-
-    wheel_radius_m: float = 0.03575
-    """Radius of a wheel [m]."""
-
-    v_max: float = 0.306
-    """Highest forward speed [m/s]."""
-
-    w_max: float = 1.9
-    """Highest yaw rate [rad/s]."""
-
-    a_max: float = 0.9
-    """Highest forward acceleration [m/s2]."""
-    rays: int = 720
-    """Rays of a scan, evenly all the way round."""
-
-
-    alpha_max: float = 7.725
-    """Highest yaw acceleration [rad/s2]."""
-
-    wheel_rate_max: float = 12.87
-    """Highest rate of a wheel [rad/s]: a Create 3's rim at 0.46 m/s, its top speed with safety off."""
-    range_noise_std_m: float = 0.01
-    """Standard deviation of a range [m]."""
-
-    latency_s: float = 0.14
-    """Time that a scan takes to arrive [s]: a whole turn, and what comes after it."""
-
-    jitter_s: float = 0.005
-    """Mean of the further delay of each scan, exponentially distributed [s]."""
-
-
-    motor_lag_s: float = 0.04
-    """Time constant of the motors' first-order lag [s]; 0 for none. Ours: that of small geared motors."""
-
-    slip_s2_m: float = 0.011
-    """Slip of the wheels along their way, for each m/s2 of acceleration [s2/m]; ours: 1 % at 0.9 m/s2."""
-    phase_s: float = 0.0
-    """How far into a cycle a run begins [s]."""
-
-
-    yaw_slip: float = 0.01
-    """Share of a yaw rate that the wheels' scrubbing takes [1]; ours."""
-
-    wheel_radius_error_std: float = 0.002
-    """Relative standard deviation of the wheels' radius about the nominal one, drawn once a run; ours."""
-
-    wheel_separation_error_std: float = 0.003
-    """Relative standard deviation of their separation about the nominal one, drawn once a run; ours."""
-
-    command_timeout_s: float = 0.5
-    """The robot stops when no command came for this long [s]."""
-
-    odometry_rate_hz: float = 62.0
-    """Odometry samples a second [Hz]."""
-
-    odometry_noise_std: float = 0.002
-    """Relative standard deviation of the wheels' scale, drawn once a run: what makes odometry drift."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._above_zero(
-            "wheel_separation_m",
-            "wheel_radius_m",
-            "v_max",
-            "w_max",
-            "a_max",
-            "alpha_max",
-            "wheel_rate_max",
-            "command_timeout_s",
-            "odometry_rate_hz",
-        )
-        self._not_negative(
-    latency_s: float = 0.05
-    """Time that a sample takes to arrive [s]."""
-
-    jitter_s: float = 0.01
-    """Mean of the further delay of each sample, exponentially distributed [s]."""
-
-            "odometry_noise_std",
-            "motor_lag_s",
-            "slip_s2_m",
-            "wheel_radius_error_std",
-            "wheel_separation_error_std",
-        )
-        self._require("yaw_slip", 0 <= self.yaw_slip < 1, "be at least 0 and below 1", self.yaw_slip)
         rises = len(curve) > 1 and curve[0] == 0 and curve[-1] == 1 and list(curve) == sorted(curve)
         self._require("discharge", rises, "rise from 0 to 1 in two numbers or more", curve)
 
@@ -405,6 +330,96 @@ class MocapSpec(Spec):
         self._above_zero("rate_hz")
         self._not_negative("latency_s", "jitter_s", "p_noise_std_m", "angle_noise_std")
         self._not_negative("dropout_every_s", "dropout_s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveSpec(Spec):
+    """A differential drive: its size, its limits and its odometry."""
+
+    left_wheel_joint: str = "left_wheel_joint"
+    right_wheel_joint: str = "right_wheel_joint"
+
+    wheel_separation_m: float = 0.233
+    """Distance between the wheels' contact points [m]."""
+
+    wheel_radius_m: float = 0.03575
+    """Radius of a wheel [m]."""
+
+    v_max: float = 0.306
+    """Highest forward speed [m/s]."""
+
+    w_max: float = 1.9
+    """Highest yaw rate [rad/s]."""
+
+    a_max: float = 0.9
+    """Highest forward acceleration [m/s2]."""
+
+    alpha_max: float = 7.725
+    """Highest yaw acceleration [rad/s2]."""
+
+    wheel_rate_max: float = 12.87
+    """Highest rate of a wheel [rad/s]: a Create 3's rim at 0.46 m/s, its top speed with safety off."""
+
+    motor_lag_s: float = 0.04
+    """Time constant of the motors' first-order lag [s]; 0 for none. Ours: that of small geared motors."""
+
+    slip_s2_m: float = 0.011
+    """Slip of the wheels along their way, for each m/s2 of acceleration [s2/m]; ours: 1 % at 0.9 m/s2."""
+
+    yaw_slip: float = 0.01
+    """Share of a yaw rate that the wheels' scrubbing takes [1]; ours."""
+
+    wheel_radius_error_std: float = 0.002
+    """Relative standard deviation of the wheels' radius about the nominal one, drawn once a run; ours."""
+
+    wheel_separation_error_std: float = 0.003
+    """Relative standard deviation of their separation about the nominal one, drawn once a run; ours."""
+
+    command_timeout_s: float = 0.5
+    """The robot stops when no command came for this long [s]."""
+
+    odometry_rate_hz: float = 62.0
+    """Odometry samples a second [Hz]."""
+
+    odometry_latency_s: float = 0.012
+    """Time that a sample of odometry takes to arrive [s]."""
+
+    odometry_jitter_s: float = 0.003
+    """Mean of the further delay of each sample, exponentially distributed [s]."""
+
+    odometry_scale: Vec2 = (1.0, 1.0)
+    """Factor by which odometry mistakes the travel of the left and the right wheel."""
+
+    odometry_noise_std: float = 0.002
+    """Relative standard deviation of the wheels' scale, drawn once a run: what makes odometry drift."""
+
+    odometry_v_noise_std: Vec3 = (0.003, 0.00275, 0.000135)
+    """Standard deviation of the noise of the linear velocity, each axis [m/s]."""
+
+    odometry_w_noise_std: Vec3 = (0.011, 0.028, 0.01)
+    """Standard deviation of the noise of the angular velocity, each axis [rad/s]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._above_zero(
+            "wheel_separation_m",
+            "wheel_radius_m",
+            "v_max",
+            "w_max",
+            "a_max",
+            "alpha_max",
+            "wheel_rate_max",
+            "command_timeout_s",
+            "odometry_rate_hz",
+        )
+        self._not_negative(
+            "odometry_noise_std",
+            "motor_lag_s",
+            "slip_s2_m",
+            "wheel_radius_error_std",
+            "wheel_separation_error_std",
+        )
+        self._require("yaw_slip", 0 <= self.yaw_slip < 1, "be at least 0 and below 1", self.yaw_slip)
         whole = f"be below 1 at a_max {self.a_max!r}, where all of the way would be slip"
         self._require("slip_s2_m", self.slip_s2_m * self.a_max < 1, whole, self.slip_s2_m)
         left, right = self.left_wheel_joint, self.right_wheel_joint
@@ -415,9 +430,9 @@ class MocapSpec(Spec):
 class PlatformFieldSpec(Spec):
     """The robot's own magnetic field at its magnetometer, in base_link axes.
 
-    B = (1 + S) b + h + E db/dt + (terms of motors, LiDAR, electronics and iron that turns), b the ambient
-    field in base_link axes: the permanent, induced and eddy parts of Tolles and Lawson (1950), then what an
-    aircraft need not mind. `magtwin.sim.interference` says how each enters.
+    B = (1 + S) b + h + E db/dt + (terms of motors, LiDAR and electronics), b the ambient field in
+    base_link axes: the permanent, induced and eddy parts of Tolles and Lawson (1950), then the
+    currents that an aircraft need not mind.
     """
 
     hard_iron_nt: Vec3 = ZERO3
@@ -429,64 +444,17 @@ class PlatformFieldSpec(Spec):
     eddy_s: Matrix3 = ZERO9
     """Eddy-current part E, by rows [nT per nT/s]."""
 
-    left_motor_nt_nm: Vec3 = ZERO3
-    """Field of the left motor for each N m of torque at its wheel, which its current is in proportion to
-    [nT/(N m)]."""
+    left_motor_nt_s: Vec3 = ZERO3
+    """Field of the left motor for each rad/s of its wheel [nT s]."""
 
-    right_motor_nt_nm: Vec3 = ZERO3
-    """Field of the right motor for each N m of torque at its wheel [nT/(N m)]."""
+    right_motor_nt_s: Vec3 = ZERO3
+    """Field of the right motor for each rad/s of its wheel [nT s]."""
 
     lidar_nt: Vec3 = ZERO3
-    """Steady field of the LiDAR and its supply while it is on [nT]."""
-
-    lidar_cos_nt: Vec3 = ZERO3
-    """Field of the LiDAR's turning motor when its angle is 0 [nT]; at angle a it is cos(a) of this."""
-
-    lidar_sin_nt: Vec3 = ZERO3
-    """Field of the LiDAR's turning motor a quarter turn on [nT]; at angle a it is sin(a) of this."""
-
-    lidar_phase: float = 0.0
-    """Angle of the LiDAR's motor at the start of a run [rad]."""
+    """Field of the LiDAR's supply while it is on [nT]."""
 
     battery_nt: Vec3 = ZERO3
-    """Field of the supply current, for each ampere above that at rest with a full pack [nT/A]."""
-
-    left_wheel_moment: float = 0.0
-    """Magnetic moment of the left wheel's iron across its axle [A m2]: it turns with the wheel."""
-
-    left_wheel_phase: float = 0.0
-    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
-
-    right_wheel_moment: float = 0.0
-    """Magnetic moment of the right wheel's iron across its axle [A m2]."""
-
-    right_wheel_phase: float = 0.0
-    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
-
-    caster_moment: float = 0.0
-    """Magnetic moment of the caster's iron across the way [A m2]; it rolls as the robot drives."""
-
-    caster_phase: float = 0.0
-    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
-
-    p_base_caster: Vec3 = ZERO3
-    """Middle of the caster in base_link [m]."""
-
-    caster_radius_m: float = 0.01
-    """Radius that the caster rolls on [m]."""
-
-    hard_iron_std_nt: float = 0.0
-    """Standard deviation of each part of h from one day to another [nT]: what handling, docking and tools
-    magnetise or demagnetise."""
-
-    current_std: float = 0.0
-    """Relative standard deviation of what motors, LiDAR and battery add, from one day to another: wires lie
-    otherwise."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._above_zero("caster_radius_m")
-        self._not_negative("hard_iron_std_nt", "current_std")
+    """Field of the supply current, for each ampere above that at full charge [nT/A]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -503,24 +471,9 @@ class RobotSpec(Spec):
     """Radius of the circle that must stay clear of walls [m]."""
 
     base_height_m: float = 0.0
-    odometry_latency_s: float = 0.012
-    """Time that a sample of odometry takes to arrive [s]."""
-
-    odometry_jitter_s: float = 0.003
-    """Mean of the further delay of each sample, exponentially distributed [s]."""
-
-    odometry_scale: Vec2 = (1.0, 1.0)
-    """Factor by which odometry mistakes the travel of the left and the right wheel."""
-
     """Height of base_link above the floor that the robot stands on [m]; read from the asset."""
 
     p_base_magnetometer: Vec3 = ZERO3
-    odometry_v_noise_std: Vec3 = (0.003, 0.00275, 0.000135)
-    """Standard deviation of the noise of the linear velocity, each axis [m/s]."""
-
-    odometry_w_noise_std: Vec3 = (0.011, 0.028, 0.01)
-    """Standard deviation of the noise of the angular velocity, each axis [rad/s]."""
-
     """Magnetometer's origin in base_link at rest, through the links between [m]; read from the asset."""
 
     q_base_magnetometer_link_xyzw: Quat = IDENTITY_XYZW
@@ -529,12 +482,19 @@ class RobotSpec(Spec):
     q_base_imu_link_xyzw: Quat = IDENTITY_XYZW
     """Axes of the link that carries the IMU, in base_link; read from the asset."""
 
+    p_base_lidar: Vec3 = ZERO3
+    """LiDAR's origin in base_link at rest [m]; read from the asset."""
+
+    q_base_lidar_link_xyzw: Quat = IDENTITY_XYZW
+    """Axes of the link that carries the LiDAR, in base_link; read from the asset."""
+
     drive: DriveSpec = field(default_factory=DriveSpec)
     battery: BatterySpec = field(default_factory=BatterySpec)
     platform: PlatformFieldSpec = field(default_factory=PlatformFieldSpec)
     magnetometer: MagnetometerSpec = field(default_factory=MagnetometerSpec)
     imu: ImuSpec = field(default_factory=ImuSpec)
     lidar: LidarSpec = field(default_factory=LidarSpec)
+    mocap: MocapSpec = field(default_factory=MocapSpec)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -550,6 +510,11 @@ class RobotSpec(Spec):
     def q_base_imu_xyzw(self) -> Quat:
         """IMU's axes in base_link."""
         return _product(self.q_base_imu_link_xyzw, self.imu.q_link_sensor_xyzw)
+
+    @property
+    def q_base_lidar_xyzw(self) -> Quat:
+        """LiDAR's axes in base_link."""
+        return _product(self.q_base_lidar_link_xyzw, self.lidar.q_link_sensor_xyzw)
 
 
 def _product(a: Quat, b: Quat) -> Quat:
@@ -604,19 +569,12 @@ class EarthFieldSpec(Spec):
 
     north_deg: float = 0.0
     """Where true north lies: angle from world +y about world +z, counter-clockwise from above [deg]."""
-    p_base_lidar: Vec3 = ZERO3
-    """LiDAR's origin in base_link at rest [m]; read from the asset."""
-
-    q_base_lidar_link_xyzw: Quat = IDENTITY_XYZW
-    """Axes of the link that carries the LiDAR, in base_link; read from the asset."""
-
 
     measured: bool = False
     """Whether the field was measured; otherwise it is the IGRF's, whose span then holds the day."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-    mocap: MocapSpec = field(default_factory=MocapSpec)
         self._within("latitude_deg", -90, 90)
         self._within("longitude_deg", -180, 360)
         self._within("north_deg", -360, 360)
@@ -632,11 +590,6 @@ def _is_day(text: str) -> bool:
         return datetime.date.fromisoformat(text).isoformat() == text
     except ValueError:
         return False
-
-    @property
-    def q_base_lidar_xyzw(self) -> Quat:
-        """LiDAR's axes in base_link."""
-        return _product(self.q_base_lidar_link_xyzw, self.lidar.q_link_sensor_xyzw)
 
 
 @dataclass(frozen=True, kw_only=True)
