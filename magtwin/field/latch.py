@@ -430,9 +430,11 @@ def _outliers(readings: Readings, cells: Readings, cell: Rows, fit: LocalFit, po
         rows = np.flatnonzero(cell == pool[at])
         outlier[rows[len(rows) // 2]] = residual[at]
     if readings.node is None:
-        for rows in _sequences(readings):
-            off = _spikes(readings.b_nt[rows])
-            outlier[rows[off != 0]] = off[off != 0]
+        for sequence in _sequences(readings):
+            jumps = np.flatnonzero(_moved(readings, sequence) > REACH_M) + 1  # a field may jump with the pose
+            for rows in np.split(sequence, jumps):
+                off = _spikes(readings.b_nt[rows])
+                outlier[rows[off != 0]] = off[off != 0]
     return outlier
 
 
@@ -450,7 +452,10 @@ def _spikes(b: Array) -> Array:
     off = np.zeros(len(b))
     off[1:-1] = b[1:-1] - (b[:-2] + b[2:]) / 2
     size = np.abs(off)
+    gaps = np.diff(np.unique(b))
+    rounding = float(gaps.min()) * np.sqrt(1.5 / 12) if gaps.size else 0.0  # sd of it in such a difference
     scale = 1.4826 * np.maximum(median_filter(size, SPREAD_ROWS, mode="reflect"), np.median(size))
+    scale = np.maximum(scale, rounding)
     limit = float(stdtrit(FREEDOM, 1 - 1 / (2 * len(b))))
     spike = (size > limit * scale) & (size == maximum_filter1d(size, 3)) & (size > 0)
     return np.where(spike, off, 0.0)
