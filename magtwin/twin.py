@@ -11,12 +11,16 @@ import magtwin
 from magtwin.field.map import AnomalyMap
 from magtwin.files import sha256
 from magtwin.names import RefusedError
+from magtwin.obstacles import Obstacles
 from magtwin.path import Path, resolve_path
 from magtwin.run import Run
 from magtwin.spec import Scene
 
+Kind = Literal["physical", "neural", "map-only"]
+
 if TYPE_CHECKING:
     from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.sim.controllers import Controller
 
 
 @dataclass(frozen=True)
@@ -31,36 +35,42 @@ class Twin:
     """The map that the magnetometer reads."""
 
     magnetometer: "NeuralMagnetometer | None"
-    """What predicts the disturbance; none where physics gives it."""
+    """What predicts the disturbance of a neural magnetometer; none for the other kinds."""
+
+    obstacles: Obstacles = dataclasses.field(default_factory=Obstacles)
+    """What stands in the scene."""
 
 
-def open_twin(scene_file: str | FilePath, *, net: str | FilePath | None = None) -> Twin:
+def open_twin(
+    scene_file: str | FilePath, *, net: str | FilePath | None = None, magnetometer: Kind | None = None
+) -> Twin:
     """Open a stage, the map layer and the network that it names.
 
     Args:
         scene_file: Root layer of a scene.
-        net: Weights to use in place of those that the magnetometer names (.safetensors or .pth), or
-            "none" for the disturbance by physics.
+        net: Weights to use in place of those that the magnetometer names (.safetensors or .pth), for a
+            neural magnetometer; or "none" for a physical one.
+        magnetometer: Kind of magnetometer to use in place of the scene's: "physical", "neural" or "map-only".
 
     Raises:
         RefusedError: The stage, its map or its weights are missing, broken, or not what the stage's
             checksums say.
     """
     from magtwin.usd.maps import load_map
+    from magtwin.usd.obstacles import read_obstacles
     from magtwin.usd.scene import read_scene
 
     scene_file = FilePath(scene_file)
-    scene = read_scene(scene_file, check_network=net is None)
+    scene = read_scene(scene_file, check_network=net is None and magnetometer in (None, "neural"))
+    spec = scene.robot.magnetometer
     if net is not None:
-        robot = scene.robot
-        magnetometer = dataclasses.replace(
-            robot.magnetometer,
-            network=None if str(net) == "none" else FilePath(net).resolve(),
-            network_sha256="",
-            inputs=(),
-        )
-        scene = dataclasses.replace(scene, robot=dataclasses.replace(robot, magnetometer=magnetometer))
-    return Twin(scene, scene_file, load_map(scene.map_layer), _magnetometer(scene))
+        kind, weights = ("physical", None) if str(net) == "none" else ("neural", FilePath(net).resolve())
+        spec = dataclasses.replace(spec, kind=kind, network=weights, network_sha256="", inputs=())  # type: ignore[arg-type]
+    if magnetometer is not None:
+        spec = dataclasses.replace(spec, kind=magnetometer)
+    scene = dataclasses.replace(scene, robot=dataclasses.replace(scene.robot, magnetometer=spec))
+    obstacles = read_obstacles(scene_file)
+    return Twin(scene, scene_file, load_map(scene.map_layer), _magnetometer(scene), obstacles)
 
 
 def scene_from_toml(
@@ -94,8 +104,13 @@ def scene_from_toml(
 def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
     """What runs the scene's magnetometer."""
     spec = scene.robot.magnetometer
-    if spec.network is None:
+    if spec.kind != "neural":
         return None
+    if spec.network is None:
+        raise RefusedError(
+            f"scene {scene.name!r} has a neural magnetometer that names no network; name one "
+            'with net, or take the kind "physical" or "map-only"'
+        )
     from magtwin.learn.magnetometer import NeuralMagnetometer
 
     magnetometer = NeuralMagnetometer.load(spec.network, sha256=spec.network_sha256)
@@ -116,8 +131,10 @@ def simulate(
     duration_s: float | None = None,
     rate_hz: float | None = None,
     net: str | FilePath | None = None,
+    magnetometer: Kind | None = None,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
+    controller: "str | Controller" = "follower",
 ) -> Run:
     """Drive the scene's robot along a path and read every sensor.
 
@@ -129,24 +146,27 @@ def simulate(
         duration_s: How long to drive [s]; None is once along the path, longer gives further laps.
         rate_hz: Magnetometer readings a second [Hz]; None takes the scene's.
         net: As for `open_twin`, where `twin` is a file.
+        magnetometer: As for `open_twin`, where `twin` is a file.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
+        controller: What drives: "follower", "release", "stanley" or "pure_pursuit", or a
+            `magtwin.sim.controllers.Controller` of one's own.
 
     Returns:
         A Run with every column of `magtwin.COLUMNS`; its facts tell how it came about.
 
     Raises:
-        RefusedError: The path leaves the floor, or an option is out of range.
+        RefusedError: The path leaves the floor or touches an obstacle, or an option is out of range.
     """
     from magtwin.sim.simulate import simulate as run_scene
 
     if not isinstance(twin, Twin):
-        twin = open_twin(twin, net=net)
-    elif net is not None:
-        raise RefusedError("net goes to open_twin where a Twin is given to simulate")
+        twin = open_twin(twin, net=net, magnetometer=magnetometer)
+    elif net is not None or magnetometer is not None:
+        raise RefusedError("net and magnetometer go to open_twin where a Twin is given to simulate")
     if not isinstance(seed, int) or seed < 0:
         raise RefusedError(f"seed must be a whole number from 0 up, got {seed!r}")
-    magnetometer = twin.magnetometer
+    network = twin.magnetometer
     run = run_scene(
         twin.scene,
         path if isinstance(path, Path) else resolve_path(path),
@@ -155,22 +175,22 @@ def simulate(
         speed=speed,
         duration_s=duration_s,
         rate_hz=rate_hz,
-        disturbance_nt=magnetometer.disturbance_nt if magnetometer else None,
+        disturbance_nt=network.disturbance_nt if network else None,
         outside=outside,
         lidar=lidar,
+        obstacles=twin.obstacles,
+        controller=controller,
     )
     facts: dict[str, str | int | float | bool] = {
         "seed": seed,
         "map": twin.field.name,
         "map_sha256": sha256(twin.scene.map_layer),
     }
-    if magnetometer:
+    if network:
         noise = twin.scene.robot.magnetometer.noise_std_nt
         run = run.with_columns(
-            b_sd_nt=np.full(run.rows, np.hypot(magnetometer.residual_sd_nt, noise)),
-            flag_out_of_distribution=magnetometer.outside_training(run),
+            b_sd_nt=np.full(run.rows, np.hypot(network.residual_sd_nt, noise)),
+            flag_out_of_distribution=network.outside_training(run),
         )
-        facts |= magnetometer.facts
-    else:
-        facts["network"] = "none (physics)"
+        facts |= network.facts
     return run.with_facts(magtwin=magtwin.__version__, numpy=np.__version__, **facts)

@@ -1,5 +1,7 @@
 """The differential drive: closed forms of its motion, wheels and limits."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -100,18 +102,71 @@ def test_acceleration_sums_up_to_speed():
     last=st.tuples(st.floats(-0.306, 0.306), st.floats(-1.9, 1.9)),
 )
 def test_a_limited_twist_keeps_every_limit_and_comes_as_near_as_they_let_it(wanted, last):
-    dt = 0.02
-    twist = limiter(DRIVE, dt)(*wanted, *last)
+    dt, drive = 0.02, replace(DRIVE, wheel_rate_max=100.0)
+    twist = limiter(drive, dt)(*wanted, *last)
     for got, want, was, top, rate in zip(
         twist, wanted, last, (DRIVE.v_max, DRIVE.w_max), (DRIVE.a_max, DRIVE.alpha_max), strict=True
     ):
         assert got == np.clip(want, max(was - rate * dt, -top), min(was + rate * dt, top))
 
 
+@given(
+    wanted=st.tuples(st.floats(-9, 9), st.floats(-99, 99)),
+    last=st.tuples(st.floats(-0.5, 0.5), st.floats(-1.9, 1.9)),
+)
+def test_no_wheel_turns_faster_than_it_can_and_turning_goes_before_speed(wanted, last):
+    dt, drive = 0.02, replace(DRIVE, v_max=0.5)
+    if np.abs(wheel_rates(*last, drive)).max() > drive.wheel_rate_max:
+        return
+    v, w = limiter(drive, dt)(*wanted, *last)
+    free_v, free_w = limiter(replace(drive, wheel_rate_max=100.0), dt)(*wanted, *last)
+    top = np.abs(wheel_rates(v, w, drive)).max()
+    assert top <= drive.wheel_rate_max * (1 + 1e-12)
+    assert abs(v - last[0]) <= drive.a_max * dt + 1e-12
+    assert abs(w - last[1]) <= drive.alpha_max * dt + 1e-12
+    if (v, w) != (free_v, free_w):
+        assert top >= drive.wheel_rate_max * (1 - 1e-12)
+    if w != free_w:  # only where speed already gives way as quickly as it may
+        assert abs(v) <= max(abs(last[0]) - drive.a_max * dt, 0.0) + 1e-12
+
+
 def test_a_motion_refuses_twists_that_are_not_finite_or_do_not_match():
-    with pytest.raises(RefusedError, match="is not finite"):
+    with pytest.raises(RefusedError, match="speed or yaw rate of a Motion is not finite"):
         Motion(DRIVE, 0.02, np.array([np.nan]), np.zeros(1))
     with pytest.raises(RefusedError, match=r"one shape \(K,\)"):
         Motion(DRIVE, 0.02, np.zeros(2), np.zeros(3))
     with pytest.raises(RefusedError, match=r"one shape \(K,\)"):
         Motion(DRIVE, 0.02, np.zeros(0), np.zeros(0))
+    with pytest.raises(RefusedError, match=r"wheel_v of a Motion must have shape \(2,\), got \(3,\)"):
+        Motion(DRIVE, 0.02, np.zeros(2), np.zeros(2), wheel_v=np.zeros(3))
+    with pytest.raises(RefusedError, match=r"poses of a Motion must have shape \(3, 3\), got \(2, 3\)"):
+        Motion(DRIVE, 0.02, np.zeros(2), np.zeros(2), poses=np.zeros((2, 3)))
+
+
+def test_an_ideal_motion_was_commanded_as_it_went_and_touched_nothing():
+    motion = Motion(DRIVE, 0.02, np.array([0.1, 0.2]), np.array([0.0, 0.5]))
+    seen = motion.at([0.0, 0.03, 9.0])
+    assert_allclose(seen.v_cmd, [0.1, 0.2, 0.0])
+    assert_allclose(seen.w_cmd, [0.0, 0.5, 0.0])
+    assert not seen.bump.any()
+
+
+def test_wheels_that_slip_turn_more_than_the_robot_goes():
+    motion = Motion(DRIVE, 0.02, np.full(9, 0.2), np.zeros(9), wheel_v=np.full(9, 0.25))
+    assert_allclose(motion.at([0.1]).wheel_angle, [[0.25 * 0.1 / 0.03575] * 2], rtol=1e-12)
+    assert_allclose(motion.at([0.1]).pose, [[0.02, 0.0, 0.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("figure", "value", "says"),
+    [
+        ("yaw_slip", 1.0, "yaw_slip of DriveSpec must be at least 0 and below 1"),
+        ("slip_s2_m", 1.2, r"slip_s2_m of DriveSpec must be below 1 at a_max 0\.9"),
+        ("motor_lag_s", -0.1, "motor_lag_s of DriveSpec must not be below 0"),
+        ("wheel_rate_max", 0.0, "wheel_rate_max of DriveSpec must be above 0"),
+        ("motor_lag_s", float("nan"), "motor_lag_s of DriveSpec must be finite"),
+    ],
+)
+def test_a_drive_that_cannot_be_is_refused(figure, value, says):
+    with pytest.raises(RefusedError, match=says):
+        replace(DRIVE, **{figure: value})

@@ -1,5 +1,7 @@
 """The follower: it stays on the path, keeps the drive's limits, stops at the end."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,11 +10,16 @@ from numpy.testing import assert_allclose
 
 from magtwin.names import RefusedError
 from magtwin.path import PATHS, Path, path_named, read_path_csv
-from magtwin.sim.drive import Motion, advance
-from magtwin.sim.follow import Follower, corners, drivable, follow, plan
+from magtwin.sim.controllers import CONTROLLERS, guide_along
+from magtwin.sim.drive import Motion, advance, limiter
+from magtwin.sim.follow import follow
+from magtwin.sim.plan import corners, drivable, plan
 from magtwin.spec import DriveSpec
 
-DRIVE = DriveSpec()
+REAL = DriveSpec()
+"""With motors that lag and wheels that slip."""
+
+DRIVE = dataclasses.replace(REAL, motor_lag_s=0.0, slip_s2_m=0.0, yaw_slip=0.0)
 RELEASED = [
     "figure8_path",
     "sinwave_data",
@@ -38,6 +45,7 @@ def assert_within_limits(motion: Motion, drive: DriveSpec = DRIVE) -> None:
     for x, top, rate in ((motion.v, drive.v_max, drive.a_max), (motion.w, drive.w_max, drive.alpha_max)):
         assert np.abs(x).max() <= top * slack
         assert np.abs(np.diff(x, prepend=0.0)).max() <= rate * motion.dt * slack
+    assert np.abs(motion.wheel_rates).max() <= drive.wheel_rate_max * slack
 
 
 @pytest.mark.parametrize("speed", [0.05, 0.2, 0.306])
@@ -52,6 +60,81 @@ def test_every_named_path_is_followed_within_the_limits_to_its_end(name, speed):
     assert np.hypot(*(motion.poses[-1, :2] - path.p_xy[-1])) < 0.002
     assert motion.v.max() == pytest.approx(speed)
     assert motion.v.min() >= 0.0
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_motors_that_lag_and_wheels_that_slip_do_not_take_it_off_its_path(name):
+    path = path_named(name)
+    motion = follow(path, REAL, speed=0.3, wheel_errors=(0.004, -0.006))
+    assert np.abs(cross_track(path, motion)).max() < 0.01
+    assert np.hypot(*(motion.poses[-1, :2] - path.p_xy[-1])) < 0.002
+    assert_allclose([motion.v[-1], motion.w[-1]], 0.0, atol=0.02)  # means of the step in which it stops
+
+
+@pytest.mark.parametrize("speed", [0.1, 0.3])
+@pytest.mark.parametrize("name", PATHS)
+@pytest.mark.parametrize("controller", ["stanley", "pure_pursuit"])
+def test_stanley_and_pure_pursuit_drive_every_named_path_to_its_end(controller, name, speed):
+    path = path_named(name)
+    motion = follow(path, REAL, speed=speed, controller=controller)
+    # 0.016 m and 0.0042 m were seen, in the bends of fast_sine.
+    assert np.abs(cross_track(path, motion)).max() < 0.02
+    assert rms(cross_track(path, motion)) < RMS_M
+    assert np.hypot(*(motion.poses[-1, :2] - path.p_xy[-1])) < 0.005
+    assert motion.v.max() == pytest.approx(speed, rel=0.02)
+
+
+def test_stanley_steers_by_its_published_law():
+    # On a line, 0.05 m beside it, turned 0.1 rad away: w = v tan(-0.1 - atan(2.5 e / (0.1 + v))) / b.
+    path = Path("line", np.array([[0.0, 0.0], [3.0, 0.0]]))
+    guide = guide_along("stanley", path, DRIVE, speed=0.2, dt=0.02)
+    guide.node = 100
+    v, w = guide.command(0.0, 0.5, 0.03, 0.1, 0.2, 0.0)
+    beside = 0.03 + 0.06 * np.sin(0.1)  # of the steered wheel, 0.06 m ahead
+    assert v == pytest.approx(0.2)
+    assert w == pytest.approx(0.2 * np.tan(-0.1 - np.arctan(2.5 * beside / 0.3)) / 0.06, rel=1e-9)
+
+
+def test_pure_pursuit_drives_the_arc_through_its_goal():
+    path = Path("line", np.array([[0.0, 0.0], [3.0, 0.0]]))
+    guide = guide_along("pure_pursuit", path, DRIVE, speed=0.2, dt=0.02)
+    guide.node = 100
+    v, w = guide.command(0.0, 0.5, 0.03, 0.05, 0.2, 0.0)
+    goal = np.array([0.15, -0.03])
+    left = -np.sin(0.05) * goal[0] + np.cos(0.05) * goal[1]
+    assert w / v == pytest.approx(2 * left / (goal @ goal), rel=1e-9)
+    ahead = advance([0.5, 0.03, 0.05], v, w, np.linspace(0, 1, 2001))  # and that arc meets the goal
+    assert np.hypot(ahead[:, 0] - 0.65, ahead[:, 1]).min() < 1e-4
+
+
+def test_the_released_follower_pursues_the_points_as_published():
+    path = Path("line", np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]))
+    guide = guide_along("release", path, DRIVE, speed=0.1, dt=0.02)
+    guide.node = 1
+    v, w = guide.command(0.0, 0.2, 0.1, 0.3, 0.1, 0.0)
+    away = np.hypot(0.8, 0.1)
+    assert v == 0.1
+    assert w == pytest.approx(np.arctan2(-0.1, 0.8) - 0.3 + np.arctan2(0.5 * away, 0.1), rel=1e-12)
+    assert guide.node == 1
+    guide.command(0.0, 0.76, 0.0, 0.0, 0.1, 0.0)
+    assert guide.node == 2
+    guide.command(0.0, 1.9, 0.0, 0.0, 0.1, 0.0)
+    assert guide.done
+    assert guide.command(0.0, 1.9, 0.0, 0.0, 0.1, 0.0) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("file", ["figure8_path", "sinwave_data", "continous_cycle"])
+def test_the_released_follower_stays_within_its_reach_of_the_released_paths(real_data, file):
+    path = read_path_csv(real_data / f"aprilab/paths/{file}.csv")
+    motion = follow(path, REAL, speed=0.2, controller="release")
+    off = cross_track(path, motion)
+    assert np.abs(off).max() < 0.3
+    assert off.mean() > 0.02  # the second term of its law is never below 0, so it keeps to the left
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_every_controller_keeps_every_limit(controller):
+    assert_within_limits(follow(path_named("figure8"), DRIVE, speed=0.306, controller=controller))
 
 
 @pytest.mark.parametrize("file", RELEASED)
@@ -178,11 +261,11 @@ def test_any_polyline_is_driven_to_its_end_within_the_limits(seed, step, size):
 
 def test_a_robot_that_is_carried_away_comes_back_to_where_it_left_the_path():
     path, dt = path_named("sine"), 0.02
-    follower = Follower(plan(path, DRIVE, speed=0.2), DRIVE, speed=0.2, dt=dt)
+    follower = guide_along("follower", path, DRIVE, speed=0.2, dt=dt)
     pose, v, w = np.array([*path.p_xy[0], path.heading(0.0)]), 0.0, 0.0
-    poses = []
+    poses, limit = [], limiter(DRIVE, dt)
     for k in range(6000):
-        v, w = follower.command(*pose.tolist(), v, w)
+        v, w = limit(*follower.command(k * dt, *pose.tolist(), v, w), v, w)
         pose = advance(pose, v, w, dt)
         if k == 1000:
             left_at = pose.copy()
