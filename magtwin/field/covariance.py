@@ -84,13 +84,21 @@ class Covariance:
         h = self.harmonics
         place_a, place_b = (self.places(figures, *pose) for pose in (a, b))
         r = _distance(place_a, place_b)
-        turned = a[1][:, None] - b[1][None, :]
         out = np.zeros_like(r)
-        for k in range(h):
-            part = np.exp(2 * figures[k]) * _value(self.kernel, r, float(np.exp(figures[h + k])))
+        for k, wave in enumerate(self._waves(a[1], b[1])):
+            part = _value(self.kernel, r, float(np.exp(figures[h + k])))
+            part *= np.exp(2 * figures[k])
             part += np.exp(2 * figures[2 * h + k])
-            out += part if k == 0 else part * np.cos(k * turned)
+            out += part if k == 0 else np.multiply(part, wave, out=part)
         return out
+
+    def _waves(self, a: Array, b: Array) -> list[Array]:
+        """cos(h (yaw - yaw')) of every pair, for each h; three cosines a pair would take longest of all."""
+        one = np.ones((len(a), len(b)))
+        if self.harmonics == 1:
+            return [one]
+        turned = np.column_stack([np.cos(a), np.sin(a)]) @ np.vstack([np.cos(b), np.sin(b)])
+        return [one, turned, 2 * turned * turned - 1]
 
     def loss(
         self, figures: Array, guess: Array, p_xy: Array, yaw: Array, run: NDArray[np.intp], b_nt: Array
@@ -117,8 +125,7 @@ class Covariance:
         h = self.harmonics
         place = self.places(figures, p_xy, yaw)
         r = _distance(place, place)
-        turned = yaw[:, None] - yaw[None, :]
-        waves = [np.cos(k * turned) for k in range(h)]
+        waves = self._waves(yaw, yaw)
         total, slope, parts = np.zeros_like(r), np.zeros_like(r), []
         for k in range(h):
             value, by_reach, by_r = _with_slopes(self.kernel, r, float(np.exp(figures[h + k])))
@@ -172,7 +179,11 @@ def _distance(a: Array, b: Array) -> Array:
 
 
 def _value(kernel: Kernel, r: Array, reach: float) -> Array:
-    return _with_slopes(kernel, r, reach)[0]
+    if kernel == "matern52":
+        a = ROOT5 / reach * r
+        return np.asarray((1 + a + a * a / 3) * np.exp(-a))
+    q = 1 + (r / reach) ** 2
+    return np.asarray(1 / (q * np.sqrt(q)))
 
 
 def _with_slopes(kernel: Kernel, r: Array, reach: float) -> tuple[Array, Array, Array]:
@@ -183,6 +194,6 @@ def _with_slopes(kernel: Kernel, r: Array, reach: float) -> tuple[Array, Array, 
         slope = (1 + a) * fall / 3
         return (1 + a + a * a / 3) * fall, a * a * slope, -5 / reach**2 * slope
     q = 1 + (r / reach) ** 2
-    value = q**-1.5
+    value = 1 / (q * np.sqrt(q))
     slope = 3 * value / q
     return value, (q - 1) * slope, -slope / reach**2
