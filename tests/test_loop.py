@@ -149,7 +149,7 @@ def test_a_robot_drives_to_the_same_bits_alone_in_blocks_and_among_others(both, 
     backward = run_courses(chosen[::-1])[::-1]
     monkeypatch.setattr(courses, "RECORDED", 1)
     one_by_one = run_courses(chosen)
-    monkeypatch.setattr(courses, "_SHARE", 1)
+    monkeypatch.setattr(courses, "SHARE", 1)
     in_threads = run_courses(chosen)
     for n, first in enumerate(plain):
         for other in (together, plain_in_blocks, in_blocks, backward, one_by_one, in_threads):

@@ -20,6 +20,7 @@ _SIGNATURE = types.void(
     _MATRIX,
     _MATRIX,
     _NUMBERS,
+    _NUMBERS,
     _MATRIX,
     _MATRIX,
     _NUMBERS,

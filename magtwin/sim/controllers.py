@@ -6,7 +6,8 @@ name from a path, or from a script of commands; what each of them computes stand
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from types import MappingProxyType
 from typing import Protocol
 
@@ -95,11 +96,11 @@ class Guide:
     driven_m: float = 0.0
     """Way since that changed [m]."""
 
-    columns: list[list[float]] = field(init=False, repr=False)
-    """`table` as lists, which plain Python reads faster."""
-
-    def __post_init__(self) -> None:
-        self.columns = self.table.tolist()
+    @cached_property
+    def columns(self) -> list[list[float]]:
+        """`table` as lists, which plain Python reads faster."""
+        columns: list[list[float]] = self.table.tolist()
+        return columns
 
     @property
     def done(self) -> bool:
@@ -145,9 +146,11 @@ def guide_along(name: str, path: Path, drive: DriveSpec, *, speed: float, dt: fl
     if law == loop.RELEASE:
         p = path.p_xy  # the release pursues the points as they stand in its file
         unused = np.zeros((loop.TABLE - 2, len(p)))
-        x, y, yaw = *p[0].tolist(), math.atan2(*(p[1] - p[0])[::-1].tolist())
+        (x, y), (dx, dy) = p[0].tolist(), (p[1] - p[0]).tolist()
         gains = (dt, dt, speed, speed, 0.0, 0.0, 0.0, RELEASE_GAIN)
-        return Guide(law, np.vstack([p.T, unused]), gains, drive.command_timeout_s, (x, y, yaw))
+        return Guide(
+            law, np.vstack([p.T, unused]), gains, drive.command_timeout_s, (x, y, math.atan2(dy, dx))
+        )
     columns = ("x", "y", "heading", "curvature", "speed2", "left_m")
     table = np.vstack([np.concatenate([getattr(piece, column) for piece in pieces]) for column in columns])
     gains = (

@@ -1,6 +1,5 @@
 """Course: a robot's closed loop, ready to be run, alone or with many others, in plain Python or compiled."""
 
-import itertools
 import math
 import os
 from array import array
@@ -28,7 +27,10 @@ BLOCK = 8192
 """Steps that are recorded at a time, as most courses end long before their last step."""
 
 RECORDED = 40_000_000
-"""Numbers that the record of robots driven at once may hold: 0.3 GB."""
+"""Numbers that the records and tables of robots driven at once may hold: 0.3 GB."""
+
+SHARE = 200_000
+"""Steps from which on a thread of compiled code is worth its start."""
 
 TOUCH_M = 1e-9
 """Rounding that a start beside an obstacle is forgiven [m]."""
@@ -117,9 +119,9 @@ class Course:
             x, y, _ = self.pose0
             radius = self.footprint_radius_m
             raise RefusedError(
-                f"the robot would begin in {obstacles.names[which[0]]}: at ({x:.3f}, {y:.3f}) m its footprint "
-                f"of radius {radius:g} m is {radius - distance[0]:.3f} m too near; begin elsewhere, or move "
-                "the obstacle"
+                f"the robot would begin in {obstacles.names[which[0]]}: at ({x:.3f}, {y:.3f}) m its "
+                f"footprint of radius {radius:g} m is {radius - distance[0]:.3f} m too near; begin elsewhere, "
+                "or move the obstacle"
             )
 
 
@@ -145,12 +147,14 @@ def run_courses(courses: Sequence[Course], obstacles: Obstacles | None = None) -
         return [_alone(course, obstacles) for course in courses]
     motions: list[Motion] = []
     group: list[Course] = []
+    size = 0
     for course in courses:
-        longest = max(c.steps for c in (*group, course))
-        if group and (len(group) + 1) * min(longest, BLOCK) * loop.RECORD > RECORDED:
+        own = min(course.steps, BLOCK) * loop.RECORD + course.guide.table.size
+        if group and size + own > RECORDED:
             motions += _together(group, obstacles)
-            group = []
+            group, size = [], 0
         group.append(course)
+        size += own
     return motions + (_together(group, obstacles) if group else [])
 
 
@@ -192,54 +196,20 @@ def _alone(course: Course, obstacles: Obstacles) -> Motion:
 
 
 def _together(courses: Sequence[Course], obstacles: Obstacles) -> list[Motion]:
-    """Courses in the compiled loop, on several threads where there is work for them."""
-    assert _Loop.compiled is not None
-    robots = _Loop.compiled.robots
-    edges, boxes, spans = fence_of(obstacles)
+    """Courses in the compiled loop."""
+    room = fence_of(obstacles)
     figures = np.array([course.figures() for course in courses])
     state = np.array([course.state() for course in courses])
     state[:, 8] = np.inf if not len(obstacles) else 0.0
-    guides = [course.guide for course in courses]
-    records: list[list[Array]] = [[] for _ in courses]
     most = np.array([course.steps for course in courses])
+    records: list[list[Array]] = [[] for _ in courses]
     first, going = 0, np.arange(len(courses))
     while len(going):
         steps = min(BLOCK, int(most[going].min()) - first)
-        tables = np.concatenate([guides[n].table for n in going], axis=1)
-        begins = np.cumsum([0, *(guides[n].table.shape[1] for n in going)])
-        laws = np.array([guides[n].law for n in going])
-        part, sized = state[going], figures[going]
-        record, made = np.empty((len(going), loop.RECORD, steps)), np.empty(len(going), np.int64)
-
-        def work(
-            rows: slice,
-            laws: Array = laws,
-            sized: Array = sized,
-            tables: Array = tables,
-            begins: Array = begins,
-            part: Array = part,
-            first: int = first,
-            steps: int = steps,
-            record: Array = record,
-            made: Array = made,
-        ) -> None:
-            own = begins[rows.start : rows.stop + 1]
-            robots(
-                laws[rows],
-                sized[rows],
-                tables,
-                own,
-                edges,
-                boxes,
-                spans,
-                part[rows],
-                first,
-                steps,
-                record[rows],
-                made[rows],
-            )
-
-        _shared(work, len(going), len(going) * steps)
+        part = state[going]
+        record, made = _block(
+            [courses[int(n)].guide for n in going], figures[going], part, room, first, steps
+        )
         state[going] = part
         for n, rows, count in zip(going, record, made, strict=True):
             records[n].append(rows[:, :count].copy())
@@ -248,20 +218,42 @@ def _together(courses: Sequence[Course], obstacles: Obstacles) -> list[Motion]:
     return [_motion(c, np.concatenate(r, axis=1)) for c, r in zip(courses, records, strict=True)]
 
 
-_SHARE = 200_000
-"""Steps from which on a thread of compiled code is worth its start."""
+def _block(
+    guides: Sequence[Guide],
+    figures: Array,
+    state: Array,
+    room: tuple[Array, Array, NDArray[np.int64]],
+    first: int,
+    steps: int,
+) -> tuple[Array, NDArray[np.int64]]:
+    """Some steps of robots, whose state is changed, on several threads where there is work for them.
 
+    Returns:
+        What happened, shape (N, RECORD, steps), and how many steps each made, shape (N,).
+    """
+    assert _Loop.compiled is not None
+    robots, count = _Loop.compiled.robots, len(guides)
+    distinct = {id(guide.table): guide.table for guide in guides}  # those on one path share its table
+    ends = np.cumsum([table.shape[1] for table in distinct.values()])
+    places = dict(zip(distinct, ends, strict=True))
+    last = np.array([places[id(guide.table)] for guide in guides], np.int64)
+    begin = last - [guide.table.shape[1] for guide in guides]
+    tables = np.concatenate(list(distinct.values()), axis=1)
+    laws = np.array([guide.law for guide in guides], np.int64)
+    record, made = np.empty((count, loop.RECORD, steps)), np.empty(count, np.int64)
 
-def _shared(work, count: int, steps: int) -> None:  # type: ignore[no-untyped-def]
-    """Do `work` on slices of `count` robots, in as many threads as pay."""
-    threads = max(1, min(os.cpu_count() or 1, count, steps // _SHARE))
+    def work(a: int, b: int) -> None:
+        mine = laws[a:b], figures[a:b], tables, begin[a:b], last[a:b]
+        robots(*mine, *room, state[a:b], first, steps, record[a:b], made[a:b])
+
+    threads = max(1, min(os.cpu_count() or 1, count, count * steps // SHARE))
     cuts = [count * k // threads for k in range(threads + 1)]
-    slices = [slice(a, b) for a, b in itertools.pairwise(cuts)]
     if threads == 1:
-        work(slices[0])
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(work, slices))
+        work(0, count)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(work, cuts[:-1], cuts[1:]))
+    return record, made
 
 
 def _motion(course: Course, record: Array) -> Motion:

@@ -529,7 +529,8 @@ def robots(
     laws: Any,
     figures: Any,
     tables: Any,
-    begins: Any,
+    begin: Any,
+    end: Any,
     fence: Any,
     boxes: Any,
     spans: Any,
@@ -545,7 +546,8 @@ def robots(
         laws: Number of each one's controller, shape (N,).
         figures: Those of each, shape (N, FIGURES).
         tables: Those of all, one after the other, shape (TABLE, M).
-        begins: Where the table of each begins, and M, shape (N + 1,).
+        begin: Where the table of each begins, shape (N,).
+        end: And where it ends, shape (N,).
         fence: x0, y0, x1, y1 of the obstacles' edges, shape (4, E).
         boxes: Lower and upper corners about each obstacle, shape (4, O).
         spans: Edge that begins each obstacle, and E, shape (O + 1,).
@@ -557,7 +559,7 @@ def robots(
     """
     walls = (fence[0], fence[1], fence[2], fence[3], boxes[0], boxes[1], boxes[2], boxes[3])
     for n in range(len(laws)):
-        a, b = begins[n], begins[n + 1]
+        a, b = begin[n], end[n]
         table = (
             tables[0, a:b],
             tables[1, a:b],

@@ -142,7 +142,7 @@ def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: f
     v2 = np.minimum.accumulate(v2 - gain) + gain
     v2 = (np.minimum.accumulate((v2 + gain)[::-1]))[::-1] - gain
     left = np.arange(len(x) - 1, -1, -1) * ((s_last - s_first) / (count - 1))
-    return Piece(x, y, heading, curvature, np.maximum(v2, 0.0), left)
+    return Piece(x, y, heading, curvature, np.maximum(v2, 0.0), np.asarray(left, float))
 
 
 def drivable(path: Path) -> Path:
@@ -154,6 +154,8 @@ def drivable(path: Path) -> Path:
     Raises:
         RefusedError: The whole path lies within 5 mm.
     """
+    if np.diff(path.s).min() >= _JITTER_M:
+        return path
     near2 = _JITTER_M**2
     points = path.p_xy.tolist()
     kept = [points[0]]
