@@ -30,7 +30,7 @@ def open_voltage(spec: BatterySpec, fraction: ArrayLike) -> Array:
 def current_a(spec: BatterySpec, power_w: ArrayLike, fraction: ArrayLike) -> Array:
     """Current of a pack that gives a power, through its inner resistance [A]: U I = (U_0 - R I) I = P.
 
-    Of the two solutions the smaller. A pack that cannot give P gives the most it can, U_0 / 2 R.
+    Of the two solutions the smaller, for a power that the pack can give: at most U_0^2 / 4 R.
 
     Args:
         spec: Discharge curve and resistance R.
@@ -89,8 +89,9 @@ def discharge(
     """Discharge a pack through a run, as its model says.
 
     "power": each step of `STEP_S` draws the mean power P of electronics, LiDAR and motors; the pack gives
-    it with the current I of `current_a` and loses (P + R I^2) dt of its energy. What the pack loses is
-    what was drawn, to rounding, until it is empty; an empty pack stays at 0, as the run goes on.
+    it with the current I of `current_a`, never more than an empty one could, and loses (P + R I^2) dt of
+    its energy. What the pack loses is what was drawn, to rounding, until it is empty; an empty pack stays
+    at 0, as the run goes on.
 
     "linear", the paper's: P is `load_w`, the charge falls by P t / E, and nothing sags.
 
@@ -111,6 +112,8 @@ def discharge(
         return Discharge(power, fraction, voltage, spec.load_w / voltage)
     power = wheels_energy_j(spec, drive, motion, times) / STEP_S
     power += spec.load_w + spec.lidar_w * lidar_on(times[:-1])
+    if spec.resistance_ohm > 0:
+        np.minimum(power, spec.voltage_empty_v**2 / (4 * spec.resistance_ohm), out=power)
     # f_{k+1} = f_k - (P_k + R I(P_k, f_k)^2) dt / E, solved for all k at once: a charge f changes I so
     # little that each pass is exact to some digits more, and the last one to all of them.
     left = np.full(count + 1, spec.initial_fraction)
