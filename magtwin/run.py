@@ -59,11 +59,15 @@ COLUMNS: Mapping[str, Column] = MappingProxyType(
         "battery_fraction": Column("", "", "charge left, 0 to 1"),
         "lidar_on": Column("bool", "", "whether the LiDAR spins"),
         "b_map_nt": Column("nT", "", "anomaly map at the true pose"),
-        "b_disturbance_nt": Column("nT", "", "disturbance by the network, or by physics"),
+        "b_disturbance_nt": Column("nT", "", "disturbance by the network, by physics, or none"),
         "b_total_nt": Column("nT", "", "b_map_nt + b_disturbance_nt"),
-        "b_measured_nt": Column("nT", "", "b_total_nt after the sensor's own noise and resolution"),
+        "b_noise_nt": Column("nT", "", "the sensor's own error; nan where it gave no reading"),
+        "b_measured_nt": Column("nT", "", "b_total_nt + b_noise_nt, in steps of the sensor's resolution"),
         "b_sd_nt": Column("nT", "", "predicted standard deviation of b_measured_nt; nan where unknown"),
         "b_vector_nt": Column("nT", "magnetometer", "exact field vector; nan where unknown", 3, _XYZ),
+        "b_vector_measured_nt": Column(
+            "nT", "magnetometer", "latest reading of each vector axis; nan where there is none", 3, _XYZ
+        ),
         "b_truth_nt": Column("nT", "", "exact field magnitude at the sensor; nan where unknown"),
         "flag_bump": Column("bool", "", "the footprint touched an obstacle"),
         "flag_outside_map": Column("bool", "", "the pose lies outside the map, or on masked nodes"),
@@ -72,7 +76,17 @@ COLUMNS: Mapping[str, Column] = MappingProxyType(
         "flag_lost_lock": Column("bool", "", "the magnetometer lost lock"),
     }
 )
-"""Every column that magtwin itself writes, in the order of the table. A localizer adds `est_*`."""
+"""Every column that magtwin itself writes, in the order of the table. A localizer adds `est_*`.
+
+Every error has an address, as where all are known
+
+    b_total_nt = b_map_nt + b_disturbance_nt
+    b_measured_nt = b_total_nt + b_noise_nt
+    b_truth_nt = |b_vector_nt|, and = b_total_nt of a physical magnetometer
+
+So b_total_nt - b_truth_nt is the error of a neural or a map-only magnetometer's model, b_truth_nt - b_map_nt
+what the map does not know, b_noise_nt the sensor's, and b_vector_measured_nt - b_vector_nt its vector axes'.
+"""
 
 
 @dataclass(frozen=True)

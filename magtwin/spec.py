@@ -93,23 +93,76 @@ class MountSpec(Spec):
         self._unit("q_link_sensor_xyzw")
 
 
+MAGNETOMETER_KINDS = ("physical", "neural", "map-only")
+"""What a magnetometer reads: the exact field; the map and what a network predicts; the map alone."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class MagnetometerSpec(MountSpec):
-    """A scalar magnetometer that reads map + disturbance."""
+    """A scalar magnetometer, whose vector axes are measured in turn; see `magtwin.sim.magnetometer`."""
 
     link: str = "magnetometer_link"
+
+    kind: Literal["physical", "neural", "map-only"] = "physical"
+    """"physical": the disturbance is the exact field less the map; "neural": `network` predicts it;
+    "map-only": there is none."""
 
     rate_hz: float = 135.0
     """Readings a second [Hz]."""
 
-    noise_std_nt: float = 0.02
-    """Standard deviation of the white noise of one reading [nT]."""
+    noise_density_nt: float = 0.002
+    """White noise, one-sided amplitude density [nT/sqrt(Hz)]."""
+
+    flicker_corner_hz: float = 0.0
+    """Frequency at which 1/f noise is as strong as white noise [Hz]; 0 for none."""
 
     resolution_nt: float = 1.664e-4
     """Smallest step of a reading [nT]; 0 for none."""
 
+    bandwidth_hz: float = 0.0
+    """Corner of the first-order low-pass that the field goes through [Hz]; 0 for none."""
+
+    clock_offset_s: float = 0.0
+    """How far its clock is ahead [s]: a reading stamped t is of the field at t less this."""
+
+    heading_error_nt: float = 0.0
+    """Error of a reading along the optical axis, its own z; falls with the cosine of the angle to it [nT]."""
+
+    dead_zone_axis: float = 0.0
+    """Angle between field and optical axis, either way, within which lock is lost [rad]."""
+
+    dead_zone_plane: float = 0.0
+    """Angle between field and the plane across the optical axis within which lock is lost [rad]."""
+
+    gradient_max_nt_m: float = 0.0
+    """Gradient of the field's magnitude above which lock is lost [nT/m]; 0 for never."""
+
+    gradient_relock_nt_m: float = 0.0
+    """Gradient below which lock is found again [nT/m]; not above `gradient_max_nt_m`."""
+
+    latched_nt: float = 35_650.0
+    """What is read while lock is lost [nT]."""
+
+    latched_std_nt: float = 50.0
+    """Standard deviation of that from one loss to the next [nT]; during one it stays the same."""
+
+    dropout_share: float = 0.0
+    """Share of readings that are missing."""
+
+    vector_noise_density_nt: float = 0.03
+    """White noise of the vector axes, one-sided amplitude density [nT/sqrt(Hz)]."""
+
+    vector_bias_nt: Vec3 = ZERO3
+    """Bias of each vector axis [nT]."""
+
+    vector_scale: Vec3 = ZERO3
+    """Relative error of each vector axis's scale."""
+
+    vector_misalignment: Matrix3 = ZERO9
+    """Where each vector axis points, by rows: its own unit vector and this [rad], brought to unit length."""
+
     network: Path | None = None
-    """Weights that predict the disturbance; none means that physics gives it."""
+    """Weights that predict the disturbance where `kind` is "neural"."""
 
     network_sha256: str = ""
     """Checksum of the weights file, lower-case hex; "" means that any file will do."""
@@ -119,8 +172,30 @@ class MagnetometerSpec(MountSpec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        kinds = MAGNETOMETER_KINDS
+        self._require("kind", self.kind in kinds, f"be a known kind ({hint(self.kind, kinds)})", self.kind)
         self._above_zero("rate_hz")
-        self._not_negative("noise_std_nt", "resolution_nt")
+        self._not_negative(
+            "noise_density_nt",
+            "flicker_corner_hz",
+            "resolution_nt",
+            "bandwidth_hz",
+            "gradient_max_nt_m",
+            "gradient_relock_nt_m",
+            "latched_std_nt",
+            "vector_noise_density_nt",
+        )
+        self._within("dead_zone_axis", 0, math.pi / 2)
+        self._within("dead_zone_plane", 0, math.pi / 2)
+        self._within("dropout_share", 0, 1)
+        low, high = self.gradient_relock_nt_m, self.gradient_max_nt_m
+        self._require("gradient_relock_nt_m", low <= high, f"not be above gradient_max_nt_m {high!r}", low)
+        self._require("vector_scale", min(self.vector_scale) > -1, "be above -1", self.vector_scale)
+
+    @property
+    def noise_std_nt(self) -> float:
+        """Standard deviation of the white noise of one reading at its own rate [nT]."""
+        return self.noise_density_nt * math.sqrt(self.rate_hz / 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -375,6 +450,9 @@ class DriveSpec(Spec):
     wheel_separation_error_std: float = 0.003
     """Relative standard deviation of their separation about the nominal one, drawn once a run; ours."""
 
+    wheel_errors: Vec2 = (0.0, 0.0)
+    """Relative error of radius and separation that the session's runs share, beside what each run draws."""
+
     command_timeout_s: float = 0.5
     """The robot stops when no command came for this long [s]."""
 
@@ -430,9 +508,9 @@ class DriveSpec(Spec):
 class PlatformFieldSpec(Spec):
     """The robot's own magnetic field at its magnetometer, in base_link axes.
 
-    B = (1 + S) b + h + E db/dt + (terms of motors, LiDAR and electronics), b the ambient field in
-    base_link axes: the permanent, induced and eddy parts of Tolles and Lawson (1950), then the
-    currents that an aircraft need not mind.
+    B = (1 + S) b + h + E db/dt + (terms of motors, LiDAR, electronics and iron that turns), b the ambient
+    field in base_link axes: the permanent, induced and eddy parts of Tolles and Lawson (1950), then what an
+    aircraft need not mind. `magtwin.sim.interference` says how each enters.
     """
 
     hard_iron_nt: Vec3 = ZERO3
@@ -444,17 +522,64 @@ class PlatformFieldSpec(Spec):
     eddy_s: Matrix3 = ZERO9
     """Eddy-current part E, by rows [nT per nT/s]."""
 
-    left_motor_nt_s: Vec3 = ZERO3
-    """Field of the left motor for each rad/s of its wheel [nT s]."""
+    left_motor_nt_nm: Vec3 = ZERO3
+    """Field of the left motor for each N m of torque at its wheel, which its current is in proportion to
+    [nT/(N m)]."""
 
-    right_motor_nt_s: Vec3 = ZERO3
-    """Field of the right motor for each rad/s of its wheel [nT s]."""
+    right_motor_nt_nm: Vec3 = ZERO3
+    """Field of the right motor for each N m of torque at its wheel [nT/(N m)]."""
 
     lidar_nt: Vec3 = ZERO3
-    """Field of the LiDAR's supply while it is on [nT]."""
+    """Steady field of the LiDAR and its supply while it is on [nT]."""
+
+    lidar_cos_nt: Vec3 = ZERO3
+    """Field of the LiDAR's turning motor when its angle is 0 [nT]; at angle a it is cos(a) of this."""
+
+    lidar_sin_nt: Vec3 = ZERO3
+    """Field of the LiDAR's turning motor a quarter turn on [nT]; at angle a it is sin(a) of this."""
+
+    lidar_phase: float = 0.0
+    """Angle of the LiDAR's motor at the start of a run [rad]."""
 
     battery_nt: Vec3 = ZERO3
-    """Field of the supply current, for each ampere above that at full charge [nT/A]."""
+    """Field of the supply current, for each ampere above that at rest with a full pack [nT/A]."""
+
+    left_wheel_moment: float = 0.0
+    """Magnetic moment of the left wheel's iron across its axle [A m2]: it turns with the wheel."""
+
+    left_wheel_phase: float = 0.0
+    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
+
+    right_wheel_moment: float = 0.0
+    """Magnetic moment of the right wheel's iron across its axle [A m2]."""
+
+    right_wheel_phase: float = 0.0
+    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
+
+    caster_moment: float = 0.0
+    """Magnetic moment of the caster's iron across the way [A m2]; it rolls as the robot drives."""
+
+    caster_phase: float = 0.0
+    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
+
+    p_base_caster: Vec3 = ZERO3
+    """Middle of the caster in base_link [m]."""
+
+    caster_radius_m: float = 0.01
+    """Radius that the caster rolls on [m]."""
+
+    hard_iron_std_nt: float = 0.0
+    """Standard deviation of each part of h from one day to another [nT]: what handling, docking and tools
+    magnetise or demagnetise."""
+
+    current_std: float = 0.0
+    """Relative standard deviation of what motors, LiDAR and battery add, from one day to another: wires lie
+    otherwise."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._above_zero("caster_radius_m")
+        self._not_negative("hard_iron_std_nt", "current_std")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -187,7 +187,8 @@ def simulate(
         "map_sha256": sha256(twin.scene.map_layer),
     }
     if network:
-        noise = twin.scene.robot.magnetometer.noise_std_nt
+        rate = twin.scene.robot.magnetometer.rate_hz if rate_hz is None else rate_hz
+        noise = twin.scene.robot.magnetometer.noise_density_nt * np.sqrt(rate / 2)
         run = run.with_columns(
             b_sd_nt=np.full(run.rows, np.hypot(network.residual_sd_nt, noise)),
             flag_out_of_distribution=network.outside_training(run),

@@ -154,7 +154,7 @@ above_zero, not_negative = st.floats(1e-6, 1e6), st.floats(0, 1e6)
         MagnetometerSpec,
         p_link_sensor=st.just((0.0, 0.0, 0.01)),
         rate_hz=above_zero,
-        noise_std_nt=not_negative,
+        noise_density_nt=not_negative,
         resolution_nt=not_negative,
     ),
     imu=st.builds(ImuSpec, rate_hz=above_zero, gyro_noise_std=not_negative),

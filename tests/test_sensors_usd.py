@@ -11,6 +11,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.names import RefusedError
 from magtwin.spec import (
+    MAGNETOMETER_KINDS,
     BatterySpec,
     DriveSpec,
     ImuSpec,
@@ -61,8 +62,11 @@ def stage_with_wheels(spec: DriveSpec) -> Usd.Stage:
         MagnetometerSpec,
         **mount,
         rate_hz=above_zero,
-        noise_std_nt=not_negative,
+        noise_density_nt=not_negative,
         resolution_nt=not_negative,
+        kind=st.sampled_from(MAGNETOMETER_KINDS),
+        vector_bias_nt=vec3,
+        vector_misalignment=st.tuples(*[number] * 9),
         network=st.sampled_from([None, Path(__file__)]),
         network_sha256=text,
         inputs=st.lists(text, max_size=4).map(tuple),
@@ -133,9 +137,13 @@ def test_a_drive_survives_the_stage(data):
 @unhurried
 @given(st.data())
 def test_a_platform_field_survives_the_stage(data):
-    spec = PlatformFieldSpec(
-        **{f.name: tuple(data.draw(number) for _ in f.default) for f in fields(PlatformFieldSpec)}
-    )
+    figures = {
+        f.name: tuple(data.draw(number) for _ in f.default)
+        if isinstance(f.default, tuple)
+        else data.draw(above_zero)
+        for f in fields(PlatformFieldSpec)
+    }
+    spec = PlatformFieldSpec(**figures)
     stage = stage_with_link()
     assert sensors.read_platform(sensors.define_platform(stage.GetPrimAtPath("/robot"), spec)) == spec
 
@@ -195,7 +203,9 @@ def test_every_figure_is_authored_also_one_that_equals_the_schemas_fallback():
 
 def test_a_layer_over_a_sensor_holds_only_what_it_changes():
     stage = stage_with_link()
-    spec = MagnetometerSpec(link="some_link", rate_hz=100.0, noise_std_nt=1.0, p_link_sensor=(0.1, 0.0, 0.0))
+    spec = MagnetometerSpec(
+        link="some_link", rate_hz=100.0, noise_density_nt=1.0, p_link_sensor=(0.1, 0.0, 0.0)
+    )
     sensors.define_magnetometer(stage, f"{LINK}/mag", spec)
     imu, lidar = ImuSpec(link="some_link", rate_hz=61.0), LidarSpec(link="some_link", range_min_m=0.2)
     sensors.define_imu(stage, f"{LINK}/imu", imu)
@@ -206,9 +216,9 @@ def test_a_layer_over_a_sensor_holds_only_what_it_changes():
     sensors.define_imu(stage, f"{LINK}/imu", imu)
     sensors.define_lidar(stage, f"{LINK}/lidar", lidar)
     assert session.empty
-    sensors.define_magnetometer(stage, f"{LINK}/mag", replace(spec, noise_std_nt=2.0))
+    sensors.define_magnetometer(stage, f"{LINK}/mag", replace(spec, noise_density_nt=2.0))
     attributes = session.GetPrimAtPath(f"{LINK}/mag").attributes
-    assert [a.name for a in attributes] == ["magtwin:magnetometer:noiseStdNt"]
+    assert [a.name for a in attributes] == ["magtwin:magnetometer:noiseDensityNt"]
 
 
 def test_a_network_is_named_relative_to_the_edited_layer_and_moves_with_it(tmp_path):

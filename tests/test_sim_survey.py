@@ -29,7 +29,7 @@ SOURCE = SourceSpec(name="pipe", p_world=(0.4, -0.2, -0.5), m_world=(2.0, 5.0, -
 
 
 def scene(**robot):
-    sensor = MagnetometerSpec(noise_std_nt=0.0, resolution_nt=0.0)
+    sensor = MagnetometerSpec(noise_density_nt=0.0, resolution_nt=0.0)
     parts = {"p_base_magnetometer": (0.05, -0.02, 0.4), "magnetometer": sensor, **robot}
     return Scene(
         name="hall",
@@ -69,8 +69,8 @@ def test_hard_iron_turns_with_the_robot():
 def test_motors_lidar_battery_and_eddy_currents_are_not_in_the_map():
     moving = PlatformFieldSpec(
         eddy_s=(0.01,) * 9,
-        left_motor_nt_s=(50, 50, 50),
-        right_motor_nt_s=(50, 50, 50),
+        left_motor_nt_nm=(50, 50, 50),
+        right_motor_nt_nm=(50, 50, 50),
         lidar_nt=(500, 500, 500),
         battery_nt=(90, 90, 90),
     )
@@ -95,7 +95,7 @@ def test_a_finer_map_comes_nearer_to_the_field_by_the_square_of_its_spacing():
 
 
 def test_readings_have_the_sensors_noise_and_resolution_and_the_map_its_variance():
-    noisy = scene(magnetometer=MagnetometerSpec(noise_std_nt=5.0, resolution_nt=0.5))
+    noisy = scene(magnetometer=MagnetometerSpec(noise_density_nt=5.0 / np.sqrt(135 / 2), resolution_nt=0.5))
     exact = survey(scene(), rng=rng()).values_nt
     one = survey(noisy, rng=rng())
     assert_array_equal(one.values_nt, np.rint(one.values_nt / 0.5) * 0.5)
@@ -106,7 +106,7 @@ def test_readings_have_the_sensors_noise_and_resolution_and_the_map_its_variance
 
 
 def test_one_generator_gives_one_map():
-    noisy = scene(magnetometer=MagnetometerSpec(noise_std_nt=5.0))
+    noisy = scene(magnetometer=MagnetometerSpec(noise_density_nt=5.0 / np.sqrt(135 / 2)))
     assert survey(noisy, rng=rng()) == survey(noisy, rng=rng())
     assert survey(noisy, rng=rng()) != survey(noisy, rng=np.random.default_rng(1))
 

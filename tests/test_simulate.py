@@ -84,11 +84,13 @@ def test_facts_tell_how_the_run_came_about():
     assert dict(run.facts) == {
         "scene": "known",
         "path": "line",
+        "controller": "follower",
         "speed_m_s": 0.3,
         "rate_hz": 135.0,
         "duration_s": 2.0,
         "outside": "nan",
         "lidar": "on",
+        "magnetometer": "physical",
     }
 
 
@@ -279,7 +281,8 @@ def test_a_network_gives_the_disturbance_from_columns_that_are_filled():
 
     run = drive(SURVEYED, disturbance_nt=network)
     assert len(seen) == 1
-    late = {"b_disturbance_nt", "b_total_nt", "b_measured_nt"}
+    late = {"b_disturbance_nt", "b_total_nt", "b_noise_nt", "b_measured_nt"}
+    late |= {"b_vector_measured_nt", "flag_lost_lock"}
     assert set(seen[0]) == set(COLUMNS) - late
     for name in set(COLUMNS) - late:
         assert_array_equal(seen[0][name], run[name])
@@ -295,7 +298,7 @@ def test_with_a_network_the_exact_field_is_still_given_where_it_is_known():
 
 
 def test_a_reading_is_the_total_with_noise_rounded_to_the_resolution():
-    spec = MagnetometerSpec(noise_std_nt=5.0, resolution_nt=0.01)
+    spec = MagnetometerSpec(noise_density_nt=5.0 / np.sqrt(135 / 2), resolution_nt=0.01)
     run = drive(with_robot(KNOWN, magnetometer=spec), path_named("figure8"))
     noise = run["b_measured_nt"] - run["b_total_nt"]
     assert noise.std() == pytest.approx(5.0, rel=4 / np.sqrt(2 * run.rows))

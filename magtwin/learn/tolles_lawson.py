@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -12,10 +12,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.files import existing
+from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
 from magtwin.run import Run
-from magtwin.spec import PlatformFieldSpec
+from magtwin.sim.drive import wheel_rates
+from magtwin.sim.interference import (
+    TORQUE_S,
+    ambient_field_nt,
+    lidar_angle,
+    rest_current_a,
+    sensor_places,
+    turning_iron_nt,
+    wheel_torques_nm,
+)
+from magtwin.spec import PlatformFieldSpec, RobotSpec, Scene
 
 Array = NDArray[np.float64]
 
@@ -286,29 +297,37 @@ def fit_platform(
     b_measured_nt: ArrayLike,
     rate_hz: float,
     *,
-    wheel_rate: ArrayLike | None = None,
+    motor_nm: ArrayLike | None = None,
     lidar_on: ArrayLike | None = None,
+    lidar_angle: ArrayLike | None = None,
     excess_current_a: ArrayLike | None = None,
+    wheel_angle: ArrayLike | None = None,
+    robot: RobotSpec | None = None,
 ) -> PlatformFieldSpec:
-    """The platform's vector field by least squares: hard and soft iron, eddy currents, and its supplies.
+    """The platform's vector field by least squares: iron, eddy currents, its supplies, and iron that turns.
 
-    B - b = S b + h + E db/dt + m_l w_l + m_r w_r + l on + c i, the vector form of Tolles and Lawson's model
-    with the currents of a robot; each axis on its own.
+    B - b = S b + h + E db/dt + m_l T_l + m_r T_r + on (l + l_c cos a + l_s sin a) + c i + (turning iron), the
+    vector form of Tolles and Lawson's model with the currents and the wheels of a robot, linear in all that
+    is sought; see `magtwin.sim.interference`.
 
     Args:
         b_ambient_nt: Field b without the robot, in base_link axes [nT], shape (N, 3).
         b_measured_nt: Field B with it, in base_link axes [nT], shape (N, 3).
         rate_hz: Readings a second [Hz].
-        wheel_rate: Rates of left and right wheel [rad/s], shape (N, 2); without it they have no part.
+        motor_nm: Torques of left and right wheel [N m], shape (N, 2); without them they have no part.
         lidar_on: Whether the LiDAR is on, shape (N,); without it that has no part.
-        excess_current_a: Supply current above that at full charge [A], shape (N,); without it, no part.
+        lidar_angle: Angle of its motor [rad], shape (N,); without it only its steady field is sought.
+        excess_current_a: Supply current above that at rest with a full pack [A], shape (N,); without it, no
+            part.
+        wheel_angle: Angles turned by left and right wheel [rad], shape (N, 2); without them no iron turns.
+        robot: Where its wheels, its caster and its magnetometer are; goes with `wheel_angle`.
 
     Returns:
-        The platform's figures. Where the readings cannot tell two of them apart, such as h and S along an
-        axis on which b never changes, the smallest that explain them.
+        The platform's figures; moments are positive. Where the readings cannot tell two of them apart, such
+        as h and S along an axis on which b never changes, the smallest that explain them.
 
     Raises:
-        RefusedError: Shapes do not fit, or a value is not finite.
+        RefusedError: Shapes do not fit, a value is not finite, or there are wheel angles and no robot.
     """
     ambient, measured = np.asarray(b_ambient_nt, float), np.asarray(b_measured_nt, float)
     n = len(ambient)
@@ -317,31 +336,136 @@ def fit_platform(
             f"b_ambient_nt and b_measured_nt must have one shape (N, 3), N at least 3, got {ambient.shape} "
             f"and {measured.shape}"
         )
-    columns = [ambient, np.ones((n, 1)), np.gradient(ambient, 1 / rate_hz, axis=0)]
-    for name, given, width in (
-        ("wheel_rate", wheel_rate, 2),
-        ("lidar_on", lidar_on, 1),
-        ("excess_current_a", excess_current_a, 1),
-    ):
-        part = np.zeros((n, width)) if given is None else np.asarray(given, float).reshape(-1, width)
-        if len(part) != n:
-            raise RefusedError(f"{name} must have {n} rows, got {len(part)}")
-        columns.append(part)
-    matrix = np.hstack(columns)
-    if not (np.all(np.isfinite(matrix)) and np.all(np.isfinite(measured))):
+    given = {
+        "motor_nm": (motor_nm, 2),
+        "lidar_on": (lidar_on, 1),
+        "lidar_angle": (lidar_angle, 1),
+        "excess_current_a": (excess_current_a, 1),
+        "wheel_angle": (wheel_angle, 2),
+    }
+    part: dict[str, Array] = {}
+    for name, (values, width) in given.items():
+        part[name] = np.zeros((n, width)) if values is None else np.asarray(values, float).reshape(-1, width)
+        if len(part[name]) != n:
+            raise RefusedError(f"{name} must have {n} rows, got {len(part[name])}")
+    on, angle = part["lidar_on"], part["lidar_angle"]
+    turning = on * np.hstack([np.cos(angle), np.sin(angle)]) * (lidar_angle is not None)
+    matrix = np.hstack(
+        [
+            ambient,
+            np.ones((n, 1)),
+            np.gradient(ambient, 1 / rate_hz, axis=0),
+            part["motor_nm"],
+            on,
+            turning,
+            part["excess_current_a"],
+        ]
+    )
+    iron = np.zeros((n, 3, 0)) if wheel_angle is None else _turning_iron(part["wheel_angle"], robot)
+    if not all(np.all(np.isfinite(values)) for values in (matrix, iron, measured)):
         raise RefusedError("every field and signal that a platform is fitted to must be finite")
-    size = np.linalg.norm(matrix, axis=0)
-    size[size == 0] = 1.0
-    found = np.linalg.lstsq(matrix / size, measured - ambient, rcond=1e-10)[0] / size[:, None]
+    found, moments = _least_squares(matrix, iron, measured - ambient)
     row = lambda k: tuple(found[k].tolist())  # noqa: E731
+    wheels: dict[str, Any] = {}
+    if robot is not None and wheel_angle is not None:
+        up, forwards = moments.reshape(3, 2).T
+        wheels = {f"{name}_moment": float(m) for name, m in zip(IRON, np.hypot(up, forwards), strict=True)}
+        phases = np.arctan2(forwards, up) % (2 * np.pi)
+        wheels |= {f"{name}_phase": float(phase) for name, phase in zip(IRON, phases, strict=True)}
+        wheels |= {
+            "p_base_caster": robot.platform.p_base_caster,
+            "caster_radius_m": robot.platform.caster_radius_m,
+        }
     return PlatformFieldSpec(
         soft_iron=tuple(found[0:3].T.ravel().tolist()),  # type: ignore[arg-type]
         hard_iron_nt=row(3),
         eddy_s=tuple(found[4:7].T.ravel().tolist()),  # type: ignore[arg-type]
-        left_motor_nt_s=row(7),
-        right_motor_nt_s=row(8),
+        left_motor_nt_nm=row(7),
+        right_motor_nt_nm=row(8),
         lidar_nt=row(9),
-        battery_nt=row(10),
+        lidar_cos_nt=row(10),
+        lidar_sin_nt=row(11),
+        battery_nt=row(12),
+        **wheels,
+    )
+
+
+IRON = ("left_wheel", "right_wheel", "caster")
+"""What turns, in the order of `magtwin.sim.interference.turning_iron_basis`."""
+
+
+def _turning_iron(wheel_angle: Array, robot: RobotSpec | None) -> Array:
+    """Field of unit moments, up and forwards at the start, in each of `IRON` [nT], shape (N, 3, 6)."""
+    if robot is None:
+        raise RefusedError("wheel_angle needs the robot, which says where its wheels are")
+    unit = {f"{name}_{what}": 0.0 for name in IRON for what in ("moment", "phase")}
+    fields = []
+    for name in IRON:
+        for phase in (0.0, np.pi / 2):
+            platform = replace(robot.platform, **{**unit, f"{name}_moment": 1.0, f"{name}_phase": phase})
+            fields.append(turning_iron_nt(replace(robot, platform=platform), wheel_angle))
+    return np.stack(fields, axis=-1)
+
+
+def _least_squares(matrix: Array, iron: Array, b: Array) -> tuple[Array, Array]:
+    """Coefficients (K, 3) of regressors that each axis has its own for, and (M,) of those that all share.
+
+    min |b - A c - T m|^2: the shared ones on what the others leave, then the others.
+
+    Args:
+        matrix: A, shape (N, K).
+        iron: T, shape (N, 3, M).
+        b: Shape (N, 3).
+    """
+    size = np.linalg.norm(matrix, axis=0)
+    size[size == 0] = 1.0
+    scaled = matrix / size
+    left, strength, _ = np.linalg.svd(scaled, full_matrices=False)
+    basis = left[:, strength > 1e-10 * strength[0]]
+    moments = np.zeros(iron.shape[2])
+    if iron.size:
+        rest = [
+            x - np.einsum("nk,k...->n...", basis, np.einsum("nk,n...->k...", basis, x)) for x in (iron, b)
+        ]
+        moments = np.linalg.lstsq(rest[0].reshape(-1, iron.shape[2]), rest[1].ravel(), rcond=1e-10)[0]
+    found = np.linalg.lstsq(scaled, b - iron @ moments, rcond=1e-10)[0] / size[:, None]
+    return found, moments
+
+
+def platform_of_run(run: Run, scene: Scene) -> PlatformFieldSpec:
+    """`fit_platform` on a calibration run: its b_vector_nt, in a lab whose own field is known.
+
+    The run should turn both ways, change its speed, and have the LiDAR on for a while.
+
+    Args:
+        run: What was recorded.
+        scene: The lab, and the robot that the run is of, but for its platform.
+
+    Returns:
+        The platform's figures.
+
+    Raises:
+        RefusedError: The run has no vectors, its readings are not evenly spaced, or the scene has no
+            Earth's field.
+    """
+    rows, rate = _unbroken(run)
+    robot, t = scene.robot, run["t"][rows]
+    pose = np.column_stack([run["p_world_base"][rows, :2], run["yaw"][rows]])
+    turn = quat_from_yaw(pose[:, 2])
+    ambient = rotate(quat_conjugate(turn), ambient_field_nt(scene, sensor_places(robot, pose)))
+    wheels = wheel_rates(run["v_base"][rows, 0], run["w_base"][rows, 2], robot.drive)
+    late = max(1, round(TORQUE_S * rate))
+    before = np.concatenate([np.repeat(wheels[:1], late, axis=0), wheels])[: len(wheels)]
+    return fit_platform(
+        ambient,
+        rotate(np.array(robot.q_base_magnetometer_xyzw), run["b_vector_nt"][rows]),
+        rate,
+        motor_nm=wheel_torques_nm(robot.battery, robot.drive, wheels, (wheels - before) * (rate / late)),
+        lidar_on=run["lidar_on"][rows],
+        lidar_angle=lidar_angle(replace(robot, platform=PlatformFieldSpec()), t),
+        excess_current_a=run["battery_a"][rows] - rest_current_a(robot.battery),
+        wheel_angle=run["wheel_angle"][rows],
+        robot=robot,
     )
 
 

@@ -1,15 +1,35 @@
 """Fields at the magnetometer: the lab's, and what the robot adds to it."""
 
+import math
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.bodies import Bodies
+from magtwin.field.sources import dipole_field_nt
 from magtwin.names import RefusedError
-from magtwin.spec import BatterySpec, EarthFieldSpec, PlatformFieldSpec, Scene, SourceSpec
+from magtwin.sim.battery import current_a
+from magtwin.sim.drive import Moment, wheel_rates
+from magtwin.sim.sensors import Moving, moment_at
+from magtwin.spec import (
+    BatterySpec,
+    DriveSpec,
+    EarthFieldSpec,
+    PlatformFieldSpec,
+    RobotSpec,
+    Scene,
+    SourceSpec,
+)
 
 Array = NDArray[np.float64]
+
+TORQUE_S = 0.05
+"""Time over which a wheel's acceleration is taken [s]: as long as its motor's current takes to follow."""
+
+CREEP = 0.05
+"""Rate of a wheel from which its friction is whole [rad/s]; below, it is in proportion."""
 
 
 def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
@@ -48,6 +68,29 @@ def ambient_field_and_rate_nt(scene: Scene, p_world: ArrayLike, v_world: ArrayLi
     return field + earth, rate
 
 
+def ambient_gradient_nt_m(scene: Scene, p_world: ArrayLike) -> Array:
+    """How steep the lab's field is: the size of the gradient of its magnitude, |grad |B||.
+
+    Args:
+        scene: A scene whose Earth's field is known.
+        p_world: Points [m], shape (..., 3).
+
+    Returns:
+        Gradient [nT/m], shape (...).
+
+    Raises:
+        RefusedError: As for `ambient_field_nt`.
+    """
+    earth, bodies = _known(scene)
+    p = np.asarray(p_world, float)
+    along = np.eye(3).reshape(3, *(1,) * (p.ndim - 1), 3)
+    each, at = np.broadcast_arrays(along, p[None])
+    field, slope = bodies.field_and_rate_nt(at, each)
+    total = field[0] + earth
+    size = np.sqrt(np.sum(total * total, axis=-1))
+    return np.asarray(np.sqrt(np.sum(np.square(np.sum(slope * total, axis=-1) / size), axis=0)))
+
+
 def _known(scene: Scene) -> tuple[Array, Bodies]:
     """The Earth's field [nT] (3,), and everything that is magnetised."""
     if scene.earth is None:
@@ -73,49 +116,234 @@ def platform_field_nt(
     platform: PlatformFieldSpec,
     b_body: ArrayLike,
     *,
-    b_rate: ArrayLike,
-    wheel_rate: ArrayLike,
-    lidar_on: ArrayLike,
-    battery_a: ArrayLike,
+    b_rate: ArrayLike = 0.0,
+    motor_nm: ArrayLike = (0.0, 0.0),
+    lidar_on: ArrayLike = False,
+    lidar_angle: ArrayLike = 0.0,
+    battery_a: ArrayLike = 0.0,
 ) -> Array:
-    """The whole field at the magnetometer, the robot's own part included.
+    """The field at the magnetometer, the robot's own part included but for iron that turns.
 
-    B = (1 + S) b + h + E db/dt + m_l w_l + m_r w_r + l on + c i: induced, permanent and eddy parts
-    after Tolles and Lawson (1950), then the motors, the LiDAR's supply and the battery's current.
+    B = (1 + S) b + h + E db/dt + m_l T_l + m_r T_r + on (l + l_c cos a + l_s sin a) + c i: induced, permanent
+    and eddy parts after Tolles and Lawson (1950), then the motors, whose currents are in proportion to their
+    torques T, the LiDAR and its motor, and the supply current. A robot at rest is what the defaults say.
 
     Args:
-        platform: S, h, E, m_l, m_r, l and c.
+        platform: S, h, E, m_l, m_r, l, l_c, l_s and c.
         b_body: Ambient field b in base_link axes [nT], shape (N, 3).
         b_rate: Its rate of change in base_link axes, turning of the robot included [nT/s], shape (N, 3).
-        wheel_rate: Rates w of the left and right wheel [rad/s], shape (N, 2).
+        motor_nm: Torques T of the left and right wheel [N m], shape (N, 2); see `wheel_torques_nm`.
         lidar_on: Whether the LiDAR spins, shape (N,).
-        battery_a: Supply current above that at full charge i [A], shape (N,); see `excess_current_a`.
+        lidar_angle: Angle a of its motor [rad], shape (N,).
+        battery_a: Supply current above that at rest with a full pack i [A], shape (N,); see `rest_current_a`.
 
     Returns:
         Field in base_link axes [nT], shape (N, 3).
     """
-    b, rate = np.asarray(b_body, float), np.asarray(b_rate, float)
-    wheels, on = np.asarray(wheel_rate, float), np.asarray(lidar_on, float)
-    motors = np.array([platform.left_motor_nt_s, platform.right_motor_nt_s])
-    supply = on[..., None] * platform.lidar_nt + np.asarray(battery_a, float)[..., None] * platform.battery_nt
-    return (
-        b
-        + b @ np.reshape(platform.soft_iron, (3, 3)).T
-        + platform.hard_iron_nt
-        + rate @ np.reshape(platform.eddy_s, (3, 3)).T
-        + wheels @ motors
-        + supply
+    b = np.asarray(b_body, float)
+    field = b + b @ np.reshape(platform.soft_iron, (3, 3)).T + platform.hard_iron_nt
+    if any(platform.eddy_s):
+        field += np.broadcast_to(b_rate, b.shape) @ np.reshape(platform.eddy_s, (3, 3)).T
+    motors = np.array([platform.left_motor_nt_nm, platform.right_motor_nt_nm])
+    if motors.any():
+        field += np.asarray(motor_nm, float) @ motors
+    on = np.asarray(lidar_on, float)[..., None]
+    field += on * platform.lidar_nt
+    if any(platform.lidar_cos_nt) or any(platform.lidar_sin_nt):
+        angle = np.asarray(lidar_angle, float)[..., None]
+        field += on * (np.cos(angle) * platform.lidar_cos_nt + np.sin(angle) * platform.lidar_sin_nt)
+    return np.asarray(field + np.asarray(battery_a, float)[..., None] * platform.battery_nt)
+
+
+def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
+    """Field of the iron in wheels and caster, dipoles that turn with them about base_link's y.
+
+    The wheels stand beside base_link's origin, at half their separation and at their radius above the
+    floor. A moment is up at the angle 0 and forwards a quarter turn on. The caster is taken to roll
+    straight on, by the mean way of the wheels: on curves its axis turns too, which is left out.
+
+    Args:
+        robot: Its platform, the size of its drive, and where its magnetometer is.
+        wheel_angle: Angles turned by the left and right wheel since the start [rad], shape (N, 2).
+
+    Returns:
+        Field in base_link axes [nT], shape (N, 3).
+    """
+    platform, angle = robot.platform, np.asarray(wheel_angle, float)
+    field = np.zeros((len(angle), 3))
+    moments = (platform.left_wheel_moment, platform.right_wheel_moment, platform.caster_moment)
+    phases = (platform.left_wheel_phase, platform.right_wheel_phase, platform.caster_phase)
+    rolled = angle.mean(axis=1) * robot.drive.wheel_radius_m / platform.caster_radius_m
+    for k, (m, phase, turned) in enumerate(zip(moments, phases, (*angle.T, rolled), strict=True)):
+        if m:
+            (up, forwards), now = turning_iron_basis(robot)[k], turned + phase
+            field += m * (np.cos(now)[:, None] * up + np.sin(now)[:, None] * forwards)
+    return field
+
+
+def turning_iron_basis(robot: RobotSpec) -> Array:
+    """Field at the magnetometer of a moment of 1 A m2 in left wheel, right wheel and caster.
+
+    Returns:
+        Fields of a moment up and of one forwards [nT], shape (3, 2, 3).
+
+    Raises:
+        RefusedError: The magnetometer is in the middle of one of them.
+    """
+    side, axle = robot.drive.wheel_separation_m / 2, robot.drive.wheel_radius_m - robot.base_height_m
+    places = np.array([(0.0, side, axle), (0.0, -side, axle), robot.platform.p_base_caster])
+    apart = np.asarray(robot.p_base_magnetometer) - places
+    if not np.all(np.linalg.norm(apart, axis=1) > 0):
+        raise RefusedError(
+            f"robot {robot.name!r}: its magnetometer, at {robot.p_base_magnetometer} of base_link, is in the "
+            "middle of a wheel or of the caster, whose iron is magnetised; move one of them"
+        )
+    directions = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 0.0)])
+    return np.array([[dipole_field_nt(r, np.zeros((1, 3)), d[None]) for d in directions] for r in apart])
+
+
+def wheel_torques_nm(
+    battery: BatterySpec, drive: DriveSpec, rate: ArrayLike, acceleration: ArrayLike
+) -> Array:
+    """Torque at each wheel: r (F / 2 sign w + m r / 2 dw/dt), half the robot's drag and inertia each.
+
+    That is what `magtwin.sim.battery` takes power for. The drag goes to nought in proportion below `CREEP`.
+
+    Args:
+        battery: Drag F [N] and mass m [kg].
+        drive: Wheel radius r.
+        rate: Rates w of the wheels [rad/s], shape (..., 2).
+        acceleration: Their accelerations dw/dt [rad/s2], shape (..., 2).
+
+    Returns:
+        Torques [N m], shape (..., 2).
+    """
+    friction = battery.drag_n / 2 * np.clip(np.asarray(rate, float) / CREEP, -1, 1)
+    inertia = battery.mass_kg / 2 * drive.wheel_radius_m * np.asarray(acceleration, float)
+    return np.asarray(drive.wheel_radius_m * (friction + inertia))
+
+
+def rest_current_a(battery: BatterySpec) -> float:
+    """Supply current of a robot that stands with a full pack and its LiDAR off [A], as when it surveys."""
+    if battery.model == "linear":
+        return battery.load_w / battery.voltage_full_v
+    return float(current_a(battery, battery.load_w, 1.0))
+
+
+def field_at_sensor_nt(
+    scene: Scene, motion: Moving, t: ArrayLike, *, true: Moment, lidar_on: ArrayLike, supply_a: ArrayLike
+) -> Array:
+    """Exact field at the magnetometer of a robot that drives: the lab's, and its own.
+
+    The rate of the ambient field in base_link axes is d/dt (R^T B) = R^T dB/dt - w x R^T B, with
+    dB/dt = (u . grad) B for the magnetometer's velocity u: that of the twist which holds from t on,
+    whatever other times are asked.
+
+    Args:
+        scene: A scene whose Earth's field is known.
+        motion: What the robot did.
+        t: Times of the readings, ascending [s], shape (N,).
+        true: The motion at these times.
+        lidar_on: Whether the LiDAR spins, shape (N,).
+        supply_a: Current drawn from the battery [A], shape (N,).
+
+    Returns:
+        Field in base_link axes [nT], shape (N, 3).
+    """
+    robot, t = scene.robot, np.asarray(t, float)
+    cos, sin = np.cos(true.pose[:, 2]), np.sin(true.pose[:, 2])
+    p_world = sensor_places(robot, true.pose)
+    x, y = true.pose[:, 0], true.pose[:, 1]
+    v_world = np.column_stack(
+        [
+            true.v * cos - true.w * (p_world[:, 1] - y),
+            true.v * sin + true.w * (p_world[:, 0] - x),
+            np.zeros(len(t)),
+        ]
+    )
+    b_world, change = ambient_field_and_rate_nt(scene, p_world, v_world)
+    b_base = _into_base(b_world, cos, sin)
+    b_rate = _into_base(change, cos, sin)
+    b_rate[:, 0] += true.w * b_base[:, 1]
+    b_rate[:, 1] -= true.w * b_base[:, 0]
+    field = platform_field_nt(
+        robot.platform,
+        b_base,
+        b_rate=b_rate,
+        motor_nm=_torques(robot, motion, t, true),
+        lidar_on=lidar_on,
+        lidar_angle=lidar_angle(robot, t),
+        battery_a=np.asarray(supply_a, float) - rest_current_a(robot.battery),
+    )
+    return field + turning_iron_nt(robot, true.wheel_angle)
+
+
+def lidar_angle(robot: RobotSpec, t: ArrayLike) -> Array:
+    """Angle of the LiDAR's motor at times [s], whether it spins or not [rad]: its rate, from its phase on."""
+    turned = 2 * math.pi * robot.lidar.scan_rate_hz * np.asarray(t, float)
+    return np.asarray(turned + robot.platform.lidar_phase)
+
+
+def sensor_places(robot: RobotSpec, pose: Array) -> Array:
+    """Where the magnetometer is for poses x, y, yaw of base_link (N, 3): points in world [m], (N, 3)."""
+    x, y, yaw = pose.T
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    px, py, pz = robot.p_base_magnetometer
+    return np.column_stack(
+        [x + px * cos - py * sin, y + px * sin + py * cos, np.full(len(x), robot.base_height_m + pz)]
     )
 
 
-def excess_current_a(battery: BatterySpec, voltage_v: ArrayLike) -> Array:
-    """Supply current above that at full charge, for a load of constant power: P / U - P / U_full.
+def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> PlatformFieldSpec:
+    """The platform as it is on one day.
+
+    Its permanent field differs from day to day by `hard_iron_std_nt` along each axis, what its currents make
+    by the factor 1 + `current_std` N(0, 1), one each for motors, LiDAR and battery, and wheels, caster and
+    LiDAR begin at any angle. So a map that was surveyed on one day errs on another by a constant and by a
+    wave over heading: of the TurtleBot 4 in Florida, whose 200 nT each way are along a field that dips 58
+    deg, by 170 nT and by an amplitude of 150 nT (root mean squares).
 
     Args:
-        battery: The pack and its load.
-        voltage_v: Voltage U [V], any shape.
+        platform: The platform as its asset has it: that of the mean day, and of the survey.
+        rng: Source of the day.
 
     Returns:
-        Current [A], the same shape.
+        The platform with these figures drawn; its own spreads are 0 then, as the day is.
     """
-    return battery.load_w / np.asarray(voltage_v, float) - battery.load_w / battery.voltage_full_v
+    hard_iron = np.add(platform.hard_iron_nt, platform.hard_iron_std_nt * rng.standard_normal(3))
+    motors, lidar, battery = 1 + platform.current_std * rng.standard_normal(3)
+    angles = rng.uniform(0, 2 * math.pi, 4).tolist()
+    scaled = {
+        "left_motor_nt_nm": motors,
+        "right_motor_nt_nm": motors,
+        "lidar_nt": lidar,
+        "lidar_cos_nt": lidar,
+        "lidar_sin_nt": lidar,
+        "battery_nt": battery,
+    }
+    fields = {name: tuple((np.array(getattr(platform, name)) * by).tolist()) for name, by in scaled.items()}
+    names = ("left_wheel_phase", "right_wheel_phase", "caster_phase", "lidar_phase")
+    return replace(
+        platform,
+        hard_iron_nt=tuple(hard_iron.tolist()),
+        hard_iron_std_nt=0.0,
+        current_std=0.0,
+        **fields,  # type: ignore[arg-type]
+        **dict(zip(names, angles, strict=True)),
+    )
+
+
+def _torques(robot: RobotSpec, motion: Moving, t: Array, true: Moment) -> Array:
+    """Torques of the wheels at times, their accelerations over `TORQUE_S` before [N m], shape (N, 2)."""
+    if not (any(robot.platform.left_motor_nt_nm) or any(robot.platform.right_motor_nt_nm)):
+        return np.zeros((len(t), 2))
+    before = moment_at(motion, t - TORQUE_S)
+    rate = wheel_rates(true.v, true.w, robot.drive)
+    acceleration = (rate - wheel_rates(before.v, before.w, robot.drive)) / TORQUE_S
+    return wheel_torques_nm(robot.battery, robot.drive, rate, acceleration)
+
+
+def _into_base(b_world: Array, cos: Array, sin: Array) -> Array:
+    """Vectors (N, 3) turned from world into base_link axes, headings given by cos and sin (N,)."""
+    bx, by, bz = b_world.T
+    return np.column_stack([cos * bx + sin * by, cos * by - sin * bx, bz])

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.frames import matrix_from_quat
 from magtwin.sim.drive import Moment
-from magtwin.spec import MagnetometerSpec, Quat
+from magtwin.spec import Quat
 
 Array = NDArray[np.float64]
 Columns = dict[str, NDArray[np.float64]]
@@ -76,21 +76,3 @@ def into_sensor(v_base: Array, q_base_sensor_xyzw: Quat) -> Array:
     """Vectors (N, 3) turned from base_link's axes into those of a sensor."""
     # einsum, as a product of so few columns is no work for the threads of a BLAS that `@` wakes.
     return np.einsum("ni,ij->nj", v_base, matrix_from_quat(q_base_sensor_xyzw))
-
-
-def sense_magnetometer(spec: MagnetometerSpec, b_total_nt: ArrayLike, rng: np.random.Generator) -> Columns:
-    """What a scalar magnetometer makes of a field: white noise, then the nearest of its steps.
-
-    Args:
-        spec: Noise and resolution.
-        b_total_nt: Field magnitude at each reading [nT], shape (N,); nan stays nan.
-        rng: Source of noise.
-
-    Returns:
-        b_measured_nt.
-    """
-    b = np.asarray(b_total_nt, float)
-    b = b + spec.noise_std_nt * rng.standard_normal(b.shape)
-    if spec.resolution_nt > 0:
-        b = np.rint(b / spec.resolution_nt) * spec.resolution_nt
-    return {"b_measured_nt": b}

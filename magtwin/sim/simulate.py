@@ -16,14 +16,15 @@ from magtwin.path import Path, check_on_floor
 from magtwin.run import COLUMNS, Run
 from magtwin.sim.battery import discharge, sense_battery
 from magtwin.sim.controllers import Controller
-from magtwin.sim.drive import Moment, draw_wheel_errors, wheel_rates
+from magtwin.sim.drive import Moment, draw_wheel_errors
 from magtwin.sim.follow import follow
 from magtwin.sim.imu import sense_imu
-from magtwin.sim.interference import ambient_field_and_rate_nt, excess_current_a, platform_field_nt
+from magtwin.sim.interference import ambient_gradient_nt_m, field_at_sensor_nt, sensor_places
 from magtwin.sim.lidar import lidar_on
+from magtwin.sim.magnetometer import LOCK_RATE_HZ, lost_in, sense_magnetometer
 from magtwin.sim.mocap import sense_mocap
 from magtwin.sim.odometry import sense_odometry
-from magtwin.sim.sensors import into_sensor, sense_magnetometer
+from magtwin.sim.sensors import Moving, into_sensor
 from magtwin.spec import Scene
 
 Array = NDArray[np.float64]
@@ -57,10 +58,11 @@ def simulate(
 ) -> Run:
     """Drive a scene's robot along a path and read its sensors.
 
-    b_total = b_map + b_disturbance, b_map at base_link's pose. The disturbance is what
-    `disturbance_nt` predicts; without it, b_truth - b_map: the exact field of the Earth, the scene's
-    sources and the robot itself at the magnetometer, less the map. Where the scene's Earth field is
-    known, b_truth and b_vector are given either way.
+    b_total = b_map + b_disturbance, b_map at base_link's pose, and b_measured = b_total + b_noise. The
+    disturbance is what `disturbance_nt` predicts, for a neural magnetometer; without it, for a physical
+    one, b_truth - b_map: the exact field of the Earth, the scene's sources and the robot itself at the
+    magnetometer, less the map; for one of the kind "map-only" it is 0. Where the scene's Earth field is
+    known, b_truth and b_vector are given whatever the kind.
 
     Args:
         scene: Lab, robot and sensors.
@@ -83,18 +85,16 @@ def simulate(
         `flag_out_of_distribution` false: both are for the caller who knows a network.
 
     Raises:
-        RefusedError: The path leaves the floor or touches an obstacle, an option is out of range, or nothing gives the
-            disturbance. Nothing has been computed then.
+        RefusedError: The path leaves the floor or touches an obstacle, an option is out of range, or nothing
+            gives the disturbance. Nothing has been computed then.
     """
     robot = scene.robot
     rate = robot.magnetometer.rate_hz if rate_hz is None else rate_hz
     if not 0 < rate < math.inf:
         raise RefusedError(f"rate_hz of the magnetometer must be above 0 Hz and finite, got {rate!r}")
-    if disturbance_nt is None and scene.earth is None:
-        raise RefusedError(
-            f"scene {scene.name!r} has neither a network nor an Earth field, so nothing gives the "
-            "disturbance; name a network's weights, or give the scene an Earth field"
-        )
+    kind = robot.magnetometer.kind if disturbance_nt is None else "neural"
+    if disturbance_nt is None:
+        _check_kind(scene)
     lidar_on(robot.lidar, 0.0, lidar)  # refuses an unknown mode before anything is computed
     check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
     if duration_s is not None:
@@ -123,7 +123,8 @@ def simulate(
     columns |= sense_battery(robot.battery, pack, t, draws["battery"])
     columns["lidar_on"] = lidar_on(robot.lidar, t, lidar)
     columns |= _map(anomaly_map, true.pose[:, :2], columns["yaw"], outside)
-    columns |= _exact_field(scene, true, columns["lidar_on"], pack.voltage_v[pack.index(t)])
+    supply_a = pack.current_a[pack.index(t)]
+    columns |= _exact_field(scene, motion, t, true, columns["lidar_on"], supply_a)
     columns |= _flags(scene, true)
     columns["b_sd_nt"] = np.full(len(t), np.nan)
     facts: dict[str, str | int | float | bool] = {
@@ -135,17 +136,42 @@ def simulate(
         "duration_s": round(float(end), 9),
         "outside": outside,
         "lidar": lidar,
+        "magnetometer": kind,
     }
     if disturbance_nt is None:
-        disturbance = columns["b_truth_nt"] - columns["b_map_nt"]
+        exact = columns["b_truth_nt"] - columns["b_map_nt"]
+        disturbance = exact if kind == "physical" else np.zeros(len(t))
     else:
         disturbance = np.asarray(disturbance_nt(Run(columns, facts)), float)
         if disturbance.shape != t.shape:
             raise RefusedError(f"disturbance_nt must give shape {t.shape}, got {disturbance.shape}")
     columns["b_disturbance_nt"] = disturbance
     columns["b_total_nt"] = columns["b_map_nt"] + disturbance
-    columns |= sense_magnetometer(robot.magnetometer, columns["b_total_nt"], draws["magnetometer"])
+    columns |= sense_magnetometer(
+        robot.magnetometer,
+        columns["b_total_nt"],
+        columns["b_vector_nt"],
+        draws["magnetometer"],
+        rate_hz=rate,
+        steep=_steep(scene, anomaly_map, motion, t),
+    )
     return Run({name: columns[name] for name in COLUMNS}, facts)
+
+
+def _check_kind(scene: Scene) -> None:
+    """Refuse a magnetometer of which nothing gives the disturbance."""
+    kind = scene.robot.magnetometer.kind
+    if kind == "neural":
+        raise RefusedError(
+            f"scene {scene.name!r} has a neural magnetometer, and no network predicts its disturbance; open "
+            'it as a twin that names one, or take the kind "physical" or "map-only"'
+        )
+    if kind == "physical" and scene.earth is None:
+        raise RefusedError(
+            f"scene {scene.name!r} has neither a network nor an Earth field, so nothing gives the "
+            "disturbance; name a network's weights, give the scene an Earth field, or take the "
+            'kind "map-only"'
+        )
 
 
 def _check_readings(duration_s: float, rate_hz: float) -> None:
@@ -186,61 +212,37 @@ def _map(
 
 
 def _exact_field(
-    scene: Scene, true: Moment, on: NDArray[np.bool_], voltage_v: Array
+    scene: Scene, motion: Moving, t: Array, true: Moment, on: NDArray[np.bool_], supply_a: Array
 ) -> dict[str, NDArray[Any]]:
-    """Field at the magnetometer, vector in its axes and magnitude; nan where the Earth's is not known.
-
-    The rate in base_link axes is d/dt (R^T B) = R^T dB/dt - w x R^T B, with dB/dt = (u . grad) B for
-    the magnetometer's velocity u: that of the twist which holds from t on, whatever other times are asked.
-    """
-    robot = scene.robot
+    """Field at the magnetometer, vector in its axes and magnitude; nan where the Earth's is not known."""
     if scene.earth is None:
-        return {"b_vector_nt": np.full((len(on), 3), np.nan), "b_truth_nt": np.full(len(on), np.nan)}
-    x, y, yaw = true.pose.T
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    px, py, pz = robot.p_base_magnetometer
-    p_world = np.column_stack(
-        [x + px * cos - py * sin, y + px * sin + py * cos, np.full(len(on), robot.base_height_m + pz)]
-    )
-    v_world = np.column_stack(
-        [
-            true.v * cos - true.w * (p_world[:, 1] - y),
-            true.v * sin + true.w * (p_world[:, 0] - x),
-            np.zeros(len(on)),
-        ]
-    )
-    b_world, change = ambient_field_and_rate_nt(scene, p_world, v_world)
-    b_base = _into_base(b_world, cos, sin)
-    b_rate = _into_base(change, cos, sin)
-    b_rate[:, 0] += true.w * b_base[:, 1]
-    b_rate[:, 1] -= true.w * b_base[:, 0]
-    vector = platform_field_nt(
-        robot.platform,
-        b_base,
-        b_rate=b_rate,
-        wheel_rate=wheel_rates(true.v, true.w, robot.drive),
-        lidar_on=on,
-        battery_a=excess_current_a(robot.battery, voltage_v),
-    )
+        return {"b_vector_nt": np.full((len(t), 3), np.nan), "b_truth_nt": np.full(len(t), np.nan)}
+    vector = field_at_sensor_nt(scene, motion, t, true=true, lidar_on=on, supply_a=supply_a)
     return {
-        "b_vector_nt": into_sensor(vector, robot.q_base_magnetometer_xyzw),
+        "b_vector_nt": into_sensor(vector, scene.robot.q_base_magnetometer_xyzw),
         "b_truth_nt": np.sqrt(np.sum(vector * vector, axis=1)),
     }
 
 
-def _into_base(b_world: Array, cos: Array, sin: Array) -> Array:
-    """Vectors (N, 3) turned from world into base_link axes, headings given by cos and sin (N,)."""
-    bx, by, bz = b_world.T
-    return np.column_stack([cos * bx + sin * by, cos * by - sin * bx, bz])
+def _steep(scene: Scene, anomaly_map: AnomalyMap, motion: Moving, t: Array) -> NDArray[np.bool_]:
+    """Where the magnetometer has lost lock to the gradient: the exact one, or the map's where that is all."""
+    spec = scene.robot.magnetometer
+    if not spec.gradient_max_nt_m:
+        return np.zeros(len(t), bool)
+    seen = (t * LOCK_RATE_HZ + 1e-9).astype(int)
+    pose = motion.at(np.arange(seen[-1] + 1) / LOCK_RATE_HZ).pose
+    if scene.earth is None:
+        gradient = np.hypot(*anomaly_map.gradient(pose[:, :2], pose[:, 2])[:, :2].T)
+    else:
+        gradient = ambient_gradient_nt_m(scene, sensor_places(scene.robot, pose))
+    return lost_in(spec, gradient)[seen]
 
 
 def _flags(scene: Scene, true: Moment) -> dict[str, NDArray[Any]]:
-    """Touching an obstacle, or the floor's border; and what this simulator does not bring about, never set."""
+    """Touching an obstacle, or the floor's border; and what only a caller with a network knows."""
     half = np.array(scene.lab.floor_m) / 2
     reach = np.abs(true.pose[:, :2]) + scene.robot.footprint_radius_m
-    never = np.zeros(len(true.v), bool)
     return {
         "flag_bump": true.bump | np.any(reach > half + 1e-9, axis=1),
-        "flag_out_of_distribution": never,
-        "flag_lost_lock": never,
+        "flag_out_of_distribution": np.zeros(len(true.v), bool),
     }

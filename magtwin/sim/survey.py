@@ -45,15 +45,7 @@ def field_at_rest_nt(
     if height_m is not None:
         p_world[..., 2] = height_m
     b_body = rotate(quat_conjugate(turn), ambient_field_nt(scene, p_world)).reshape(-1, 3)
-    still = np.zeros(len(b_body))
-    field = platform_field_nt(
-        scene.robot.platform,
-        b_body,
-        b_rate=np.zeros_like(b_body),
-        wheel_rate=np.zeros((len(b_body), 2)),
-        lidar_on=still,
-        battery_a=still,
-    )
+    field = platform_field_nt(scene.robot.platform, b_body)
     return np.asarray(np.linalg.norm(field, axis=-1)).reshape(shape)
 
 

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Literal
 
 from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 
@@ -113,7 +114,8 @@ def read_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> S
     field_map = require_api(target(magnetometer, MAP_RELATIONSHIP), "anomalyMap")
     read_map(field_map)
     network = robot.magnetometer.network
-    if check_network and network is not None and not network.exists():
+    neural = robot.magnetometer.kind == "neural"
+    if check_network and neural and network is not None and not network.exists():
         raise RefusedError(
             f"{place(magnetometer)}: magtwin:magnetometer:network names {network}, which is not there"
         )
@@ -149,6 +151,8 @@ class _RobotTable(RobotSettings):
     asset: Path | None = None
     urdf: Path | None = None
     network: Path | None = None
+    kind: Literal["physical", "neural", "map-only"] | None = None
+    """Of its magnetometer; "neural" where a network is named, unless given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,9 +246,17 @@ def scene_from_toml(
     if weights is not None:
         weights = existing(weights, "weights file")
         magnetometer = replace(
-            robot.magnetometer, network=weights, network_sha256=sha256(weights), inputs=inputs_of(weights)
+            robot.magnetometer,
+            kind="neural",
+            network=weights,
+            network_sha256=sha256(weights),
+            inputs=inputs_of(weights),
         )
         robot = replace(robot, magnetometer=magnetometer)
+    if given.robot.kind is not None and network is None:
+        robot = replace(robot, magnetometer=replace(robot.magnetometer, kind=given.robot.kind))
+    if robot.magnetometer.kind == "neural" and robot.magnetometer.network is None:
+        raise RefusedError(f'{path}: [robot] kind = "neural" needs network = "FILE" beside it')
     own_map = map_layer is None
     sources, furniture = given.source, tuple(table.spec for table in given.furniture)
     if given.sources and own_map:
@@ -271,7 +283,7 @@ def _robot(
 ) -> RobotSpec:
     """The robot of a scene's TOML, built from its URDF where it names one."""
     if table.asset is not None and table.urdf is None:
-        if others := sorted(set(keys) - {"asset", "network"}):
+        if others := sorted(set(keys) - {"asset", "network", "kind"}):
             raise RefusedError(f"{path}: [robot] {others[0]} goes with urdf; the asset says it already")
         return read_robot(table.asset)
     if table.urdf is None or table.asset is not None:

@@ -4,6 +4,7 @@ Figures and their meaning after SDFormat's specification of `<sensor>` (sdformat
 sensors look along x, z up; USD's cameras along -z, y up.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -166,7 +167,8 @@ def _define_magnetometer(tags: Tags, sensor: Element, site: Site, robot: Usd.Pri
     if prims_with(robot, "magnetometer"):
         tags.description.note(f"{_say(sensor)} is a magnetometer more than magtwin simulates")
         return _facts(site.define(), rateHz=rate, noiseStdNt=noise)
-    spec = MagnetometerSpec(**site.mount, rate_hz=rate, noise_std_nt=noise, resolution_nt=0.0)
+    density = noise / math.sqrt(rate / 2)
+    spec = MagnetometerSpec(**site.mount, rate_hz=rate, noise_density_nt=density, resolution_nt=0.0)
     return define_magnetometer(site.stage, site.path, spec)
 
 
