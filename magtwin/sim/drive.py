@@ -99,9 +99,16 @@ def limiter(drive: DriveSpec, dt: float) -> Callable[[float, float, float, float
 
 
 def draw_wheel_errors(drive: DriveSpec, rng: np.random.Generator) -> tuple[float, float]:
-    """How far the wheels are from their nominal size in one session: of radius and separation, relative."""
+    """How far the wheels are from their nominal size in one run: of radius and separation, relative.
+
+    What the runs of a session share, and what this run draws beside it.
+    """
     radius, separation = rng.standard_normal(2).tolist()
-    return drive.wheel_radius_error_std * radius, drive.wheel_separation_error_std * separation
+    shared = drive.wheel_errors
+    return (
+        shared[0] + drive.wheel_radius_error_std * radius,
+        shared[1] + drive.wheel_separation_error_std * separation,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from magtwin.sim.drive import draw_wheel_errors
 from magtwin.spec import DriveSpec, RobotSpec
 
 YAW_ZERO = (np.pi, 0.3)
@@ -33,30 +34,44 @@ GYRO_BIAS_STD = 1e-4
 SPEEDS = (0.2, 0.3)
 """Least and most wanted speed [m/s]: with stops and corners the real 0.233 +- 0.066 m/s, and below v_max."""
 
+_STREAMS = ("battery", "imu", "lidar", "drive")
+"""Who draws, each from a child generator of its own; append only: the order is the seed."""
+
 
 def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
-    """The robot as it is on one day: charge, IMU's zero and bias, LiDAR's phase, odometry's scale.
+    """The robot as it is on one day: charge, IMU's zero and bias, LiDAR's phase, errors of wheels and odometry.
 
     Args:
         robot: The robot as its asset has it.
         rng: Source of the session.
 
     Returns:
-        The robot with `initial_fraction`, `yaw_zero`, `gyro_bias`, `phase_s` and `odometry_scale` drawn.
-        Its `odometry_noise_std` is 0, as the scale is the same in all runs of a session.
+        The robot with `initial_fraction`, `yaw_zero`, `gyro_bias`, `phase_s`, `wheel_errors` and
+        `odometry_scale` drawn. What a run draws of the last two otherwise, it no longer does: their
+        standard deviations are 0.
     """
     drive, imu, lidar = robot.drive, robot.imu, robot.lidar
-    missing = float(rng.exponential(CHARGE_SPENT))
-    yaw_zero = float(rng.normal(*YAW_ZERO))
-    bias = np.add(imu.gyro_bias, GYRO_BIAS_STD * rng.standard_normal(3))
-    phase = float(rng.uniform(0.0, lidar.on_s + lidar.off_s))
-    left, right = np.array(drive.odometry_scale) * (1.0 + drive.odometry_noise_std * rng.standard_normal(2))
+    draws = dict(zip(_STREAMS, rng.spawn(len(_STREAMS)), strict=True))
+    missing = float(draws["battery"].exponential(CHARGE_SPENT))
+    yaw_zero = float(draws["imu"].normal(*YAW_ZERO))
+    bias = np.add(imu.gyro_bias, GYRO_BIAS_STD * draws["imu"].standard_normal(3))
+    phase = float(draws["lidar"].uniform(0.0, lidar.on_s + lidar.off_s))
+    errors = draw_wheel_errors(drive, draws["drive"])
+    scale = 1.0 + drive.odometry_noise_std * draws["drive"].standard_normal(2)
+    left, right = np.array(drive.odometry_scale) * scale
     return replace(
         robot,
         battery=replace(robot.battery, initial_fraction=max(1.0 - missing, LEAST_CHARGE)),
         imu=replace(imu, yaw_zero=yaw_zero, gyro_bias=tuple(bias.tolist())),
         lidar=replace(lidar, phase_s=phase),
-        drive=replace(drive, odometry_scale=(float(left), float(right)), odometry_noise_std=0.0),
+        drive=replace(
+            drive,
+            wheel_errors=errors,
+            wheel_radius_error_std=0.0,
+            wheel_separation_error_std=0.0,
+            odometry_scale=(float(left), float(right)),
+            odometry_noise_std=0.0,
+        ),
     )
 
 
