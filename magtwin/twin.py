@@ -21,6 +21,7 @@ Kind = Literal["physical", "neural", "map-only"]
 if TYPE_CHECKING:
     from magtwin.learn.magnetometer import NeuralMagnetometer
     from magtwin.sim.controllers import Controller
+    from magtwin.sim.lidar import Scans
 
 
 @dataclass(frozen=True)
@@ -195,3 +196,18 @@ def simulate(
         )
         facts |= network.facts
     return run.with_facts(magtwin=magtwin.__version__, numpy=np.__version__, **facts)
+
+
+def scan(twin: Twin, run: Run, *, seed: int = 0) -> "Scans":
+    """What the LiDAR of a scene's robot saw in a run, one scan a turn while it spun.
+
+    Args:
+        twin: What `open_twin` gave.
+        run: What `simulate` gave, or any run with t, p_world_base, yaw and lidar_on.
+        seed: Seed of its noise; that of the run, unless another draw is wanted.
+    """
+    from magtwin.sim.lidar import scans_of
+    from magtwin.sim.simulate import streams
+
+    rng = streams(np.random.default_rng(seed))["lidar"]
+    return scans_of(run, twin.scene.robot, twin.obstacles, rng)

@@ -69,6 +69,7 @@ def run(
     out: Path | None = None,
     rrd: Path | None = None,
     parquet: Path | None = None,
+    scans: bool = False,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -103,6 +104,9 @@ def run(
         Rerun recording to write.
     parquet
         Parquet table to write.
+    scans
+        Cast the LiDAR's rays while it spins: into the recording, and into a table beside the run's, such as
+        run.scans.parquet beside run.parquet.
     force
         Replace what exists.
     json
@@ -113,7 +117,8 @@ def run(
     existing(scene, "scene")
     if out is rrd is parquet is None:
         out = Path("run")
-    targets = (out, rrd, parquet)
+    beside = parquet.with_suffix(".scans.parquet") if scans and parquet is not None else None
+    targets = (out, rrd, parquet, beside)
     places = [target.resolve() for target in targets if target is not None]
     if len(set(places)) < len(places):
         raise RefusedError("two outputs have one name; give each its own")
@@ -132,7 +137,17 @@ def run(
         asides = [t if t is None else stack.enter_context(output(t, force=force)) for t in targets]
         if asides[0] is not None:
             asides[0].mkdir()
-        report = _run(scene, path, asides[0], rrd=asides[1], parquet=asides[2], **options)
+        out_aside, rrd_aside, parquet_aside, scans_aside = asides
+        report = _run(
+            scene,
+            path,
+            out_aside,
+            rrd=rrd_aside,
+            parquet=parquet_aside,
+            scans=scans,
+            scans_parquet=scans_aside,
+            **options,
+        )
     print_report(report, json)
     if not json:
         say("Wrote " + ", ".join(str(target) for target in targets if target is not None))
@@ -147,6 +162,8 @@ def _run(
     title: str,
     rrd: Path | None = None,
     parquet: Path | None = None,
+    scans: bool = False,
+    scans_parquet: Path | None = None,
     net: Path | None = None,
     **options: Any,
 ) -> Any:
@@ -154,12 +171,21 @@ def _run(
     from magtwin.io.rerun import write_rrd
     from magtwin.io.tables import write_parquet
     from magtwin.path import resolve_path
-    from magtwin.twin import open_twin, simulate
+    from magtwin.twin import open_twin, scan, simulate
 
     planned = resolve_path(path)
     twin = open_twin(scene_file, net=net)
     steps(f"Driving {planned.name}")
     result = simulate(twin, planned, **options)
+    seen = None
+    if scans:
+        from magtwin.io.scans import write_scans
+
+        steps("Casting the LiDAR's rays")
+        seen = scan(twin, result, seed=options["seed"])
+        for target in (folder / "run.scans.parquet" if folder else None, scans_parquet):
+            if target is not None:
+                write_scans(seen, target)
     steps("Writing the run")
     for target in (folder / "run.parquet" if folder else None, parquet):
         if target is not None:
@@ -173,6 +199,7 @@ def _run(
                 scene_file=twin.scene_file,
                 field=twin.field,
                 planned=planned,
+                scans=seen,
             )
     if folder:
         from magtwin.io.plots import plot_run

@@ -26,6 +26,7 @@ from magtwin.io.viewer import show
 from magtwin.names import RefusedError, find
 from magtwin.path import Path
 from magtwin.run import Run
+from magtwin.sim.lidar import Scans
 from magtwin.spec import RobotSpec, Scene
 from magtwin.usd.geometry import BASE_LINK, Link, Shape, open_stage, read_links, read_shapes, srgb_from_linear
 from magtwin.usd.maps import HEAT_MAP, HEAT_MAP_HEIGHT_M
@@ -35,6 +36,12 @@ Array = NDArray[np.float64]
 APPLICATION = "magtwin"
 BLOCK = 8192
 """Rows sent in one chunk: few enough for the viewer to skip what it does not show."""
+
+SCAN = "world/scan"
+"""Entity of what the LiDAR sees."""
+
+SCANS = 64
+"""Scans sent in one chunk."""
 
 POSE_HZ = 50.0
 """Poses a second, at most: above this no eye sees a difference."""
@@ -54,6 +61,7 @@ def write_rrd(
     scene_file: FilePath,
     field: AnomalyMap,
     planned: Path,
+    scans: Scans | None = None,
     force: bool = False,
 ) -> None:
     """Write a run as a Rerun recording that opens in a ready layout.
@@ -70,6 +78,7 @@ def write_rrd(
         scene_file: The composed stage of the scene, whose shapes are shown.
         field: The map that was driven over, drawn on the floor.
         planned: The path that was to be driven.
+        scans: What the LiDAR saw, drawn as points in world; none draws none.
         force: Whether a file that exists is replaced.
 
     Raises:
@@ -86,6 +95,8 @@ def write_rrd(
         _log_bodies(rec, run, scene, read_shapes(stage), read_links(stage))
         _log_paths(rec, run, scene, scale, planned)
         _log_series(rec, run)
+        if scans is not None and len(scans.t):
+            _log_scans(rec, scans)
 
 
 def view(path: str | os.PathLike[str]) -> None:
@@ -338,6 +349,25 @@ def _log_paths(rec: rr.RecordingStream, run: Run, scene: Scene, scale: _Scale, p
     colours = scale.colours(run["b_total_nt"][rows])
     packed = colours.astype(np.uint32) @ np.array([1 << 24, 1 << 16, 1 << 8, 1], np.uint32)
     _send(rec, "world/readings", run["t"][rows], rr.Points3D, positions=sensor, colors=packed)
+
+
+def _log_scans(rec: rr.RecordingStream, scans: Scans) -> None:
+    """What each scan hit, at its moment, until the next; cleared when the LiDAR stops."""
+    rec.log(SCAN, rr.Points3D.from_fields(radii=[0.012], colors=[(255, 90, 90)]), static=True)
+    points = scans.points_world()
+    turn = float(np.diff(scans.t).min(initial=1.0))
+    last = np.append(np.diff(scans.t) > 1.5 * turn, True)
+    t = np.concatenate([scans.t, scans.t[last] + turn])
+    order = np.argsort(t, kind="stable")
+    points += [np.empty((0, 3))] * int(last.sum())
+    for start in range(0, len(t), SCANS):
+        rows = order[start : start + SCANS]
+        part = [points[row] for row in rows]
+        times = np.rint(t[rows] * 1e9).astype("timedelta64[ns]")
+        columns = rr.Points3D.columns(positions=np.concatenate(part).astype(np.float32))
+        rec.send_columns(
+            SCAN, [rr.TimeColumn(TIMELINE, duration=times)], columns.partition([len(p) for p in part])
+        )
 
 
 def _log_series(rec: rr.RecordingStream, run: Run) -> None:

@@ -45,12 +45,12 @@ def lidar_on(
     return np.full(t.shape, mode == "on")
 
 
-def ray_angles(spec: LidarSpec) -> Array:
+def ray_angles(rays: int) -> Array:
     """Directions of a scan's rays in the LiDAR's own xy plane, from its x axis [rad], shape (rays,).
 
     They go anticlockwise from -pi, evenly all the way round.
     """
-    return np.arange(spec.rays, dtype=float) * (2 * np.pi / spec.rays) - np.pi
+    return np.arange(rays, dtype=float) * (2 * np.pi / rays) - np.pi
 
 
 def scan(
@@ -78,7 +78,7 @@ def scan(
 
 @dataclass(frozen=True, eq=False)
 class Scans:
-    """The scans of a run."""
+    """The scans of a run, a row each."""
 
     t: Array
     """Moment of each scan [s], shape (S,)."""
@@ -86,17 +86,22 @@ class Scans:
     arrival: Array
     """When it arrived [s], shape (S,)."""
 
-    ranges_m: Array
-    """Ranges [m], shape (S, rays); see `scan`."""
+    p_world_lidar: Array
+    """Where the LiDAR was at that moment [m], shape (S, 3)."""
 
-    angles: Array
-    """Directions of the rays in the LiDAR's xy plane [rad], shape (rays,)."""
+    q_world_lidar_xyzw: Array
+    """Its axes, shape (S, 4)."""
 
-    @property
-    def points(self) -> list[Array]:
-        """What each scan hit, in the LiDAR's axes [m], each of shape (H, 3)."""
-        unit = np.column_stack([np.cos(self.angles), np.sin(self.angles), np.zeros(len(self.angles))])
-        return [unit[hit] * row[hit, None] for row in self.ranges_m for hit in [np.isfinite(row)]]
+    ranges_m: NDArray[np.float32]
+    """Ranges along `ray_angles` [m], shape (S, rays); see `scan`."""
+
+    def points_world(self) -> list[Array]:
+        """What each scan hit, in world [m], each of shape (H, 3)."""
+        angle = ray_angles(self.ranges_m.shape[1])
+        unit = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
+        hits = [np.isfinite(row) for row in self.ranges_m]
+        rows = zip(hits, self.ranges_m, self.p_world_lidar, self.q_world_lidar_xyzw, strict=True)
+        return [p + (unit[hit] * row[hit, None]) @ matrix_from_quat(q).T for hit, row, p, q in rows]
 
 
 def scans_of(run: Run, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Generator) -> Scans:
@@ -119,7 +124,7 @@ def scans_of(run: Run, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Ge
     q_base = quat_from_yaw(np.interp(stamps, t, yaw))
     p = p + rotate(q_base, np.array(robot.p_base_lidar))
     q = quat_multiply(q_base, robot.q_base_lidar_xyzw)
-    ranges = np.empty((len(stamps), spec.rays))
+    ranges = np.empty((len(stamps), spec.rays), np.float32)
     level = matrix_from_quat(robot.q_base_lidar_xyzw)
     if len(stamps) and abs(abs(level[2, 2]) - 1) < _UPRIGHT and np.ptp(p[:, 2]) == 0:
         cuts = _cuts(obstacles.triangles, p[0, 2])
@@ -128,7 +133,7 @@ def scans_of(run: Run, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Ge
     else:
         for row, pose in enumerate(zip(p, q, strict=True)):
             ranges[row] = scan(obstacles, pose, spec, noise)
-    return Scans(stamps, arrival, ranges, ray_angles(spec))
+    return Scans(stamps, arrival, p, q, ranges)
 
 
 def _told(ranges: Array, spec: LidarSpec, rng: np.random.Generator | None) -> Array:

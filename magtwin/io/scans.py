@@ -1,0 +1,74 @@
+"""Scans: those of a run as a Parquet file, a row each."""
+
+import os
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from magtwin.files import existing, output
+from magtwin.io.tables import check_parquet
+from magtwin.names import RefusedError
+from magtwin.sim.lidar import Scans
+
+_VECTORS = {"p_world_lidar": 3, "q_world_lidar_xyzw": 4}
+_DOCS = {
+    "t": ("s", "moment of the scan"),
+    "arrival": ("s", "when it arrived"),
+    "p_world_lidar": ("m", "where the LiDAR was at that moment"),
+    "q_world_lidar_xyzw": ("", "its axes"),
+    "ranges_m": ("m", "range along each ray, evenly from -pi anticlockwise; inf: nothing, -inf: too near"),
+}
+
+
+def write_scans(scans: Scans, path: str | os.PathLike[str], *, force: bool = False) -> None:
+    """Write scans as Parquet; the same scans give the same bytes.
+
+    Columns t and arrival [s], p_world_lidar [m], q_world_lidar_xyzw, and ranges_m [m], a list of a fixed
+    length; unit and meaning are on each Arrow field.
+
+    Args:
+        scans: What the LiDAR saw.
+        path: The file to make.
+        force: Whether one that exists is replaced.
+
+    Raises:
+        RefusedError: The file exists and `force` was not given.
+    """
+    columns, fields = [], []
+    for name, (unit, doc) in _DOCS.items():
+        values = getattr(scans, name)
+        flat = pa.array(np.ascontiguousarray(values).reshape(-1))
+        column = flat if values.ndim == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+        columns.append(column)
+        fields.append(pa.field(name, column.type, nullable=False, metadata={"unit": unit, "doc": doc}))
+    table = pa.Table.from_arrays(columns, schema=pa.schema(fields))
+    with output(path, force=force) as aside:
+        pq.write_table(table, aside, compression="zstd", use_dictionary=False)
+
+
+def read_scans(path: str | os.PathLike[str]) -> Scans:
+    """The scans that `write_scans` wrote, to the last bit.
+
+    Raises:
+        RefusedError: The file is missing, is not Parquet, was cut short, or holds no scans.
+    """
+    path = existing(path, "Parquet file of scans")
+    check_parquet(path)
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        raise RefusedError(
+            f"{path}: damaged Parquet ({str(error).splitlines()[0]}); write it again"
+        ) from error
+    values = {}
+    for name in _DOCS:
+        if name not in table.column_names:
+            raise RefusedError(f"{path}: no scans: column {name!r} is missing; write them with --scans")
+        column = table.column(name).combine_chunks()
+        width = column.type.list_size if pa.types.is_fixed_size_list(column.type) else 0
+        if name in _VECTORS and width != _VECTORS[name]:
+            raise RefusedError(f"{path}: column {name!r} must hold {_VECTORS[name]} numbers a row")
+        array = (column.flatten() if width else column).to_numpy(zero_copy_only=False)
+        values[name] = array.reshape(-1, width) if width else array
+    return Scans(**values)
