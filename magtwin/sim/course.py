@@ -20,7 +20,7 @@ from magtwin.spec import DriveSpec
 
 Array = NDArray[np.float64]
 
-PAYS = 150_000
+PAYS = 300_000
 """Steps in plain Python that take as long as opening the compiled loop; whoever had as many has more."""
 
 BLOCK = 8192
@@ -117,11 +117,10 @@ class Course:
         distance, which = obstacles.clearance([self.pose0[:2]], reach_m=self.footprint_radius_m)
         if distance[0] < self.footprint_radius_m - TOUCH_M:
             x, y, _ = self.pose0
-            radius = self.footprint_radius_m
+            radius, name = self.footprint_radius_m, obstacles.names[which[0]]
             raise RefusedError(
-                f"the robot would begin in {obstacles.names[which[0]]}: at ({x:.3f}, {y:.3f}) m its "
-                f"footprint of radius {radius:g} m is {radius - distance[0]:.3f} m too near; begin elsewhere, "
-                "or move the obstacle"
+                f"the robot would begin in {name}: at ({x:.3f}, {y:.3f}) m its footprint of radius "
+                f"{radius:g} m is {radius - distance[0]:.3f} m too near; begin elsewhere, or move that"
             )
 
 

@@ -11,7 +11,7 @@ from magtwin.path import Path, check_clear
 from magtwin.sim.controllers import Controller, guide_along, guide_by_commands
 from magtwin.sim.course import Chassis, Course, run_courses
 from magtwin.sim.drive import Motion, Pose
-from magtwin.sim.plan import SLOWEST
+from magtwin.sim.plan import SLOWEST, drivable
 from magtwin.spec import DriveSpec
 
 CONTROL_RATE_HZ = 50.0
@@ -40,7 +40,9 @@ def course_along(
         _check_duration(duration_s)
     if obstacles is not None:
         check_clear(path, obstacles, footprint_radius_m)
-    way = path if duration_s is None else path.prolonged(speed * duration_s)
+    way = path if controller == "release" else drivable(path)
+    if duration_s is not None:
+        way = way.prolonged(speed * duration_s)
     if start is not None:
         way = Path(way.name, np.vstack([start[:2], way.p_xy]))
         if obstacles is not None and math.dist(*way.p_xy[:2]) > 0:

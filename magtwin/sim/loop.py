@@ -48,6 +48,9 @@ REST_M_S = 1e-3
 GRAZE = 1e-6
 """Way that a touching robot may come nearer to an obstacle per way driven, so that rounding holds none."""
 
+A1, A2, A3 = 1 / 6, 1 / 20, 1 / 42
+"""sin(x)/x = 1 - A1 x^2 (1 - A2 x^2 (1 - A3 x^2 ...))."""
+
 SHORT = 4e-4
 """Square of half a turn below which four terms of the series of sin(x)/x are all of it."""
 
@@ -172,7 +175,8 @@ def along_path(
     """Command of a controller that drives along planned nodes, the node that is next, and the way since.
 
     Where on the path the robot is, and the planned speed there, is one for all; how it is steered is not.
-    The follower's wanted heading leans towards the path, by atan(d / L) for a distance d from it, and
+    The follower's wanted heading leans towards the path, by u / (1 + 0.28 u^2) for a distance u L from it,
+    which is the angle whose tangent is u to half a percent of a radian; and
     w = v k + (4 / L) max(v, v_turn) (wanted - actual), which for small errors is critically damped, with
     both poles at -2 / L per metre driven. Stanley's (Hoffmann et al., ACC 2007, eq. 5): a point b ahead of
     the axle is a steered wheel, turned by the path's heading there less the robot's and by
@@ -252,8 +256,9 @@ def along_path(
             bend = w_path
         elif bend < -w_path:
             bend = -w_path
-        offset = (dx * ey - dy * ex) / math.sqrt(length2)
-        wanted = headings[j] + part * (headings[j + 1] - headings[j]) - math.atan(offset / SETTLE_M)
+        lean = (dx * ey - dy * ex) / (math.sqrt(length2) * SETTLE_M)
+        lean /= 1.0 + 0.28 * lean * lean
+        wanted = headings[j] + part * (headings[j + 1] - headings[j]) - lean
         error = wrapped(wanted - (yaw + w * delay))
         off = abs(error)
         if off > ALIGN:
@@ -487,7 +492,7 @@ def drive_on(
         half = w_body * half_dt
         square = half * half
         if square < SHORT:
-            chord = v_body * dt * (1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0)))
+            chord = v_body * dt * (1.0 - square * A1 * (1.0 - square * A2 * (1.0 - square * A3)))
         else:
             chord = v_body * dt * (math.sin(half) / half)
         yaw += half
