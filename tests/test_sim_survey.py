@@ -1,3 +1,4 @@
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.field.sources import dipole_field_nt
 from magtwin.names import RefusedError
-from magtwin.sim.survey import field_at_rest_nt, survey
+from magtwin.sim.survey import field_at_rest_nt, survey, survey_readings
 from magtwin.spec import (
     EarthFieldSpec,
     LabSpec,
@@ -152,3 +153,110 @@ def test_a_survey_that_cannot_be_made_is_refused(options, message):
 def test_a_lab_without_the_earths_field_cannot_be_surveyed():
     with pytest.raises(RefusedError, match="has no Earth's field"):
         survey(replace(scene(), earth=None), rng=rng())
+
+
+# Readings, and the twin as it stands
+
+
+def test_readings_stand_on_their_nodes_and_are_the_maps_values():
+    read = survey_readings(scene(), rng=rng(), spacing_m=0.5)
+    field = survey(scene(), rng=rng(), spacing_m=0.5)
+    assert read.grid == field.grid
+    p, yaw = read.grid.poses()
+    assert_array_equal(read.p_xy, p.reshape(-1, 2))
+    assert_array_equal(read.yaw, yaw.ravel())
+    assert_array_equal(read.b_nt, field.values_nt.ravel())
+    assert read.height_m == field.height_m == 0.4
+
+
+def test_headings_that_deviate_are_recorded_and_read_as_they_are():
+    read = survey_readings(scene(), rng=rng(), spacing_m=0.5, heading_error_rad=0.1)
+    nominal = np.asarray(read.grid.headings_rad)[read.node[:, 0]]
+    assert np.std(read.yaw - nominal) == pytest.approx(0.1, rel=0.15)
+    assert_allclose(read.b_nt, field_at_rest_nt(scene(), read.p_xy, read.yaw), rtol=0, atol=1e-9)
+
+
+def test_places_that_deviate_are_not_recorded():
+    read = survey_readings(scene(), rng=rng(), spacing_m=0.5, position_error_m=0.02)
+    assert_array_equal(read.p_xy, read.grid.poses()[0].reshape(-1, 2))
+    off = read.b_nt - field_at_rest_nt(scene(), read.p_xy, read.yaw)
+    step = 1e-4
+    slope = [
+        (
+            field_at_rest_nt(scene(), read.p_xy + d, read.yaw)
+            - field_at_rest_nt(scene(), read.p_xy - d, read.yaw)
+        )
+        / (2 * step)
+        for d in step * np.eye(2)
+    ]
+    want = 0.02 * np.sqrt(np.mean(np.square(slope[0]) + np.square(slope[1])))
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(want, rel=0.2)
+
+
+def test_a_survey_at_another_height_is_the_field_there():
+    low, high = (
+        survey(scene(), rng=rng(), spacing_m=0.5, height_m=0.1),
+        survey(scene(), rng=rng(), spacing_m=0.5),
+    )
+    p, yaw = low.grid.poses()
+    assert_allclose(low.values_nt, field_at_rest_nt(scene(), p, yaw, height_m=0.1), rtol=0, atol=1e-9)
+    assert low.height_m == 0.1
+    assert np.ptp(low.values_nt) > 1.5 * np.ptp(high.values_nt)
+
+
+def test_a_survey_tells_frame_datum_and_figures():
+    field = survey(scene(), rng=rng(), spacing_m=0.5, readings=3)
+    assert field.frame == "world: x east, y north, z up"
+    assert "29.65 deg N, -82.35 deg E, 50 m" in field.datum
+    assert field.parameters == {"readings": 3, "noise_std_nt": 0.0, "resolution_nt": 0.0}
+    turned = replace(scene(), earth=replace(EARTH, north_deg=30.0))
+    assert "true north 30 deg" in survey(turned, rng=rng(), spacing_m=0.5).frame
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"heading_error_rad": -1.0}, "heading_error_rad must not be below 0, got -1"),
+        ({"position_error_m": np.nan}, "position_error_m must not be below 0, got nan"),
+        ({"height_m": np.inf}, "height_m must be a number, got inf"),
+    ],
+)
+def test_errors_and_heights_that_are_none_are_refused(options, message):
+    with pytest.raises(RefusedError, match=message):
+        survey_readings(scene(), rng=rng(), **options)
+
+
+def test_a_desk_moved_in_the_stage_changes_the_next_survey_by_what_its_steel_says(tmp_path, lab_scene):
+    from pxr import Gf, Usd
+
+    from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
+    from magtwin.sim.interference import ambient_field_nt
+    from magtwin.usd.scene import read_scene
+
+    folder = Path(shutil.copytree(lab_scene.parent, tmp_path / "lab"))
+    before = read_scene(folder / lab_scene.name)
+    stage = Usd.Stage.Open(str(folder / lab_scene.name))  # plain usd-core from here
+    stage.GetPrimAtPath("/World/Furniture/desk_0").GetAttribute("xformOp:translate").Set(
+        Gf.Vec3d(0.3, -2.3, 0)
+    )
+    stage.Save()
+    after = read_scene(folder / lab_scene.name)
+    desk, moved = (next(piece for piece in s.furniture if piece.name == "desk_0") for s in (before, after))
+    assert moved == replace(desk, p_world=(0.3, -2.3, 0.0))
+
+    maps = [survey(s, rng=rng(), spacing_m=0.5) for s in (before, after)]
+    p, yaw = maps[0].grid.poses()
+    robot, turn = before.robot, quat_from_yaw(yaw)
+    place = np.concatenate([p, np.full((*yaw.shape, 1), robot.base_height_m)], axis=-1)
+    place += rotate(turn, np.broadcast_to(robot.p_base_magnetometer, place.shape))
+    flat = place.reshape(-1, 3)
+    steel = [sum(s.body().exact_field_nt(flat) for s in piece.sources()) for piece in (desk, moved)]
+    world = ambient_field_nt(before, flat) - steel[0] + steel[1]
+    body = rotate(quat_conjugate(turn.reshape(-1, 4)), world)
+    platform = robot.platform
+    want = np.linalg.norm(
+        body + body @ np.reshape(platform.soft_iron, (3, 3)).T + platform.hard_iron_nt, axis=-1
+    ).reshape(yaw.shape)
+    noise = 6 * np.hypot(robot.magnetometer.noise_std_nt, robot.magnetometer.resolution_nt)
+    assert np.abs(maps[1].values_nt - want).max() < noise + 0.2  # 1e-4 of 2,000 nT stands in for the steel
+    assert np.abs(maps[1].values_nt - maps[0].values_nt).max() > 200

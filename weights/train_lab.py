@@ -30,9 +30,10 @@ from magtwin.path import PATHS, Path, figure8, lawnmower, path_named, sine
 from magtwin.run import Run
 from magtwin.sim.simulate import simulate
 from magtwin.sim.survey import field_at_rest_nt
-from magtwin.spec import EarthFieldSpec, Scene, SourceSpec
+from magtwin.spec import EarthFieldSpec, Scene
 from magtwin.usd.maps import load_map
 from magtwin.usd.robot import read_robot
+from magtwin.usd.scene import read_sources
 
 Array = NDArray[np.float64]
 
@@ -90,14 +91,14 @@ class Rows:
 def lab() -> Scene:
     """The default lab with its robot, whose disturbance is given by physics."""
     about = read_toml(shipped("maps", "lab", "map.toml"))
-    listed = shipped("maps", "lab", "sources.toml")
-    sources = tuple(from_table(SourceSpec, table, listed, "source") for table in read_toml(listed)["source"])
+    sources, furniture = read_sources(shipped("maps", "lab", "sources.toml"))
     return Scene(
         name="lab",
         map_layer=shipped("maps", "lab", "lab.usdc"),
         robot=read_robot(shipped("robots", "turtlebot4", "turtlebot4.usda")),
-        earth=from_table(EarthFieldSpec, about["earth"], listed.with_name("map.toml"), "earth"),
+        earth=from_table(EarthFieldSpec, about["earth"], shipped("maps", "lab", "map.toml"), "earth"),
         sources=sources,
+        furniture=furniture,
     )
 
 

@@ -33,7 +33,7 @@ def define_furniture(stage: Usd.Stage, furniture: tuple[FurnitureSpec, ...]) -> 
     Raises:
         RefusedError: A name cannot name a prim.
     """
-    UsdGeom.Xform.Define(stage, FURNITURE)
+    Usd.ModelAPI(UsdGeom.Xform.Define(stage, FURNITURE)).SetKind(Kind.Tokens.group)
     for spec in furniture:
         path = FURNITURE.AppendChild(check_prim_name(spec.name, "furniture"))
         piece = UsdGeom.Xform.Define(stage, path).GetPrim()

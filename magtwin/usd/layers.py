@@ -84,7 +84,8 @@ def layer_files(path: str | os.PathLike[str]) -> list[Path]:
     Raises:
         RefusedError: As for `open_stage`.
     """
-    layers = open_stage(path).GetLayerStack(includeSessionLayers=False)
+    stage = open_stage(path)  # held in a name: its layers go with it
+    layers = stage.GetLayerStack(includeSessionLayers=False)
     return [Path(layer.realPath) for layer in layers if layer.realPath]
 
 

@@ -328,9 +328,9 @@ def _check(scene: Scene) -> None:
         names = [thing.name for thing in things]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise RefusedError(f"two {what} are called {twice[0]!r}; give each a name of its own")
-    for source in scene.sources:
-        if source.name == LOOKS:
-            raise RefusedError(f"source {LOOKS!r} has the name of the materials beside it; rename it")
+    if any(source.name == LOOKS for source in scene.sources):
+        raise RefusedError(f"source {LOOKS!r} has the name of the materials beside it; rename it")
+    for source in scene.magnets:
         if source.susceptibility and scene.earth is None:
             source.body()  # refuses
     load_map(scene.map_layer)
