@@ -216,10 +216,15 @@ class ImuSpec(MountSpec):
     yaw_zero: float = 0.0
     """World heading of base_link at which the orientation's yaw is 0 [rad]: where it was switched on."""
 
-    tilt: Vec2 = (-0.0042, -0.0033)
-    """Roll and pitch by which the orientation is off, as the sensor is not quite level [rad]."""
+    tilt: Vec2 = (-0.009, 0.0002)
+    """Roll and pitch by which the sensor is not quite level on its robot [rad]."""
 
-    tilt_std: float = 0.011
+    level_error: Vec2 = (0.0048, -0.0036)
+    """Roll and pitch, about axes that do not turn with the robot, by which what the sensor takes for level
+    is off [rad]: the floor slopes a little. With `tilt` it gives the orientation's x and y the means and the
+    rank correlations with the disturbance that the published ones have."""
+
+    tilt_std: float = 0.0095
     """Standard deviation of the roll and pitch that wander, by floor and casters [rad]."""
 
     tilt_time_s: float = 20.0
@@ -568,9 +573,12 @@ class PlatformFieldSpec(Spec):
     caster_radius_m: float = 0.01
     """Radius that the caster rolls on [m]."""
 
+    hard_iron_drift_nt: Vec3 = ZERO3
+    """Mean change of h from the day of a survey to the days of driving that follow [nT]: handling, docking
+    and tools magnetise or demagnetise."""
+
     hard_iron_std_nt: float = 0.0
-    """Standard deviation of each part of h from one day to another [nT]: what handling, docking and tools
-    magnetise or demagnetise."""
+    """Standard deviation of each part of h from one day of driving to another [nT]."""
 
     current_std: float = 0.0
     """Relative standard deviation of what motors, LiDAR and battery add, from one day to another: wires lie
@@ -851,6 +859,8 @@ class FurnitureSpec(Spec):
         self._require(
             "magnetization", fits, f"have one number for each of {', '.join(steel)}", self.magnetization
         )
+        if not any(self.magnetization):
+            object.__setattr__(self, "magnetization", ())
 
     def sources(self, *, in_world: bool = True) -> tuple[SourceSpec, ...]:
         """Its steel, a source each, named after the piece and the part.

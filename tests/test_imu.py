@@ -24,6 +24,7 @@ QUIET = {
     "latency_s": 0.0,
     "jitter_s": 0.0,
     "tilt": (0.0, 0.0),
+    "level_error": (0.0, 0.0),
     "tilt_std": 0.0,
     "orientation_noise_std": 0.0,
     "gyro_noise_std": 0.0,

@@ -222,6 +222,7 @@ def test_columns_turn_with_the_links_that_carry_the_sensors():
     none = (0.0, 0.0, 0.0)
     quiet = ImuSpec(
         tilt=(0.0, 0.0),
+        level_error=(0.0, 0.0),
         tilt_std=0.0,
         orientation_noise_std=0.0,
         gyro_noise_std=0.0,

@@ -23,7 +23,8 @@ def sense_imu(
     * acceleration: white noise and vibration;
     * orientation: heading from the IMU's own zero, running away with the bias about base_link's z; the
       tilt with which the sensor is mounted, and a wandering one (first-order Gauss-Markov) from the floor
-      and the casters; white noise as three small angles in the sensor's axes.
+      and the casters; the error of what it takes for level, which does not turn with the robot; white noise
+      as three small angles in the sensor's axes.
 
     Vibration is white and grows with the forward speed: a robot that stands does not shake. The tilt
     wanders too slowly to be seen in the rates.
@@ -55,6 +56,7 @@ def sense_imu(
     heading = true.pose[:, 2] - spec.yaw_zero + (ran_away - ran_away[0])
     tilt = spec.tilt + spec.tilt_std * gauss_markov(wander[:, 3:], spec.tilt_time_s, spec.rate_hz)
     q = quat_multiply(quat_from_rpy(np.column_stack([tilt, heading])), q_base_imu_xyzw)
+    q = quat_multiply(quat_from_rpy([*spec.level_error, 0.0]), q)
     q = quat_multiply(q, quat_from_rpy(spec.orientation_noise_std * noise[:, :3]))
     return {
         "imu_q_xyzw": canonical(q)[latest],

@@ -14,6 +14,7 @@ from magtwin.sim.battery import current_a
 from magtwin.sim.drive import Moment, wheel_rates
 from magtwin.sim.sensors import Moving, moment_at
 from magtwin.spec import (
+    ZERO3,
     BatterySpec,
     DriveSpec,
     EarthFieldSpec,
@@ -297,20 +298,22 @@ def sensor_places(robot: RobotSpec, pose: Array) -> Array:
 def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> PlatformFieldSpec:
     """The platform as it is on one day.
 
-    Its permanent field differs from day to day by `hard_iron_std_nt` along each axis, what its currents make
-    by the factor 1 + `current_std` N(0, 1), one each for motors, LiDAR and battery, and wheels, caster and
-    LiDAR begin at any angle. So a map that was surveyed on one day errs on another by a constant and by a
-    wave over heading: of the TurtleBot 4 in Florida, whose 200 nT each way are along a field that dips 58
-    deg, by 170 nT and by an amplitude of 150 nT (root mean squares).
+    Its permanent field has changed since the survey by `hard_iron_drift_nt`, and differs from day to day by
+    `hard_iron_std_nt` along each axis; what its currents make differs by the factor 1 + `current_std` N(0, 1),
+    one each for motors, LiDAR and battery; wheels, caster and LiDAR begin at any angle. So a map that was
+    surveyed on one day errs on another by a constant and by a wave over heading. Of the TurtleBot 4 in
+    Florida, where the field dips by 58 deg, the drift makes 380 nT and a wave of 175 nT, and the 250 nT that
+    days differ by each way another 210 nT and a wave of 190 nT (root mean squares).
 
     Args:
         platform: The platform as its asset has it: that of the mean day, and of the survey.
         rng: Source of the day.
 
     Returns:
-        The platform with these figures drawn; its own spreads are 0 then, as the day is.
+        The platform with these figures drawn; its own drift and spreads are 0 then: it is that of the day.
     """
-    hard_iron = np.add(platform.hard_iron_nt, platform.hard_iron_std_nt * rng.standard_normal(3))
+    hard_iron = np.add(platform.hard_iron_nt, platform.hard_iron_drift_nt)
+    hard_iron += platform.hard_iron_std_nt * rng.standard_normal(3)
     motors, lidar, battery = 1 + platform.current_std * rng.standard_normal(3)
     angles = rng.uniform(0, 2 * math.pi, 4).tolist()
     scaled = {
@@ -326,6 +329,7 @@ def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> Plat
     return replace(
         platform,
         hard_iron_nt=tuple(hard_iron.tolist()),
+        hard_iron_drift_nt=ZERO3,
         hard_iron_std_nt=0.0,
         current_std=0.0,
         **fields,  # type: ignore[arg-type]

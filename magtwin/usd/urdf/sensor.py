@@ -141,6 +141,7 @@ def _define_imu(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd
         **site.mount,
         rate_hz=rate,
         tilt=(0.0, 0.0),  # Gazebo gives the true orientation, and shakes nothing
+        level_error=(0.0, 0.0),
         tilt_std=0.0,
         orientation_noise_std=0.0,
         gyro_bias_walk=0.0,
