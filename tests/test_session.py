@@ -113,6 +113,7 @@ def test_a_session_draws_what_differs_from_day_to_day_and_nothing_else():
     robot = draw_session(ROBOT, np.random.default_rng(0))
     undrawn = dataclasses.replace(
         robot,
+        platform=ROBOT.platform,
         battery=dataclasses.replace(robot.battery, initial_fraction=ROBOT.battery.initial_fraction),
         imu=dataclasses.replace(robot.imu, yaw_zero=0.0, gyro_bias=(0.0, 0.0, 0.0)),
         lidar=dataclasses.replace(robot.lidar, phase_s=0.0),

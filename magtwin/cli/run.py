@@ -60,6 +60,7 @@ def run(
     *,
     path: str = "figure8",
     net: Path | None = None,
+    magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     seed: Seed = 0,
     speed: float = 0.2,
     duration: float | None = None,
@@ -85,7 +86,11 @@ def run(
         sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle,
         curvilinear, curvilinear_2; A to E, the cases of the paper's Table 1; or a CSV file of x,y [m].
     net
-        Weights to use in place of the scene's (.safetensors or .pth); "none" for the disturbance by physics.
+        Weights to use in place of the scene's (.safetensors or .pth), for a neural magnetometer; "none" for
+        a physical one.
+    magnetometer
+        What it reads, in place of what the scene says: the exact field (physical), the map and what a
+        network predicts (neural), or the map alone (map-only).
     seed
         Seed of all noise; one seed, one Run.
     speed
@@ -125,6 +130,7 @@ def run(
     options: dict[str, Any] = {
         "steps": announcer(quiet=json),
         "net": net,
+        "magnetometer": magnetometer,
         "seed": seed,
         "speed": speed,
         "duration_s": duration,
@@ -165,6 +171,7 @@ def _run(
     scans: bool = False,
     scans_parquet: Path | None = None,
     net: Path | None = None,
+    magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     **options: Any,
 ) -> Any:
     """Run a scene and write the outputs asked for; returns the run's report."""
@@ -174,7 +181,7 @@ def _run(
     from magtwin.twin import open_twin, scan, simulate
 
     planned = resolve_path(path)
-    twin = open_twin(scene_file, net=net)
+    twin = open_twin(scene_file, net=net, magnetometer=magnetometer)
     steps(f"Driving {planned.name}")
     result = simulate(twin, planned, **options)
     seen = None

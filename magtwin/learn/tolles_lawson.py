@@ -402,7 +402,7 @@ def _turning_iron(wheel_angle: Array, robot: RobotSpec | None) -> Array:
     fields = []
     for name in IRON:
         for phase in (0.0, np.pi / 2):
-            platform = replace(robot.platform, **{**unit, f"{name}_moment": 1.0, f"{name}_phase": phase})
+            platform = replace(robot.platform, **{**unit, f"{name}_moment": 1.0, f"{name}_phase": phase})  # type: ignore[arg-type]
             fields.append(turning_iron_nt(replace(robot, platform=platform), wheel_angle))
     return np.stack(fields, axis=-1)
 

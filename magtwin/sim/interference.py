@@ -299,11 +299,12 @@ def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> Plat
     """The platform as it is on one day.
 
     Its permanent field has changed since the survey by `hard_iron_drift_nt`, and differs from day to day by
-    `hard_iron_std_nt` along each axis; what its currents make differs by the factor 1 + `current_std` N(0, 1),
-    one each for motors, LiDAR and battery; wheels, caster and LiDAR begin at any angle. So a map that was
-    surveyed on one day errs on another by a constant and by a wave over heading. Of the TurtleBot 4 in
-    Florida, where the field dips by 58 deg, the drift makes 380 nT and a wave of 175 nT, and the 250 nT that
-    days differ by each way another 210 nT and a wave of 190 nT (root mean squares).
+    `hard_iron_std_nt` along each axis; what its currents make differs by the factor 1 + `current_std` N, with
+    one standard normal N each for motors, LiDAR and battery; wheels, caster and LiDAR begin at any angle.
+
+    So a map that was surveyed on one day errs on another by a constant and by a wave over heading. Of the
+    TurtleBot 4 in Florida, where the field dips by 58 deg, the drift makes 380 nT and a wave of 175 nT, and
+    the 250 nT that days differ by each way another 210 nT and a wave of 190 nT (root mean squares).
 
     Args:
         platform: The platform as its asset has it: that of the mean day, and of the survey.

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from magtwin.sim.drive import draw_wheel_errors
+from magtwin.sim.interference import draw_platform
 from magtwin.spec import DriveSpec, RobotSpec
 
 YAW_ZERO = (np.pi, 0.3)
@@ -34,12 +35,12 @@ GYRO_BIAS_STD = 1e-4
 SPEEDS = (0.2, 0.3)
 """Least and most wanted speed [m/s]: with stops and corners the real 0.233 +- 0.066 m/s, and below v_max."""
 
-_STREAMS = ("battery", "imu", "lidar", "drive")
+_STREAMS = ("battery", "imu", "lidar", "drive", "platform")
 """Who draws, each from a child generator of its own; append only: the order is the seed."""
 
 
 def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
-    """The robot as it is on one day: charge, IMU's zero and bias, LiDAR's phase, errors of wheels and odometry.
+    """The robot as it is on one day: charge, IMU, LiDAR's phase, wheels and odometry, and its own field.
 
     Args:
         robot: The robot as its asset has it.
@@ -47,8 +48,8 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
 
     Returns:
         The robot with `initial_fraction`, `yaw_zero`, `gyro_bias`, `phase_s`, `wheel_errors` and
-        `odometry_scale` drawn. What a run draws of the last two otherwise, it no longer does: their
-        standard deviations are 0.
+        `odometry_scale` drawn, and its platform by `magtwin.sim.interference.draw_platform`. What a run
+        draws of wheels and odometry otherwise, it no longer does: their standard deviations are 0.
     """
     drive, imu, lidar = robot.drive, robot.imu, robot.lidar
     draws = dict(zip(_STREAMS, rng.spawn(len(_STREAMS)), strict=True))
@@ -64,6 +65,7 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
         battery=replace(robot.battery, initial_fraction=max(1.0 - missing, LEAST_CHARGE)),
         imu=replace(imu, yaw_zero=yaw_zero, gyro_bias=tuple(bias.tolist())),
         lidar=replace(lidar, phase_s=phase),
+        platform=draw_platform(robot.platform, draws["platform"]),
         drive=replace(
             drive,
             wheel_errors=errors,

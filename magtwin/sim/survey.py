@@ -126,7 +126,7 @@ def survey_readings(
         yaw=yaw.ravel(),
         b_nt=(total / readings).ravel(),
         grid=grid,
-        node=np.stack(np.indices(grid.shape), axis=-1).reshape(-1, 3),
+        node=np.moveaxis(np.indices(grid.shape), 0, -1).reshape(-1, 3),
         height_m=height,
         name=scene.name,
         source=source,
@@ -163,7 +163,7 @@ def survey(
     Raises:
         RefusedError: As for `survey_readings`.
     """
-    errors = {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
+    errors: dict[str, Any] = {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
     read = survey_readings(scene, rng=rng, readings=readings, **errors, **options)
     assert read.grid is not None
     sensor, grid = scene.robot.magnetometer, read.grid
