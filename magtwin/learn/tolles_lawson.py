@@ -391,7 +391,7 @@ def fit_platform(
 
 
 IRON = ("left_wheel", "right_wheel", "caster")
-"""What turns, in the order of `magtwin.sim.interference.turning_iron_basis`."""
+"""What turns, by the names of its figures in a PlatformFieldSpec."""
 
 
 def _turning_iron(wheel_angle: Array, robot: RobotSpec | None) -> Array:

@@ -22,6 +22,7 @@ from magtwin.spec import (
     RobotSpec,
     Scene,
     SourceSpec,
+    Vec3,
 )
 
 Array = NDArray[np.float64]
@@ -31,6 +32,9 @@ TORQUE_S = 0.05
 
 CREEP = 0.05
 """Rate of a wheel from which its friction is whole [rad/s]; below, it is in proportion."""
+
+NEAREST_M = 1e-3
+"""Distance from the middle of a wheel within which no magnetometer can be [m]."""
 
 
 def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
@@ -169,38 +173,36 @@ def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
 
     Returns:
         Field in base_link axes [nT], shape (N, 3).
-    """
-    platform, angle = robot.platform, np.asarray(wheel_angle, float)
-    field = np.zeros((len(angle), 3))
-    moments = (platform.left_wheel_moment, platform.right_wheel_moment, platform.caster_moment)
-    phases = (platform.left_wheel_phase, platform.right_wheel_phase, platform.caster_phase)
-    rolled = angle.mean(axis=1) * robot.drive.wheel_radius_m / platform.caster_radius_m
-    for k, (m, phase, turned) in enumerate(zip(moments, phases, (*angle.T, rolled), strict=True)):
-        if m:
-            (up, forwards), now = turning_iron_basis(robot)[k], turned + phase
-            field += m * (np.cos(now)[:, None] * up + np.sin(now)[:, None] * forwards)
-    return field
-
-
-def turning_iron_basis(robot: RobotSpec) -> Array:
-    """Field at the magnetometer of a moment of 1 A m2 in left wheel, right wheel and caster.
-
-    Returns:
-        Fields of a moment up and of one forwards [nT], shape (3, 2, 3).
 
     Raises:
         RefusedError: The magnetometer is in the middle of one of them.
     """
+    platform, angle = robot.platform, np.asarray(wheel_angle, float)
+    rolled = angle.mean(axis=1) * robot.drive.wheel_radius_m / platform.caster_radius_m
     side, axle = robot.drive.wheel_separation_m / 2, robot.drive.wheel_radius_m - robot.base_height_m
-    places = np.array([(0.0, side, axle), (0.0, -side, axle), robot.platform.p_base_caster])
-    apart = np.asarray(robot.p_base_magnetometer) - places
-    if not np.all(np.linalg.norm(apart, axis=1) > 0):
+    field = np.zeros((len(angle), 3))
+    for m, phase, place, turned in (
+        (platform.left_wheel_moment, platform.left_wheel_phase, (0.0, side, axle), angle[:, 0]),
+        (platform.right_wheel_moment, platform.right_wheel_phase, (0.0, -side, axle), angle[:, 1]),
+        (platform.caster_moment, platform.caster_phase, platform.p_base_caster, rolled),
+    ):
+        if m:
+            up, forwards = _unit_fields(robot, place)
+            now = (turned + phase)[:, None]
+            field += m * (np.cos(now) * up + np.sin(now) * forwards)
+    return field
+
+
+def _unit_fields(robot: RobotSpec, p_base: Vec3) -> Array:
+    """Field at the magnetometer of 1 A m2 at a place in base_link, up and forwards [nT], shape (2, 3)."""
+    apart = np.subtract(robot.p_base_magnetometer, p_base)
+    if not np.linalg.norm(apart) > NEAREST_M:
         raise RefusedError(
             f"robot {robot.name!r}: its magnetometer, at {robot.p_base_magnetometer} of base_link, is in the "
             "middle of a wheel or of the caster, whose iron is magnetised; move one of them"
         )
-    directions = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 0.0)])
-    return np.array([[dipole_field_nt(r, np.zeros((1, 3)), d[None]) for d in directions] for r in apart])
+    up_and_forwards = np.array([[[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]])
+    return np.array([dipole_field_nt(apart, np.zeros((1, 3)), m) for m in up_and_forwards])
 
 
 def wheel_torques_nm(
