@@ -3,7 +3,7 @@
 import math
 import os
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import ModuleType
@@ -105,7 +105,20 @@ class Course:
 
     def state(self) -> list[float]:
         """At the start, as `loop.drive_on` takes it."""
-        return [*self.pose0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, self.guide.node, self.guide.driven_m]
+        return [
+            *self.pose0,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+            self.guide.node,
+            self.guide.driven_m,
+            0.0,
+            0.0,
+        ]
 
     def check(self, obstacles: Obstacles) -> None:
         """Refuse a course that begins in an obstacle, or whose steps are too long."""
@@ -165,6 +178,15 @@ def _opened(courses: Sequence[Course]) -> ModuleType | None:
         except ImportError:
             _Loop.made = -(2**62)  # there is no compiled loop here
     return _Loop.compiled
+
+
+def compiled_robots() -> Callable[..., None]:
+    """The compiled `loop.robots`, for those who lay out its arrays themselves; opened by `warm_up`."""
+    if _Loop.compiled is None:
+        warm_up()
+    assert _Loop.compiled is not None
+    robots: Callable[..., None] = _Loop.compiled.robots
+    return robots
 
 
 def fence_of(obstacles: Obstacles) -> tuple[Array, Array, NDArray[np.int64]]:
@@ -230,8 +252,7 @@ def _block(
     Returns:
         What happened, shape (N, RECORD, steps), and how many steps each made, shape (N,).
     """
-    assert _Loop.compiled is not None
-    robots, count = _Loop.compiled.robots, len(guides)
+    robots, count = compiled_robots(), len(guides)
     distinct = {id(guide.table): guide.table for guide in guides}  # those on one path share its table
     ends = np.cumsum([table.shape[1] for table in distinct.values()])
     places = dict(zip(distinct, ends, strict=True))
@@ -340,10 +361,11 @@ class Chassis:
             self._last, self._age_s = (float(v), float(w)), 0.0
         for column in self._record:
             column.append(0.0)
+        k = len(self._record[0]) - 1
         now = [memoryview(column)[-1:] for column in self._record]
-        table = ([0.0], [self._last[0]], [self._last[1]])
+        table = ([k * self._course.dt], [self._last[0]], [self._last[1]])
         self._state[10] = 0.0
-        loop.drive_on(loop.COMMANDS, self._figures, table, self._fence, self._spans, self._state, 0, 1, now)
+        loop.drive_on(loop.COMMANDS, self._figures, table, self._fence, self._spans, self._state, k, 1, now)
 
     def motion(self) -> Motion:
         """What it has done so far."""

@@ -122,7 +122,14 @@ def follow(
         motion = run_courses([course], obstacles)[0]
     else:
         motion = _by(controller, Chassis(course, obstacles), course)
-    if duration_s is None and len(motion.v) == course.steps:
+    if duration_s is None:
+        check_arrived(path, speed, course, motion)
+    return motion
+
+
+def check_arrived(path: Path, speed: float, course: Course, motion: Motion) -> None:
+    """Refuse a motion that took all the steps which its course allows for reaching the end of a path."""
+    if len(motion.v) == course.steps:
         assert motion.bump is not None
         why = (
             "the robot stands at an obstacle"
@@ -133,7 +140,6 @@ def follow(
             f"path {path.name}: its end was not reached in {course.steps * course.dt:.0f} s at {speed:g} "
             f"m/s; {why}"
         )
-    return motion
 
 
 def play(

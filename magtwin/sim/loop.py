@@ -30,9 +30,9 @@ FIGURES = 22
 TABLE = 6
 """Columns of a controller's table."""
 
-STATE = 12
+STATE = 14
 """x, y, yaw; limited command v, w; wheels' v, w; mean v of the last step; way that is surely free; bump; node
-that is next; way driven since that changed.
+that is next; way driven since that changed; cosine and sine of yaw.
 """
 
 RECORD = 10
@@ -51,8 +51,14 @@ GRAZE = 1e-6
 A1, A2, A3 = 1 / 6, 1 / 20, 1 / 42
 """sin(x)/x = 1 - A1 x^2 (1 - A2 x^2 (1 - A3 x^2 ...))."""
 
+B1, B2, B3 = 1 / 2, 1 / 12, 1 / 30
+"""cos(x) = 1 - B1 x^2 (1 - B2 x^2 (1 - B3 x^2 ...))."""
+
+ANEW = 64
+"""Steps after which the heading's cosine and sine, turned step by step, are computed anew."""
+
 SHORT = 4e-4
-"""Square of half a turn below which four terms of the series of sin(x)/x are all of it."""
+"""Square of half a turn below which four terms of the series of sin(x)/x and cos(x) are all of them."""
 
 LATE_S = 1e-9
 """Rounding of a time that is forgiven [s]."""
@@ -175,8 +181,8 @@ def along_path(
     """Command of a controller that drives along planned nodes, the node that is next, and the way since.
 
     Where on the path the robot is, and the planned speed there, is one for all; how it is steered is not.
-    The follower's wanted heading leans towards the path, by u / (1 + 0.28 u^2) for a distance u L from it,
-    which is the angle whose tangent is u to half a percent of a radian; and
+    The follower's wanted heading leans towards the path, by u (1 - 0.3 u^2) for a distance u L from it, which
+    is atan(u) to a milliradian as far as the robot is not lost; and
     w = v k + (4 / L) max(v, v_turn) (wanted - actual), which for small errors is critically damped, with
     both poles at -2 / L per metre driven. Stanley's (Hoffmann et al., ACC 2007, eq. 5): a point b ahead of
     the axle is a steered wheel, turned by the path's heading there less the robot's and by
@@ -232,14 +238,15 @@ def along_path(
         ex, ey = x - xs[i], y - ys[i]
     left = lefts[i]
     spacing = left - lefts[i + 1]
-    last = i + int(left / spacing + 0.5) - 1
+    per_m = 1.0 / spacing
+    last = i + int(left * per_m + 0.5) - 1
     left -= along * spacing
     if left < ARRIVED_M:
         return 0.0, 0.0, last + 2, 0.0
     if along < 0.0:
         along = 0.0
     # The plan is read where the robot will be when the motors have done what they are told.
-    ahead = along + (v * delay / spacing if v > 0.0 else 0.0)
+    ahead = along + (v * delay * per_m if v > 0.0 else 0.0)
     j = int(ahead)
     part = ahead - j
     j += i
@@ -257,14 +264,14 @@ def along_path(
         elif bend < -w_path:
             bend = -w_path
         lean = (dx * ey - dy * ex) / (math.sqrt(length2) * SETTLE_M)
-        lean /= 1.0 + 0.28 * lean * lean
+        lean *= 1.0 - 0.3 * lean * lean
         wanted = headings[j] + part * (headings[j + 1] - headings[j]) - lean
         error = wrapped(wanted - (yaw + w * delay))
         off = abs(error)
         if off > ALIGN:
             planned *= (ASTRAY - off) / (ASTRAY - ALIGN) if off < ASTRAY else 0.0
         return planned, bend + GAIN * (v if v > V_TURN else V_TURN) * error, i, driven
-    ahead = along + look / spacing
+    ahead = along + look * per_m
     j = int(ahead)
     part = ahead - j
     j += i
@@ -472,6 +479,7 @@ def drive_on(
     x, y, yaw = state[0], state[1], state[2]
     v_told, w_told, v, w, v_mean, free = state[3], state[4], state[5], state[6], state[7], state[8]
     bump, node, driven = state[9], int(state[10]), state[11]
+    cos_yaw, sin_yaw = state[12], state[13]
     to_x, to_y, to_yaw, to_v, to_w, to_wheel_v, to_wheel_w, to_v_cmd, to_w_cmd, to_bump = record
     half_dt = dt / 2
     made = steps
@@ -489,14 +497,20 @@ def drive_on(
             v = w = 0.0
         v_body = v_mean * (1.0 - slip * (v_mean - was)) * scale_v
         w_body = w_mean * scale_w
+        if (first + k) % ANEW == 0:
+            cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
         half = w_body * half_dt
         square = half * half
         if square < SHORT:
-            chord = v_body * dt * (1.0 - square * A1 * (1.0 - square * A2 * (1.0 - square * A3)))
+            share = 1.0 - square * A1 * (1.0 - square * A2 * (1.0 - square * A3))
+            sin_half = half * share
+            cos_half = 1.0 - square * B1 * (1.0 - square * B2 * (1.0 - square * B3))
         else:
-            chord = v_body * dt * (math.sin(half) / half)
-        yaw += half
-        cos, sin = math.cos(yaw), math.sin(yaw)
+            sin_half, cos_half = math.sin(half), math.cos(half)
+            share = sin_half / half
+        chord = v_body * dt * share
+        cos, sin = cos_yaw * cos_half - sin_yaw * sin_half, sin_yaw * cos_half + cos_yaw * sin_half
+        cos_yaw, sin_yaw = cos * cos_half - sin * sin_half, sin * cos_half + cos * sin_half
         free -= abs(chord)
         if free < 0.0:
             way = abs(chord)
@@ -515,7 +529,7 @@ def drive_on(
                     bump = 1.0
         x += chord * cos
         y += chord * sin
-        yaw += half
+        yaw += half + half
         to_x[k], to_y[k], to_yaw[k] = x, y, yaw
         to_v[k], to_w[k] = v_body, w_body
         to_wheel_v[k], to_wheel_w[k] = v_mean, w_mean
@@ -526,7 +540,7 @@ def drive_on(
             break
     state[0], state[1], state[2] = x, y, yaw
     state[3], state[4], state[5], state[6], state[7], state[8] = v_told, w_told, v, w, v_mean, free
-    state[9], state[10], state[11] = bump, float(node), driven
+    state[9], state[10], state[11], state[12], state[13] = bump, float(node), driven, cos_yaw, sin_yaw
     return made
 
 
