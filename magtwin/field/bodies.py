@@ -535,7 +535,12 @@ def _interpolated(
     node = np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
     x, y = np.meshgrid(middle[0] + half * node, middle[1] + half * node, indexing="ij")
     square = np.stack([x, y, np.full_like(x, middle[2])], axis=-1).reshape(-1, 3)
-    values, _ = dipole_block(square, None, places[clear], moments[clear])
+    values = np.concatenate(
+        [
+            dipole_block(square[some], None, places[clear], moments[clear])[0]
+            for some in in_blocks(len(square), np.count_nonzero(clear))
+        ]
+    )
     waves = np.linalg.inv(np.polynomial.chebyshev.chebvander(node, NODES - 1))
     sums = np.einsum("ki,lj,ijc->klc", waves, waves, values.reshape(NODES, NODES, 3))
     u, w = (np.polynomial.chebyshev.chebvander((p[:, k] - middle[k]) / half, NODES - 1) for k in (0, 1))

@@ -22,7 +22,7 @@ SHARED = 16
 PAIRS = 32_768
 """Point-dipole pairs worked on at a time: a few arrays of them stay in the second-level cache."""
 
-CLOSE = 1e-2
+CLOSE = 1e-4
 """Part of the squares of the distances from the origin below which |r|^2 is formed without cancelling."""
 
 T = TypeVar("T")
