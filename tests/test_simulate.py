@@ -120,13 +120,15 @@ def test_columns_of_the_truth_agree_with_each_other():
     assert_allclose(moved, wanted, atol=2e-3)  # a reading's turn, and a step of 0.018 m/s shared by two
     turned = np.diff(np.unwrap(run["yaw"])) * 1000
     assert np.abs(turned - run["w_base"][:-1, 2]).mean() < 1e-3
-    assert_array_equal(run["v_cmd"], run["v_base"][:, 0])
-    assert_array_equal(run["w_cmd"], run["w_base"][:, 2])
+    # The motors lag, the wheels slip, and the drive keeps its limits: in the mean it does what it is told.
+    assert_allclose(run["v_cmd"].mean(), run["v_base"][:, 0].mean(), rtol=0.02)
+    assert_allclose(run["w_cmd"].mean(), run["w_base"][:, 2].mean(), atol=0.01)
 
 
 def test_wheels_have_turned_by_the_path_length():
     run = drive()
-    assert_allclose(run["wheel_angle"][-1] * ROBOT.drive.wheel_radius_m, 1.0, atol=0.002)
+    off = 4 * ROBOT.drive.wheel_radius_error_std  # of the wheels in this session
+    assert_allclose(run["wheel_angle"][-1] * ROBOT.drive.wheel_radius_m, 1.0, atol=0.002 + off)
 
 
 def test_the_map_is_read_at_base_links_pose():

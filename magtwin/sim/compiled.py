@@ -5,6 +5,7 @@ where that cannot be written to, in the user's cache folder; where neither can, 
 Sums and products are neither reordered nor fused, so it gives the bits that plain Python gives.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 from numba import njit, types
@@ -35,9 +36,17 @@ _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 # What each step asks for is put in its place: as calls, which count references to every array that they
 # are given, these would double the time of a step.
-for _part in (loop.towards_point, loop.along_path, loop.commanded):
+_IN_PLACE: tuple[Callable[..., Any], ...] = (loop.towards_point, loop.along_path, loop.commanded)
+_CALLED: tuple[Callable[..., Any], ...] = (
+    loop.wrapped,
+    loop.limited,
+    loop.clearance,
+    loop.free_way,
+    loop.drive_on,
+)
+for _part in _IN_PLACE:
     register_jitable(inline="always", **_OPTIONS)(_part)
-for _part in (loop.wrapped, loop.limited, loop.clearance, loop.free_way, loop.drive_on):
+for _part in _CALLED:
     register_jitable(**_OPTIONS)(_part)
 
 
