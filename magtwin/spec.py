@@ -309,6 +309,7 @@ class LidarSpec(MountSpec):
         self._above_zero("scan_rate_hz", "range_max_m")
         self._not_negative("range_min_m", "range_noise_std_m", "latency_s", "jitter_s")
         self._not_negative("on_s", "off_s", "phase_s")
+        self._require("rays", isinstance(self.rays, int), "be a whole number", self.rays)
         self._within("rays", 1, MOST_RAYS)
         low, high = self.range_min_m, self.range_max_m
         self._require("range_min_m", low < high, f"be below range_max_m {high!r}", low)
@@ -494,9 +495,14 @@ class DriveSpec(Spec):
             "wheel_rate_max",
             "command_timeout_s",
             "odometry_rate_hz",
+            "odometry_scale",
         )
         self._not_negative(
+            "odometry_latency_s",
+            "odometry_jitter_s",
             "odometry_noise_std",
+            "odometry_v_noise_std",
+            "odometry_w_noise_std",
             "motor_lag_s",
             "slip_s2_m",
             "wheel_radius_error_std",
@@ -505,6 +511,7 @@ class DriveSpec(Spec):
         self._require("yaw_slip", 0 <= self.yaw_slip < 1, "be at least 0 and below 1", self.yaw_slip)
         whole = f"be below 1 at a_max {self.a_max!r}, where all of the way would be slip"
         self._require("slip_s2_m", self.slip_s2_m * self.a_max < 1, whole, self.slip_s2_m)
+        self._require("wheel_errors", min(self.wheel_errors) > -1, "be above -1", self.wheel_errors)
         left, right = self.left_wheel_joint, self.right_wheel_joint
         self._require("right_wheel_joint", left != right, "be another joint than the left wheel's", right)
 

@@ -17,6 +17,7 @@ from magtwin.spec import (
     ImuSpec,
     LidarSpec,
     MagnetometerSpec,
+    MocapSpec,
     PlatformFieldSpec,
 )
 from magtwin.usd import sensors
@@ -86,6 +87,11 @@ def test_a_magnetometer_survives_the_stage(spec):
         orientation_noise_std=not_negative,
         gyro_noise_std=not_negative,
         accel_noise_std=not_negative,
+        latency_s=not_negative,
+        yaw_zero=not_negative,
+        tilt=st.tuples(not_negative, not_negative),
+        gyro_bias=st.tuples(not_negative, not_negative, not_negative),
+        accel_vibration=st.tuples(not_negative, not_negative, not_negative),
     )
 )
 def test_an_imu_survives_the_stage(spec):
@@ -95,7 +101,16 @@ def test_an_imu_survives_the_stage(spec):
 
 @unhurried
 @given(
-    st.fixed_dictionaries({**mount, "scan_rate_hz": above_zero, "on_s": not_negative, "off_s": not_negative}),
+    st.fixed_dictionaries(
+        {
+            **mount,
+            "scan_rate_hz": above_zero,
+            "on_s": not_negative,
+            "off_s": not_negative,
+            "phase_s": not_negative,
+            "rays": st.integers(1, 100_000),
+        }
+    ),
     ordered(not_negative).filter(lambda ranges: ranges[0] < ranges[1]),
 )
 def test_a_lidar_survives_the_stage(figures, ranges):
@@ -108,6 +123,8 @@ def test_a_lidar_survives_the_stage(figures, ranges):
 @given(
     st.builds(
         BatterySpec,
+        model=st.sampled_from(["power", "linear"]),
+        discharge=st.lists(st.floats(0, 1), max_size=5).map(lambda between: (0.0, *sorted(between), 1.0)),
         capacity_wh=above_zero,
         load_w=not_negative,
         initial_fraction=st.floats(0, 1),
@@ -125,10 +142,24 @@ def test_a_battery_survives_the_stage(spec, voltages):
 
 @unhurried
 @given(st.data())
+def test_motion_capture_survives_the_stage(data):
+    spec = MocapSpec(**{f.name: data.draw(above_zero) for f in fields(MocapSpec)})
+    stage = stage_with_link()
+    prim = stage.GetPrimAtPath("/robot")
+    assert sensors.read_mocap(prim) == MocapSpec()
+    assert sensors.read_mocap(sensors.define_mocap(prim, spec)) == spec
+
+
+@unhurried
+@given(st.data())
 def test_a_drive_survives_the_stage(data):
     names = data.draw(st.lists(name, min_size=2, max_size=2, unique=True))
     joints = dict(zip(sensors.JOINT_FIELDS, names, strict=True))
-    figures = {f.name: data.draw(above_zero) for f in fields(DriveSpec) if f.name not in joints}
+    figures = {
+        f.name: tuple(data.draw(above_zero) for _ in f.default) if isinstance(f.default, tuple)
+        else data.draw(above_zero)
+        for f in fields(DriveSpec) if f.name not in joints
+    } | {"yaw_slip": 0.25, "slip_s2_m": 0.0}  # fmt: skip
     spec = DriveSpec(**joints, **figures)
     stage = stage_with_wheels(spec)
     assert sensors.read_drive(sensors.define_drive(stage.GetPrimAtPath("/robot"), spec)) == spec

@@ -95,6 +95,28 @@ def test_no_number_of_a_spec_may_be_infinite_or_none(given, name, bad):
             "right_wheel_joint of DriveSpec must be another joint than the left wheel's, got",
         ),
         (spec.BatterySpec(), {"initial_fraction": 1.5}, r"must lie in 0\.\.1, got 1\.5"),
+        *(
+            (given, {"rate_hz": rate}, rf"rate_hz of {type(given).__name__} must be above 0, got")
+            for given in (spec.MagnetometerSpec(), spec.ImuSpec(), spec.BatterySpec(), spec.MocapSpec())
+            for rate in (0.0, -62.0)
+        ),
+        (spec.DriveSpec(), {"odometry_rate_hz": 0.0}, "odometry_rate_hz of DriveSpec must be above 0, got 0"),
+        (spec.DriveSpec(), {"odometry_scale": (1.0, 0.0)}, r"odometry_scale .* must be above 0, got \(1"),
+        (spec.DriveSpec(), {"wheel_errors": (0.0, -1.0)}, r"wheel_errors .* must be above -1, got \(0"),
+        (spec.ImuSpec(), {"latency_s": -0.1}, r"latency_s of ImuSpec must not be below 0, got -0\.1"),
+        (spec.ImuSpec(), {"accel_vibration": (1.0, -1.0, 1.0)}, "accel_vibration .* must not be below 0"),
+        (spec.LidarSpec(), {"scan_rate_hz": 0.0}, "scan_rate_hz of LidarSpec must be above 0"),
+        (spec.LidarSpec(), {"rays": 0}, r"rays of LidarSpec must lie in 1\.\.100000, got 0"),
+        (spec.LidarSpec(), {"rays": 90.5}, r"rays of LidarSpec must be a whole number, got 90\.5"),
+        (
+            spec.BatterySpec(),
+            {"model": "magic"},
+            """model of BatterySpec must be "power" or "linear", got 'magic'""",
+        ),
+        (spec.BatterySpec(), {"discharge": (0.0, 0.6, 0.5, 1.0)}, "discharge .* must rise from 0 to 1"),
+        (spec.BatterySpec(), {"discharge": ()}, "discharge .* must rise from 0 to 1"),
+        (spec.BatterySpec(), {"motor_efficiency": 1.1}, r"motor_efficiency .* must lie in 0\.\.1, got 1\.1"),
+        (spec.MocapSpec(), {"dropout_s": -1.0}, r"dropout_s of MocapSpec must not be below 0, got -1\.0"),
         (spec.LabSpec(), {"floor_m": (6.0, 0.0)}, r"floor_m of LabSpec must be above 0 m each way, got"),
     ],
 )

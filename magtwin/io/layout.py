@@ -89,7 +89,7 @@ STATES = {
     "lidar_on": ("LiDAR", "off", "on"),
     "flag_bump": ("bump", "no", "bump"),
     "flag_outside_map": ("map", "inside", "outside"),
-    "flag_pose_lost": ("motion capture", "seen", "lost"),
+    "flag_pose_lost": ("mocap", "seen", "lost"),
     "flag_out_of_distribution": ("network", "in distribution", "out of distribution"),
     "flag_lost_lock": ("lock", "held", "lost"),
 }
