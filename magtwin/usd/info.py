@@ -8,7 +8,9 @@ from pxr import Usd, UsdGeom, UsdPhysics
 from magtwin.report import Figure, Report
 from magtwin.usd.layers import open_stage
 
-_PREFIX, _SOURCE = "Magtwin", "MagtwinMagneticSourceAPI"
+_PREFIX = "Magtwin"
+_MANY = ("MagtwinMagneticSourceAPI", "MagtwinFurnitureAPI")
+"""Schemas that a stage has on many prims, which are counted."""
 
 
 def info_of_stage(path: Path) -> Report:
@@ -37,7 +39,8 @@ def info_of_stage(path: Path) -> Report:
     applied = [
         (schema, prim) for prim in prims for schema in prim.GetAppliedSchemas() if schema.startswith(_PREFIX)
     ]
-    figures += [Figure(schema, str(prim.GetPath())) for schema, prim in applied if schema != _SOURCE]
-    if sources := sum(schema == _SOURCE for schema, _ in applied):
-        figures.append(Figure(_SOURCE, sources, "prims"))
+    figures += [Figure(schema, str(prim.GetPath())) for schema, prim in applied if schema not in _MANY]
+    for many in _MANY:
+        if count := sum(schema == many for schema, _ in applied):
+            figures.append(Figure(many, count, "prims"))
     return Report(str(path), tuple(figures))
