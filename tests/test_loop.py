@@ -462,3 +462,28 @@ def test_courses_of_different_steps_are_not_run_at_once():
     chosen = [course_along(LINE, REAL, speed=0.2, rate_hz=rate) for rate in (50.0, 20.0)]
     with pytest.raises(RefusedError, match="the same length of a step"):
         run_courses(chosen)
+
+
+def test_a_shipped_scene_refuses_a_path_through_its_wall_or_its_furniture():
+    from magtwin.files import shipped
+    from magtwin.twin import open_twin, simulate
+
+    twin = open_twin(shipped("scenes", "lab", "lab.usda"), net="none")
+    desk = next(i for i, name in enumerate(twin.obstacles.names) if "desk" in name)
+    x, y = twin.obstacles.outlines[desk].mean(axis=0)
+    scene = dataclasses.replace(twin.scene, lab=dataclasses.replace(twin.scene.lab, floor_m=(40.0, 40.0)))
+    through = Path("through", np.array([[x - 1.0, y], [x + 1.0, y]]))
+    with pytest.raises(RefusedError, match=r"path through runs into /World/"):
+        simulate(dataclasses.replace(twin, scene=scene), through)
+
+
+@pytest.mark.parametrize("name", ["stanley", "pure_pursuit"])
+def test_a_run_tells_which_controller_drove(name):
+    from magtwin.files import shipped
+    from magtwin.twin import open_twin, simulate
+
+    run = simulate(
+        open_twin(shipped("scenes", "lab", "lab.usda"), net="none"), duration_s=5.0, controller=name
+    )
+    assert run.facts["controller"] == name
+    assert not run["flag_bump"].any()

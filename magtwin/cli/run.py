@@ -59,6 +59,7 @@ def run(
     scene: Path,
     *,
     path: str = "figure8",
+    controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     seed: Seed = 0,
@@ -85,6 +86,9 @@ def run(
     path
         sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle,
         curvilinear, curvilinear_2; A to E, the cases of the paper's Table 1; or a CSV file of x,y [m].
+    controller
+        What drives: magtwin's follower; that of the released package, which drives the real robot; Stanley's;
+        or pure pursuit.
     net
         Weights to use in place of the scene's (.safetensors or .pth), for a neural magnetometer; "none" for
         a physical one.
@@ -137,6 +141,7 @@ def run(
         "rate_hz": rate_hz,
         "lidar": lidar,
         "outside": outside,
+        "controller": controller,
         "title": f"{path} in {scene}",
     }
     with ExitStack() as stack:  # all are written, or none
