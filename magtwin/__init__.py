@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from magtwin.path import Path
     from magtwin.run import COLUMNS, Run
     from magtwin.spec import Scene
-    from magtwin.twin import Twin, open_twin, scene_from_toml, simulate
+    from magtwin.twin import Twin, open_twin, scene_from_toml, simulate, simulate_many
 
 __version__ = "0.1.0"
 
@@ -28,6 +28,7 @@ _HOME = {
     "open_twin": "magtwin.twin",
     "scene_from_toml": "magtwin.twin",
     "simulate": "magtwin.twin",
+    "simulate_many": "magtwin.twin",
 }
 
 __all__ = [
@@ -41,6 +42,7 @@ __all__ = [
     "open_twin",
     "scene_from_toml",
     "simulate",
+    "simulate_many",
 ]
 
 

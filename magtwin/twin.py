@@ -1,11 +1,13 @@
 """Twin: a scene opened for running, with the map and the network that its prims name."""
 
 import dataclasses
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 import magtwin
 from magtwin.field.map import AnomalyMap
@@ -14,7 +16,7 @@ from magtwin.names import RefusedError
 from magtwin.obstacles import Obstacles
 from magtwin.path import Path, resolve_path
 from magtwin.run import Run
-from magtwin.spec import Scene
+from magtwin.spec import RobotSpec, Scene
 
 Kind = Literal["physical", "neural", "map-only"]
 
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
     from magtwin.learn.magnetometer import NeuralMagnetometer
     from magtwin.sim.controllers import Controller
     from magtwin.sim.lidar import Scans
+    from magtwin.sim.many import Runs
+    from magtwin.sim.simulate import Sensed
 
 
 @dataclass(frozen=True)
@@ -161,12 +165,7 @@ def simulate(
     """
     from magtwin.sim.simulate import simulate as run_scene
 
-    if not isinstance(twin, Twin):
-        twin = open_twin(twin, net=net, magnetometer=magnetometer)
-    elif net is not None or magnetometer is not None:
-        raise RefusedError("net and magnetometer go to open_twin where a Twin is given to simulate")
-    if not isinstance(seed, int) or seed < 0:
-        raise RefusedError(f"seed must be a whole number from 0 up, got {seed!r}")
+    twin, seed = _opened(twin, net, magnetometer, "simulate"), _seed(seed)
     network = twin.magnetometer
     run = run_scene(
         twin.scene,
@@ -182,20 +181,170 @@ def simulate(
         obstacles=twin.obstacles,
         controller=controller,
     )
+    outside_training = network.outside_training(run) if network else None
+    return run.with_columns(**_known(twin.scene, run, network, outside_training)).with_facts(
+        **_facts(twin, seed, sha256(twin.scene.map_layer))
+    )
+
+
+def simulate_many(
+    twin: Twin | str | FilePath,
+    paths: Path | str | Sequence[Path | str],
+    seeds: Iterable[int],
+    *,
+    speeds: float | Sequence[float] = 0.2,
+    robots: RobotSpec | Sequence[RobotSpec] | None = None,
+    columns: Iterable[str] | None = None,
+    block: int | None = None,
+    duration_s: float | None = None,
+    rate_hz: float | None = None,
+    net: str | FilePath | None = None,
+    magnetometer: Kind | None = None,
+    lidar: Literal["schedule", "on", "off"] = "schedule",
+    outside: Literal["nan", "clamp", "raise"] = "nan",
+    controller: str = "follower",
+) -> "Runs":
+    """Many robots, each in the scene by itself; `simulate_many(twin, paths, seeds)[i]` is
+    `simulate(twin, paths[i], seed=seeds[i])`, to the last bit, whatever the number, the order and the block.
+
+    All are driven at once by the compiled loop, and their readings go through the network in one stream of
+    blocks. Checked at once, made when asked for: iterate over the result to have bounded memory, `list` it to
+    keep all.
+
+    Args:
+        twin: What `open_twin` gave, or the file of a scene.
+        paths: The path of each run, or one for all: a path, the name of one, or a CSV file of x, y [m].
+        seeds: A seed for each run; their number is that of the runs.
+        speeds: Forward speed of each where its path is straight [m/s], or one for all.
+        robots: What drives in each, such as `magtwin.sim.session.draw_session` gives, or one for all; None
+            takes the scene's.
+        columns: Columns to keep, beside t; None keeps all.
+        block: Runs made at a time; None takes what fits into 0.1 GB for runs of a minute.
+        duration_s: As for `simulate`, of each run.
+        rate_hz: As for `simulate`.
+        net: As for `simulate`.
+        magnetometer: As for `simulate`.
+        lidar: As for `simulate`.
+        outside: As for `simulate`.
+        controller: A name of `magtwin.sim.controllers.CONTROLLERS`.
+
+    Returns:
+        A sequence of runs, made when they are asked for.
+
+    Raises:
+        RefusedError: There is no seed, numbers of paths, speeds, robots and seeds differ, a seed is no whole
+            number from 0 up, a robot's magnetometer is not the twin's, or `simulate` would refuse a run.
+    """
+    from magtwin.sim.many import BLOCK, Conditions, Job, Runs
+
+    twin = _opened(twin, net, magnetometer, "simulate_many")
+    numbers = [_seed(seed) for seed in seeds]
+    if not isinstance(controller, str):
+        raise RefusedError(
+            f"controller of many runs must be a name, got {type(controller).__name__}; one of your own "
+            "remembers a single run: give it to simulate"
+        )
+    count = len(numbers)
+    resolved = {
+        path: resolve_path(path) for path in _each("paths", paths, count) if not isinstance(path, Path)
+    }
+    scenes: dict[int, Scene] = {}
+    jobs = []
+    for seed, path, speed, robot in zip(
+        numbers,
+        _each("paths", paths, count),
+        _each("speeds", speeds, count),
+        _each("robots", robots, count),
+        strict=True,
+    ):
+        if robot is not None and id(robot) not in scenes:
+            _check_magnetometer(twin, robot)
+            scenes[id(robot)] = dataclasses.replace(twin.scene, robot=robot)
+        scene = twin.scene if robot is None else scenes[id(robot)]
+        jobs.append(Job(scene, path if isinstance(path, Path) else resolved[path], seed, speed))
+    network, checksum = twin.magnetometer, sha256(twin.scene.map_layer)
+
+    def finish(jobs: Sequence[Job], sensed: Sequence["Sensed"]) -> list[Run]:
+        read = network.read([one.run for one in sensed]) if network else [(None, None)] * len(sensed)
+        runs = []
+        for job, one, (disturbance, outside_training) in zip(jobs, sensed, read, strict=True):
+            run = one.read(disturbance)
+            run = run.with_columns(**_known(job.scene, run, network, outside_training))
+            runs.append(run.with_facts(**_facts(twin, job.seed, checksum)))
+        return runs
+
+    conditions = Conditions(
+        anomaly_map=twin.field,
+        obstacles=twin.obstacles,
+        network=network is not None,
+        duration_s=duration_s,
+        rate_hz=rate_hz,
+        controller=controller,
+        lidar=lidar,
+        outside=outside,
+    )
+    return Runs(jobs, conditions, finish, columns=columns, block=BLOCK if block is None else block)
+
+
+def _opened(
+    twin: Twin | str | FilePath, net: str | FilePath | None, magnetometer: Kind | None, what: str
+) -> Twin:
+    """A twin, opened if it is not."""
+    if not isinstance(twin, Twin):
+        return open_twin(twin, net=net, magnetometer=magnetometer)
+    if net is not None or magnetometer is not None:
+        raise RefusedError(f"net and magnetometer go to open_twin where a Twin is given to {what}")
+    return twin
+
+
+def _seed(seed: object) -> int:
+    """A seed, if it is one; NumPy's whole numbers are."""
+    if isinstance(seed, int | np.integer) and not isinstance(seed, bool) and seed >= 0:
+        return int(seed)
+    raise RefusedError(f"seed must be a whole number from 0 up, got {seed!r}")
+
+
+def _each(name: str, values: Any, count: int) -> Sequence[Any]:
+    """A value for each run, from as many, or from one for all."""
+    if values is None or isinstance(values, str | FilePath | Path | RobotSpec | float | int):
+        return [values] * count
+    if len(values) != count:
+        raise RefusedError(f"{name} and seeds must be equally many, got {len(values)} and {count}")
+    return list(values)
+
+
+def _check_magnetometer(twin: Twin, robot: RobotSpec) -> None:
+    """Refuse a robot whose magnetometer the twin's network does not run."""
+    ours, its = twin.scene.robot.magnetometer, robot.magnetometer
+    if (its.kind, its.network) != (ours.kind, ours.network):
+        raise RefusedError(
+            f"robot {robot.name!r} has a magnetometer of the kind {its.kind!r} with the network "
+            f"{its.network}, the twin's is {ours.kind!r} with {ours.network}; open a twin for each"
+        )
+
+
+def _known(
+    scene: Scene, run: Run, network: "NeuralMagnetometer | None", outside_training: NDArray[np.bool_] | None
+) -> dict[str, NDArray[Any]]:
+    """Columns that only who knows the network can fill; none without one."""
+    if network is None or outside_training is None:
+        return {}
+    spec = scene.robot.magnetometer
+    noise = spec.noise_density_nt * np.sqrt(float(run.facts["rate_hz"]) / 2)
+    sd = np.full(run.rows, np.hypot(network.residual_sd_nt, noise))
+    return {"b_sd_nt": sd, "flag_out_of_distribution": outside_training}
+
+
+def _facts(twin: Twin, seed: int, map_sha256: str) -> dict[str, str | int | float | bool]:
+    """What a twin adds to the facts of a run."""
     facts: dict[str, str | int | float | bool] = {
+        "magtwin": magtwin.__version__,
+        "numpy": np.__version__,
         "seed": seed,
         "map": twin.field.name,
-        "map_sha256": sha256(twin.scene.map_layer),
+        "map_sha256": map_sha256,
     }
-    if network:
-        rate = twin.scene.robot.magnetometer.rate_hz if rate_hz is None else rate_hz
-        noise = twin.scene.robot.magnetometer.noise_density_nt * np.sqrt(rate / 2)
-        run = run.with_columns(
-            b_sd_nt=np.full(run.rows, np.hypot(network.residual_sd_nt, noise)),
-            flag_out_of_distribution=network.outside_training(run),
-        )
-        facts |= network.facts
-    return run.with_facts(magtwin=magtwin.__version__, numpy=np.__version__, **facts)
+    return facts | dict(twin.magnetometer.facts) if twin.magnetometer else facts
 
 
 def scan(twin: Twin, run: Run, *, seed: int = 0) -> "Scans":

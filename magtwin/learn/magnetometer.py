@@ -4,7 +4,7 @@ import itertools
 import math
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -136,6 +136,16 @@ class NeuralMagnetometer:
             RefusedError: The run lacks a column that the network reads.
         """
         return self.predict(features(run, self.features))
+
+    def read(self, runs: Sequence[Run]) -> list[tuple[Array, NDArray[np.bool_]]]:
+        """`disturbance_nt` and `outside_training` of each of many runs, all rows in one stream of blocks.
+
+        Raises:
+            RefusedError: A run lacks a column that the network reads.
+        """
+        x = np.concatenate([features(run, self.features) for run in runs])
+        ends = np.cumsum([run.rows for run in runs])[:-1]
+        return list(zip(np.split(self.predict(x), ends), np.split(self.outside(x), ends), strict=True))
 
     def outside_training(self, run: Run) -> NDArray[np.bool_]:
         """Whether an input of a reading left the range of the training rows, shape (N,).

@@ -41,7 +41,7 @@ def course_along(
     if obstacles is not None:
         check_clear(path, obstacles, footprint_radius_m)
     way = path if controller == "release" else drivable(path)
-    if duration_s is not None:
+    if duration_s is not None and 0 < speed < math.inf:  # the plan refuses others
         way = way.prolonged(speed * duration_s)
     if start is not None:
         way = Path(way.name, np.vstack([start[:2], way.p_xy]))

@@ -1,7 +1,8 @@
 """simulate: a scene and a path go in, a Run with every column comes out."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
@@ -16,7 +17,7 @@ from magtwin.path import Path, check_on_floor
 from magtwin.run import COLUMNS, Run
 from magtwin.sim.battery import discharge, sense_battery
 from magtwin.sim.controllers import Controller
-from magtwin.sim.drive import Moment, draw_wheel_errors
+from magtwin.sim.drive import Moment, Motion, draw_wheel_errors
 from magtwin.sim.follow import follow
 from magtwin.sim.imu import sense_imu
 from magtwin.sim.interference import ambient_gradient_nt_m, field_at_sensor_nt, sensor_places
@@ -88,19 +89,10 @@ def simulate(
         RefusedError: The path leaves the floor or touches an obstacle, an option is out of range, or nothing
             gives the disturbance. Nothing has been computed then.
     """
-    robot = scene.robot
-    rate = robot.magnetometer.rate_hz if rate_hz is None else rate_hz
-    if not 0 < rate < math.inf:
-        raise RefusedError(f"rate_hz of the magnetometer must be above 0 Hz and finite, got {rate!r}")
-    kind = robot.magnetometer.kind if disturbance_nt is None else "neural"
-    if disturbance_nt is None:
-        _check_kind(scene)
-    lidar_on(robot.lidar, 0.0, lidar)  # refuses an unknown mode before anything is computed
-    check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
-    if duration_s is not None:
-        _check_readings(duration_s, rate)
-
-    draws = streams(rng)
+    rate = check_run(
+        scene, path, rate_hz=rate_hz, duration_s=duration_s, lidar=lidar, network=disturbance_nt is not None
+    )
+    robot, draws = scene.robot, streams(rng)
     motion = follow(
         path,
         robot.drive,
@@ -111,9 +103,130 @@ def simulate(
         footprint_radius_m=robot.footprint_radius_m,
         wheel_errors=draw_wheel_errors(robot.drive, draws["drive"]),
     )
+    sensed = sense(
+        scene,
+        motion,
+        draws,
+        anomaly_map=anomaly_map,
+        rate_hz=rate,
+        duration_s=duration_s,
+        outside=outside,
+        lidar=lidar,
+        facts={
+            "path": path.name,
+            "controller": controller if isinstance(controller, str) else type(controller).__name__,
+            "speed_m_s": float(speed),
+        },
+        network=disturbance_nt is not None,
+    )
+    return sensed.read(None if disturbance_nt is None else disturbance_nt(sensed.run))
+
+
+def check_run(
+    scene: Scene,
+    path: Path,
+    *,
+    rate_hz: float | None,
+    duration_s: float | None,
+    lidar: Literal["schedule", "on", "off"],
+    network: bool,
+) -> float:
+    """The magnetometer's rate [Hz] in a run against which nothing speaks; arguments as for `simulate`.
+
+    Raises:
+        RefusedError: The path leaves the floor, an option is out of range, or nothing gives the disturbance.
+    """
+    robot = scene.robot
+    rate = robot.magnetometer.rate_hz if rate_hz is None else rate_hz
+    if not 0 < rate < math.inf:
+        raise RefusedError(f"rate_hz of the magnetometer must be above 0 Hz and finite, got {rate!r}")
+    if not network:
+        _check_kind(scene)
+    lidar_on(robot.lidar, 0.0, lidar)  # refuses an unknown mode before anything is computed
+    check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
+    if duration_s is not None:
+        _check_readings(duration_s, rate)
+    return rate
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sensed:
+    """A run in which every sensor has been read but the magnetometer."""
+
+    run: Run
+    """Every column but those that the disturbance makes."""
+
+    scene: Scene
+
+    rate_hz: float
+    """Magnetometer readings a second [Hz]."""
+
+    steep: NDArray[np.bool_]
+    """Whether lock is lost to the gradient at each reading, shape (N,)."""
+
+    rng: np.random.Generator
+    """Source of the magnetometer's noise; spent by one reading."""
+
+    def read(self, disturbance_nt: NDArray[Any] | None = None) -> Run:
+        """The whole run.
+
+        Args:
+            disturbance_nt: What a network predicts for each reading [nT], shape (N,); none for a magnetometer
+                without one.
+        """
+        columns, spec = dict(self.run.columns), self.scene.robot.magnetometer
+        rows = len(columns["t"])
+        if disturbance_nt is None:
+            exact = columns["b_truth_nt"] - columns["b_map_nt"]
+            disturbance = exact if spec.kind == "physical" else np.zeros(rows)
+        else:
+            disturbance = np.asarray(disturbance_nt, float)
+            if disturbance.shape != (rows,):
+                raise RefusedError(f"disturbance_nt must give shape {(rows,)}, got {disturbance.shape}")
+        columns["b_disturbance_nt"] = disturbance
+        columns["b_total_nt"] = columns["b_map_nt"] + disturbance
+        columns |= sense_magnetometer(
+            spec,
+            columns["b_total_nt"],
+            columns["b_vector_nt"],
+            self.rng,
+            rate_hz=self.rate_hz,
+            steep=self.steep,
+        )
+        return Run({name: columns[name] for name in COLUMNS}, self.run.facts)
+
+
+def sense(
+    scene: Scene,
+    motion: Motion,
+    draws: Mapping[str, np.random.Generator],
+    *,
+    anomaly_map: AnomalyMap,
+    rate_hz: float,
+    duration_s: float | None,
+    outside: Literal["nan", "clamp", "raise"],
+    lidar: Literal["schedule", "on", "off"],
+    facts: Mapping[str, str | int | float | bool],
+    network: bool,
+) -> Sensed:
+    """Read every sensor but the magnetometer in what a robot did.
+
+    Args:
+        scene: As for `simulate`.
+        motion: What the robot did.
+        draws: What `streams` gave.
+        anomaly_map: As for `simulate`.
+        rate_hz: Magnetometer readings a second [Hz].
+        duration_s: How long [s]; None is as long as the motion.
+        outside: As for `simulate`.
+        lidar: As for `simulate`.
+        facts: How the motion came about.
+        network: Whether a network will predict the disturbance.
+    """
+    robot = scene.robot
     end = motion.duration_s if duration_s is None else duration_s
-    _check_readings(end, rate)
-    t = np.arange(max(1, math.ceil(end * rate - 1e-9))) / rate
+    _check_readings(end, rate_hz)
+    t = np.arange(max(1, math.ceil(end * rate_hz - 1e-9))) / rate_hz
     true = motion.at(t)
     columns = _truth(true, t, robot.base_height_m)
     columns |= sense_odometry(robot.drive, motion, t, draws["odometry"])
@@ -127,35 +240,22 @@ def simulate(
     columns |= _exact_field(scene, motion, t, true, columns["lidar_on"], supply_a)
     columns |= _flags(scene, true)
     columns["b_sd_nt"] = np.full(len(t), np.nan)
-    facts: dict[str, str | int | float | bool] = {
+    told: dict[str, str | int | float | bool] = {
         "scene": scene.name,
-        "path": path.name,
-        "controller": controller if isinstance(controller, str) else type(controller).__name__,
-        "speed_m_s": float(speed),
-        "rate_hz": float(rate),
+        **facts,
+        "rate_hz": float(rate_hz),
         "duration_s": round(float(end), 9),
         "outside": outside,
         "lidar": lidar,
-        "magnetometer": kind,
+        "magnetometer": "neural" if network else robot.magnetometer.kind,
     }
-    if disturbance_nt is None:
-        exact = columns["b_truth_nt"] - columns["b_map_nt"]
-        disturbance = exact if kind == "physical" else np.zeros(len(t))
-    else:
-        disturbance = np.asarray(disturbance_nt(Run(columns, facts)), float)
-        if disturbance.shape != t.shape:
-            raise RefusedError(f"disturbance_nt must give shape {t.shape}, got {disturbance.shape}")
-    columns["b_disturbance_nt"] = disturbance
-    columns["b_total_nt"] = columns["b_map_nt"] + disturbance
-    columns |= sense_magnetometer(
-        robot.magnetometer,
-        columns["b_total_nt"],
-        columns["b_vector_nt"],
-        draws["magnetometer"],
-        rate_hz=rate,
+    return Sensed(
+        run=Run(columns, told),
+        scene=scene,
+        rate_hz=rate_hz,
         steep=_steep(scene, anomaly_map, motion, t),
+        rng=draws["magnetometer"],
     )
-    return Run({name: columns[name] for name in COLUMNS}, facts)
 
 
 def _check_kind(scene: Scene) -> None:

@@ -1,0 +1,244 @@
+"""simulate_many: thousands of robots, each as if it were alone, driven at once and read in blocks.
+
+A robot's bits depend on nothing but its own scene, path and seed: the closed loop drives each as it would
+alone, sensors draw from generators of its own, and a network gives a row the same whatever is beside it. So
+runs can be made in any order, in blocks of any size, and any of them anew.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from typing import Literal, overload
+
+import numpy as np
+
+from magtwin.field.map import AnomalyMap
+from magtwin.names import RefusedError, find
+from magtwin.obstacles import Obstacles
+from magtwin.path import Path
+from magtwin.run import COLUMNS, Run
+from magtwin.sim.course import PAYS, Course, run_courses, warm_up
+from magtwin.sim.drive import Motion, draw_wheel_errors
+from magtwin.sim.follow import check_arrived, course_along
+from magtwin.sim.simulate import Sensed, check_run, sense, streams
+from magtwin.spec import DriveSpec, Scene
+
+BLOCK = 16
+"""Runs made at a time: 130,000 readings of a minute each, 0.1 GB, and work for every thread."""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A run that is wanted."""
+
+    scene: Scene
+    """Lab, robot and sensors."""
+
+    path: Path
+    """Where to drive."""
+
+    seed: int
+    """Seed of all noise."""
+
+    speed: float
+    """Forward speed where the path is straight [m/s]."""
+
+
+Finish = Callable[[Sequence[Job], Sequence[Sensed]], list[Run]]
+"""From jobs, and what was sensed in each, to whole runs: where a network predicts, all rows in one stream."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Conditions:
+    """What all runs have in common."""
+
+    anomaly_map: AnomalyMap
+    obstacles: Obstacles
+    network: bool
+    """Whether a network predicts the disturbance."""
+
+    duration_s: float | None = None
+    rate_hz: float | None = None
+    controller: str = "follower"
+    lidar: Literal["schedule", "on", "off"] = "schedule"
+    outside: Literal["nan", "clamp", "raise"] = "nan"
+
+
+class Runs(Sequence[Run]):
+    """Runs that are made when they are asked for.
+
+    `runs[i]` makes one, `for run in runs` all, block by block, so that memory stays bounded however many
+    there are; `list(runs)` keeps them. Asked again, a run is made again, to the same bits. While one block
+    goes through the network, the next is driven and sensed.
+    """
+
+    def __init__(
+        self,
+        jobs: Sequence[Job],
+        conditions: Conditions,
+        finish: Finish,
+        *,
+        columns: Iterable[str] | None = None,
+        block: int = BLOCK,
+    ) -> None:
+        """Check every job; nothing is driven yet.
+
+        Args:
+            jobs: The runs, at least one.
+            conditions: What they have in common.
+            finish: What makes whole runs of what was sensed.
+            columns: Those to keep, beside t; None keeps all.
+            block: Runs made at a time.
+
+        Raises:
+            RefusedError: There is no job, a column or `block` is not as said, or `simulate` would refuse a
+                job; the text then gives its number.
+        """
+        if not jobs:
+            raise RefusedError("no runs are asked for; give a seed for each")
+        if not isinstance(block, int) or block < 1:
+            raise RefusedError(f"block must be a whole number from 1 up, got {block!r}")
+        self._jobs, self._conditions, self._finish, self._block = jobs, conditions, finish, block
+        self._columns = None if columns is None else {"t", *columns}
+        for name in sorted(self._columns or ()):
+            find("column", name, COLUMNS)
+        self._planned: dict[tuple[Path, float, DriveSpec, float], Course] = {}
+        checked = set()
+        steps = 0
+        for i in range(len(jobs)):
+            job = jobs[i]
+            with self._numbered(i):
+                key = (id(job.scene), id(job.path))
+                if key not in checked:
+                    self._rate(job)
+                    checked.add(key)
+                steps += self._course(job).least_steps
+        if steps >= PAYS:
+            with suppress(ImportError):  # plain Python gives the same bits
+                warm_up()
+
+    def __len__(self) -> int:
+        return len(self._jobs)
+
+    @overload
+    def __getitem__(self, index: int) -> Run: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Run]: ...
+
+    def __getitem__(self, index: int | slice) -> Run | list[Run]:
+        numbers = range(len(self))[index]
+        if isinstance(numbers, int):
+            return self._finished([numbers], self._sensed([numbers]))[0]
+        return list(self._made(numbers))
+
+    def __iter__(self) -> Iterator[Run]:
+        return self._made(range(len(self)))
+
+    def _made(self, numbers: Sequence[int]) -> Iterator[Run]:
+        """Runs by number, in their order."""
+        blocks = [numbers[k : k + self._block] for k in range(0, len(numbers), self._block)]
+        if not blocks:
+            return
+        with ThreadPoolExecutor(1) as pool:
+            ahead = pool.submit(self._sensed, blocks[0])
+            for block, after in zip(blocks, [*blocks[1:], None], strict=True):
+                sensed = ahead.result()
+                if after is not None:
+                    ahead = pool.submit(self._sensed, after)
+                yield from self._finished(block, sensed)
+
+    def _sensed(self, numbers: Sequence[int]) -> list[Sensed]:
+        """Drive and sense some runs."""
+        jobs = [self._jobs[i] for i in numbers]
+        draws = [streams(np.random.default_rng(job.seed)) for job in jobs]
+        courses = [
+            replace(
+                self._course(job),
+                drive=job.scene.robot.drive,
+                wheel_errors=draw_wheel_errors(job.scene.robot.drive, own["drive"]),
+            )
+            for job, own in zip(jobs, draws, strict=True)
+        ]
+        motions = run_courses(courses, self._conditions.obstacles)
+        done = []
+        for i, job, own, course, motion in zip(numbers, jobs, draws, courses, motions, strict=True):
+            with self._numbered(i):
+                done.append(self._sense(job, own, course, motion))
+        return done
+
+    def _sense(
+        self, job: Job, draws: dict[str, np.random.Generator], course: Course, motion: Motion
+    ) -> Sensed:
+        common = self._conditions
+        if common.duration_s is None:
+            check_arrived(job.path, job.speed, course, motion)
+        rate = job.scene.robot.magnetometer.rate_hz if common.rate_hz is None else common.rate_hz
+        return sense(
+            job.scene,
+            motion,
+            draws,
+            anomaly_map=common.anomaly_map,
+            rate_hz=rate,
+            duration_s=common.duration_s,
+            outside=common.outside,
+            lidar=common.lidar,
+            facts={
+                "path": job.path.name,
+                "controller": common.controller,
+                "speed_m_s": float(job.speed),
+            },
+            network=common.network,
+        )
+
+    def _finished(self, numbers: Sequence[int], sensed: list[Sensed]) -> list[Run]:
+        """Whole runs, of the columns that are kept."""
+        runs = self._finish([self._jobs[i] for i in numbers], sensed)
+        keep = self._columns
+        if keep is None:
+            return runs
+        return [Run({name: run[name] for name in COLUMNS if name in keep}, run.facts) for run in runs]
+
+    def _rate(self, job: Job) -> float:
+        common = self._conditions
+        return check_run(
+            job.scene,
+            job.path,
+            rate_hz=common.rate_hz,
+            duration_s=common.duration_s,
+            lidar=common.lidar,
+            network=common.network,
+        )
+
+    def _course(self, job: Job) -> Course:
+        """The course of a job, without its wheels' errors: planned once for all who drive alike."""
+        common, radius = self._conditions, job.scene.robot.footprint_radius_m
+        alike = replace(
+            job.scene.robot.drive,
+            wheel_errors=(0.0, 0.0),
+            wheel_radius_error_std=0.0,
+            wheel_separation_error_std=0.0,
+            odometry_scale=(1.0, 1.0),
+            odometry_noise_std=0.0,
+        )
+        key = (job.path, job.speed, alike, radius)
+        if key not in self._planned:
+            self._planned[key] = course_along(
+                job.path,
+                alike,
+                speed=job.speed,
+                duration_s=common.duration_s,
+                controller=common.controller,
+                obstacles=common.obstacles,
+                footprint_radius_m=radius,
+            )
+        return self._planned[key]
+
+    @contextmanager
+    def _numbered(self, index: int) -> Iterator[None]:
+        """Refusals say of which run they are."""
+        try:
+            yield
+        except RefusedError as error:
+            raise RefusedError(f"run {index} of {len(self)}, counted from 0: {error}") from error
