@@ -1,6 +1,7 @@
 """Tolles-Lawson: regressors as others have them, coefficients that come back, runs that get quiet."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,11 +16,13 @@ from magtwin.learn.tolles_lawson import (
     fit_platform,
     fit_run,
     fit_tolles_lawson,
+    platform_of_run,
 )
 from magtwin.names import RefusedError
 from magtwin.path import path_named
+from magtwin.run import Run
 from magtwin.sim.simulate import simulate
-from magtwin.spec import EarthFieldSpec, PlatformFieldSpec, RobotSpec, Scene
+from magtwin.spec import EarthFieldSpec, LidarSpec, PlatformFieldSpec, RobotSpec, Scene
 
 RATE_HZ = 20.0
 EARTH_NT = np.array([-2700.0, 24000.0, -38400.0])
@@ -27,6 +30,19 @@ PLATFORM = PlatformFieldSpec(
     hard_iron_nt=(415.0, 760.0, -300.0),
     soft_iron=(0.008, 0.001, 0.0, 0.001, -0.004, 0.0005, 0.0, 0.0005, 0.002),
     eddy_s=(0.004, 0.0, 0.0, 0.0, 0.004, 0.0, 0.0, 0.0, 0.006),
+)
+EARTH = EarthFieldSpec(
+    b_world_nt=tuple(EARTH_NT.tolist()),
+    latitude_deg=29.65,
+    longitude_deg=-82.35,
+    height_m=50,
+    date="2026-01-01",
+)
+FLAT = AnomalyMap(
+    values_nt=np.full((1, 2, 2), np.linalg.norm(EARTH_NT)),
+    origin_m=(-3, -2),
+    cell_m=(6, 4),
+    headings_rad=np.zeros(1),
 )
 
 
@@ -104,44 +120,114 @@ def test_the_vector_fit_recovers_the_platform():
     assert_allclose(found.hard_iron_nt, PLATFORM.hard_iron_nt, rtol=1e-6)
     assert_allclose(found.soft_iron, PLATFORM.soft_iron, atol=1e-10)
     assert_allclose(found.eddy_s, PLATFORM.eddy_s, atol=1e-10)
-    assert found.left_motor_nt_s == (0.0, 0.0, 0.0)
+    assert found.left_motor_nt_nm == (0.0, 0.0, 0.0)
+    assert found.left_wheel_moment == 0
 
 
 def test_the_vector_fit_recovers_moments_to_two_percent_through_noise():
     rng = np.random.default_rng(3)
     b = manoeuvres(300)
-    wheels, on = rng.uniform(-8, 8, (len(b), 2)), rng.random(len(b)) < 0.3
-    motors = np.array([[22.0, 46.0, -17.0], [15.0, -34.0, -20.0]])
+    torques, on = rng.uniform(-0.05, 0.05, (len(b), 2)), rng.random(len(b)) < 0.3
+    motors = np.array([[3300.0, 6600.0, -3000.0], [5200.0, 3700.0, -4500.0]])
     lidar = np.array([380.0, -210.0, -540.0])
-    measured = with_platform(b) + wheels @ motors + on[:, None] * lidar + rng.normal(0, 20, b.shape)
-    found = fit_platform(b, measured, RATE_HZ, wheel_rate=wheels, lidar_on=on)
+    measured = with_platform(b) + torques @ motors + on[:, None] * lidar + rng.normal(0, 20, b.shape)
+    found = fit_platform(b, measured, RATE_HZ, motor_nm=torques, lidar_on=on)
     assert_allclose(found.hard_iron_nt, PLATFORM.hard_iron_nt, rtol=0.02)
-    assert_allclose([found.left_motor_nt_s, found.right_motor_nt_s], motors, rtol=0.02, atol=0.3)
+    assert_allclose([found.left_motor_nt_nm, found.right_motor_nt_nm], motors, rtol=0.02)
     assert_allclose(found.lidar_nt, lidar, rtol=0.02)
+
+
+EVERYTHING = replace(
+    PLATFORM,
+    left_motor_nt_nm=(-3300.0, -6600.0, 3000.0),
+    right_motor_nt_nm=(-5200.0, -3700.0, 4500.0),
+    lidar_nt=(200.0, -250.0, -1200.0),
+    lidar_cos_nt=(0.0, 60.0, 150.0),
+    lidar_sin_nt=(90.0, 0.0, 0.0),
+    left_wheel_moment=0.012,
+    left_wheel_phase=1.0,
+    right_wheel_moment=0.009,
+    right_wheel_phase=4.0,
+    caster_moment=0.006,
+    caster_phase=2.0,
+    p_base_caster=(0.125, 0.0, 0.0139),
+)
+
+
+def calibration_run(
+    platform: PlatformFieldSpec, *, seed: int = 0, path: str = "figure8"
+) -> tuple[Run, Scene]:
+    """A robot that drives about in the Earth's field, its LiDAR on and off; and its scene without its figures."""
+    robot = RobotSpec(
+        name="robot",
+        asset="robot.usda",
+        p_base_magnetometer=(-0.05, 0.02, 0.35),
+        q_base_magnetometer_link_xyzw=(0.0, 0.0, 0.6, 0.8),
+        lidar=LidarSpec(on_s=15.0, off_s=10.0),
+        platform=PlatformFieldSpec(p_base_caster=EVERYTHING.p_base_caster),
+    )
+    scene = Scene(name="field", map_layer="flat.usdc", robot=robot, earth=EARTH)
+    run = simulate(
+        replace(scene, robot=replace(robot, platform=platform)),
+        path_named(path),
+        anomaly_map=FLAT,
+        rng=np.random.default_rng(seed),
+        duration_s=90.0,
+        rate_hz=60.0,
+    )
+    return run, scene
+
+
+def test_a_run_gives_back_the_moments_of_the_robot_that_drove_it():
+    run, scene = calibration_run(EVERYTHING)
+    found = platform_of_run(run, scene)
+    # the field turns about z alone, so h and S's third column cannot be told apart: what they do together can
+    up = EARTH.b_world_nt[2]
+    permanent = [np.add(p.hard_iron_nt, np.multiply(p.soft_iron[2::3], up)) for p in (found, EVERYTHING)]
+    assert np.linalg.norm(permanent[0] - permanent[1]) < 0.02 * np.linalg.norm(permanent[1])
+    level = [np.reshape(p.soft_iron, (3, 3))[:, :2] for p in (found, EVERYTHING)]
+    assert_allclose(*level, rtol=0.02, atol=1e-4)  # of 24,000 nT, 2 nT
+    for name in ("left_motor_nt_nm", "right_motor_nt_nm", "lidar_nt", "lidar_cos_nt", "lidar_sin_nt"):
+        want = np.array(getattr(EVERYTHING, name))
+        error = np.linalg.norm(np.subtract(getattr(found, name), want))
+        assert error < 0.02 * np.linalg.norm(want), (name, getattr(found, name))
+    for name in ("left_wheel", "right_wheel", "caster"):
+        for what in ("moment", "phase"):
+            figure = f"{name}_{what}"
+            assert getattr(found, figure) == pytest.approx(getattr(EVERYTHING, figure), rel=0.02), figure
+
+
+def test_wheel_angles_need_the_robot_and_every_signal_its_rows():
+    b = manoeuvres(20)
+    with pytest.raises(RefusedError, match="wheel_angle needs the robot"):
+        fit_platform(b, with_platform(b), RATE_HZ, wheel_angle=np.zeros((len(b), 2)))
+    with pytest.raises(RefusedError, match="motor_nm must have 400 rows, got 3"):
+        fit_platform(b, with_platform(b), RATE_HZ, motor_nm=np.zeros((3, 2)))
+    with pytest.raises(RefusedError, match="must be finite"):
+        fit_platform(b, with_platform(b), RATE_HZ, lidar_on=np.full(len(b), np.nan))
+
+
+def test_a_held_out_run_of_a_whole_robot_loses_over_95_percent_of_the_platforms_variance():
+    # all but the LiDAR, which no attitude tells of
+    plain = replace(EVERYTHING, lidar_nt=(0, 0, 0), lidar_cos_nt=(0, 0, 0), lidar_sin_nt=(0, 0, 0))
+    model = fit_run(calibration_run(plain, seed=1)[0], band_hz=None)
+    run, _ = calibration_run(plain, seed=2, path="curvilinear")
+    # in a uniform field over a map of it, what the map does not know is what the platform adds
+    platform = run["b_truth_nt"] - run["b_map_nt"]
+    left = platform - model.interference_nt(run["b_vector_nt"], 60.0)
+    assert platform.std() > 100
+    assert left.var() < 0.05 * platform.var()
 
 
 @pytest.fixture(scope="module")
 def calibration():
     """A robot that drives about in a uniform field, above a map that knows only that field."""
-    earth = EarthFieldSpec(
-        b_world_nt=tuple(EARTH_NT.tolist()),
-        latitude_deg=29.65,
-        longitude_deg=-82.35,
-        height_m=50,
-        date="2026-01-01",
-    )
     robot = RobotSpec(name="robot", asset="robot.usda", platform=PLATFORM)
-    scene = Scene(name="field", map_layer="flat.usdc", robot=robot, earth=earth)
-    flat = AnomalyMap(
-        values_nt=np.full((1, 2, 2), np.linalg.norm(EARTH_NT)),
-        origin_m=(-3, -2),
-        cell_m=(6, 4),
-        headings_rad=np.zeros(1),
-    )
+    scene = Scene(name="field", map_layer="flat.usdc", robot=robot, earth=EARTH)
 
     def run(path: str, seed: int):
         return simulate(
-            scene, path_named(path), anomaly_map=flat, rng=np.random.default_rng(seed), rate_hz=20
+            scene, path_named(path), anomaly_map=FLAT, rng=np.random.default_rng(seed), rate_hz=20
         )
 
     return run

@@ -320,7 +320,8 @@ def fit_platform(
         excess_current_a: Supply current above that at rest with a full pack [A], shape (N,); without it, no
             part.
         wheel_angle: Angles turned by left and right wheel [rad], shape (N, 2); without them no iron turns.
-        robot: Where its wheels, its caster and its magnetometer are; goes with `wheel_angle`.
+        robot: Where its wheels, its caster and its magnetometer are, of its platform no more than the caster's
+            place and radius; goes with `wheel_angle`.
 
     Returns:
         The platform's figures; moments are positive. Where the readings cannot tell two of them apart, such
@@ -439,7 +440,7 @@ def platform_of_run(run: Run, scene: Scene) -> PlatformFieldSpec:
 
     Args:
         run: What was recorded.
-        scene: The lab, and the robot that the run is of, but for its platform.
+        scene: The lab, and the robot that the run is of; of its platform only the caster's place is used.
 
     Returns:
         The platform's figures.
