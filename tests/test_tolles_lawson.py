@@ -157,7 +157,7 @@ EVERYTHING = replace(
 def calibration_run(
     platform: PlatformFieldSpec, *, seed: int = 0, path: str = "figure8"
 ) -> tuple[Run, Scene]:
-    """A robot that drives about in the Earth's field, its LiDAR on and off; and its scene without its figures."""
+    """A robot that drives about, its LiDAR on and off; and its scene, which does not know its figures."""
     robot = RobotSpec(
         name="robot",
         asset="robot.usda",

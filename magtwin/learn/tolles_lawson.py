@@ -450,18 +450,19 @@ def platform_of_run(run: Run, scene: Scene) -> PlatformFieldSpec:
             Earth's field.
     """
     rows, rate = _unbroken(run)
-    robot, t = scene.robot, run["t"][rows]
-    pose = np.column_stack([run["p_world_base"][rows, :2], run["yaw"][rows]])
-    turn = quat_from_yaw(pose[:, 2])
-    ambient = rotate(quat_conjugate(turn), ambient_field_nt(scene, sensor_places(robot, pose)))
+    robot = scene.robot
     wheels = wheel_rates(run["v_base"][rows, 0], run["w_base"][rows, 2], robot.drive)
     late = max(1, round(TORQUE_S * rate))
-    before = np.concatenate([np.repeat(wheels[:1], late, axis=0), wheels])[: len(wheels)]
+    gained = (wheels[late:] - wheels[:-late]) * (rate / late)
+    rows, wheels = slice(rows.start + late, rows.stop), wheels[late:]
+    t, yaw = run["t"][rows], run["yaw"][rows]
+    p_world = sensor_places(robot, np.column_stack([run["p_world_base"][rows, :2], yaw]))
+    ambient = rotate(quat_conjugate(quat_from_yaw(yaw)), ambient_field_nt(scene, p_world))
     return fit_platform(
         ambient,
         rotate(np.array(robot.q_base_magnetometer_xyzw), run["b_vector_nt"][rows]),
         rate,
-        motor_nm=wheel_torques_nm(robot.battery, robot.drive, wheels, (wheels - before) * (rate / late)),
+        motor_nm=wheel_torques_nm(robot.battery, robot.drive, wheels, gained),
         lidar_on=run["lidar_on"][rows],
         lidar_angle=lidar_angle(replace(robot, platform=PlatformFieldSpec()), t),
         excess_current_a=run["battery_a"][rows] - rest_current_a(robot.battery),
