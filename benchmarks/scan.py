@@ -94,5 +94,7 @@ def measure(things: int, sides: int, repetitions: int) -> None:
 
 
 if __name__ == "__main__":
+    if not trimesh.ray.has_embree:
+        raise SystemExit(print("Embree is not installed, so nothing to compare with: pip install embreex"))
     for things, sides in ((4, 8), (20, 32), (100, 128)):
         measure(things, sides, int(sys.argv[1]) if len(sys.argv) > 1 else 3)
