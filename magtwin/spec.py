@@ -7,6 +7,7 @@ for one attribute of a prim. Lengths are metres, angles radians, fields nT. A sp
 import datetime
 import math
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -894,6 +895,12 @@ class FurnitureSpec(Spec):
         return tuple(sources)
 
 
+@lru_cache(maxsize=1024)
+def _steel(piece: FurnitureSpec) -> tuple[SourceSpec, ...]:
+    """`piece.sources()`, kept, as every run of a furnished lab asks for them."""
+    return tuple(piece.sources())
+
+
 @dataclass(frozen=True, kw_only=True)
 class Scene(Spec):
     """A lab, its magnetic map, and a robot in it."""
@@ -924,4 +931,4 @@ class Scene(Spec):
     @property
     def magnets(self) -> tuple[SourceSpec, ...]:
         """Everything that is magnetised: the sources, and the steel of the furniture."""
-        return (*self.sources, *(source for piece in self.furniture for source in piece.sources()))
+        return (*self.sources, *(source for piece in self.furniture for source in _steel(piece)))

@@ -269,7 +269,8 @@ def simulate_many(
         runs = []
         for job, one, (disturbance, outside_training) in zip(jobs, sensed, read, strict=True):
             run = one.read(disturbance)
-            run = run.with_columns(**_known(job.scene, run, network, outside_training))
+            known = _known(job.scene, run, network, outside_training)
+            run = run.with_columns(**{name: known[name] for name in known.keys() & run.keys()})
             runs.append(run.with_facts(**_facts(twin, job.seed, checksum)))
         return runs
 
@@ -277,6 +278,7 @@ def simulate_many(
         anomaly_map=twin.field,
         obstacles=twin.obstacles,
         network=network is not None,
+        inputs=frozenset(network.columns if network else ()),
         duration_s=duration_s,
         rate_hz=rate_hz,
         controller=controller,

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin import files
-from magtwin.learn.features import features
+from magtwin.learn.features import FEATURES, features
 from magtwin.learn.model import Fact, FieldNet, load_net
 from magtwin.names import RefusedError
 from magtwin.run import Run
@@ -112,6 +112,11 @@ class NeuralMagnetometer:
     def features(self) -> tuple[str, ...]:
         """Names of the inputs, in order."""
         return self.net.features
+
+    @property
+    def columns(self) -> frozenset[str]:
+        """Columns of a Run that the inputs are taken from."""
+        return frozenset(FEATURES[name].column for name in self.features)
 
     @property
     def residual_sd_nt(self) -> float:

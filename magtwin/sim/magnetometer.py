@@ -59,7 +59,7 @@ def sense_magnetometer(
     """
     noise, vector_noise, latch, drop = rng.spawn(4)
     true, vector = np.asarray(b_total_nt, float), np.asarray(b_vector_nt, float)
-    along = _along_axis(vector) if _feels_direction(spec) else np.full(len(true), np.nan)
+    along = _along_axis(vector) if feels_direction(spec) else np.full(len(true), np.nan)
     lost = np.broadcast_to(np.asarray(steep, bool), true.shape) | _in_dead_zone(spec, along)
     known = np.isfinite(true)
     b = true
@@ -185,7 +185,8 @@ def rounded(b_nt: Array, resolution_nt: float) -> Array:
     return np.rint(b_nt / resolution_nt) * resolution_nt if resolution_nt else b_nt
 
 
-def _feels_direction(spec: MagnetometerSpec) -> bool:
+def feels_direction(spec: MagnetometerSpec) -> bool:
+    """Whether a scalar reading depends on the direction of the field: by heading error or dead zones."""
     return bool(spec.heading_error_nt or spec.dead_zone_axis or spec.dead_zone_plane)
 
 

@@ -58,6 +58,9 @@ class Conditions:
     network: bool
     """Whether a network predicts the disturbance."""
 
+    inputs: frozenset[str] = frozenset()
+    """Columns that it reads."""
+
     duration_s: float | None = None
     rate_hz: float | None = None
     controller: str = "follower"
@@ -100,8 +103,8 @@ class Runs(Sequence[Run]):
         if not isinstance(block, int) or block < 1:
             raise RefusedError(f"block must be a whole number from 1 up, got {block!r}")
         self._jobs, self._conditions, self._finish, self._block = jobs, conditions, finish, block
-        self._columns = None if columns is None else {"t", *columns}
-        for name in sorted(self._columns or ()):
+        self._columns = frozenset(COLUMNS if columns is None else {"t", *columns})
+        for name in sorted(self._columns):
             find("column", name, COLUMNS)
         self._planned: dict[tuple[Path, float, DriveSpec, float], Course] = {}
         checked = set()
@@ -190,15 +193,13 @@ class Runs(Sequence[Run]):
                 "speed_m_s": float(job.speed),
             },
             network=common.network,
+            wanted=self._columns,
+            inputs=common.inputs,
         )
 
     def _finished(self, numbers: Sequence[int], sensed: list[Sensed]) -> list[Run]:
-        """Whole runs, of the columns that are kept."""
-        runs = self._finish([self._jobs[i] for i in numbers], sensed)
-        keep = self._columns
-        if keep is None:
-            return runs
-        return [Run({name: run[name] for name in COLUMNS if name in keep}, run.facts) for run in runs]
+        """Whole runs of what was sensed."""
+        return self._finish([self._jobs[i] for i in numbers], sensed)
 
     def _rate(self, job: Job) -> float:
         common = self._conditions

@@ -1,7 +1,7 @@
 """simulate: a scene and a path go in, a Run with every column comes out."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -22,7 +22,7 @@ from magtwin.sim.follow import follow
 from magtwin.sim.imu import sense_imu
 from magtwin.sim.interference import ambient_gradient_nt_m, field_at_sensor_nt, sensor_places
 from magtwin.sim.lidar import lidar_on
-from magtwin.sim.magnetometer import LOCK_RATE_HZ, lost_in, sense_magnetometer
+from magtwin.sim.magnetometer import LOCK_RATE_HZ, feels_direction, lost_in, sense_magnetometer
 from magtwin.sim.mocap import sense_mocap
 from magtwin.sim.odometry import sense_odometry
 from magtwin.sim.sensors import Moving, into_sensor
@@ -35,6 +35,15 @@ MOST_READINGS = 20_000_000
 
 _STREAMS = ("odometry", "imu", "battery", "magnetometer", "mocap", "lidar", "drive")
 """Who draws random numbers, each from a child generator of its own; append only: the order is the seed."""
+
+
+_ODOMETRY = frozenset(("odom_p", "odom_q_xyzw", "odom_v", "odom_w"))
+_IMU = frozenset(("imu_q_xyzw", "imu_w", "imu_a"))
+_MOCAP = frozenset(("mocap_p", "mocap_q_xyzw", "flag_pose_lost"))
+_BATTERY = frozenset(("battery_v", "battery_a", "battery_fraction"))
+_EXACT = frozenset(("b_vector_nt", "b_truth_nt", "b_vector_measured_nt"))
+_READ = frozenset(("b_measured_nt", "b_noise_nt", "b_vector_measured_nt", "flag_lost_lock"))
+"""Columns that are made together."""
 
 
 def streams(rng: np.random.Generator) -> dict[str, np.random.Generator]:
@@ -167,8 +176,11 @@ class Sensed:
     rng: np.random.Generator
     """Source of the magnetometer's noise; spent by one reading."""
 
+    wanted: frozenset[str]
+    """Columns of `COLUMNS` that the whole run is to have."""
+
     def read(self, disturbance_nt: NDArray[Any] | None = None) -> Run:
-        """The whole run.
+        """The whole run, of the columns that are wanted.
 
         Args:
             disturbance_nt: What a network predicts for each reading [nT], shape (N,); none for a magnetometer
@@ -185,15 +197,16 @@ class Sensed:
                 raise RefusedError(f"disturbance_nt must give shape {(rows,)}, got {disturbance.shape}")
         columns["b_disturbance_nt"] = disturbance
         columns["b_total_nt"] = columns["b_map_nt"] + disturbance
-        columns |= sense_magnetometer(
-            spec,
-            columns["b_total_nt"],
-            columns["b_vector_nt"],
-            self.rng,
-            rate_hz=self.rate_hz,
-            steep=self.steep,
-        )
-        return Run({name: columns[name] for name in COLUMNS}, self.run.facts)
+        if self.wanted & _READ:
+            columns |= sense_magnetometer(
+                spec,
+                columns["b_total_nt"],
+                columns["b_vector_nt"] if "b_vector_nt" in columns else np.full((rows, 3), np.nan),
+                self.rng,
+                rate_hz=self.rate_hz,
+                steep=self.steep,
+            )
+        return Run({name: columns[name] for name in COLUMNS if name in self.wanted}, self.run.facts)
 
 
 def sense(
@@ -208,8 +221,13 @@ def sense(
     lidar: Literal["schedule", "on", "off"],
     facts: Mapping[str, str | int | float | bool],
     network: bool,
+    wanted: Iterable[str] = COLUMNS,
+    inputs: Iterable[str] = COLUMNS,
 ) -> Sensed:
     """Read every sensor but the magnetometer in what a robot did.
+
+    What neither is wanted nor goes into what is, is not computed; as each sensor draws from a generator of
+    its own, the bits of the others do not depend on that.
 
     Args:
         scene: As for `simulate`.
@@ -222,22 +240,36 @@ def sense(
         lidar: As for `simulate`.
         facts: How the motion came about.
         network: Whether a network will predict the disturbance.
+        wanted: Columns of `COLUMNS` that the whole run is to have.
+        inputs: Columns that the network reads.
     """
-    robot = scene.robot
+    robot, wanted = scene.robot, frozenset(wanted)
+    needed = wanted | frozenset(inputs if network else ())
+    read = bool(wanted & _READ)
+    exact = bool(
+        wanted & _EXACT
+        or (not network and robot.magnetometer.kind == "physical")
+        or (read and feels_direction(robot.magnetometer))
+    )
     end = motion.duration_s if duration_s is None else duration_s
     _check_readings(end, rate_hz)
     t = np.arange(max(1, math.ceil(end * rate_hz - 1e-9))) / rate_hz
     true = motion.at(t)
     columns = _truth(true, t, robot.base_height_m)
-    columns |= sense_odometry(robot.drive, motion, t, draws["odometry"])
-    columns |= sense_imu(robot.imu, robot.q_base_imu_xyzw, motion, t, draws["imu"])
-    columns |= sense_mocap(robot.mocap, robot.base_height_m, motion, t, draws["mocap"])
-    pack = discharge(robot.battery, robot.drive, motion, partial(lidar_on, robot.lidar, mode=lidar), end)
-    columns |= sense_battery(robot.battery, pack, t, draws["battery"])
+    if needed & _ODOMETRY:
+        columns |= sense_odometry(robot.drive, motion, t, draws["odometry"])
+    if needed & _IMU:
+        columns |= sense_imu(robot.imu, robot.q_base_imu_xyzw, motion, t, draws["imu"])
+    if needed & _MOCAP:
+        columns |= sense_mocap(robot.mocap, robot.base_height_m, motion, t, draws["mocap"])
     columns["lidar_on"] = lidar_on(robot.lidar, t, lidar)
     columns |= _map(anomaly_map, true.pose[:, :2], columns["yaw"], outside)
-    supply_a = pack.current_a[pack.index(t)]
-    columns |= _exact_field(scene, motion, t, true, columns["lidar_on"], supply_a)
+    if exact or needed & _BATTERY:
+        pack = discharge(robot.battery, robot.drive, motion, partial(lidar_on, robot.lidar, mode=lidar), end)
+        columns |= sense_battery(robot.battery, pack, t, draws["battery"])
+        if exact:
+            supply_a = pack.current_a[pack.index(t)]
+            columns |= _exact_field(scene, motion, t, true, columns["lidar_on"], supply_a)
     columns |= _flags(scene, true)
     columns["b_sd_nt"] = np.full(len(t), np.nan)
     told: dict[str, str | int | float | bool] = {
@@ -253,8 +285,9 @@ def sense(
         run=Run(columns, told),
         scene=scene,
         rate_hz=rate_hz,
-        steep=_steep(scene, anomaly_map, motion, t),
+        steep=_steep(scene, anomaly_map, motion, t) if read else np.zeros(len(t), bool),
         rng=draws["magnetometer"],
+        wanted=wanted,
     )
 
 
