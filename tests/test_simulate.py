@@ -12,6 +12,7 @@ from magtwin.frames import quat_from_rpy, rotate, yaw_from_quat
 from magtwin.names import RefusedError
 from magtwin.path import Path, path_named
 from magtwin.run import COLUMNS, Run
+from magtwin.sim.interference import ambient_gradient_nt_m
 from magtwin.sim.simulate import simulate
 from magtwin.spec import (
     EarthFieldSpec,
@@ -310,6 +311,85 @@ def test_a_reading_is_the_total_with_noise_rounded_to_the_resolution():
     assert_allclose(steps, np.rint(steps), atol=1e-6)
 
 
+def test_every_error_has_an_address():
+    spec = MagnetometerSpec(
+        noise_density_nt=0.5, bandwidth_hz=20.0, heading_error_nt=3.0, vector_bias_nt=(50, 0, 0)
+    )
+    neural = with_robot(KNOWN, magnetometer=dataclasses.replace(spec, kind="neural"))
+    for scene, predicts in (
+        (with_robot(KNOWN, magnetometer=spec), None),
+        (with_robot(KNOWN, magnetometer=dataclasses.replace(spec, kind="map-only")), None),
+        (neural, lambda run: 30 * run["yaw"]),
+    ):
+        run = drive(scene, path_named("figure8"), disturbance_nt=predicts, duration_s=20.0)
+        assert_allclose(run["b_map_nt"] + run["b_disturbance_nt"], run["b_total_nt"], rtol=0, atol=1e-9)
+        assert_allclose(run["b_total_nt"] + run["b_noise_nt"], run["b_measured_nt"], rtol=0, atol=1e-9)
+        assert_allclose(np.linalg.norm(run["b_vector_nt"], axis=1), run["b_truth_nt"], rtol=1e-12)
+        assert np.abs(run["b_noise_nt"]).max() > 1
+        off = (run["b_vector_measured_nt"] - run["b_vector_nt"]).mean(axis=0)
+        # an axis is held for a reading on average, in which a field of 24,000 nT turns by about 1 mrad
+        assert_allclose(off, [50, 0, 0], atol=25)
+
+
+def test_a_physical_magnetometer_reads_the_exact_field_and_one_of_the_map_alone_the_map():
+    exact, known = drive(), with_robot(KNOWN, magnetometer=MagnetometerSpec(kind="map-only"))
+    alone, surveyed = drive(known), drive(with_robot(SURVEYED, magnetometer=known.robot.magnetometer))
+    assert exact.facts["magnetometer"] == "physical"
+    assert_array_equal(exact["b_total_nt"], exact["b_map_nt"] + (exact["b_truth_nt"] - exact["b_map_nt"]))
+    for run in (alone, surveyed):  # the map is there whether or not the exact field is known
+        assert run.facts["magnetometer"] == "map-only"
+        assert_array_equal(run["b_total_nt"], run["b_map_nt"])
+        assert_array_equal(run["b_disturbance_nt"], 0)
+    assert_array_equal(alone["b_truth_nt"], exact["b_truth_nt"])
+    assert np.isnan(surveyed["b_truth_nt"]).all()
+
+
+STEEP = SourceSpec(name="beam", p_world=(0.0, 0.35, 0.36), m_world=(0.0, 0.0, 3.0))
+"""Beside the middle of LINE, at the magnetometer's height and 15 cm from where it comes by."""
+
+
+def test_lock_is_lost_beside_steel_and_found_again_farther_on():
+    spec = MagnetometerSpec(gradient_max_nt_m=60e3, gradient_relock_nt_m=30e3, latched_std_nt=20.0)
+    scene = with_robot(dataclasses.replace(KNOWN, sources=(STEEP,)), magnetometer=spec)
+    run = drive(scene)
+    lost, b = run["flag_lost_lock"], run["b_measured_nt"]
+    begins = np.flatnonzero(np.diff(lost.astype(int)) == 1)
+    ends = np.flatnonzero(np.diff(lost.astype(int)) == -1)
+    assert len(begins) == len(ends) == 1
+    assert len(np.unique(b[lost])) == 1  # a plateau, exactly repeated
+    assert abs(b[lost][0] - 35_650) < 100
+    # gradients where it is lost and found, of the exact field, within a step of the look-out (4 cm)
+    sensor = run["p_world_base"] + rotate(run["q_world_base_xyzw"], np.array([0.05, 0.0, 0.36]))
+    step = 0.2 / 5.0
+    for k, limit in ((begins[0], 60e3), (ends[0], 30e3)):
+        near = sensor[k] + np.array([[0, 0, 0], [-step, 0, 0]])
+        before, after = np.sort(ambient_gradient_nt_m(scene, near))
+        assert before * 0.99 < limit < after * 1.01
+    distance = np.abs(sensor[:, 0])
+    assert distance[ends[0]] > distance[begins[0]] + 0.03  # hysteresis: found later than lost
+    assert_array_equal(
+        run["b_measured_nt"][~lost],
+        drive(with_robot(scene, magnetometer=MagnetometerSpec()))["b_measured_nt"][~lost],
+    )
+
+
+def test_where_only_the_map_is_known_its_gradient_costs_the_lock():
+    spec = MagnetometerSpec(kind="map-only", gradient_max_nt_m=4e3, gradient_relock_nt_m=3e3)
+    scene = with_robot(SURVEYED, magnetometer=spec)
+    run = drive(scene, rate_hz=5.0)
+    gradient = np.hypot(*MAP.gradient(run["p_world_base"][:, :2], run["yaw"])[:, :2].T)
+    assert run["flag_lost_lock"][gradient > 4e3].all()
+    assert not run["flag_lost_lock"][gradient < 3e3].any()
+    assert 0 < run["flag_lost_lock"].sum() < run.rows
+
+
+def test_lock_does_not_depend_on_how_often_it_is_read():
+    spec = MagnetometerSpec(gradient_max_nt_m=60e3, gradient_relock_nt_m=30e3)
+    scene = with_robot(dataclasses.replace(KNOWN, sources=(STEEP,)), magnetometer=spec)
+    seldom, often = (drive(scene, rate_hz=rate)["flag_lost_lock"] for rate in (5.0, 100.0))
+    assert_array_equal(seldom, often[::20])
+
+
 @pytest.mark.parametrize("outside", ["nan", "clamp"])
 def test_poses_off_the_map_are_flagged_whatever_they_read(outside):
     small = wavy_map((0.5, 3.5))
@@ -392,6 +472,10 @@ def test_a_single_reading_is_a_run_too():
         ({"lidar": "maybe"}, 'lidar must be "schedule", "on" or "off"'),
         ({"outside": "guess"}, 'outside must be "nan", "clamp" or "raise"'),
         ({"scene": SURVEYED}, r"scene 'surveyed' has neither a network nor an Earth field.*name a network"),
+        (
+            {"scene": with_robot(KNOWN, magnetometer=MagnetometerSpec(kind="neural"))},
+            "scene 'known' has a neural magnetometer, and no network predicts its disturbance; open it",
+        ),
         (
             {"path": Path("far", np.array([[0.0, 0.0], [2.9, 0.0]]))},
             r"path far leaves the floor at point 2 of 2",

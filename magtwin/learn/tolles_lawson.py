@@ -320,8 +320,8 @@ def fit_platform(
         excess_current_a: Supply current above that at rest with a full pack [A], shape (N,); without it, no
             part.
         wheel_angle: Angles turned by left and right wheel [rad], shape (N, 2); without them no iron turns.
-        robot: Where its wheels, its caster and its magnetometer are, of its platform no more than the caster's
-            place and radius; goes with `wheel_angle`.
+        robot: Where its wheels, its caster and its magnetometer are; of its platform only the caster's place
+            and radius are used. Goes with `wheel_angle`.
 
     Returns:
         The platform's figures; moments are positive. Where the readings cannot tell two of them apart, such
@@ -436,7 +436,8 @@ def _least_squares(matrix: Array, iron: Array, b: Array) -> tuple[Array, Array]:
 def platform_of_run(run: Run, scene: Scene) -> PlatformFieldSpec:
     """`fit_platform` on a calibration run: its b_vector_nt, in a lab whose own field is known.
 
-    The run should turn both ways, change its speed, and have the LiDAR on for a while.
+    The run should turn on the spot both ways, as a motor that pulls one way all the time cannot be told from
+    iron, and have the LiDAR on for a while.
 
     Args:
         run: What was recorded.
