@@ -1,7 +1,7 @@
 """Shape and Link: what a stage shows, as triangles, and the bodies that carry it."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,6 +132,25 @@ def read_vertices(
     return found
 
 
+def read_triangles(
+    stage: Usd.Stage, *, purposes: Sequence[str], wanted: Callable[[Usd.Prim, bool], bool]
+) -> dict[Sdf.Path, NDArray[np.float64]]:
+    """The triangles alone of what `read_shapes` reads, of those gprims that are wanted.
+
+    Args:
+        stage: A stage.
+        purposes: USD's purposes of what is wanted.
+        wanted: Whether a gprim is, from its prim and whether a rigid body carries it.
+
+    Returns:
+        By path of the gprim, its triangles in its body's frame, else in world [m], shape (T, 3, 3).
+    """
+    return {
+        gprim.GetPath(): _placed(solid, to_frame)[solid.corners[solid.triangles]].astype(np.float32).astype(float)
+        for gprim, solid, to_frame, _ in _shown(stage, purposes, wanted)
+    }
+
+
 def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
     """The rigid bodies of a stage by name, with their rest poses in their robot's base.
 
@@ -183,7 +202,9 @@ def _prims(stage: Usd.Stage) -> Iterator[Usd.Prim]:
 
 
 def _shown(
-    stage: Usd.Stage, purposes: Sequence[str]
+    stage: Usd.Stage,
+    purposes: Sequence[str],
+    wanted: Callable[[Usd.Prim, bool], bool] = lambda prim, carried: True,
 ) -> Iterator[tuple[UsdGeom.Gprim, "_Solid", NDArray, str]]:
     """Visible gprims with a surface, the map to the frame of their body (4, 4), and its name."""
     cache, bodies = UsdGeom.XformCache(), _bodies(stage)
@@ -191,10 +212,12 @@ def _shown(
         gprim = UsdGeom.Gprim(prim)
         if not gprim or not _is_shown(gprim, purposes):
             continue
+        body = _carrier(prim, bodies)
+        if not wanted(prim, body is not None):
+            continue
         solid = _solid(gprim)
         if solid is None:
             continue
-        body = _carrier(prim, bodies)
         to_frame = cache.GetLocalToWorldTransform(prim)
         if body is not None:
             to_frame = to_frame * _rigid(cache.GetLocalToWorldTransform(body)).GetInverse()

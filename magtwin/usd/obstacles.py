@@ -1,12 +1,13 @@
 """Obstacles of a stage: its colliders that stand still, as a robot that drives among them meets them."""
 
+import functools
 import os
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Usd, UsdGeom, UsdPhysics
 
 from magtwin.obstacles import Obstacles
-from magtwin.usd.geometry import SHOWN, Shape, read_shapes
+from magtwin.usd.geometry import SHOWN, read_triangles
 from magtwin.usd.layers import open_stage
 
 LOWEST_M = 0.01
@@ -35,13 +36,15 @@ def read_obstacles(
     """
     stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
     purposes = (*SHOWN, UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy)
-    things: dict[str, list[Shape]] = {}
-    for shape in read_shapes(stage, purposes=purposes):
-        if not shape.link and (collider := _collider(stage, shape.prim)):
-            things.setdefault(collider, []).append(shape)
+    collider = functools.cache(_collider)
+    things: dict[str, list[np.ndarray]] = {}
+    for path, corners in read_triangles(
+        stage, purposes=purposes, wanted=lambda prim, carried: not carried and bool(collider(prim))
+    ).items():
+        things.setdefault(collider(stage.GetPrimAtPath(path)), []).append(corners)
     names, outlines, triangles = [], [], []
-    for name, shapes in things.items():
-        corners = np.concatenate([s.vertices[s.faces] for s in shapes]).astype(float)
+    for name, parts in things.items():
+        corners = np.concatenate(parts)
         triangles.append(corners)
         outline = _outline(corners, height_m)
         if outline is not None:
@@ -51,9 +54,8 @@ def read_obstacles(
     return Obstacles(tuple(names), tuple(outlines), surface)
 
 
-def _collider(stage: Usd.Stage, path: str) -> str:
-    """The prim at or above a shape that collides, "" for none."""
-    prim = stage.GetPrimAtPath(Sdf.Path(path))
+def _collider(prim: Usd.Prim) -> str:
+    """Path of the prim at or above a gprim that collides, "" for none."""
     while prim and not prim.IsPseudoRoot():
         if prim.HasAPI(UsdPhysics.CollisionAPI):
             enabled = UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get()
