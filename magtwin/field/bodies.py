@@ -538,7 +538,7 @@ def _interpolated(
     values = np.concatenate(
         [
             dipole_block(square[some], None, places[clear], moments[clear])[0]
-            for some in in_blocks(len(square), np.count_nonzero(clear))
+            for some in in_blocks(len(square), int(np.count_nonzero(clear)))
         ]
     )
     waves = np.linalg.inv(np.polynomial.chebyshev.chebvander(node, NODES - 1))

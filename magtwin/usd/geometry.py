@@ -145,10 +145,11 @@ def read_triangles(
     Returns:
         By path of the gprim, its triangles in its body's frame, else in world [m], shape (T, 3, 3).
     """
-    return {
-        gprim.GetPath(): _placed(solid, to_frame)[solid.corners[solid.triangles]].astype(np.float32).astype(float)
-        for gprim, solid, to_frame, _ in _shown(stage, purposes, wanted)
-    }
+    found = {}
+    for gprim, solid, to_frame, _ in _shown(stage, purposes, wanted):
+        points = _placed(solid, to_frame).astype(np.float32)
+        found[gprim.GetPath()] = points[solid.corners[solid.triangles]].astype(float)
+    return found
 
 
 def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
