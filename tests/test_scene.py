@@ -32,7 +32,7 @@ from magtwin.spec import (
     Scene,
     SourceSpec,
 )
-from magtwin.twin import open_twin
+from magtwin.twin import open_twin, simulate
 from magtwin.usd import sensors
 from magtwin.usd.figures import write_pose
 from magtwin.usd.lab import LAB, define_lab, read_lab
@@ -686,6 +686,47 @@ def test_a_twin_is_opened_with_other_weights_or_none_where_the_scenes_own_are_go
     assert open_twin(root, net="none").magnetometer is None
     with pytest.raises(RefusedError, match=r"net\.pth, which is not there"):
         open_twin(root)
+
+
+def test_a_toml_names_the_kind_of_magnetometer_and_a_network_makes_it_neural(own_parts):
+    def kind(robot: str, **options) -> str:
+        (own_parts / "scene.toml").write_text(TOML + robot)
+        return scene_from_toml(own_parts / "scene.toml", **options).robot.magnetometer.kind
+
+    assert kind("") == "physical"
+    assert kind('network = "net.pth"') == "neural"
+    assert kind('kind = "map-only"') == "map-only"
+    assert kind('network = "net.pth"\nkind = "physical"') == "physical"
+    assert kind('kind = "map-only"', network=own_parts / "net.pth") == "neural"  # weights asked for are used
+    with pytest.raises(RefusedError, match=r'\[robot\] kind = "neural" needs network = "FILE" beside it'):
+        kind('kind = "neural"')
+    with pytest.raises(RefusedError, match=r"scene\.toml"):
+        kind('kind = "magnetic"')
+
+
+@pytest.mark.parametrize("kind", ["physical", "neural", "map-only"])
+def test_the_kind_of_a_magnetometer_survives_the_stage(parts, tmp_path, kind):
+    scene = full_scene(parts)
+    magnetometer = replace(scene.robot.magnetometer, kind=kind)
+    scene = replace(scene, robot=replace(scene.robot, magnetometer=magnetometer))
+    assert read_scene(author_scene(scene, tmp_path / "s", by_reference=True)) == scene
+
+
+def test_a_twin_loads_a_network_only_for_a_neural_magnetometer(lab_scene, tmp_path):
+    assert open_twin(lab_scene).magnetometer is not None
+    for kind in ("physical", "map-only"):
+        twin = open_twin(lab_scene, magnetometer=kind)
+        assert twin.magnetometer is None
+        assert twin.scene.robot.magnetometer.kind == kind
+    assert open_twin(lab_scene, net="none").scene.robot.magnetometer.kind == "physical"
+    with pytest.raises(RefusedError, match="a neural magnetometer that names no network"):
+        open_twin(lab_scene, net="none", magnetometer="neural")
+    with pytest.raises(RefusedError, match=r"kind of MagnetometerSpec must be a known kind .*'physical'"):
+        open_twin(lab_scene, magnetometer="physicall")  # type: ignore[arg-type]
+    run = simulate(open_twin(lab_scene, magnetometer="map-only"), duration_s=1.0)
+    np.testing.assert_array_equal(run["b_total_nt"], run["b_map_nt"])
+    assert run.facts["magnetometer"] == "map-only"
+    assert "network" not in run.facts
 
 
 def test_a_robot_that_stands_nowhere_is_refused_by_prim(parts, tmp_path):
