@@ -7,7 +7,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.field.sources import dipole_field_nt
+from magtwin.frames import quat_from_yaw, rotate
 from magtwin.names import RefusedError
+from magtwin.sim.interference import ambient_gradient_nt_m
 from magtwin.sim.survey import field_at_rest_nt, survey, survey_readings
 from magtwin.spec import (
     EarthFieldSpec,
@@ -260,3 +262,25 @@ def test_a_desk_moved_in_the_stage_changes_the_next_survey_by_what_its_steel_say
     noise = 6 * np.hypot(robot.magnetometer.noise_std_nt, robot.magnetometer.resolution_nt)
     assert np.abs(maps[1].values_nt - want).max() < noise + 0.2  # 1e-4 of 2,000 nT stands in for the steel
     assert np.abs(maps[1].values_nt - maps[0].values_nt).max() > 200
+
+
+def test_a_sensor_that_loses_lock_latches_along_its_rows():
+    sensor = MagnetometerSpec(
+        noise_density_nt=0.0, resolution_nt=0.0, gradient_max_nt_m=4e3, gradient_relock_nt_m=3e3
+    )
+    fine = survey(scene(), rng=rng())
+    field = survey(scene(magnetometer=sensor), rng=rng())
+    x, y = np.meshgrid(field.x_m, field.y_m)
+    height = scene().robot.base_height_m + scene().robot.p_base_magnetometer[2]
+    latched = np.abs(field.values_nt - fine.values_nt) > 1
+    assert 0 < latched.mean() < 0.2
+    plateaus = np.unique(field.values_nt[latched])
+    assert len(plateaus) < 0.7 * latched.sum()  # read over and over
+    assert np.abs(plateaus - 35_650).max() < 5 * 50
+    for layer, yaw in enumerate(field.headings_rad):
+        turn = quat_from_yaw(yaw)
+        lever = rotate(turn, np.array(scene().robot.p_base_magnetometer))[:2]
+        p = np.stack([x + lever[0], y + lever[1], 0 * x + height], axis=-1)
+        steep = ambient_gradient_nt_m(scene(), p)
+        assert latched[layer][steep > 4e3].all()
+        assert not latched[layer][steep < 3e3].any()

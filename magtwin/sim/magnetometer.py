@@ -69,7 +69,7 @@ def sense_magnetometer(
         b = _low_passed(_late(_filled(b), spec.clock_offset_s * rate_hz), spec.bandwidth_hz / rate_hz)
     read = b + sensor_noise_nt(spec, len(b), rate_hz, noise)
     if lost.any():
-        read[lost] = _latched_nt(spec, lost, latch)[lost]
+        read[lost] = latched_nt(spec, lost, latch)[lost]
     read = rounded(read, spec.resolution_nt)
     read[~known] = np.nan
     axes = sense_vector(spec, vector, vector_noise, rate_hz=rate_hz, lost=lost)
@@ -180,6 +180,22 @@ def lost_in(spec: MagnetometerSpec, gradient_nt_m: ArrayLike) -> Flags:
     return np.asarray(lost[latest] & (latest >= 0))
 
 
+def latched_nt(spec: MagnetometerSpec, lost: Flags, rng: np.random.Generator) -> Array:
+    """What is read while lock is lost: a value of its own for each time that it is.
+
+    Args:
+        spec: Its mean and spread.
+        lost: Whether lock is lost, in the order of time, shape (N,).
+        rng: Source of the values.
+
+    Returns:
+        Readings [nT], shape (N,); of use where lock is lost.
+    """
+    begins = lost & ~np.concatenate([[False], lost[:-1]])
+    values = spec.latched_nt + spec.latched_std_nt * rng.standard_normal(int(begins.sum()) + 1)
+    return np.asarray(values[np.cumsum(begins)])
+
+
 def rounded(b_nt: Array, resolution_nt: float) -> Array:
     """The nearest multiples of a step [nT]; as they are where it is 0."""
     return np.rint(b_nt / resolution_nt) * resolution_nt if resolution_nt else b_nt
@@ -200,13 +216,6 @@ def _in_dead_zone(spec: MagnetometerSpec, along: Array) -> Flags:
     """Whether the field is too near to the optical axis, or to the plane across it."""
     off_plane = np.arcsin(np.abs(np.clip(along, -1, 1)))  # nan is in none
     return (np.pi / 2 - off_plane < spec.dead_zone_axis) | (off_plane < spec.dead_zone_plane)
-
-
-def _latched_nt(spec: MagnetometerSpec, lost: Flags, rng: np.random.Generator) -> Array:
-    """What is read while lock is lost: a value of its own for each time that it is, shape (N,)."""
-    begins = lost & ~np.concatenate([[False], lost[:-1]])
-    values = spec.latched_nt + spec.latched_std_nt * rng.standard_normal(int(begins.sum()) + 1)
-    return np.asarray(values[np.cumsum(begins)])
 
 
 def _filled(b: Array) -> Array:

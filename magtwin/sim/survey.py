@@ -11,7 +11,8 @@ from magtwin.field.map import AnomalyMap
 from magtwin.field.readings import Readings
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.names import RefusedError
-from magtwin.sim.interference import ambient_field_nt, platform_field_nt
+from magtwin.sim.interference import ambient_field_nt, ambient_gradient_nt_m, platform_field_nt
+from magtwin.sim.magnetometer import latched_nt, lost_in, rounded
 from magtwin.spec import Scene
 
 Array = NDArray[np.float64]
@@ -37,6 +38,16 @@ def field_at_rest_nt(
         Field magnitude [nT], shape (...).
     """
     p, yaw = np.asarray(p_world_base, float), np.asarray(yaw, float)
+    shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
+    turn = quat_from_yaw(np.broadcast_to(yaw, shape))
+    p_world = _sensor_places(scene, p, yaw, height_m)
+    b_body = rotate(quat_conjugate(turn), ambient_field_nt(scene, p_world)).reshape(-1, 3)
+    field = platform_field_nt(scene.robot.platform, b_body)
+    return np.asarray(np.linalg.norm(field, axis=-1)).reshape(shape)
+
+
+def _sensor_places(scene: Scene, p: Array, yaw: Array, height_m: float | None) -> Array:
+    """Where the magnetometer is in world [m] for base_link at points (..., 2) or (..., 3), headings (...)."""
     if p.shape[-1] == 2:
         p = np.concatenate([p, np.full((*p.shape[:-1], 1), scene.robot.base_height_m)], axis=-1)
     shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
@@ -44,9 +55,7 @@ def field_at_rest_nt(
     p_world = p + rotate(turn, np.broadcast_to(scene.robot.p_base_magnetometer, (*shape, 3)))
     if height_m is not None:
         p_world[..., 2] = height_m
-    b_body = rotate(quat_conjugate(turn), ambient_field_nt(scene, p_world)).reshape(-1, 3)
-    field = platform_field_nt(scene.robot.platform, b_body)
-    return np.asarray(np.linalg.norm(field, axis=-1)).reshape(shape)
+    return p_world
 
 
 def sensor_height_m(scene: Scene) -> float:
@@ -72,7 +81,9 @@ def survey_readings(
     """What the robot reads that stands at each node of a grid in each heading.
 
     base_link is on the node, so the magnetometer is beside it by its lever arm, turned with the
-    heading; the motors rest, the LiDAR is off and the battery is full.
+    heading; the motors rest, the LiDAR is off and the battery is full. Nodes are visited along x, row by
+    row, and where the field is too steep for the magnetometer it latches: until it finds lock again, it
+    reads one value over and over, as nobody tells it that it is wrong.
 
     Args:
         scene: A scene whose Earth's field is known; its map is not read.
@@ -112,15 +123,21 @@ def survey_readings(
         stands = node + position_error_m * rng.standard_normal(node.shape)
     if heading_error_rad:
         yaw = nominal + heading_error_rad * rng.standard_normal(nominal.shape)
-    exact = np.empty(grid.shape)
+    sensor, latch = scene.robot.magnetometer, rng.spawn(1)[0]
+    exact, lost = np.empty(grid.shape), np.zeros(grid.shape, bool)
     for k in range(len(grid.headings_rad)):
         progress(k, len(grid.headings_rad), "surveying")
         exact[k] = field_at_rest_nt(scene, stands[k], yaw[k], height_m=height_m)
+        if sensor.gradient_max_nt_m:
+            gradient = ambient_gradient_nt_m(scene, _sensor_places(scene, stands[k], yaw[k], height))
+            lost[k] = lost_in(sensor, gradient.ravel()).reshape(exact[k].shape)
     progress(len(grid.headings_rad), len(grid.headings_rad), "surveying")
-    sensor = scene.robot.magnetometer
     total = np.zeros_like(exact)
     for _ in range(readings):
         total += _read(exact, sensor.noise_std_nt, sensor.resolution_nt, rng)
+    if lost.any():
+        value = rounded(latched_nt(sensor, lost.ravel(), latch), sensor.resolution_nt).reshape(grid.shape)
+        total[lost] = value[lost] * readings
     return Readings(
         p_xy=node.reshape(-1, 2),
         yaw=yaw.ravel(),
@@ -210,5 +227,4 @@ def _datum(scene: Scene) -> str:
 
 
 def _read(exact: Array, noise_std_nt: float, resolution_nt: float, rng: np.random.Generator) -> Array:
-    noisy = exact + noise_std_nt * rng.standard_normal(exact.shape)
-    return np.rint(noisy / resolution_nt) * resolution_nt if resolution_nt else noisy
+    return rounded(exact + noise_std_nt * rng.standard_normal(exact.shape), resolution_nt)
