@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import magtwin
 from magtwin.field.map import AnomalyMap
 from magtwin.files import sha256
-from magtwin.names import RefusedError
+from magtwin.names import RefusedError, find
 from magtwin.obstacles import Obstacles
 from magtwin.path import Path, resolve_path
 from magtwin.run import Run
@@ -22,7 +22,9 @@ Kind = Literal["physical", "neural", "map-only"]
 
 if TYPE_CHECKING:
     from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.sim.commands import Commands
     from magtwin.sim.controllers import Controller
+    from magtwin.sim.engine import Engine
     from magtwin.sim.lidar import Scans
     from magtwin.sim.many import Runs
     from magtwin.sim.simulate import Sensed
@@ -127,9 +129,25 @@ def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
     return magnetometer
 
 
+def engine_named(name: str, twin: Twin) -> "Engine":
+    """What moves a twin's robot: "kinematic" or "newton".
+
+    Raises:
+        RefusedError: No such engine, or it is not installed; the text says how to get it.
+    """
+    from magtwin.sim.engine import Kinematic
+    from magtwin.sim.newton import Newton, check_installed
+
+    find("engine", name, {"kinematic": None, "newton": None})
+    if name == "kinematic":
+        return Kinematic()
+    check_installed()
+    return Newton(twin.scene_file, twin.scene.robot)
+
+
 def simulate(
     twin: Twin | str | FilePath,
-    path: Path | str = "figure8",
+    path: "Path | Commands | Run | str" = "figure8",
     *,
     seed: int = 0,
     speed: float = 0.2,
@@ -140,12 +158,15 @@ def simulate(
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: "str | Controller" = "follower",
+    engine: "Literal['kinematic', 'newton'] | Engine" = "kinematic",
 ) -> Run:
     """Drive the scene's robot along a path and read every sensor.
 
     Args:
         twin: What `open_twin` gave, or the file of a scene.
-        path: A path, the name of one, or a CSV file of x, y [m].
+        path: A path, the name of one, or a CSV file of x, y [m]; "random", for a human-like driver who goes
+            where the seed takes them; Commands, to be played; or a Run, to be driven once more as it was
+            recorded, with the sensors as the scene has them now.
         seed: Seed of all noise; one seed, one Run.
         speed: Forward speed where the path is straight [m/s].
         duration_s: How long to drive [s]; None is once along the path, longer gives further laps.
@@ -156,6 +177,8 @@ def simulate(
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
         controller: What drives: "follower", "release", "stanley" or "pure_pursuit", or a
             `magtwin.sim.controllers.Controller` of one's own.
+        engine: What moves the robot: "kinematic"; "newton", physics in the stage itself (extra `physics`); or
+            a `magtwin.sim.engine.Engine` of one's own.
 
     Returns:
         A Run with every column of `magtwin.COLUMNS`; its facts tell how it came about.
@@ -169,7 +192,7 @@ def simulate(
     network = twin.magnetometer
     run = run_scene(
         twin.scene,
-        path if isinstance(path, Path) else resolve_path(path),
+        path if path == "random" or not isinstance(path, str | FilePath) else resolve_path(path),
         anomaly_map=twin.field,
         rng=np.random.default_rng(seed),
         speed=speed,
@@ -180,6 +203,7 @@ def simulate(
         lidar=lidar,
         obstacles=twin.obstacles,
         controller=controller,
+        engine=engine_named(engine, twin) if isinstance(engine, str) else engine,
     )
     outside_training = network.outside_training(run) if network else None
     return run.with_columns(**_known(twin.scene, run, network, outside_training)).with_facts(

@@ -58,7 +58,10 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
 def run(
     scene: Path,
     *,
-    path: str = "figure8",
+    path: str | None = None,
+    commands: Path | None = None,
+    engine: Literal["kinematic", "newton", "replay"] | None = None,
+    replay: Path | None = None,
     controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
@@ -85,7 +88,15 @@ def run(
         USD stage to drive in.
     path
         sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle,
-        curvilinear, curvilinear_2; A to E, the cases of the paper's Table 1; or a CSV file of x,y [m].
+        curvilinear, curvilinear_2; A to E, the cases of the paper's Table 1; random, a human-like driver
+        who goes where the seed takes them, for a minute or --duration; or a CSV file of x,y [m]. figure8
+        unless given.
+    commands
+        CSV file of t,v,w [s, m/s, rad/s] to drive by in place of a path, as magtwin drive leaves it.
+    engine
+        What moves the robot: kinematic (default), newton for physics in the stage itself, or replay.
+    replay
+        Parquet file of a run to drive once more as it was recorded, with the sensors as they are set now.
     controller
         What drives: magtwin's follower; that of the released package, which drives the real robot; Stanley's;
         or pure pursuit.
@@ -131,7 +142,15 @@ def run(
     places = [target.resolve() for target in targets if target is not None]
     if len(set(places)) < len(places):
         raise RefusedError("two outputs have one name; give each its own")
+    way = _way(path, commands, engine, replay)
+    if engine == "newton":
+        from magtwin.sim.newton import check_installed
+
+        check_installed()
     options: dict[str, Any] = {
+        "commands": commands,
+        "replay": replay,
+        "engine": "newton" if engine == "newton" else "kinematic",
         "steps": announcer(quiet=json),
         "net": net,
         "magnetometer": magnetometer,
@@ -142,7 +161,7 @@ def run(
         "lidar": lidar,
         "outside": outside,
         "controller": controller,
-        "title": f"{path} in {scene}",
+        "title": f"{way} in {scene}",
     }
     with ExitStack() as stack:  # all are written, or none
         asides = [t if t is None else stack.enter_context(output(t, force=force)) for t in targets]
@@ -151,7 +170,7 @@ def run(
         out_aside, rrd_aside, parquet_aside, scans_aside = asides
         report = _run(
             scene,
-            path,
+            way,
             out_aside,
             rrd=rrd_aside,
             parquet=parquet_aside,
@@ -175,20 +194,32 @@ def _run(
     parquet: Path | None = None,
     scans: bool = False,
     scans_parquet: Path | None = None,
+    commands: Path | None = None,
+    replay: Path | None = None,
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     **options: Any,
 ) -> Any:
     """Run a scene and write the outputs asked for; returns the run's report."""
     from magtwin.io.rerun import write_rrd
-    from magtwin.io.tables import write_parquet
+    from magtwin.io.tables import read_parquet, write_parquet
     from magtwin.path import resolve_path
+    from magtwin.sim.commands import read_commands
     from magtwin.twin import open_twin, scan, simulate
 
-    planned = resolve_path(path)
+    planned = None
+    what: Any = path
+    if commands is not None:
+        what = read_commands(commands)
+    elif replay is not None:
+        what = read_parquet(replay)
+    elif path != "random":
+        what = planned = resolve_path(path)
     twin = open_twin(scene_file, net=net, magnetometer=magnetometer)
-    steps(f"Driving {planned.name}")
-    result = simulate(twin, planned, **options)
+    if commands is not None and what.beyond(twin.scene.robot.drive):
+        print(f"  {what.beyond(twin.scene.robot.drive)}", file=sys.stderr)  # noqa: T201
+    steps(f"Driving {planned.name if planned else path}")
+    result = simulate(twin, what, **options)
     seen = None
     if scans:
         from magtwin.io.scans import write_scans
@@ -216,8 +247,26 @@ def _run(
     if folder:
         from magtwin.io.plots import plot_run
 
-        plot_run(result, twin.field, folder / "run.png", planned=planned.p_xy)
+        plot_run(result, twin.field, folder / "run.png", planned=planned.p_xy if planned else None)
     return result.report(title)
+
+
+def _way(path: str | None, commands: Path | None, engine: str | None, replay: Path | None) -> str:
+    """What is driven, in a word; refused where more than one thing is named."""
+    named = [
+        f"--{option}"
+        for option, value in (("path", path), ("commands", commands), ("replay", replay))
+        if value is not None
+    ]
+    if len(named) > 1:
+        raise RefusedError(f"{' and '.join(named)} each say what to drive; give one of them")
+    if engine == "replay" and replay is None:
+        raise RefusedError("the engine replay needs the run that it drives once more: --replay RUN.parquet")
+    if engine not in (None, "replay") and replay is not None:
+        raise RefusedError(
+            f"--replay drives a run as it was recorded, which --engine {engine} cannot; drop one"
+        )
+    return path or str(commands or replay or "figure8")
 
 
 def _picture(scene_file: Path, out: Path) -> None:

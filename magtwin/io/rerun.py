@@ -60,7 +60,7 @@ def write_rrd(
     scene: Scene,
     scene_file: FilePath,
     field: AnomalyMap,
-    planned: Path,
+    planned: Path | None,
     scans: Scans | None = None,
     force: bool = False,
 ) -> None:
@@ -77,7 +77,7 @@ def write_rrd(
         scene: What it happened in.
         scene_file: The composed stage of the scene, whose shapes are shown.
         field: The map that was driven over, drawn on the floor.
-        planned: The path that was to be driven.
+        planned: The path that was to be driven; none where there was none.
         scans: What the LiDAR saw, drawn as points in world; none draws none.
         force: Whether a file that exists is replaced.
 
@@ -336,10 +336,11 @@ def _log_vector(rec: rr.RecordingStream, run: Run, robot: RobotSpec, rows: NDArr
     _send(rec, f"{entity}/field", run["t"][rows], rr.Arrows3D, vectors=arrows, origins=-arrows / 2)
 
 
-def _log_paths(rec: rr.RecordingStream, run: Run, scene: Scene, scale: _Scale, planned: Path) -> None:
+def _log_paths(rec: rr.RecordingStream, run: Run, scene: Scene, scale: _Scale, planned: Path | None) -> None:
     """The path planned and the path driven on the floor, the readings above it where they were taken."""
-    plan = np.column_stack([planned.p_xy, np.full(len(planned.p_xy), 0.012)])
-    rec.log("world/planned", rr.LineStrips3D([plan], colors=(255, 255, 255), radii=0.008), static=True)
+    if planned is not None:
+        plan = np.column_stack([planned.p_xy, np.full(len(planned.p_xy), 0.012)])
+        rec.log("world/planned", rr.LineStrips3D([plan], colors=(255, 255, 255), radii=0.008), static=True)
     rows = _thinned(run, DOT_HZ)
     base, q = run["p_world_base"][rows], run["q_world_base_xyzw"][rows]
     driven = np.column_stack([base[:, :2], np.full(len(base), 0.016)])  # as seen from above, over the plan

@@ -9,8 +9,9 @@ from magtwin.names import RefusedError
 from magtwin.obstacles import Obstacles
 from magtwin.path import Path, check_clear
 from magtwin.sim.controllers import Controller, guide_along, guide_by_commands
-from magtwin.sim.course import Chassis, Course, run_courses
-from magtwin.sim.drive import Motion, Pose
+from magtwin.sim.course import Course
+from magtwin.sim.drive import Pose
+from magtwin.sim.engine import Engine, Kinematic, Travel
 from magtwin.sim.plan import SLOWEST, drivable
 from magtwin.spec import DriveSpec
 
@@ -83,7 +84,8 @@ def follow(
     obstacles: Obstacles | None = None,
     footprint_radius_m: float = 0.0,
     wheel_errors: tuple[float, float] = (0.0, 0.0),
-) -> Motion:
+    engine: Engine | None = None,
+) -> Travel:
     """Drive along a path.
 
     Args:
@@ -100,6 +102,7 @@ def follow(
         obstacles: What stops the robot.
         footprint_radius_m: Radius of the circle that they stop [m].
         wheel_errors: How far the wheels' radius and separation are from the nominal ones, relative.
+        engine: What moves the robot; None is the kinematic one.
 
     Raises:
         RefusedError: `speed`, `duration_s` or `rate_hz` is out of range, the path or the start touches an
@@ -118,22 +121,19 @@ def follow(
         footprint_radius_m=footprint_radius_m,
         wheel_errors=wheel_errors,
     )
-    if isinstance(controller, str):
-        motion = run_courses([course], obstacles)[0]
-    else:
-        motion = _by(controller, Chassis(course, obstacles), course)
+    own = None if isinstance(controller, str) else controller
+    motion = (engine or Kinematic()).drive(course, own, obstacles)
     if duration_s is None:
         check_arrived(path, speed, course, motion)
     return motion
 
 
-def check_arrived(path: Path, speed: float, course: Course, motion: Motion) -> None:
+def check_arrived(path: Path, speed: float, course: Course, motion: Travel) -> None:
     """Refuse a motion that took all the steps which its course allows for reaching the end of a path."""
-    if len(motion.v) == course.steps:
-        assert motion.bump is not None
+    if motion.duration_s > (course.steps - 0.5) * course.dt:
         why = (
             "the robot stands at an obstacle"
-            if motion.bump[-1]
+            if motion.at([motion.duration_s]).bump[-1]
             else "it winds too tightly for this drive: smooth it, or drive more slowly"
         )
         raise RefusedError(
@@ -152,7 +152,9 @@ def play(
     obstacles: Obstacles | None = None,
     footprint_radius_m: float = 0.0,
     wheel_errors: tuple[float, float] = (0.0, 0.0),
-) -> Motion:
+    controller: Controller | None = None,
+    engine: Engine | None = None,
+) -> Travel:
     """Drive by a script: each command holds until the next one, or until it is older than the drive allows.
 
     Args:
@@ -164,6 +166,8 @@ def play(
         obstacles: What stops the robot.
         footprint_radius_m: Radius of the circle that they stop [m].
         wheel_errors: How far the wheels' radius and separation are from the nominal ones, relative.
+        controller: Who commands in place of the script, whose times then only say how long; a driver.
+        engine: What moves the robot; None is the kinematic one.
 
     Raises:
         RefusedError: Commands are not finite or not in order of time, `duration_s` or `rate_hz` is out of
@@ -187,16 +191,7 @@ def play(
         footprint_radius_m=footprint_radius_m,
         wheel_errors=wheel_errors,
     )
-    return run_courses([course], obstacles)[0]
-
-
-def _by(controller: Controller, chassis: Chassis, course: Course) -> Motion:
-    """Drive as a controller of somebody else's says."""
-    for k in range(course.steps):
-        chassis.step(controller.command(k * course.dt, *chassis.pose, *chassis.twist))
-        if controller.done and chassis.twist == (0.0, 0.0):
-            break
-    return chassis.motion()
+    return (engine or Kinematic()).drive(course, controller, obstacles)
 
 
 def _step(rate_hz: float, drive: DriveSpec) -> float:

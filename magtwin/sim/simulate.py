@@ -16,24 +16,31 @@ from magtwin.obstacles import Obstacles
 from magtwin.path import Path, check_on_floor
 from magtwin.run import COLUMNS, Run
 from magtwin.sim.battery import discharge, sense_battery
+from magtwin.sim.commands import Commands
 from magtwin.sim.controllers import Controller
-from magtwin.sim.drive import Moment, Motion, draw_wheel_errors
-from magtwin.sim.follow import follow
+from magtwin.sim.drive import Moment, draw_wheel_errors
+from magtwin.sim.driver import Driver
+from magtwin.sim.engine import Engine, Kinematic, Travel
+from magtwin.sim.follow import follow, play
 from magtwin.sim.imu import sense_imu
 from magtwin.sim.interference import ambient_gradient_nt_m, field_at_sensor_nt, sensor_places
 from magtwin.sim.lidar import lidar_on
 from magtwin.sim.magnetometer import LOCK_RATE_HZ, feels_direction, lost_in, sense_magnetometer
 from magtwin.sim.mocap import sense_mocap
 from magtwin.sim.odometry import sense_odometry
+from magtwin.sim.replay import replayed
 from magtwin.sim.sensors import Moving, into_sensor
 from magtwin.spec import Scene
 
 Array = NDArray[np.float64]
 
+RANDOM_S = 60.0
+"""How long a driver drives about unless told otherwise [s]."""
+
 MOST_READINGS = 20_000_000
 """Most readings of a run: about 8 GB of columns."""
 
-_STREAMS = ("odometry", "imu", "battery", "magnetometer", "mocap", "lidar", "drive")
+_STREAMS = ("odometry", "imu", "battery", "magnetometer", "mocap", "lidar", "drive", "driver")
 """Who draws random numbers, each from a child generator of its own; append only: the order is the seed."""
 
 
@@ -53,7 +60,7 @@ def streams(rng: np.random.Generator) -> dict[str, np.random.Generator]:
 
 def simulate(
     scene: Scene,
-    path: Path,
+    path: Path | Commands | Run | str,
     *,
     anomaly_map: AnomalyMap,
     rng: np.random.Generator,
@@ -65,6 +72,7 @@ def simulate(
     disturbance_nt: Callable[[Run], NDArray[Any]] | None = None,
     outside: Literal["nan", "clamp", "raise"] = "nan",
     lidar: Literal["schedule", "on", "off"] = "schedule",
+    engine: Engine | None = None,
 ) -> Run:
     """Drive a scene's robot along a path and read its sensors.
 
@@ -76,7 +84,9 @@ def simulate(
 
     Args:
         scene: Lab, robot and sensors.
-        path: Where to drive; the robot begins on its first point, along it.
+        path: Where to drive; the robot begins on its first point, along it. Commands are played from the
+            scene's start; a Run is driven once more as it was recorded, for its sensors to be read anew;
+            "random" is wherever a human-like driver goes from the scene's start.
         anomaly_map: What `scene.map_layer` holds.
         rng: Source of all noise.
         speed: Forward speed where the path is straight [m/s].
@@ -89,6 +99,7 @@ def simulate(
             disturbance of each reading [nT], shape (N,). Called once.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
+        engine: What moves the robot; None is the kinematic one. A Run is not moved anew.
 
     Returns:
         A Run with every column of `COLUMNS`, in their order. `b_sd_nt` is nan and
@@ -101,16 +112,9 @@ def simulate(
     rate = check_run(
         scene, path, rate_hz=rate_hz, duration_s=duration_s, lidar=lidar, network=disturbance_nt is not None
     )
-    robot, draws = scene.robot, streams(rng)
-    motion = follow(
-        path,
-        robot.drive,
-        speed=speed,
-        duration_s=duration_s,
-        controller=controller,
-        obstacles=obstacles,
-        footprint_radius_m=robot.footprint_radius_m,
-        wheel_errors=draw_wheel_errors(robot.drive, draws["drive"]),
+    draws = streams(rng)
+    motion, facts = _travel(
+        scene, path, draws, speed, duration_s, obstacles or Obstacles(), controller, engine or Kinematic()
     )
     sensed = sense(
         scene,
@@ -121,19 +125,64 @@ def simulate(
         duration_s=duration_s,
         outside=outside,
         lidar=lidar,
-        facts={
-            "path": path.name,
-            "controller": controller if isinstance(controller, str) else type(controller).__name__,
-            "speed_m_s": float(speed),
-        },
+        facts=facts,
         network=disturbance_nt is not None,
     )
     return sensed.read(None if disturbance_nt is None else disturbance_nt(sensed.run))
 
 
+def _travel(
+    scene: Scene,
+    path: Path | Commands | Run | str,
+    draws: Mapping[str, np.random.Generator],
+    speed: float,
+    duration_s: float | None,
+    obstacles: Obstacles,
+    controller: str | Controller,
+    engine: Engine,
+) -> tuple[Travel, dict[str, str | int | float | bool]]:
+    """What the robot did, and how that came about."""
+    robot = scene.robot
+    if isinstance(path, Run):
+        told = {name: path.facts[name] for name in ("path", "controller", "speed_m_s") if name in path.facts}
+        return replayed(path, robot.drive), {**told, "engine": "replay"}
+    room: dict[str, Any] = {
+        "duration_s": duration_s,
+        "obstacles": obstacles,
+        "footprint_radius_m": robot.footprint_radius_m,
+        "wheel_errors": draw_wheel_errors(robot.drive, draws["drive"]),
+        "engine": engine,
+    }
+    facts: dict[str, str | int | float | bool] = {}
+    if engine.name != "kinematic":
+        facts["engine"] = engine.name
+    if isinstance(path, Path):
+        name = controller if isinstance(controller, str) else type(controller).__name__
+        motion = follow(path, robot.drive, speed=speed, controller=controller, **room)
+        return motion, {"path": path.name, "controller": name, "speed_m_s": float(speed), **facts}
+    if isinstance(path, Commands):
+        motion = play(path.rows, robot.drive, start=scene.start, **room)
+        return motion, {"path": path.name, "controller": "commands", **facts}
+    if path != "random":
+        raise RefusedError(f'what to drive must be a Path, Commands, a Run or "random", got {path!r}')
+    room["duration_s"] = RANDOM_S if duration_s is None else duration_s
+    driver = Driver(
+        robot.drive,
+        draws["driver"],
+        floor_m=scene.lab.floor_m,
+        obstacles=obstacles,
+        footprint_radius_m=robot.footprint_radius_m,
+        start=scene.start,
+        speed=speed,
+        duration_s=room["duration_s"],
+    )
+    motion = play([[0.0, 0.0, 0.0]], robot.drive, start=scene.start, controller=driver, **room)
+    return motion, {"path": "random", "controller": "driver", "speed_m_s": float(speed), **facts}
+
+
 def check_run(
     scene: Scene,
-    path: Path,
+    path: Path | Commands | Run | str,
     *,
     rate_hz: float | None,
     duration_s: float | None,
@@ -152,7 +201,8 @@ def check_run(
     if not network:
         _check_kind(scene)
     lidar_on(robot.lidar, 0.0, lidar)  # refuses an unknown mode before anything is computed
-    check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
+    if isinstance(path, Path):
+        check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
     if duration_s is not None:
         _check_readings(duration_s, rate)
     return rate
@@ -211,7 +261,7 @@ class Sensed:
 
 def sense(
     scene: Scene,
-    motion: Motion,
+    motion: Travel,
     draws: Mapping[str, np.random.Generator],
     *,
     anomaly_map: AnomalyMap,

@@ -1,0 +1,201 @@
+"""Newton: the engine that drives the stage itself, its bodies, contact and drives (extra `physics`)."""
+
+import importlib.util
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from magtwin.names import RefusedError
+from magtwin.obstacles import Obstacles
+from magtwin.sim.controllers import Controller
+from magtwin.sim.course import Course
+from magtwin.sim.drive import limiter, wheel_rates
+from magtwin.sim.loop import LATE_S, REST_M_S, wrapped
+from magtwin.sim.sampled import SampledMotion
+from magtwin.spec import RobotSpec
+
+STEP_S = 0.001
+"""Length of a physics step, about [s]; a control step has a whole number of them."""
+
+TOUCH_M = 0.003
+"""Distance from an obstacle at which the footprint counts as touching it [m]: shapes are no circles."""
+
+UPRIGHT = 0.8
+"""Cosine of the tilt beyond which the robot has fallen over."""
+
+
+@dataclass(frozen=True)
+class Newton:
+    """A robot in Newton on the CPU; the same commands give the same bits.
+
+    Commands are limited, and followed by the wheels' set speeds with the motors' lag, as in the kinematic
+    engine; what comes of them is physics. Wheels are as the stage has them, without the errors of a
+    session, and slip as its contact says.
+    """
+
+    stage: FilePath
+    """Root layer of the scene."""
+
+    robot: RobotSpec
+    """The robot that is driven; it is found in the stage by its name."""
+
+    name = "newton"
+
+    def drive(
+        self, course: Course, controller: Controller | None, obstacles: Obstacles | None
+    ) -> SampledMotion:
+        """As for `magtwin.sim.engine.Engine`.
+
+        Raises:
+            RefusedError: Newton is not installed or cannot run the stage, the start touches an obstacle, a
+                command is not finite, or the robot falls over.
+        """
+        check_installed()
+        obstacles = obstacles or Obstacles()
+        course.check(obstacles)
+        drive, dt = course.drive, course.dt
+        guide: Controller = replace(course.guide) if controller is None else controller
+        limit, parts = limiter(drive, dt), max(1, round(dt / STEP_S))
+        step = dt / parts
+        left = math.exp(-step / drive.motor_lag_s) if drive.motor_lag_s else 0.0
+        in_mean = drive.motor_lag_s / step * (1.0 - left)
+        told, wheels, last, age = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), 0.0
+        rest_w = REST_M_S * 2 / drive.wheel_separation_m
+        asked: list[tuple[float, float]] = []
+        with _Process(self, course, step) as world:
+            rows = [world.seen()]
+            yaw = rows[0][2]
+            for k in range(course.steps):
+                command = guide.command(k * dt, rows[-1][0], rows[-1][1], yaw, *wheels)
+                age = 0.0 if command is not None else age + dt
+                if command is not None:
+                    last = float(command[0]), float(command[1])
+                    if not all(map(math.isfinite, last)):
+                        raise RefusedError(
+                            f"the command at {k * dt:.3f} s is not finite: v, w = {last!r}; a controller "
+                            "must give numbers"
+                        )
+                elif age > drive.command_timeout_s + LATE_S:
+                    last = 0.0, 0.0
+                told = limit(*last, *told)
+                rates = []
+                for _ in range(parts):
+                    mean = [b + in_mean * (a - b) for a, b in zip(wheels, told, strict=True)]
+                    wheels = told[0] + left * (wheels[0] - told[0]), told[1] + left * (wheels[1] - told[1])
+                    rates.append(wheel_rates(mean[0], mean[1], drive).tolist())
+                if told == (0.0, 0.0) and abs(wheels[0]) < REST_M_S and abs(wheels[1]) < rest_w:
+                    wheels = 0.0, 0.0
+                rows.append(world.step(rates))
+                asked.append(last)
+                yaw += wrapped(rows[-1][2] - yaw)
+                if rows[-1][8] < UPRIGHT or not math.isfinite(rows[-1][7]):
+                    raise RefusedError(
+                        f"{self.stage}: {self.robot.name} fell over in Newton after {(k + 1) * dt:.2f} s; "
+                        "drive more gently, or look at its masses and colliders"
+                    )
+                if guide.done and wheels == (0.0, 0.0):
+                    break
+        seen = np.array(rows)
+        commands = np.array([*asked, asked[-1]])
+        distance, _ = obstacles.clearance(seen[:, :2], reach_m=course.footprint_radius_m + 1.0)
+        return SampledMotion(
+            t=np.arange(len(seen), dtype=float) * dt,
+            pose=np.column_stack([seen[:, :2], np.unwrap(seen[:, 2])]),
+            v=seen[:, 3],
+            w=seen[:, 4],
+            wheel_angle=seen[:, 5:7],
+            v_cmd=commands[:, 0],
+            w_cmd=commands[:, 1],
+            bump=distance < course.footprint_radius_m + TOUCH_M,
+            duration_s=(len(seen) - 1) * dt,
+        )
+
+
+def check_installed() -> None:
+    """Refuse where Newton is not installed; the text says how to get it."""
+    lacking = [m for m in ("newton", "newton_usd_schemas", "mujoco") if importlib.util.find_spec(m) is None]
+    if lacking:
+        raise RefusedError(
+            f"the engine newton needs {', '.join(lacking)}, which is not installed; get it (600 MB) with: "
+            "pip install 'magtwin[physics]'"
+        )
+
+
+class _Process:
+    """`newton_world` in a process of its own, ended with the block."""
+
+    def __init__(self, engine: Newton, course: Course, step_s: float) -> None:
+        self._engine = engine
+        drive = course.drive
+        self._job = {
+            "stage": str(FilePath(engine.stage).resolve()),
+            "robot": engine.robot.name,
+            "base": "base_link",
+            "joints": [drive.left_wheel_joint, drive.right_wheel_joint],
+            "start": list(course.pose0),
+            "step_s": step_s,
+        }
+
+    def __enter__(self) -> "_Process":
+        self._folder = tempfile.TemporaryDirectory()  # MuJoCo leaves its log where it runs
+        self._log = open(FilePath(self._folder.name, "log"), "w+", encoding="utf-8")
+        root = str(FilePath(__file__).resolve().parents[2])
+        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "magtwin.sim.newton_world"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            text=True,
+            bufsize=1,
+            cwd=self._folder.name,
+            env={**os.environ, "PYTHONPATH": path},
+        )
+        self._say(self._job)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with suppress(OSError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+        self._log.close()
+        self._folder.cleanup()
+
+    def seen(self) -> list[float]:
+        """The next answer."""
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            self._log.seek(0)
+            said = [text for text in self._log.read().splitlines() if text.strip()]
+            raise RefusedError(
+                f"{self._engine.stage}: Newton cannot run it: {said[-1] if said else 'it gave no reason'}"
+            )
+        row: list[float] = json.loads(line)
+        return row
+
+    def step(self, rates: list[list[float]]) -> list[float]:
+        """Drive on for one control step, a pair of wheel rates [rad/s] a physics step."""
+        self._say(rates)
+        return self.seen()
+
+    def _say(self, message: object) -> None:
+        assert self._process.stdin is not None
+        with suppress(OSError):  # it has ended: `seen` says why
+            self._process.stdin.write(json.dumps(message) + "\n")
+            self._process.stdin.flush()

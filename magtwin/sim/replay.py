@@ -1,0 +1,71 @@
+"""Replay: a recorded Run driven once more, so that sensors set anew read what they would have read on it."""
+
+import numpy as np
+
+from magtwin.frames import yaw_from_quat
+from magtwin.names import RefusedError
+from magtwin.run import Run
+from magtwin.sim.drive import wheel_rates
+from magtwin.sim.sampled import SampledMotion
+from magtwin.spec import DriveSpec
+
+
+def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
+    """The motion that a Run recorded, from its first row on.
+
+    Args:
+        run: It needs t, p_world_base, and yaw or q_world_base_xyzw. Where v_base or w_base are missing,
+            speeds follow from the poses; where wheel_angle is missing, the wheels roll without slip;
+            commands that are missing are not known.
+        drive: The robot's wheels.
+
+    Returns:
+        The motion, one mean interval longer than the rows, so that at the rate of the Run it has as many
+        readings as the Run has rows.
+
+    Raises:
+        RefusedError: A column is missing, there are fewer than two rows, time does not go on, or a pose is
+            not finite; the text gives the row.
+    """
+    if run.rows < 2:
+        raise RefusedError(f"a run of {run.rows} rows is no motion to replay; two or more are needed")
+    t = run["t"]
+    yaw = run["yaw"] if "yaw" in run else yaw_from_quat(run["q_world_base_xyzw"])
+    pose = np.column_stack([run["p_world_base"][:, :2], yaw])
+    for broken, what in (
+        (~np.isfinite(t), "its time is not finite"),
+        (np.diff(t, prepend=-np.inf) <= 0, "its time is not after that of the row before"),
+        (~np.isfinite(pose).all(axis=1), "its pose is not finite"),
+    ):
+        rows = np.flatnonzero(broken)
+        if len(rows):
+            raise RefusedError(
+                f"row {rows[0] + 1} of {run.rows} of the run to replay: {what} (t = {t[rows[0]]:g} s); leave "
+                "such rows out"
+            )
+    t = t - t[0]
+    pose[:, 2] = np.unwrap(pose[:, 2])
+    if "v_base" in run and "w_base" in run:
+        v, w = run["v_base"][:, 0], run["w_base"][:, 2]
+    else:
+        way = np.gradient(pose, t, axis=0)
+        v = way[:, 0] * np.cos(pose[:, 2]) + way[:, 1] * np.sin(pose[:, 2])
+        w = way[:, 2]
+    if "wheel_angle" in run:
+        wheels = run["wheel_angle"] - run["wheel_angle"][0]
+    else:
+        rates = wheel_rates(v, w, drive)
+        turned = np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(t)[:, None], axis=0)
+        wheels = np.vstack([[0.0, 0.0], turned])
+    unknown = np.full(len(t), np.nan)
+    return SampledMotion(
+        t=t,
+        pose=pose,
+        v=v,
+        w=w,
+        wheel_angle=wheels,
+        v_cmd=run.get("v_cmd", unknown),
+        w_cmd=run.get("w_cmd", unknown),
+        bump=run["flag_bump"] if "flag_bump" in run else np.zeros(len(t), bool),
+        duration_s=float(t[-1] * len(t) / (len(t) - 1)),
+    )

@@ -1,0 +1,270 @@
+"""Engines: kinematic, Newton and replay move one robot alike; scripts of commands; the human-like driver."""
+
+import importlib.util
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.cli import main
+from magtwin.io.tables import read_parquet
+from magtwin.names import RefusedError
+from magtwin.obstacles import Obstacles
+from magtwin.path import figure8, lawnmower, sine
+from magtwin.run import Run
+from magtwin.sim.commands import Commands, read_commands, write_commands
+from magtwin.sim.controllers import guide_by_commands
+from magtwin.sim.driver import Driver
+from magtwin.sim.engine import Kinematic
+from magtwin.sim.follow import course_along, follow, play
+from magtwin.sim.newton import Newton
+from magtwin.sim.replay import replayed
+from magtwin.spec import DriveSpec
+from magtwin.twin import open_twin, simulate
+
+DRIVE = DriveSpec()
+
+
+@pytest.fixture(scope="module")
+def twin(lab_scene):
+    return open_twin(lab_scene, net="none")
+
+
+def test_a_run_that_is_replayed_has_the_poses_of_the_run_to_the_last_bit(twin):
+    path = figure8(half_length_m=0.6, half_width_m=0.3)
+    first = simulate(twin, path, seed=3)
+    again = simulate(twin, first, seed=3)
+    for name in ("t", "p_world_base", "yaw", "v_base", "w_base", "v_cmd", "w_cmd", "flag_bump"):
+        assert_array_equal(again[name], first[name], err_msg=name)
+    off = again["b_truth_nt"] - first["b_truth_nt"]
+    assert np.sqrt(np.mean(off * off)) < 1.0  # nT; the motors' torque is of sampled speeds
+    assert again.facts["engine"] == "replay"
+
+
+def test_a_replay_between_its_samples_is_the_drive_itself():
+    motion = follow(figure8(half_length_m=0.6, half_width_m=0.3), DRIVE, speed=0.2)
+    t = np.arange(0, motion.duration_s, 1 / 135)
+    seen = motion.at(t)
+    zero = np.zeros(len(t))
+    run = Run(
+        {
+            "t": t,
+            "p_world_base": np.column_stack([seen.pose[:, :2], zero]),
+            "yaw": (seen.pose[:, 2] + np.pi) % (2 * np.pi) - np.pi,
+            "v_base": np.column_stack([seen.v, zero, zero]),
+            "w_base": np.column_stack([zero, zero, seen.w]),
+            "wheel_angle": seen.wheel_angle,
+        }
+    )
+    between = (t[:-1] + t[1:]) / 2
+    got, want = replayed(run, DRIVE).at(between), motion.at(between)
+    assert_allclose(got.pose, want.pose, atol=1e-4)
+    assert_allclose(got.wheel_angle, want.wheel_angle, atol=1e-3)
+    bare = Run({name: run[name] for name in ("t", "p_world_base", "yaw")})
+    guessed = replayed(bare, DRIVE).at(between)
+    assert_allclose(guessed.pose, want.pose, atol=2e-4)
+    assert_allclose(guessed.wheel_angle, want.wheel_angle, atol=0.3)  # of 80 rad, by speeds of differences
+
+
+@pytest.mark.parametrize(
+    ("t", "x", "what"),
+    [([0, 1, 1], [0, 1, 2], "row 3"), ([0, 1, 2], [0, np.nan, 2], "row 2"), ([0], [0], "two or more")],
+)
+def test_a_run_that_cannot_be_replayed_is_refused(t, x, what):
+    zero = np.zeros(len(t))
+    run = Run({"t": np.array(t, float), "p_world_base": np.column_stack([x, zero, zero]), "yaw": zero})
+    with pytest.raises(RefusedError, match=what):
+        replayed(run, DRIVE)
+
+
+def test_commands_are_read_as_they_were_written(tmp_path):
+    rows = np.column_stack([np.arange(5) / 50, np.linspace(0, 1, 5) / 3, np.full(5, 0.1)])
+    write_commands(Commands("mine", rows), tmp_path / "mine.csv")
+    assert_array_equal(read_commands(tmp_path / "mine.csv").rows, rows)
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("t,v,w\n0,0.1,0\n0.5,0.1,0\n0.4,0.1,0\n", ":4: time must go on"),
+        ("0,nan,0\n", ":1: a command must be finite"),
+        ("0,0.1\n", ":1: a command is three numbers"),
+        ("t,v,w\nx,y,z\n", ":2: not a number"),
+        ("-1,0.1,0\n", ":1: time must go on"),
+        ("t,v,w\n", "no commands"),
+    ],
+)
+def test_commands_that_make_no_sense_are_refused_with_their_line(tmp_path, text, what):
+    (tmp_path / "c.csv").write_text(text)
+    with pytest.raises(RefusedError, match=what):
+        read_commands(tmp_path / "c.csv")
+
+
+def test_what_is_beyond_a_drive_is_said_and_limited():
+    rows = np.array([[0, 0.5, 0], [0.1, 0.2, -3.0], [3.0, 0.9, 0.0]])
+    said = Commands("fast.csv", rows).beyond(DRIVE)
+    assert "2 of 3 commands have |v| above 0.306" in said
+    assert "1 of 3 commands have |w| above 1.9" in said
+    assert Commands("slow.csv", rows * [1, 0.1, 0.1]).beyond(DRIVE) == ""
+    motion = play(rows, DRIVE)
+    assert np.abs(motion.v).max() <= DRIVE.v_max
+    assert np.abs(motion.w).max() <= DRIVE.w_max
+
+
+def test_the_commands_of_a_drive_drive_it_again_to_the_last_bit():
+    motion = follow(sine(x_first_m=-0.5, x_last_m=0.5, amplitude_m=0.2), DRIVE, speed=0.2)
+    rows = np.column_stack([np.arange(len(motion.v)) * motion.dt, motion.v_cmd, motion.w_cmd])
+    again = play(rows, DRIVE, start=motion.pose0, duration_s=motion.duration_s)
+    assert_array_equal(again.poses[: len(motion.poses)], motion.poses)
+
+
+def box(name, x, y, half):
+    return name, [[x - half, y - half], [x + half, y - half], [x + half, y + half], [x - half, y + half]]
+
+
+def drive_about(seed, *, duration_s=300.0, obstacles, wheel_errors=(0.0, 0.0)):
+    driver = Driver(
+        DRIVE,
+        np.random.default_rng(seed),
+        floor_m=(6.0, 3.5),
+        obstacles=obstacles,
+        footprint_radius_m=0.171,
+        start=(0.0, 0.0, 0.0),
+        duration_s=duration_s,
+    )
+    return play(
+        [[0.0, 0.0, 0.0]],
+        DRIVE,
+        duration_s=duration_s,
+        controller=driver,
+        obstacles=obstacles,
+        footprint_radius_m=0.171,
+        wheel_errors=wheel_errors,
+    )
+
+
+ROOM = (box("desk", 1.5, 0.9, 0.4), box("chair", -1.2, -0.6, 0.2), box("cabinet", -2.7, 1.5, 0.25))
+OBSTACLES = Obstacles(tuple(n for n, _ in ROOM), tuple(np.array(o) for _, o in ROOM))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_driver_covers_the_floor_and_never_bumps(seed):
+    errors = np.random.default_rng(seed).normal(0, [0.004, 0.006]).tolist()
+    motion = drive_about(seed, obstacles=OBSTACLES, wheel_errors=tuple(errors))
+    assert not motion.bump.any()
+    distance, _ = OBSTACLES.clearance(motion.poses[:, :2])
+    wall = np.min(np.array([3.0, 1.75]) - np.abs(motion.poses[:, :2]), axis=1)
+    assert min(distance.min(), wall.min()) > 0.171
+    cells = {tuple(c) for c in np.floor(motion.poses[:, :2] / 0.5).astype(int).tolist()}
+    assert len(cells) >= 32  # of 70 that the robot's centre can come to, and those beside obstacles fewer
+    going = motion.v[motion.v > 0.02]
+    assert 0.4 < len(going) / len(motion.v) < 0.98  # it stands, too
+    assert 0.1 < going.mean() < 0.25
+    assert going.std() > 0.03
+    assert np.abs(motion.w).max() <= DRIVE.w_max
+    assert -0.4 < motion.w.mean() < 0.4
+    assert motion.w.std() > 0.2
+
+
+def test_one_seed_is_one_driver_and_another_seed_another():
+    a, b, c = (drive_about(seed, duration_s=20.0, obstacles=OBSTACLES) for seed in (1, 1, 2))
+    assert_array_equal(a.poses, b.poses)
+    assert not np.array_equal(a.poses[: len(c.poses)], c.poses[: len(a.poses)])
+
+
+def test_a_driver_without_room_is_refused():
+    with pytest.raises(RefusedError, match="no room"):
+        Driver(
+            DRIVE,
+            np.random.default_rng(0),
+            floor_m=(6.0, 3.5),
+            obstacles=Obstacles(),
+            footprint_radius_m=0.171,
+            start=(2.9, 0.0, 0.0),
+        )
+
+
+def test_run_drives_at_random_by_commands_and_by_replay(lab_scene, tmp_path, capsys):
+    arguments = ["run", str(lab_scene), "--net", "none", "--json"]
+    once, again = tmp_path / "a.parquet", tmp_path / "b.parquet"
+    main([*arguments, "--path", "random", "--duration", "5", "--parquet", str(once)])
+    main([*arguments, "--engine", "replay", "--replay", str(once), "--parquet", str(again)])
+    assert_array_equal(read_parquet(once)["p_world_base"], read_parquet(again)["p_world_base"])
+    (tmp_path / "c.csv").write_text("t,v,w\n0,0.5,0\n0.4,0,0\n")
+    capsys.readouterr()
+    main([*arguments, "--commands", str(tmp_path / "c.csv"), "--parquet", str(tmp_path / "c.parquet")])
+    assert "|v| above 0.306 m/s" in capsys.readouterr().err
+    run = read_parquet(tmp_path / "c.parquet")
+    assert 0.05 < run["p_world_base"][-1, 0] - run["p_world_base"][0, 0] < 0.2
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        (["--path", "sine", "--commands", "c.csv"], "--path and --commands"),
+        (["--engine", "replay"], "--replay RUN.parquet"),
+        (["--engine", "newton", "--replay", "r.parquet"], "--engine newton cannot"),
+    ],
+)
+def test_run_refuses_two_ways_of_driving(lab_scene, options, what, capsys):
+    with pytest.raises(SystemExit):
+        main(["run", str(lab_scene), *options])
+    assert what in capsys.readouterr().err
+
+
+def test_newton_that_is_not_installed_is_refused_with_how_to_get_it(monkeypatch, lab_scene, capsys):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == "newton" else found(n, *a))
+    with pytest.raises(SystemExit):
+        main(["run", str(lab_scene), "--engine", "newton"])
+    assert "pip install 'magtwin[physics]'" in capsys.readouterr().err
+
+
+PHYSICS = [
+    pytest.mark.physics,
+    pytest.mark.skipif(
+        importlib.util.find_spec("newton") is None or importlib.util.find_spec("mujoco") is None,
+        reason="newton is not installed: pip install magtwin[physics]",
+    ),
+]
+
+
+def physics(test):
+    for mark in PHYSICS:
+        test = mark(test)
+    return test
+
+
+@physics
+@pytest.mark.parametrize(
+    "path",
+    [
+        figure8(half_length_m=0.8, half_width_m=0.4),
+        sine(x_first_m=-0.8, x_last_m=0.8, amplitude_m=0.4),
+        lawnmower(x_first_m=-0.8, x_last_m=0.0, height_m=0.8, y_first_m=-0.4, step_m=0.4),
+    ],
+    ids=lambda path: path.name,
+)
+def test_kinematic_and_newton_go_the_same_way_by_the_same_commands(twin, path):
+    drive = replace(twin.scene.robot.drive, slip_s2_m=0.0, yaw_slip=0.0)
+    course = course_along(path, drive, speed=0.2)
+    want = Kinematic().drive(course, None, None)
+    rows = np.column_stack([np.arange(len(want.v)) * course.dt, want.v_cmd, want.w_cmd])
+    scripted = replace(course, guide=guide_by_commands(rows, drive), steps=len(want.v))
+    got = Newton(twin.scene_file, twin.scene.robot).drive(scripted, None, None)
+    t = np.arange(0, want.duration_s, 0.02)
+    a, b = want.at(t), got.at(t)
+    assert np.sqrt(np.mean(np.sum((a.pose - b.pose)[:, :2] ** 2, axis=1))) < 0.05
+    assert_allclose(b.wheel_angle, a.wheel_angle, atol=0.05)
+
+
+@physics
+def test_newton_follows_a_path_by_the_same_controller_and_gives_the_same_bits_again(twin):
+    path = sine(x_first_m=-0.3, x_last_m=0.3, amplitude_m=0.15)
+    runs = [simulate(twin, path, engine="newton", seed=1) for _ in range(2)]
+    for name in runs[0]:
+        assert_array_equal(runs[0][name], runs[1][name], err_msg=name)
+    _, aside = path.nearest(runs[0]["p_world_base"][:, :2])
+    assert np.abs(aside).max() < 0.02
+    assert runs[0].facts["engine"] == "newton"
