@@ -146,18 +146,26 @@ def platform_field_nt(
         Field in base_link axes [nT], shape (N, 3).
     """
     b = np.asarray(b_body, float)
-    field = b + b @ np.reshape(platform.soft_iron, (3, 3)).T + platform.hard_iron_nt
+    field = b + _times(b, np.reshape(platform.soft_iron, (3, 3)).T)
+    field += platform.hard_iron_nt
     if any(platform.eddy_s):
-        field += np.broadcast_to(b_rate, b.shape) @ np.reshape(platform.eddy_s, (3, 3)).T
+        field += _times(np.broadcast_to(b_rate, b.shape), np.reshape(platform.eddy_s, (3, 3)).T)
     motors = np.array([platform.left_motor_nt_nm, platform.right_motor_nt_nm])
     if motors.any():
-        field += np.asarray(motor_nm, float) @ motors
-    on = np.asarray(lidar_on, float)[..., None]
-    field += on * platform.lidar_nt
-    if any(platform.lidar_cos_nt) or any(platform.lidar_sin_nt):
-        angle = np.asarray(lidar_angle, float)[..., None]
-        field += on * (np.cos(angle) * platform.lidar_cos_nt + np.sin(angle) * platform.lidar_sin_nt)
-    return np.asarray(field + np.asarray(battery_a, float)[..., None] * platform.battery_nt)
+        field += _times(np.asarray(motor_nm, float), motors)
+    if any(platform.battery_nt):
+        field += np.asarray(battery_a, float)[..., None] * platform.battery_nt
+    on = np.broadcast_to(np.asarray(lidar_on, bool), b.shape[:-1])
+    if on.any():
+        angle = np.broadcast_to(lidar_angle, on.shape)[on]
+        parts = np.array([platform.lidar_nt, platform.lidar_cos_nt, platform.lidar_sin_nt])
+        field[on] += _times(np.column_stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)]), parts)
+    return field
+
+
+def _times(rows: Array, matrix: Array) -> Array:
+    """Rows (..., K) times a matrix (K, 3): so few columns are no work for the threads that `@` wakes."""
+    return np.einsum("...k,kj->...j", rows, matrix)
 
 
 def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
@@ -178,7 +186,7 @@ def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
         RefusedError: The magnetometer is in the middle of one of them.
     """
     platform, angle = robot.platform, np.asarray(wheel_angle, float)
-    rolled = angle.mean(axis=1) * robot.drive.wheel_radius_m / platform.caster_radius_m
+    rolled = (angle[:, 0] + angle[:, 1]) * (robot.drive.wheel_radius_m / platform.caster_radius_m / 2)
     side, axle = robot.drive.wheel_separation_m / 2, robot.drive.wheel_radius_m - robot.base_height_m
     field = np.zeros((len(angle), 3))
     for m, phase, place, turned in (
@@ -187,9 +195,8 @@ def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
         (platform.caster_moment, platform.caster_phase, platform.p_base_caster, rolled),
     ):
         if m:
-            up, forwards = _unit_fields(robot, place)
-            now = (turned + phase)[:, None]
-            field += m * (np.cos(now) * up + np.sin(now) * forwards)
+            now = turned + phase
+            field += _times(np.column_stack([np.cos(now), np.sin(now)]), m * _unit_fields(robot, place))
     return field
 
 
