@@ -43,7 +43,7 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
         scene = scene_from_toml(shipped("scenes", "lab.toml"))
         scene = replace(scene, robot=replace(scene.robot, asset=asset))
         scene_file = author_scene(scene, folder / "scene")
-        report = _run(
+        report = write_run(
             scene_file, "figure8", folder, steps=steps, seed=seed, speed=0.2, title=f"Demo in {out}"
         )
         steps("Taking pictures")
@@ -168,7 +168,7 @@ def run(
         if asides[0] is not None:
             asides[0].mkdir()
         out_aside, rrd_aside, parquet_aside, scans_aside = asides
-        report = _run(
+        report = write_run(
             scene,
             way,
             out_aside,
@@ -183,7 +183,7 @@ def run(
         say("Wrote " + ", ".join(str(target) for target in targets if target is not None))
 
 
-def _run(
+def write_run(
     scene_file: Path,
     path: str,
     folder: Path | None,

@@ -280,7 +280,7 @@ def _log_bodies(
     rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for shape in shapes:
         if not shape.link and shape.prim != str(HEAT_MAP):  # the map is drawn finer, see _log_map
-            rec.log(f"world/lab/{_entity(shape.prim)}", _mesh([shape]), static=True)
+            rec.log(f"world/lab/{_entity(shape.prim)}", mesh_of([shape]), static=True)
     rows = _thinned(run, POSE_HZ)
     _send(
         rec,
@@ -302,7 +302,7 @@ def _log_bodies(
         else:
             entity, p, q = f"world/robot/{_entity(name)}", link.p_base_link, link.q_base_link_xyzw
         if carried:
-            rec.log(entity, _mesh(carried), static=True)
+            rec.log(entity, mesh_of(carried), static=True)
         if link.joint in wheels and link.axis_link is not None:
             half = run["wheel_angle"][rows, wheels[link.joint]][:, None] / 2
             turn = np.hstack([np.sin(half) * link.axis_link, np.cos(half)])
@@ -413,7 +413,7 @@ def _thinned(run: Run, rate_hz: float) -> NDArray[np.intp]:
     return np.unique(np.append(np.arange(0, run.rows, stride), run.rows - 1))
 
 
-def _mesh(shapes: Sequence[Shape]) -> rr.Mesh3D:
+def mesh_of(shapes: Sequence[Shape]) -> rr.Mesh3D:
     """Shapes as one mesh, flat triangles in the colours of their materials."""
     corners = np.concatenate([shape.vertices[shape.faces] for shape in shapes])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

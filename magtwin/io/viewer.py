@@ -119,6 +119,31 @@ def headless_viewer(size: tuple[int, int] = (1600, 1000)) -> Iterator[ViewerClie
             _end(process)
 
 
+@contextmanager
+def live_viewer(*, headless: bool = False) -> Iterator[tuple[str, ViewerClient]]:
+    """A viewer in a window, for what is still going on; ended with the block.
+
+    Args:
+        headless: Whether it has no window, but can be asked for pictures.
+
+    Yields:
+        The address that recordings connect to, on this machine only, and a client.
+
+    Raises:
+        RefusedError: It cannot run here; the text says what it said.
+    """
+    port = _free_port()
+    command = [_binary(), "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen"]
+    with tempfile.TemporaryFile("w+") as log:
+        process = subprocess.Popen(
+            command + ["--headless"] * headless, stdout=log, stderr=log, start_new_session=True
+        )
+        try:
+            yield f"rerun+http://{LOCALHOST}:{port}/proxy", _connected(process, port, log)
+        finally:
+            _end(process)
+
+
 def _connected(process: "subprocess.Popen[bytes]", port: int, log: IO[str]) -> ViewerClient:
     """A client of a viewer that was just started, once it draws: it listens before it knows if it can."""
     clients: list[ViewerClient] = []

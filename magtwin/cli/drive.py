@@ -1,0 +1,164 @@
+"""`magtwin drive`: drive a scene's robot by hand, in real time, and record it."""
+
+import os
+import select
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from magtwin.cli.app import app
+from magtwin.cli.run import write_run
+from magtwin.cli.terminal import Force, Json, Seed, announcer, print_report, say
+from magtwin.names import RefusedError
+
+if TYPE_CHECKING:
+    from magtwin.sim.manual import Hand, Recorder
+
+STATUS_HZ = 10.0
+"""Lines about pose and speed a second [Hz]."""
+
+
+@app.command
+def drive(
+    scene: Path,
+    *,
+    out: Path = Path("drive"),
+    gamepad: Path | None = None,
+    net: Path | None = None,
+    seed: Seed = 0,
+    view: bool = True,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Drive a scene's robot by hand, in real time, and write what happened.
+
+    The kinematic engine moves it from the scene's start. Keys: w/s or up/down for speed, a/d or left/right
+    for turning, x to go straight on, space to stop, q to end. Writes run.rrd, run.parquet, run.png and
+    commands.csv, which magtwin run --commands drives again to the last bit.
+
+    Parameters
+    ----------
+    scene
+        USD stage to drive in.
+    out
+        Folder to make.
+    gamepad
+        A gamepad of Linux to drive with, such as /dev/input/js0, in place of the keyboard: the left stick
+        drives, Start ends.
+    net
+        Weights to use in place of the scene's; "none" for a physical magnetometer.
+    seed
+        Seed of all noise, and of the wheels' errors.
+    view
+        Show the drive in a Rerun viewer while it goes on, where a window can be opened.
+    force
+        Replace the folder if it exists.
+    json
+        Print the summary as JSON.
+    """
+    import numpy as np
+
+    from magtwin.files import existing, output
+    from magtwin.sim.commands import write_commands
+    from magtwin.sim.drive import draw_wheel_errors
+    from magtwin.sim.follow import CONTROL_RATE_HZ
+    from magtwin.sim.manual import HELP, Gamepad, Keyboard, Recorder, at_start
+    from magtwin.sim.simulate import streams
+    from magtwin.twin import open_twin
+
+    existing(scene, "scene")
+    if gamepad is not None:
+        existing(gamepad, "gamepad")
+    with output(out, force=force) as folder:
+        twin = open_twin(scene, net=net)
+        robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
+        errors = draw_wheel_errors(robot.drive, streams(np.random.default_rng(seed))["drive"])
+        chassis = at_start(
+            robot.drive, twin.scene.start, twin.obstacles, robot.footprint_radius_m, errors, dt
+        )
+        hand: Hand = Keyboard(robot.drive) if gamepad is None else Gamepad(robot.drive)
+        recorder = Recorder(chassis, hand, dt)
+        with ExitStack() as stack:
+            show = None
+            if view:
+                from magtwin.io.live import live_view
+
+                try:
+                    show = stack.enter_context(live_view(twin.scene, scene))
+                except RefusedError as error:
+                    print(f"  no view: {error}", file=sys.stderr)  # noqa: T201
+            device = stack.enter_context(_device(gamepad))
+            print(f"  {HELP if gamepad is None else 'left stick drives, Start ends'}\r", file=sys.stderr)  # noqa: T201
+            _drive(recorder, hand, device, dt, show)
+        folder.mkdir()
+        write_commands(recorder.commands("commands.csv"), folder / "commands.csv")
+        report = write_run(
+            scene,
+            "commands.csv",
+            folder,
+            commands=folder / "commands.csv",
+            steps=announcer(quiet=json),
+            net=net,
+            seed=seed,
+            title=f"Manual drive in {scene}",
+        )
+    print_report(report, json)
+    if not json:
+        say(f"Wrote {out}; again: magtwin run {scene} --commands {out / 'commands.csv'} --seed {seed}")
+
+
+def _drive(recorder: "Recorder", hand: "Hand", device: int, dt: float, show: object) -> None:
+    """Drive in real time until the hand has done; a machine too slow for that drives in slow motion."""
+    due, step, told = time.monotonic(), 0, ""
+    try:
+        while not hand.done:
+            due = max(due + dt, time.monotonic())
+            while (left := due - time.monotonic()) > 0 and not hand.done:
+                if select.select([device], [], [], left)[0]:
+                    hand.feed(os.read(device, 1024))
+            recorder.step()
+            chassis = recorder.chassis
+            if callable(show):
+                show(chassis.t, chassis.pose)
+            if step % round(1 / dt / STATUS_HZ) == 0 and sys.stderr.isatty():
+                x, y, yaw = chassis.pose
+                v, w = hand.command
+                told = f"  {chassis.t:6.1f} s  at {x:+.2f} {y:+.2f} m  yaw {yaw:+.2f}  v {v:+.2f}  w {w:+.2f}"
+                print(f"\r{told}{'  BUMP' if chassis.bump else '      '}", end="", file=sys.stderr)  # noqa: T201
+            step += 1
+    except KeyboardInterrupt:
+        pass  # an end like any other: what was driven is kept
+    if told:
+        print("\r", file=sys.stderr)  # noqa: T201
+
+
+@contextmanager
+def _device(gamepad: Path | None) -> Iterator[int]:
+    """A gamepad, or the terminal, whose keys come one by one; it is as it was before at any end."""
+    if gamepad is not None:
+        try:
+            pad = os.open(gamepad, os.O_RDONLY | os.O_NONBLOCK)
+        except OSError as error:
+            raise RefusedError(f"{gamepad}: cannot be read ({error.strerror}); name a gamepad") from error
+        try:
+            yield pad
+        finally:
+            os.close(pad)
+        return
+    keys = sys.stdin.fileno()
+    if not os.isatty(keys):
+        yield keys  # keys from a pipe
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(keys)
+    try:
+        tty.setcbreak(keys)
+        yield keys
+    finally:
+        with suppress(termios.error):
+            termios.tcsetattr(keys, termios.TCSADRAIN, before)
