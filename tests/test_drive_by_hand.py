@@ -13,12 +13,16 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.cli import main
+from magtwin.io.live import streamed
 from magtwin.io.tables import read_parquet
+from magtwin.io.viewer import live_viewer
+from magtwin.names import RefusedError
 from magtwin.obstacles import Obstacles
 from magtwin.sim.commands import read_commands
 from magtwin.sim.follow import play
 from magtwin.sim.manual import Gamepad, Keyboard, Recorder, at_start
 from magtwin.spec import DriveSpec
+from magtwin.twin import open_twin
 
 DRIVE = DriveSpec()
 
@@ -124,3 +128,21 @@ def test_a_gamepad_that_is_not_there_is_refused(tmp_path, lab_scene, capsys):
         main(["drive", str(lab_scene), "--out", str(tmp_path / "d"), "--gamepad", str(tmp_path / "js0")])
     assert "no such gamepad" in capsys.readouterr().err
     assert not (tmp_path / "d").exists()
+
+
+def test_a_viewer_that_listens_shows_the_drive_while_it_goes_on(lab_scene):
+    scene = open_twin(lab_scene, net="none").scene
+    try:
+        with live_viewer(headless=True) as (address, client), streamed(scene, lab_scene, address) as show:
+            for k in range(20):
+                show(k / 50, (k / 100, 0.0, 0.0))
+            end = time.monotonic() + 60
+            while time.monotonic() < end and not any(r.timelines for r in client.get_state().recordings):
+                client.take_screenshot(max_size=64)
+            state = client.get_state()
+            assert [timeline.name for r in state.recordings for timeline in r.timelines if r.timelines]
+            assert [report for seen in state.views for report in seen.reports] == []
+    except RefusedError as error:
+        if "cannot draw here" not in str(error):
+            raise
+        pytest.skip(str(error))

@@ -6,8 +6,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import rerun as rr
+import rerun.blueprint as rrb
 
-from magtwin.io.layout import TIMELINE
+from magtwin.io.layout import TIMELINE, lab_eye
 from magtwin.io.rerun import APPLICATION, mesh_of
 from magtwin.io.viewer import live_viewer
 from magtwin.spec import Scene
@@ -36,7 +37,15 @@ def live_view(scene: Scene, scene_file: Path) -> Iterator[Show]:
 def streamed(scene: Scene, scene_file: Path, address: str) -> Iterator[Show]:
     """The same into a viewer that listens at an address."""
     rec = rr.RecordingStream(APPLICATION, send_properties=False)
-    rec.connect_grpc(address)
+    position, target = lab_eye(scene.lab)
+    lab = rrb.Spatial3DView(
+        origin="world",
+        name="Lab, driven by hand",
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(position=position, look_target=target, eye_up=(0, 0, 1)),
+    )
+    rec.connect_grpc(address, default_blueprint=rrb.Blueprint(lab, collapse_panels=True))
+    rec.send_recording_name("manual drive")
     stage = open_stage(scene_file)
     shapes, links = read_shapes(stage), read_links(stage)
     rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
