@@ -28,7 +28,7 @@ LOCK_RATE_HZ = 5.0
 which fields of things that lie half a metre away hardly change."""
 
 LOCK_STEP_M = 0.02
-"""Spacing of the places where that is seen [m]: over half of it gradients near steel change by some per cent."""
+"""Spacing of the places where that is seen [m]; over half of it gradients change by some per cent."""
 
 FLICKER_LOWEST_HZ = 1e-3
 """Frequency below which 1/f noise is flat: a run of a quarter of an hour [Hz]."""
