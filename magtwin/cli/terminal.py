@@ -16,7 +16,8 @@ def _whole(kind: type, tokens: Any) -> int:
     return int(tokens[0].value)
 
 
-Seed = Annotated[int, Parameter(converter=_whole)]
+Whole = Annotated[int, Parameter(converter=_whole)]
+Seed = Whole
 Force = Annotated[bool, Parameter(name="--force", negative="")]
 Json = Annotated[bool, Parameter(name="--json", negative="")]
 

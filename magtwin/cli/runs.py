@@ -1,0 +1,148 @@
+"""`magtwin runs`: many seeded runs of a scene's robot into one folder, as a data set."""
+
+import csv
+import time
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, Json, Seed, Whole, announcer, print_report, progress, say
+
+Names = Annotated[list[str] | None, Parameter(consume_multiple=True, negative="")]
+
+
+@app.command
+def runs(
+    scene: Path,
+    *,
+    out: Path = Path("runs"),
+    count: Whole = 100,
+    path: Names = None,
+    seed: Seed = 0,
+    sessions: Whole = 0,
+    speed: float | None = None,
+    duration: float | None = None,
+    rate_hz: float | None = None,
+    columns: Names = None,
+    net: Path | None = None,
+    magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    lidar: Literal["schedule", "on", "off"] = "schedule",
+    outside: Literal["nan", "clamp", "raise"] = "nan",
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Drive a scene's robot many times and write a data set: a Parquet file a run, and a list of them.
+
+    Run k, in run_00000.parquet and so on, has the seed SEED + k and drives the next path in turn; without
+    sessions it is what `magtwin run` writes with these, to the last bit. runs.csv lists file, path, seed,
+    session, speed and readings.
+
+    Parameters
+    ----------
+    scene
+        USD stage to drive in.
+    out
+        Folder to make.
+    count
+        How many runs.
+    path
+        Paths to drive in turn, as for `magtwin run`: names, cases A to E, CSV files; figure8 unless given.
+    seed
+        Seed of the first run; each next one's is one more.
+    sessions
+        Days to deal the runs to, in turn: on each, charge, IMU zero, wheels, odometry and the robot's own
+        field are drawn anew, and a speed for each run. 0 takes the robot as its asset has it.
+    speed
+        Forward speed where the path is straight [m/s]; 0.2 unless given, or drawn where there are sessions.
+    duration
+        How long each run is [s]; once along its path unless given, longer gives further laps.
+    rate_hz
+        Magnetometer readings a second [Hz]; the scene's unless given.
+    columns
+        Columns to keep beside t; all unless given.
+    net
+        As for `magtwin run`.
+    magnetometer
+        As for `magtwin run`.
+    lidar
+        Whether the LiDAR follows its schedule, or stays on or off.
+    outside
+        What the map reads outside its extent: nan, the nearest value inside, or a refusal.
+    force
+        Replace the folder if it exists.
+    json
+        Print the summary as JSON.
+    """
+    import numpy as np
+
+    from magtwin.files import existing, output
+    from magtwin.io.tables import write_parquet
+    from magtwin.names import RefusedError
+    from magtwin.path import resolve_path
+    from magtwin.report import Figure, Report
+    from magtwin.sim.session import draw_session, draw_speed
+    from magtwin.twin import open_twin, simulate_many
+
+    existing(scene, "scene")
+    for name, value, least in (("count", count, 1), ("sessions", sessions, 0), ("seed", seed, 0)):
+        if value < least:
+            raise RefusedError(f"--{name} must be a whole number from {least} up, got {value}")
+    steps = announcer(quiet=json)
+    with output(out, force=force) as folder:
+        steps("Opening the scene")
+        twin = open_twin(scene, net=net, magnetometer=magnetometer)
+        paths = [resolve_path(name) for name in path or ["figure8"]]
+        robot = twin.scene.robot
+        days = [robot]
+        draws = np.random.default_rng((seed, 1)).spawn(2)  # none that a run draws from
+        if sessions:
+            days = [draw_session(robot, rng) for rng in draws[0].spawn(min(sessions, count))]
+        speeds = [0.2 if speed is None else speed] * count
+        if sessions and speed is None:
+            speeds = [draw_speed(robot.drive, rng) for rng in draws[1].spawn(count)]
+        made = simulate_many(
+            twin,
+            [paths[k % len(paths)] for k in range(count)],
+            range(seed, seed + count),
+            speeds=speeds,
+            robots=[days[k % len(days)] for k in range(count)],
+            columns=columns,
+            duration_s=duration,
+            rate_hz=rate_hz,
+            lidar=lidar,
+            outside=outside,
+        )
+        folder.mkdir()
+        readings, seconds, start = 0, 0.0, time.monotonic()
+        with (
+            progress("Driving") as advance,
+            open(folder / "runs.csv", "w", encoding="utf-8", newline="") as listing,
+        ):
+            table: Any = csv.writer(listing, lineterminator="\n")
+            table.writerow(("file", "path", "seed", "session", "speed_m_s", "readings"))
+            for k, run in enumerate(made):
+                file = f"run_{k:05d}.parquet"
+                day: int | str = k % len(days) if sessions else ""
+                write_parquet(run.with_facts(session=day) if sessions else run, folder / file)
+                facts = run.facts
+                table.writerow((file, facts["path"], facts["seed"], day, facts["speed_m_s"], run.rows))
+                readings, seconds = readings + run.rows, seconds + float(facts["duration_s"])
+                rate = (k + 1) / (time.monotonic() - start)
+                advance(k + 1, count, f"{rate:.3g} runs/s")
+    took = time.monotonic() - start
+    report = Report(
+        f"{count} runs in {scene}",
+        (
+            Figure("runs", count),
+            Figure("readings", readings),
+            Figure("driven", seconds, "s"),
+            Figure("took", round(took, 3), "s"),
+            Figure("rate", count / took, "runs/s"),
+        ),
+        {"paths": ", ".join(one.name for one in paths), "sessions": sessions},
+    )
+    print_report(report, json)
+    if not json:
+        say(f"Wrote {out}")

@@ -1,0 +1,99 @@
+"""`magtwin runs`: the data set that it writes, its seeds and sessions, and what it refuses."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from magtwin.cli import main
+from magtwin.io.tables import read_parquet
+from magtwin.path import path_named
+from magtwin.twin import open_twin, simulate
+
+SHORT = ("--duration", "1", "--magnetometer", "physical")
+
+
+def listed(folder):
+    with open(folder / "runs.csv", encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_each_file_is_the_run_of_its_seed_and_path_to_the_last_bit(lab_scene, tmp_path):
+    out = tmp_path / "set"
+    main(
+        [
+            "runs",
+            str(lab_scene),
+            "--out",
+            str(out),
+            "--count",
+            "5",
+            "--path",
+            "figure8",
+            "B",
+            "--seed",
+            "7",
+            *SHORT,
+        ]
+    )
+    rows = listed(out)
+    assert sorted(p.name for p in out.iterdir()) == [f"run_0000{k}.parquet" for k in range(5)] + ["runs.csv"]
+    twin = open_twin(lab_scene, magnetometer="physical")
+    for k, row in enumerate(rows):
+        own = simulate(twin, path_named(("figure8", "B")[k % 2]), seed=7 + k, duration_s=1.0)
+        run = read_parquet(out / row["file"])
+        assert dict(run.facts) == dict(own.facts)
+        assert list(run) == list(own)
+        assert all(run[name].tobytes() == own[name].tobytes() for name in own)
+        assert row["path"] == own.facts["path"]
+        assert (int(row["seed"]), int(row["readings"]), row["session"]) == (7 + k, own.rows, "")
+
+
+def test_sessions_differ_and_their_runs_share_what_a_day_has(lab_scene, tmp_path):
+    options = ["--count", "4", "--sessions", "2", "--columns", "battery_fraction", "b_measured_nt", *SHORT]
+    for name in ("a", "b"):
+        main(["runs", str(lab_scene), "--out", str(tmp_path / name), *options])
+    runs = [read_parquet(tmp_path / "a" / row["file"]) for row in listed(tmp_path / "a")]
+    charges = [run["battery_fraction"][0] for run in runs]
+    assert charges[0] == charges[2] != charges[1] == charges[3]
+    assert [run.facts["session"] for run in runs] == [0, 1, 0, 1]
+    assert len({run.facts["speed_m_s"] for run in runs}) == 4
+    assert list(runs[0]) == ["t", "battery_fraction", "b_measured_nt"]
+    assert not np.array_equal(runs[0]["b_measured_nt"], runs[2]["b_measured_nt"])
+    for file in (tmp_path / "a").iterdir():
+        assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes()
+
+
+def test_the_summary_is_json_where_that_is_asked_for(lab_scene, tmp_path, capsys):
+    main(["runs", str(lab_scene), "--out", str(tmp_path / "set"), "--count", "2", "--json", *SHORT])
+    figures = json.loads(capsys.readouterr().out)["figures"]
+    assert figures["runs"]["value"] == 2
+    assert figures["readings"]["value"] == 2 * 135
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (("--count", "0"), "--count must be a whole number from 1 up"),
+        (("--sessions", "-1"), "--sessions must be a whole number from 0 up"),
+        (("--seed", "-1"), "--seed must be a whole number from 0 up"),
+        (("--path", "figure9"), "did you mean 'figure8'"),
+        (("--columns", "yaww"), "did you mean 'yaw'"),
+        (("--speed", "0"), "speed must be above 0"),
+    ],
+)
+def test_what_cannot_be_driven_is_refused_and_leaves_nothing(lab_scene, tmp_path, capsys, options, text):
+    with pytest.raises(SystemExit) as end:
+        main(["runs", str(lab_scene), "--out", str(tmp_path / "set"), *SHORT, *options])
+    assert end.value.code == 1
+    assert text in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_exists_is_kept_unless_forced(lab_scene, tmp_path, capsys):
+    (tmp_path / "set").mkdir()
+    with pytest.raises(SystemExit):
+        main(["runs", str(lab_scene), "--out", str(tmp_path / "set"), "--count", "1", *SHORT])
+    assert "--force" in capsys.readouterr().err
+    assert list((tmp_path / "set").iterdir()) == []
