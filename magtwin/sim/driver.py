@@ -38,7 +38,7 @@ TURN_TAU_S, TURN_STD = 0.8, 0.35
 PAUSE_EVERY_S, PAUSE_S = 25.0, 1.5
 """Mean time between pauses and mean length of one [s]."""
 
-PLACE_M = 0.5
+PLACE_M = 0.25
 """Spacing of the places that are made for [m]."""
 
 NEAR_M, PATIENCE_S = 0.25, 15.0
@@ -99,7 +99,7 @@ class Driver:
             )
         across = [np.arange(-half + PLACE_M / 2, half, PLACE_M) for half in self._half]
         grid = np.array([(x, y) for x in across[0] for y in across[1]])
-        free = [self._clearance(x, y) > self._keep + NEAR_M / 2 for x, y in grid.tolist()]
+        free = [self._clearance(x, y) > self._keep + 0.05 for x, y in grid.tolist()]
         self._places = grid[free] if any(free) else np.array([start[:2]])
         self._visits = np.zeros(len(self._places))
         self._goal, self._goal_until = 0, -1.0
@@ -155,7 +155,7 @@ class Driver:
     def _visit(self, t: float, x: float, y: float) -> None:
         """Note where they are, and choose where to go next."""
         away = np.hypot(self._places[:, 0] - x, self._places[:, 1] - y)
-        self._visits[away < PLACE_M / 2] += LOOK_S
+        self._visits[away < PLACE_M] += LOOK_S
         if t < self._goal_until and away[self._goal] > NEAR_M:
             return
         self._visits[self._goal] += 1.0  # reached, or given up
