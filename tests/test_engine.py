@@ -204,6 +204,8 @@ def test_run_drives_at_random_by_commands_and_by_replay(lab_scene, tmp_path, cap
     [
         (["--path", "sine", "--commands", "c.csv"], "--path and --commands"),
         (["--engine", "replay"], "--replay RUN.parquet"),
+        (["--path", "random", "--controller", "stanley"], "--controller stanley follows a path"),
+        (["--commands", "c.csv", "--speed", "0.1"], "--speed is for a path"),
         (["--engine", "newton", "--replay", "r.parquet"], "--engine newton cannot"),
     ],
 )

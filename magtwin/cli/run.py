@@ -143,6 +143,10 @@ def run(
     if len(set(places)) < len(places):
         raise RefusedError("two outputs have one name; give each its own")
     way = _way(path, commands, engine, replay)
+    if controller != "follower" and (commands or replay or path == "random"):
+        raise RefusedError(f"--controller {controller} follows a path, and {way} is none; drop one")
+    if speed != 0.2 and (commands or replay):
+        raise RefusedError(f"--speed is for a path or a driver, and {way} has speeds of its own; drop one")
     if engine == "newton":
         from magtwin.sim.newton import check_installed
 
