@@ -213,6 +213,20 @@ def test_debug_lets_the_traceback_through(tmp_path):
         main(["info", str(tmp_path / "a.usda"), "--debug"])
 
 
+def test_run_takes_the_kind_of_magnetometer(lab_scene, tmp_path, capsys):
+    from magtwin.io.tables import read_parquet
+
+    for options, kind in ((["--magnetometer", "map-only"], "map-only"), (["--net", "none"], "physical")):
+        out = tmp_path / f"{kind}.parquet"
+        main(["run", str(lab_scene), "--duration", "1", "--parquet", str(out), "--json", *options])
+        run = read_parquet(out)
+        assert run.facts["magnetometer"] == kind
+        assert (run["b_disturbance_nt"] == 0).all() == (kind == "map-only")
+    capsys.readouterr()
+    line = refused(capsys, "run", lab_scene, "--net", "none", "--magnetometer", "neural", "--duration", "1")
+    assert "a neural magnetometer that names no network" in line
+
+
 def test_options_come_from_the_environment_and_from_magtwin_toml(tmp_path, monkeypatch, capsys, lab_scene):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "magtwin.toml").write_text("[run]\nspeed = 0.15\nseed = 5\n")
