@@ -4,8 +4,8 @@ Each robot drives a figure of eight for 60 s at 135 Hz, 8,100 readings, with a s
 through a 20-512-512-512-512-1 network. The yardstick is `NeuralMagnetometer.predict` on as many rows, in the
 chunking that the runs use: what a data set costs when its inputs are there already. Kept are poses and
 readings, as for a map or a filter; the exact field of a furnished lab, `--exact`, costs more. Both are
-measured in turn in one process; the ratio is the median over repetitions. Then the closed loop alone, compiled, for 10 to
-10,000 robots. Weights are random: how long a product takes does not depend on them.
+measured in turn in one process; the ratio is the median over repetitions. Then the closed loop alone,
+compiled, for 10 to 10,000 robots. Weights are random: how long a product takes does not depend on them.
 
     python benchmarks/many.py [--robots 100] [--repetitions 3] [--most 10000]
 """

@@ -75,7 +75,7 @@ def rotate(q: ArrayLike, v: ArrayLike) -> Array:
 def matrix_from_quat(q: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of unit quaternions xyzw (..., 4); columns are the turned axes."""
     q = np.asarray(q, float)
-    return np.stack([rotate(q, axis) for axis in np.eye(3)], axis=-1)
+    return np.ascontiguousarray(np.swapaxes(rotate(q[..., None, :], np.eye(3)), -1, -2))
 
 
 def yaw_from_quat(q: ArrayLike) -> Array:

@@ -213,11 +213,11 @@ def simulate(
 
 def simulate_many(
     twin: Twin | str | FilePath,
-    paths: Path | str | Sequence[Path | str],
+    paths: Path | str | Iterable[Path | str],
     seeds: Iterable[int],
     *,
-    speeds: float | Sequence[float] = 0.2,
-    robots: RobotSpec | Sequence[RobotSpec] | None = None,
+    speeds: float | Iterable[float] = 0.2,
+    robots: RobotSpec | Iterable[RobotSpec] | None = None,
     columns: Iterable[str] | None = None,
     block: int | None = None,
     duration_s: float | None = None,
@@ -269,14 +269,13 @@ def simulate_many(
             "remembers a single run: give it to simulate"
         )
     count = len(numbers)
-    resolved = {
-        path: resolve_path(path) for path in _each("paths", paths, count) if not isinstance(path, Path)
-    }
+    given = _each("paths", paths, count)
+    resolved = {path: resolve_path(path) for path in given if not isinstance(path, Path)}
     scenes: dict[int, Scene] = {}
     jobs = []
     for seed, path, speed, robot in zip(
         numbers,
-        _each("paths", paths, count),
+        given,
         _each("speeds", speeds, count),
         _each("robots", robots, count),
         strict=True,
@@ -332,11 +331,12 @@ def _seed(seed: object) -> int:
 
 def _each(name: str, values: Any, count: int) -> Sequence[Any]:
     """A value for each run, from as many, or from one for all."""
-    if values is None or isinstance(values, str | FilePath | Path | RobotSpec | float | int):
+    if isinstance(values, str) or not isinstance(values, Iterable):
         return [values] * count
+    values = list(values)
     if len(values) != count:
         raise RefusedError(f"{name} and seeds must be equally many, got {len(values)} and {count}")
-    return list(values)
+    return values
 
 
 def _check_magnetometer(twin: Twin, robot: RobotSpec) -> None:

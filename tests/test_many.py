@@ -133,6 +133,12 @@ def test_no_more_than_two_blocks_are_made_ahead(neural, monkeypatch):
     runs.close()
 
 
+def test_what_differs_from_run_to_run_may_come_from_any_iterable(physical):
+    options = {"speeds": np.array([0.1, 0.2], np.float32), **SHORT}
+    runs = simulate_many(physical, (name for name in ("figure8", "sine")), iter((3, 4)), **options)
+    assert [(run.facts["path"], run.facts["seed"]) for run in runs] == [("figure8", 3), ("sine", 4)]
+
+
 def test_seeds_of_numpy_are_seeds(physical):
     run = simulate_many(physical, "figure8", np.arange(5), **SHORT)[4]
     assert_same(run, simulate(physical, "figure8", seed=4, **SHORT))

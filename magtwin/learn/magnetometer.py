@@ -167,9 +167,11 @@ class NeuralMagnetometer:
         low = np.where(np.isnan(low), self._x_mean - _FAR * self._x_scale, low)
         high = np.where(np.isnan(high), self._x_mean + _FAR * self._x_scale, high)
         slack = 1e-9 * np.maximum(np.abs(low), np.abs(high))  # rounding of inputs that never vary
-        inside = np.ones(len(x), bool)
-        for column, a, b in zip(x.T, low - slack, high + slack, strict=True):
-            inside &= (column >= a) & (column <= b)
+        low, high = low - slack, high + slack
+        inside = np.empty(len(x), bool)
+        for start in range(0, len(x), _CHUNK):
+            block = x[start : start + _CHUNK]
+            np.all((block >= low) & (block <= high), axis=1, out=inside[start : start + _CHUNK])
         return ~inside
 
     def predict(self, x: ArrayLike) -> Array:

@@ -151,7 +151,8 @@ def run_courses(courses: Sequence[Course], obstacles: Obstacles | None = None) -
         RefusedError: A robot would begin in an obstacle, or lengths of steps differ.
     """
     obstacles = obstacles or Obstacles()
-    for course in courses:
+    starts = {(c.pose0, c.footprint_radius_m, c.dt, c.drive.command_timeout_s): c for c in courses}
+    for course in starts.values():
         course.check(obstacles)
     if len({course.dt for course in courses}) > 1:
         raise RefusedError("courses that are run at once must have the same length of a step")
