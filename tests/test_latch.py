@@ -230,3 +230,14 @@ def test_the_same_survey_gives_the_same_findings():
     a, b = (find_latched(gridded(2)) for _ in range(2))
     assert_array_equal(a.outlier, b.outlier)
     assert_array_equal(a.doubt, b.doubt)
+
+
+def test_rows_in_no_order_are_judged_as_those_of_a_drive_are():
+    rng = np.random.default_rng(3)
+    p, yaw = rng.uniform(-3, 3, (400, 2)), rng.uniform(0, 2 * np.pi, 400)
+    b = 45_000 + 1_000 * np.sin(p[:, 0]) + 800 * np.cos(1.3 * p[:, 1]) + 5 * rng.standard_normal(400)
+    b[7] += 2_000
+    found = find_latched(Readings(p_xy=p, yaw=yaw, b_nt=b))
+    assert found.judged
+    assert not (found.stuck | found.latched).any()
+    assert np.argmax(np.abs(found.outlier)) == 7

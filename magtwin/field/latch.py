@@ -25,6 +25,7 @@ Chance is Student's t with 4 degrees of freedom about a Gaussian process on the 
 (`magtwin.field.local`).
 """
 
+import itertools
 from dataclasses import dataclass
 from math import lgamma
 from typing import Any
@@ -318,10 +319,16 @@ def _cells(readings: Readings) -> tuple[Readings, Rows]:
     ), cell
 
 
+def _driven(readings: Readings, rows: Rows) -> list[Rows]:
+    """The parts of a sequence without a jump: from one to the next the field is like itself."""
+    return np.split(rows, np.flatnonzero(_moved(readings, rows) > REACH_M) + 1)
+
+
 def _flats(readings: Readings, sound: NDArray[np.bool_]) -> list[Rows]:
     """Stretches of a drive that stay within the sensor's noise over `FLAT_M` or more."""
     flats = []
-    for rows in _sequences(readings.with_(good=sound)):
+    drives = (_driven(readings, rows) for rows in _sequences(readings.with_(good=sound)))
+    for rows in itertools.chain.from_iterable(drives):
         b, p = readings.b_nt[rows], readings.p_xy[rows]
         if len(rows) < 8:
             continue
@@ -431,8 +438,7 @@ def _outliers(readings: Readings, cells: Readings, cell: Rows, fit: LocalFit, po
         outlier[rows[len(rows) // 2]] = residual[at]
     if readings.node is None:
         for sequence in _sequences(readings):
-            jumps = np.flatnonzero(_moved(readings, sequence) > REACH_M) + 1  # a field may jump with the pose
-            for rows in np.split(sequence, jumps):
+            for rows in _driven(readings, sequence):  # a field may jump with the pose
                 off = _spikes(readings.b_nt[rows])
                 outlier[rows[off != 0]] = off[off != 0]
     return outlier
