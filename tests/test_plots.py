@@ -185,8 +185,8 @@ def test_a_drawing_says_what_where_and_in_which_unit(tmp_path, what, said):
         "hall",
         "heading 0°",
         "heading 270°",
-        "x [m], east",
-        "y [m], north",
+        "x [m]",
+        "y [m]",
         "sensor at 0.35 m",
         "2026-01-02",
     ):

@@ -250,8 +250,8 @@ def _draw_path(
     ax.plot(*p_xy[0], marker="o", ms=7, mfc="white", mec=INK, ls="", zorder=5, label="start")
     _flat_bar(ax, driven, "total field along the path [µT]")
     ax.set_aspect("equal")
-    ax.set_xlabel("x [m], east", fontsize=9)
-    ax.set_ylabel("y [m], north", fontsize=9)
+    ax.set_xlabel("x [m]", fontsize=9)
+    ax.set_ylabel("y [m]", fontsize=9)
     ax.tick_params(labelsize=8)
     ax.legend(loc="upper right", fontsize=8, framealpha=0.85)
 
@@ -312,10 +312,10 @@ def _panels(extent: tuple[float, float, float, float], count: int) -> "tuple[Fig
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     for k, ax in enumerate(axes[:count]):
         if k + columns >= count:
-            ax.set_xlabel("x [m], east", fontsize=9)
+            ax.set_xlabel("x [m]", fontsize=9)
             ax.tick_params(labelbottom=True)  # above an empty panel too
         if k % columns == 0:
-            ax.set_ylabel("y [m], north", fontsize=9)
+            ax.set_ylabel("y [m]", fontsize=9)
     for ax in axes[count:]:
         ax.set_axis_off()
     return figure, axes
