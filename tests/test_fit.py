@@ -100,3 +100,10 @@ def test_every_method_has_its_own_name():
     for method in QUICK:
         assert fit(readings, method).method == method
     assert set(QUICK) < set(METHODS)
+
+
+def test_a_map_has_its_surveys_frame_and_datum_and_a_height_only_where_the_survey_has_one():
+    given = drive(400).with_(frame="world: x east", datum="the door", height_m=None)
+    for method in ("trilinear", "harmonic"):
+        field = raster(fit(given, method), given, spacing_m=1.0, headings_rad=[0.0])
+        assert (field.frame, field.datum, field.height_m) == ("world: x east", "the door", None)

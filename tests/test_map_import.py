@@ -153,3 +153,55 @@ def test_headings_that_are_none_are_refused(tmp_path, capsys, headings):
     save_readings(gridded(0), tmp_path / "a.parquet")
     arguments = ("map", "fit", tmp_path / "a.parquet", "--out", tmp_path / "a.usdc", "--headings", headings)
     assert "headings are degrees with commas between" in refused(capsys, *arguments)
+
+
+def test_frame_and_datum_are_said_at_import_or_fit_and_kept_from_readings_to_map(tmp_path, capsys, real_data):
+    maps = real_data / "aprilab/maps"
+    said = ("--frame", "world: x east, y north, z up", "--datum", "the door", "--licence", "MIT")
+    run("map", "import", maps, "--out", tmp_path / "a.parquet", *said)
+    run("map", "import", maps, "--out", tmp_path / "a.usdc", *said)
+    run("map", "fit", tmp_path / "a.parquet", "--method", "trilinear", "--out", tmp_path / "b.usdc")
+    run("map", "fit", maps, "--method", "trilinear", "--out", tmp_path / "c.usdc", *said[2:])
+    capsys.readouterr()
+    for name in ("a", "b"):
+        field = load_map(tmp_path / f"{name}.usdc")
+        assert (field.frame, field.datum, field.licence) == (said[1], "the door", "MIT")
+    assert (load_map(tmp_path / "c.usdc").frame, load_map(tmp_path / "c.usdc").datum) == ("", "the door")
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        (("--created", "yesterday"), "--created must be a day YYYY-MM-DD, got 'yesterday'"),
+        (("--height", "-1"), "height_m of Readings is a height above the floor, 0 m or more, got -1.0"),
+        (("--height", "nan"), "height_m of Readings is a height above the floor, 0 m or more, got nan"),
+    ],
+)
+def test_a_day_or_a_height_that_is_none_is_refused(tmp_path, capsys, real_data, said, why):
+    maps = real_data / "aprilab/maps"
+    assert why in refused(capsys, "map", "import", maps, "--out", tmp_path / "a.usdc", *said)
+    assert not (tmp_path / "a.usdc").exists()
+
+
+def test_a_refusal_names_the_survey_not_the_file_to_be_written(tmp_path, capsys):
+    (tmp_path / "hall.csv").write_text("x,y,heading,field\n0,0,0,41000\n1,0,0,42000\n")
+    with pytest.raises(SystemExit):
+        run("map", "fit", tmp_path / "hall.csv", "--out", tmp_path / "z.usdc")
+    assert "2 of 2 readings of 'hall' are good" in capsys.readouterr().err
+
+
+def test_runs_under_several_licences_keep_all_of_them(tmp_path, capsys):
+    for name, licence in (("a", "MIT"), ("b", "CC-BY-4.0")):
+        (tmp_path / f"{name}.csv").write_text("x,y,heading,field\n0,0,0,41000\n1,0,0,42000\n")
+        run(
+            "map",
+            "import",
+            tmp_path / f"{name}.csv",
+            "--out",
+            tmp_path / f"{name}.parquet",
+            "--licence",
+            licence,
+        )
+    run("map", "import", tmp_path / "a.parquet", tmp_path / "b.parquet", "--out", tmp_path / "c.parquet")
+    capsys.readouterr()
+    assert load_readings(tmp_path / "c.parquet").licence == "MIT; CC-BY-4.0"

@@ -220,7 +220,7 @@ def test_a_survey_tells_frame_datum_and_figures():
     [
         ({"heading_error_rad": -1.0}, "heading_error_rad must not be below 0, got -1"),
         ({"position_error_m": np.nan}, "position_error_m must not be below 0, got nan"),
-        ({"height_m": np.inf}, "height_m must be a number, got inf"),
+        ({"height_m": np.inf}, "height_m is a height above the floor, 0 m or more, got inf"),
     ],
 )
 def test_errors_and_heights_that_are_none_are_refused(options, message):

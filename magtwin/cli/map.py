@@ -1,6 +1,6 @@
 """`magtwin map`: make and look at anomaly maps."""
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,14 +19,53 @@ TableColumns = Annotated[Columns, Parameter(name="*")]
 NO_COLUMNS = Columns()
 
 
+@dataclass(frozen=True, kw_only=True)
+class About:
+    """What a survey cannot say of itself."""
+
+    name: str | None = None
+    """Name of the map; the file's unless given."""
+
+    licence: str = ""
+    """Licence of the survey, an SPDX identifier such as MIT."""
+
+    created: str = ""
+    """Day of the survey, YYYY-MM-DD."""
+
+    height: float | None = None
+    """Height of the sensor above the floor [m]."""
+
+    frame: str = ""
+    """Axes that x, y and heading are in, such as "world: x east, y north, z up"."""
+
+    datum: str = ""
+    """Where that frame lies, such as "origin amid the floor, heights above it"."""
+
+    def given(self, out: Path) -> dict[str, Any]:
+        """What it says, by the names that readings have; refused where the day is none."""
+        from magtwin.field.epochs import parse_day
+
+        if self.created:
+            parse_day(self.created, "--created")
+        return {
+            "name": self.name or out.stem,
+            "licence": self.licence,
+            "created": self.created,
+            "height_m": self.height,
+            "frame": self.frame,
+            "datum": self.datum,
+        }
+
+
+AboutSurvey = Annotated[About, Parameter(name="*")]
+NOTHING_SAID = About()
+
+
 @map_app.command(name="import")
 def map_import(
     *sources: Path,
     out: Path,
-    name: str | None = None,
-    licence: str = "",
-    created: str = "",
-    height: float | None = None,
+    about: AboutSurvey = NOTHING_SAID,
     keep_latched: KeepLatched = False,
     pose_topic: str | None = None,
     field_topic: str | None = None,
@@ -46,14 +85,6 @@ def map_import(
         joined by a plus, time.csv+place.csv+field.csv.
     out
         Map layer to write, a .usdc file; or readings, a .parquet file, to fit a model to.
-    name
-        Name of the map; the file's unless given.
-    licence
-        Licence of the survey, an SPDX identifier such as MIT.
-    created
-        Day of the survey, YYYY-MM-DD.
-    height
-        Height of the sensor above the floor [m].
     keep_latched
         Leave latched and stuck readings in.
     pose_topic
@@ -70,17 +101,13 @@ def map_import(
 
     check_suffix(out, (".usdc", ".usd", ".parquet"), "a map layer, or a file of readings,")
     check_free(out, force=force)
-    about: dict[str, Any] = {
-        "name": name or out.stem,
-        "licence": licence,
-        "created": created,
-        "height_m": height,
-    }
+    given = about.given(out)
     if out.suffix != ".parquet" and len(sources) == 1 and _is_survey_folder(sources[0], columns):
         field: Any
-        field, report = read_survey(sources[0], **about, unit=columns.unit or "nT", keep_latched=keep_latched)
+        field, report = read_survey(sources[0], **given, unit=columns.unit or "nT", keep_latched=keep_latched)
     else:
-        readings, found = _read(sources, columns, about, keep_latched, pose_topic, field_topic)
+        readings, found = _read(sources, columns, given, keep_latched, pose_topic, field_topic)
+        readings = readings.with_(name=given["name"])
         field = None if out.suffix == ".parquet" else node_map(readings)
         report = _joined((field or readings).report(), found)
     if field is None:
@@ -103,10 +130,7 @@ def map_fit(
     method: Literal["trilinear", "cubic", "gp", "harmonic"] = "harmonic",
     spacing: float | None = None,
     headings: str | None = None,
-    name: str | None = None,
-    licence: str = "",
-    created: str = "",
-    height: float | None = None,
+    about: AboutSurvey = NOTHING_SAID,
     keep_latched: KeepLatched = False,
     pose_topic: str | None = None,
     field_topic: str | None = None,
@@ -129,14 +153,6 @@ def map_fit(
         Distance between the map's nodes [m]; the survey's own for trilinear, else a fifth of it.
     headings
         Headings of the map [deg], as 0,90,180,270; the survey's own for trilinear, else every 15 deg.
-    name
-        Name of the map; the file's unless given.
-    licence
-        Licence of the survey, an SPDX identifier such as MIT.
-    created
-        Day of the survey, YYYY-MM-DD.
-    height
-        Height of the sensor above the floor [m].
     keep_latched
         Leave latched and stuck readings in.
     pose_topic
@@ -154,18 +170,14 @@ def map_fit(
     check_suffix(out, (".usdc", ".usd"), "a map layer")
     check_free(out, force=force)
     angles = None if headings is None else _headings_rad(headings)
-    about: dict[str, Any] = {
-        "name": name or out.stem,
-        "licence": licence,
-        "created": created,
-        "height_m": height,
-    }
-    readings, found = _read(sources, columns, about, keep_latched, pose_topic, field_topic)
+    given = about.given(out)
+    readings, found = _read(sources, columns, given, keep_latched, pose_topic, field_topic)
     from magtwin.field.fit import fit, raster
 
     with progress(f"Fitting {method}") as advance:
         model = fit(readings, method, progress=advance)
-        field = raster(model, readings, spacing_m=spacing, headings_rad=angles, progress=advance)
+        named = readings.with_(name=given["name"])
+        field = raster(model, named, spacing_m=spacing, headings_rad=angles, progress=advance)
     save_map(field, out, force=force)
     print_report(_joined(field.report(), found), json)
     if not json:
@@ -501,8 +513,8 @@ def _read(
     from magtwin.io.readings import read_readings
 
     readings = read_readings(
-        *sources, columns=columns, pose_topic=pose_topic, field_topic=field_topic, **about
-    )
+        *sources, columns=columns, pose_topic=pose_topic, field_topic=field_topic, **{**about, "name": None}
+    )  # refusals name the survey, not the file to be written
     masked, found = mask_latched(readings)
     if not (keep_latched or masked.good.any()):
         raise RefusedError(

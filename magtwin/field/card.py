@@ -40,7 +40,7 @@ def map_card(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report:
     )
     figures += [_deviation(field), _height(field)]
     if field.harmonic is not None:
-        figures += _harmonic(field.harmonic)
+        figures += _harmonic(field.harmonic, "sensor" if field.height_m is None else "floor")
     if len(epochs) > 1:
         figures += drift(epochs).figures
     facts: dict[str, Any] = {"headings deg": ", ".join(f"{h:.6g}" for h in np.degrees(field.headings_rad))}
@@ -78,10 +78,10 @@ def _height(field: AnomalyMap) -> Figure:
     return Figure("height", field.height_m, "m", note="of the sensor above the floor")
 
 
-def _harmonic(harmonic: HarmonicField) -> list[Figure]:
-    """Figures of the sources, and of the robot."""
+def _harmonic(harmonic: HarmonicField, above: str) -> list[Figure]:
+    """Figures of the sources, below what heights count from, and of the robot."""
     depths = -harmonic.p_world_dipole[:, 2]
-    below = f"{depths.min():.3g} to {depths.max():.3g} m below the floor" if len(depths) else ""
+    below = f"{depths.min():.3g} to {depths.max():.3g} m below the {above}" if len(depths) else ""
     x, y, z = harmonic.p_base_sensor
     return [
         Figure("dipoles", len(depths), note=below),

@@ -43,7 +43,8 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
     distance to the nearest node that is known, at most the spread of the layer times the root of 2.
 
     Args:
-        field: The map; its height must be known, or its harmonic field.
+        field: The map; its height must be known: the dipoles of a survey whose height was not lie below its
+            sensor, nobody knows how far above the floor.
         height_m: Height of the sensor above the floor [m]. A grid goes down by a quarter of a cell at
             most, for its noise grows as exp(dz |k|); a harmonic field down to the floor, and not nearer to a
             layer of dipoles than these are to each other.
@@ -58,12 +59,12 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
     if not np.isfinite(height_m):
         raise RefusedError(f"height_m must be a length [m], got {height_m!r}")
     height_m = float(height_m)
-    start = field.harmonic.height_m if field.harmonic is not None else field.height_m
-    if start is None:
+    if field.height_m is None:
         raise RefusedError(
             f"the height of map {field.name!r} is unknown, so it cannot be taken to another; say it when the "
             "survey is read (--height)"
         )
+    start = field.harmonic.height_m if field.harmonic is not None else field.height_m
     if abs(height_m - start) < GRAIN_M:
         return field
     if field.harmonic is not None:

@@ -114,8 +114,8 @@ def raster(
         progress: Called as progress(done, total, what), once a heading.
 
     Returns:
-        The map, with values, variance, method, parameters and the survey's name, source, licence, day
-        and height; and with the harmonic field where the model has one.
+        The map, with values, variance, method, parameters and the survey's name, source, licence, day,
+        frame, datum and height; and with the harmonic field where the model has one.
 
     Raises:
         RefusedError: The spacing leaves no cell, the headings do not ascend, or no node is valid.
@@ -136,8 +136,6 @@ def raster(
             f"no node of x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m is known to the {model.method} fit of "
             f"{readings.name!r}; keep the extent within the readings"
         )
-    harmonic = getattr(model, "field", None)
-    height = readings.height_m
     return AnomalyMap(
         values_nt=values,
         valid=valid,
@@ -151,8 +149,10 @@ def raster(
         source=readings.source,
         licence=readings.licence,
         created=readings.created,
-        height_m=harmonic.height_m if height is None and harmonic is not None else height,
-        harmonic=harmonic,
+        frame=readings.frame,
+        datum=readings.datum,
+        height_m=readings.height_m,
+        harmonic=getattr(model, "field", None),
     )
 
 

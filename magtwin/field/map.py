@@ -107,6 +107,10 @@ class AnomalyMap:
         self._check_values()
 
     def _check_values(self) -> None:
+        if self.height_m is not None and not 0 <= self.height_m < np.inf:
+            raise RefusedError(
+                f"height_m of AnomalyMap is a height above the floor, 0 m or more, got {self.height_m!r}"
+            )
         bad = self.valid & ~np.isfinite(self.values_nt)
         if bad.any():
             h, j, i = np.argwhere(bad)[0]

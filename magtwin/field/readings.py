@@ -66,6 +66,12 @@ class Readings:
     created: str = ""
     """Day of the survey, YYYY-MM-DD; "" where unknown."""
 
+    frame: str = ""
+    """Axes that x, y and heading are in, such as "world: x east, y north, z up"; "" where unknown."""
+
+    datum: str = ""
+    """Where that frame lies: its origin in the room or on Earth; "" where unknown."""
+
     def __post_init__(self) -> None:
         p = np.asarray(self.p_xy, float)
         if p.ndim != 2 or p.shape[1] != 2 or not len(p):
@@ -97,6 +103,10 @@ class Readings:
             raise RefusedError(
                 f"b_nt of Readings is a magnitude, above 0 nT, got {self.b_nt.min():g} in row "
                 f"{self.b_nt.argmin()}"
+            )
+        if self.height_m is not None and not 0 <= self.height_m < np.inf:
+            raise RefusedError(
+                f"height_m of Readings is a height above the floor, 0 m or more, got {self.height_m!r}"
             )
         if not (self.run.min() >= 0 and self.run.max() < len(self.runs)):
             raise RefusedError(

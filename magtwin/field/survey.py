@@ -45,6 +45,8 @@ def read_grid(
     licence: str = "",
     created: str = "",
     height_m: float | None = None,
+    frame: str = "",
+    datum: str = "",
     headings_deg: tuple[float, ...] | None = None,
     unit: str = "nT",
 ) -> Readings:
@@ -60,6 +62,8 @@ def read_grid(
         licence: SPDX name of the survey's licence.
         created: Day of the survey, YYYY-MM-DD.
         height_m: Height of the sensor above the floor [m].
+        frame: Axes that x, y and heading are in, in words.
+        datum: Where that frame lies, in words.
         headings_deg: Headings that the survey has [deg]. Unless given, the files must be evenly
             spaced on the circle and at most 90 deg apart, so that a lost file is noticed.
         unit: Unit of the field, one of `NT_PER`.
@@ -73,7 +77,7 @@ def read_grid(
             a node two values, the headings' grids differ, or the unit cannot be; with file and line.
     """
     readings = _readings(_read(folder, headings_deg, unit), Path(folder), name)
-    return readings.with_(licence=licence, created=created, height_m=height_m)
+    return readings.with_(licence=licence, created=created, height_m=height_m, frame=frame, datum=datum)
 
 
 def node_map(readings: Readings) -> AnomalyMap:
@@ -114,6 +118,8 @@ def node_map(readings: Readings) -> AnomalyMap:
         source=readings.source,
         licence=readings.licence,
         created=readings.created,
+        frame=readings.frame,
+        datum=readings.datum,
         height_m=readings.height_m,
     )
 
@@ -125,6 +131,8 @@ def read_survey(
     licence: str = "",
     created: str = "",
     height_m: float | None = None,
+    frame: str = "",
+    datum: str = "",
     headings_deg: tuple[float, ...] | None = None,
     unit: str = "nT",
     keep_latched: bool = False,
@@ -137,6 +145,8 @@ def read_survey(
         licence: SPDX name of the survey's licence.
         created: Day of the survey, YYYY-MM-DD.
         height_m: Height of the sensor above the floor [m].
+        frame: Axes that x, y and heading are in, in words.
+        datum: Where that frame lies, in words.
         headings_deg: Headings that the survey has [deg].
         unit: Unit of the field, one of `NT_PER`.
         keep_latched: Whether readings of a sensor that had lost lock stay valid nodes.
@@ -154,7 +164,7 @@ def read_survey(
 
     layers = _read(folder, headings_deg, unit)
     readings = _readings(layers, Path(folder), name)
-    readings = readings.with_(licence=licence, created=created, height_m=height_m)
+    readings = readings.with_(licence=licence, created=created, height_m=height_m, frame=frame, datum=datum)
     masked, found = mask_latched(readings)
     if not (keep_latched or masked.good.any()):
         raise RefusedError(

@@ -36,6 +36,7 @@ _PARTS = {"p_xy": ("x", "y"), "b_body_nt": ("x", "y", "z"), "node": ("heading", 
 _UNITS = {"p_xy": "m", "yaw": "rad", "b_nt": "nT", "b_body_nt": "nT", "t": "s", "good": "bool"}
 _FRAMES = {"p_xy": "world", "yaw": "world", "b_body_nt": "base_link"}
 _TEXTS = ("name", "source", "licence", "created")
+_PLACES = ("frame", "datum")
 
 
 def read_readings(
@@ -45,6 +46,8 @@ def read_readings(
     licence: str = "",
     created: str = "",
     height_m: float | None = None,
+    frame: str = "",
+    datum: str = "",
     headings_deg: tuple[float, ...] | None = None,
     pose_topic: str | None = None,
     field_topic: str | None = None,
@@ -63,6 +66,8 @@ def read_readings(
         licence: SPDX name of the licence; where the source knows its own, "" keeps that.
         created: Day of the survey, YYYY-MM-DD; likewise.
         height_m: Height of the sensor above the floor [m]; likewise.
+        frame: Axes that x, y and heading are in, in words; likewise.
+        datum: Where that frame lies, in words; likewise.
         headings_deg: Headings of a folder of CSVs [deg], for one that is not whole.
         pose_topic: Topic of a bag's poses, where there are several.
         field_topic: Topic of a bag's field, where there are several.
@@ -95,6 +100,7 @@ def read_readings(
             parts.append(_of_file(str(source), path, columns))
     readings = parts[0] if len(parts) == 1 else _together(parts)
     own = {"licence": licence, "created": created, "height_m": height_m, "name": name}
+    own |= {"frame": frame, "datum": datum}
     return readings.with_(**{key: value for key, value in own.items() if value not in (None, "")})
 
 
@@ -162,7 +168,7 @@ def save_readings(readings: Readings, path: Source, *, force: bool = False) -> N
             label = f"{key}_{part}" if part else key
             fields.append(pa.field(label, array.type, nullable=False, metadata=said))
             arrays.append(array)
-    about: dict[str, Any] = {key: getattr(readings, key) for key in _TEXTS}
+    about: dict[str, Any] = {key: getattr(readings, key) for key in (*_TEXTS, *_PLACES)}
     about |= {"runs": readings.runs, "height_m": readings.height_m}
     about["grid"] = None if readings.grid is None else asdict(readings.grid)
     schema = pa.schema(fields, metadata={_SURVEY: json.dumps(about, ensure_ascii=False)})
@@ -193,6 +199,7 @@ def load_readings(path: Source) -> Readings:
             **{**about["grid"], "headings_rad": tuple(about["grid"]["headings_rad"])}
         )
         given = {key: about[key] for key in (*_TEXTS, "height_m")} | {"runs": tuple(about["runs"])}
+        given |= {key: about.get(key, "") for key in _PLACES}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         if isinstance(error, RefusedError):
             raise RefusedError(f"{path}: {error}") from error
@@ -385,9 +392,10 @@ def _together(parts: Sequence[Readings]) -> Readings:
         values = [getattr(part, key) for part in parts]
         arrays[key] = None if any(v is None for v in values) else np.concatenate(values)
     same: dict[str, Any] = {}
-    for key, unknown in (("licence", ""), ("created", ""), ("height_m", None)):
+    for key, unknown in (("created", ""), ("frame", ""), ("datum", ""), ("height_m", None)):
         found = {getattr(part, key) for part in parts}
         same[key] = found.pop() if len(found) == 1 else unknown
+    same["licence"] = "; ".join(dict.fromkeys(part.licence for part in parts if part.licence))
     runs = tuple(run for part in parts for run in part.runs)
     source = "; ".join(part.source for part in parts)
     return Readings(**arrays, **same, runs=runs, name=parts[0].name, source=source)

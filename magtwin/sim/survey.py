@@ -113,8 +113,8 @@ def survey_readings(
         if not 0 <= sd < np.inf:
             raise RefusedError(f"{name} must not be below 0, got {sd!r}")
     height = sensor_height_m(scene) if height_m is None else height_m
-    if not np.isfinite(height):
-        raise RefusedError(f"height_m must be a number, got {height!r}")
+    if not 0 <= height < np.inf:
+        raise RefusedError(f"height_m is a height above the floor, 0 m or more, got {height!r}")
     x, y = scene.lab.floor_m
     grid = Grid.over((-x / 2, x / 2, -y / 2, y / 2), spacing_m, np.asarray(headings_rad, float))
     node, nominal = grid.poses()
@@ -149,6 +149,8 @@ def survey_readings(
         source=source,
         licence=licence,
         created=created,
+        frame=_frame(scene),
+        datum=_datum(scene),
     )
 
 
@@ -196,8 +198,8 @@ def survey(
         source=read.source,
         licence=read.licence,
         created=read.created,
-        frame=_frame(scene),
-        datum=_datum(scene),
+        frame=read.frame,
+        datum=read.datum,
         height_m=read.height_m,
         parameters={
             "readings": readings,
