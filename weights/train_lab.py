@@ -340,7 +340,7 @@ map's error alone, all that would be left if the robot's own part were known exa
 |---|---|---|---|---|---|---|---|---|
 {chr(10).join(table)}
 
-Root mean square error on the two kinds never seen: {net.residual_sd_nt:.0f} nT. The file keeps it as
+Root mean square error on the kinds never seen: {net.residual_sd_nt:.0f} nT. The file keeps it as
 `residual_sd_nt`; it is the `b_sd_nt` of a Run.
 
 ## What it cannot do
@@ -349,8 +349,8 @@ Root mean square error on the two kinds never seen: {net.residual_sd_nt:.0f} nT.
   says where that is. The network goes below it where interpolation between the map's four headings
   errs with the heading, which it reads. A finer map gains more than a better network.
 * It knows one robot in one lab, as simulated. Its ratio is below the 0.70 to 0.97 that the paper
-  reports for a real robot, because here the robot's field is the same in every run, nothing
-  vibrates, motors draw what their speed says, and the map's headings are exact. Not for real robots.
+  reports for a real robot, because here the robot's field is the same in every run, no
+  day differs from another, and the map's headings are exact. Not for real robots.
 * Inputs outside the training ranges, which the file holds, are flagged in the Run
   (`flag_out_of_distribution`), not mended.
 * Rows of a run are alike, and the spread of these figures between seeds was not measured.
