@@ -49,6 +49,9 @@ POSE_HZ = 50.0
 DOT_HZ = 10.0
 """Readings a second that are drawn along the path."""
 
+SCALE_HEIGHT_M = 1.0
+"""Height of the colour bar: above desks and chairs, which would hide it on the floor."""
+
 ARROW_M_PER_NT = 1.4e-5
 """Length of the field's arrow: 70 cm for 50 uT."""
 
@@ -224,15 +227,15 @@ def _nearest_heading(field: AnomalyMap, run: Run) -> float:
 
 
 def _log_scale(rec: rr.RecordingStream, field: AnomalyMap, scale: _Scale) -> None:
-    """A colour bar with its values, lying on the ground in front of the map."""
+    """A colour bar with its values, in front of the map and above what stands there."""
     x0, x1, y0, _ = field.extent
     length, breadth = 0.6 * (x1 - x0), 0.03 * (x1 - x0)
     cell = length / 256
-    corner = ((x0 + x1 - length) / 2, y0 - 0.5 - breadth, HEAT_MAP_HEIGHT_M)
+    corner = ((x0 + x1 - length) / 2, y0 - 0.3 - breadth, SCALE_HEIGHT_M)
     bar = np.broadcast_to(scale.table, (max(1, round(breadth / cell)), 256, 4))
     _log_image(rec, "world/scale", bar, cell, corner)
     share = np.linspace(0, 1, 5)
-    at = np.column_stack([corner[0] + share * length, np.full(5, corner[1] - 0.08), np.zeros(5)])
+    at = np.column_stack([corner[0] + share * length, np.full(5, corner[1] - 0.08), np.full(5, corner[2])])
     value_ut = (scale.low_nt + share * (scale.high_nt - scale.low_nt)) / 1000
     rec.log(
         "world/scale/values",
