@@ -157,7 +157,7 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
             f"{place(prim)}: the map's values are not those that its checksum was taken of; make the map anew"
         )
     shape = tuple(_get(prim, "shape"))
-    if len(shape) != 3 or not values.size == valid.size == np.prod(shape):
+    if len(shape) != 3 or min(shape) < 1 or not values.size == valid.size == math.prod(shape):
         raise RefusedError(
             f"{place(prim)}: shape {list(shape)} does not fit {values.size} values and {valid.size} flags"
         )
@@ -200,6 +200,7 @@ def _read_parameters(prim: Usd.Prim, text: str) -> dict[str, Any]:
     name = attribute_name("anomalyMap", "parameters")
     try:
         figures = json.loads(text, parse_constant=_no_number)
+        json.dumps(figures, allow_nan=False)  # 1e999 is a number to JSON, and infinite
     except (ValueError, RecursionError) as error:
         raise RefusedError(f"{name} is not JSON ({error}), got {text[:60]!r}; make the map anew") from error
     if not isinstance(figures, dict):
