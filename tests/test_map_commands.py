@@ -110,7 +110,7 @@ def test_info_tells_everything_that_a_map_knows(layer, capsys):
         assert facts[name] == value
     main(["map", "info", str(layer)])
     text = capsys.readouterr().out
-    for part in ("the door", "0_map.csv", "dipoles", "(300, 0, -400)", "parameters depth_m"):
+    for part in ("the door", "0_map.csv", "dipoles", "(300, 0, -400)", "parameters", "depth_m  0.5"):
         assert part in text
 
 
@@ -280,3 +280,20 @@ def test_a_picture_of_another_kind_is_refused_before_anything_is_read(tmp_path, 
     assert "no such USD file" in refused(
         capsys, "map", "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.png"
     )
+
+
+def test_info_fits_80_columns_with_each_checksum_whole_on_a_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    save_map(a_map(), tmp_path / "m.usdc")
+    main(["map", "info", str(tmp_path / "m.usdc")])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert all(any(checksum in line for line in lines) for checksum in (SHA, SHA[::-1]))
+
+
+def test_a_maps_own_texts_do_not_steer_the_terminal(tmp_path, capsys):
+    save_map(a_map(datum="the \x1b[31mdoor"), tmp_path / "m.usdc")
+    main(["map", "info", str(tmp_path / "m.usdc")])
+    told = capsys.readouterr().out
+    assert "\x1b" not in told
+    assert "the \\x1b[31mdoor" in told

@@ -67,27 +67,56 @@ def print_report(report: Any, as_json: bool) -> None:
 
     console = Console(highlight=False)
     numbers, words = ((Table(show_header=False, box=None, pad_edge=False)) for _ in range(2))
-    for column in ("name", "value", "spread", "unit", "note"):
-        numbers.add_column(column, justify="right" if column == "value" else "left", overflow="fold")
-    for column in ("name", "text"):
-        words.add_column(column, overflow="fold")
+    for column in ("name", "value", "unit"):
+        numbers.add_column(column, justify="right" if column == "value" else "left", no_wrap=True)
+    numbers.add_column("note", overflow="fold")
+    words.add_column("name", no_wrap=True)
+    words.add_column("text", overflow="fold")
+    lists: list[tuple[str, Any]] = []
     for figure in report.figures:
         if isinstance(figure.value, str):
             note = f"  ({figure.note})" if figure.note else ""
-            words.add_row(Text(figure.name), Text(f"{figure.value} {figure.unit}{note}".strip()))
+            words.add_row(Text(figure.name), Text(_printable(f"{figure.value} {figure.unit}{note}".strip())))
         else:
             value = f"{figure.value:,.6g}" if isinstance(figure.value, float) else f"{figure.value:,}"
-            spread = f"± {figure.spread:,.3g}" if figure.spread is not None else ""
-            cells = (figure.name, value, spread, figure.unit)
+            spread = f"± {_rounded(figure.spread)}" if figure.spread is not None else ""
+            cells = (figure.name, value, f"{spread} {figure.unit}".strip())
             numbers.add_row(*map(Text, cells), Text(figure.note, style="dim"))
     for name, fact in report.facts.items():
-        if isinstance(fact, dict):
-            entries = list(fact.items())
-        else:
-            entries = [("", entry) for entry in (fact if isinstance(fact, list) else [fact])]
-        for key, entry in entries:
-            words.add_row(Text(f"{name} {key}".strip()), Text(str(entry)))
-    console.print(Text(report.title, style="bold"))
+        if isinstance(fact, (dict, list)):
+            lists.append((name, fact))
+        elif fact != "":
+            words.add_row(Text(name), Text(_printable(str(fact))))
+    console.print(Text(_printable(report.title), style="bold"))
     for table in (numbers, words):
         if table.row_count:
             console.print(table)
+    for name, fact in lists:
+        console.print(Text(name))
+        entries = fact.items() if isinstance(fact, dict) else (("", entry) for entry in fact)
+        for key, entry in entries:
+            _print_entry(console, _printable(str(key)), _printable(str(entry)))
+
+
+def _printable(text: str) -> str:
+    """A file's own text, with its control characters written out: a terminal would obey them."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def _rounded(spread: float) -> str:
+    """A spread to three digits, without an exponent where it is a usual number."""
+    text = f"{spread:,.3g}"
+    return f"{round(spread, 3 - len(str(int(spread)))):,.0f}" if "e+" in text and spread < 1e9 else text
+
+
+def _print_entry(console: Any, key: str, text: str) -> None:
+    """An entry of a list, below its title: on one line, or its text on lines of its own below its key."""
+    from rich.padding import Padding
+    from rich.text import Text
+
+    whole = f"{key}  {text}" if key else text
+    if not key or len(whole) + 2 <= console.width:
+        console.print(Padding(Text(whole, overflow="fold"), (0, 0, 0, 2), expand=False))
+        return
+    console.print(Padding(Text(key), (0, 0, 0, 2), expand=False))
+    console.print(Padding(Text(text, overflow="fold"), (0, 0, 0, 4), expand=False))
