@@ -196,3 +196,16 @@ def test_a_heading_without_three_good_nodes_is_refused_by_name():
 
     with pytest.raises(RefusedError, match="heading 180 deg has 2 nodes"):
         fit_trilinear(grid_survey(wave, good=good))
+
+
+@pytest.mark.parametrize("fit", [fit_trilinear, fit_cubic])
+def test_a_nodes_variance_is_what_headings_off_the_nominal_ones_leave_in_it(fit):
+    even = grid_survey(lambda x, y, yaw: 41_000 + 400 * np.cos(yaw))
+    off = np.random.default_rng(2).normal(0, 0.1, len(even))
+    readings = even.with_(yaw=even.yaw + off, b_nt=41_000 + 400 * np.cos(even.yaw + off))
+    model = fit(readings)
+    mean, variance = model.predict(readings.p_xy, even.yaw)
+    error = np.mean((mean - even.b_nt) ** 2)
+    assert error > 100
+    assert_allclose(variance, model.noise_nt2)
+    assert error / 3 < model.noise_nt2 < error  # chords over 90 deg are flatter than the cosine, (2 / pi)^2

@@ -142,6 +142,7 @@ class GridInterpolation:
                 mean += weights[:, h] * splines[h].ev(u[:, 1], u[:, 0])
         at = np.where(inside[:, None], p, self.grid.origin_m)
         variance = self.roughness.variance_nt2(at) + (between * (1 - between)) ** 2 * self.turned_nt2
+        variance += self.noise_nt2  # a node's value is a reading, and errs as one
         hole = ~inside | (unknown > EDGE)
         mean[hole] = variance[hole] = np.nan
         return mean.reshape(shape), variance.reshape(shape)
