@@ -1,4 +1,4 @@
-"""Forward: what a robot reads over layers of vertical dipoles, and how that changes with every unknown."""
+"""Forward: what a robot reads over layers of dipoles, and how that changes with every unknown."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,17 @@ from magtwin.field.sources import MU_0_OVER_4_PI, NT_PER_T
 
 Array = NDArray[np.float64]
 
-PLATFORM = 14
-"""Unknowns of the platform: hard iron (3), soft iron (9, row by row), lever arm (2)."""
+SOFT = np.zeros((8, 3, 3))
+"""Soft iron's parts, orthonormal: the six off the diagonal, and two on it. The trace is none of them: how
+much a platform strengthens every field alike cannot be told from how strong the field is, and if it were
+free, the prior of the moments would make it grow."""
+SOFT[np.arange(6), [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = 1.0
+SOFT[6] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2)
+SOFT[7] = np.diag([1.0, 1.0, -2.0]) / np.sqrt(6)
+SOFT.flags.writeable = False
+
+PLATFORM = 13
+"""Unknowns of the platform: hard iron (3), soft iron (8, see `SOFT`), lever arm (2)."""
 
 SPIN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 """dR/dyaw = R SPIN for turns about z."""
@@ -36,12 +45,10 @@ class Reading:
 
 @dataclass(frozen=True, eq=False)
 class Forward:
-    """Vertical dipoles, a uniform field and a platform; the sensor moves in the plane at `height_m`.
+    """Dipoles, a uniform field and a platform; the sensor moves in the plane at `height_m`.
 
-    A layer of vertical dipoles makes every field that has neither curl nor divergence above it: a
-    horizontal dipole's, of wave number k, differs from theirs by a factor of modulus k_x / k only
-    (Blakely 1995, section 12.1). The unknowns are, in order, the moments m (D), the uniform field B_0 (3)
-    and the platform's h, S and l (`PLATFORM`).
+    The unknowns are, in order, the moments, dipole by dipole (3 D), the uniform field B_0 (3) and the
+    platform's h, S and l (`PLATFORM`).
     """
 
     p_world_dipole: Array
@@ -53,16 +60,14 @@ class Forward:
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return len(self.p_world_dipole) + 3 + PLATFORM
+        return 3 * len(self.p_world_dipole) + 3 + PLATFORM
 
     def field(self, unknowns: Array) -> HarmonicField:
         """The unknowns as a field with its platform."""
         m, uniform, hard, soft, lever = self._parts(unknowns)
-        moments = np.zeros((len(m), 3))
-        moments[:, 2] = m
         return HarmonicField(
             p_world_dipole=self.p_world_dipole,
-            m_world=moments,
+            m_world=m,
             b_uniform_nt=uniform,
             hard_iron_nt=hard,
             soft_iron=soft,
@@ -75,13 +80,11 @@ class Forward:
         Args:
             p_world: Points [m], shape (N, 3).
         """
-        rx, ry, rz, cubed, fifth = self._distances(p_world)
         jacobian = np.zeros((len(p_world), 3, self.size))
-        count = len(self.p_world_dipole)
-        fifth = fifth * rz
-        jacobian[:, 0, :count] = fifth * rx
-        jacobian[:, 1, :count] = fifth * ry
-        jacobian[:, 2, :count] = fifth * rz - cubed
+        count = 3 * len(self.p_world_dipole)
+        self._fill(
+            jacobian[:, :, :count], np.broadcast_to(np.eye(3), (len(p_world), 3, 3)), *self._ways(p_world)
+        )
         jacobian[:, :, count : count + 3] = np.eye(3)
         return jacobian
 
@@ -97,8 +100,8 @@ class Forward:
         m, uniform, hard, soft, lever = self._parts(unknowns)
         turn, swing = _turns(yaw)
         at = np.column_stack([p_xy + turn[:, :2, :2] @ lever, np.full(len(p_xy), self.height_m)])
-        rx, ry, rz, cubed, fifth = self._distances(at)
-        b, slope = self._sums(m, at, rz[0], cubed, fifth)
+        way, cubed, fifth = self._ways(at)
+        b, slope = self._sums(m, at, way, cubed, fifth)
         b += uniform
         whole = np.eye(3) + soft
         base = np.einsum("nji,nj->ni", turn, b)
@@ -112,65 +115,64 @@ class Forward:
         by_place = world @ slope
         turned = np.einsum("nji,nj->ni", swing, b)
         carried = np.einsum("nji,njk,nk->ni", turn, slope[:, :, :2], swing[:, :2, :2] @ lever)
-        count, parts = len(m), out.shape[1]
+        count, parts = m.size, out.shape[1]
         jacobian = np.empty((len(b), parts, self.size))
-        for c in range(parts):
-            w = world[:, c, :, None]
-            towards = w[:, 0] * rx
-            towards += w[:, 1] * ry
-            towards += w[:, 2] * rz
-            towards *= rz
-            towards *= fifth
-            towards -= w[:, 2] * cubed
-            jacobian[:, c, :count] = towards
+        self._fill(jacobian[:, :, :count], world, way, cubed, fifth)
         jacobian[:, :, count : count + 3] = world
         jacobian[:, :, count + 3 : count + 6] = out
-        jacobian[:, :, count + 6 : count + 15] = (out[..., None] * base[:, None, None, :]).reshape(
-            len(b), parts, 9
-        )
-        jacobian[:, :, count + 15 :] = by_place[:, :, :2] @ turn[:, :2, :2]
+        jacobian[:, :, count + 6 : count + 14] = np.einsum("nci,kij,nj->nck", out, SOFT, base, optimize=True)
+        jacobian[:, :, count + 14 :] = by_place[:, :, :2] @ turn[:, :2, :2]
         values = inner if vectors else size[:, None]
         by_yaw = np.einsum("nci,ni->nc", rows, turned + carried)
         return Reading(values, jacobian, by_place[:, :, :2], by_yaw)
 
     def _parts(self, unknowns: Array) -> tuple[Array, Array, Array, Array, Array]:
-        count = len(self.p_world_dipole)
+        count = 3 * len(self.p_world_dipole)
         rest = unknowns[count:]
-        return unknowns[:count], rest[:3], rest[3:6], rest[6:15].reshape(3, 3), rest[15:]
+        return (
+            unknowns[:count].reshape(-1, 3),
+            rest[:3],
+            rest[3:6],
+            np.tensordot(rest[6:14], SOFT, 1),
+            rest[14:],
+        )
 
-    def _distances(self, p: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """x, y and z of the ways from dipoles, 1 / r^3 and 3 / r^5 with the field's factor, (N, D) each."""
-        q = self.p_world_dipole
-        rx, ry, rz = (p[:, axis, None] - q[:, axis] for axis in range(3))
-        inverse = 1 / (rx * rx + ry * ry + rz * rz)
+    def _ways(self, p: Array) -> tuple[Array, Array, Array]:
+        """Ways r from the dipoles [m], (3, N, D); 1 / |r|^3 and 3 / |r|^5 with the factor, (N, D)."""
+        way = p.T[:, :, None] - self.p_world_dipole.T[:, None, :]
+        inverse = 1 / (way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
         cubed = MU_0_OVER_4_PI * NT_PER_T * inverse * np.sqrt(inverse)
-        return rx, ry, rz, cubed, 3 * cubed * inverse
+        return way, cubed, 3 * cubed * inverse
 
-    def _sums(self, m: Array, at: Array, rz: Array, cubed: Array, fifth: Array) -> tuple[Array, Array]:
-        """Field (N, 3) and its gradient dB_a/dx_b (N, 3, 3), by products with sums over the dipoles.
+    @staticmethod
+    def _fill(jacobian: Array, world: Array, way: Array, cubed: Array, fifth: Array) -> None:
+        """Derivatives by the moments of world (N, C, 3) . field, into (N, C, 3 D)."""
+        for c in range(world.shape[1]):
+            w = world[:, c, :, None]
+            towards = fifth * (w[:, 0] * way[0] + w[:, 1] * way[1] + w[:, 2] * way[2])
+            for axis in range(3):
+                jacobian[:, c, axis::3] = towards * way[axis] - w[:, axis] * cubed
 
-        Every reading has the same height, so r_z is one number a dipole, and the powers of r_x = x - x_d
-        come out of sums of the powers of x_d.
+    def _sums(self, m: Array, at: Array, way: Array, cubed: Array, fifth: Array) -> tuple[Array, Array]:
+        """Field (N, 3) and its gradient dB_a/dx_b (N, 3, 3): see `magtwin.field.dipoles`.
+
+        The powers of r = p - p_d come out of products with the powers of p_d, both from the middle.
         """
-        q = self.p_world_dipole[:, :2] - self.p_world_dipole[:, :2].mean(axis=0)
-        x, y = (at[:, :2] - self.p_world_dipole[:, :2].mean(axis=0)).T
+        middle = self.p_world_dipole.mean(axis=0)
+        q, at = self.p_world_dipole - middle, at - middle
+        radial = way[0] * m[:, 0] + way[1] * m[:, 1] + way[2] * m[:, 2]
+        along = fifth * radial
         one = np.column_stack([np.ones(len(q)), q])
-        two = np.column_stack([one, q[:, 0] ** 2, q[:, 0] * q[:, 1], q[:, 1] ** 2])
-        a = fifth @ ((m * rz)[:, None] * one)
-        d = fifth @ (m[:, None] * one)
-        seventh = fifth * (fifth / (3 * cubed))
-        c = seventh @ ((5 * m * rz)[:, None] * two)
-        e = seventh @ ((5 * m * rz**2)[:, None] * one)
-        f = seventh @ (5 * m * rz**3)
-        b = np.column_stack([x * a[:, 0] - a[:, 1], y * a[:, 0] - a[:, 2], fifth @ (m * rz**2) - cubed @ m])
-        g = np.empty((len(at), 3, 3))
-        g[:, 0, 0] = a[:, 0] - (x * x * c[:, 0] - 2 * x * c[:, 1] + c[:, 3])
-        g[:, 1, 1] = a[:, 0] - (y * y * c[:, 0] - 2 * y * c[:, 2] + c[:, 5])
-        g[:, 0, 1] = g[:, 1, 0] = -(x * y * c[:, 0] - y * c[:, 1] - x * c[:, 2] + c[:, 4])
-        g[:, 0, 2] = g[:, 2, 0] = (x * d[:, 0] - d[:, 1]) - (x * e[:, 0] - e[:, 1])
-        g[:, 1, 2] = g[:, 2, 1] = (y * d[:, 0] - d[:, 2]) - (y * e[:, 0] - e[:, 2])
-        g[:, 2, 2] = 3 * a[:, 0] - f
-        return b, g
+        a = along @ one
+        b = at * a[:, :1] - a[:, 1:] - cubed @ m
+        tilt = at[:, :, None] * (fifth @ m)[:, None, :]
+        tilt -= (fifth @ (q[:, :, None] * m[:, None, :]).reshape(len(q), 9)).reshape(-1, 3, 3)
+        s = 5 / 3 * along * fifth / cubed
+        first = s @ one
+        cross = at[:, :, None] * first[:, None, 1:]
+        square = at[:, :, None] * at[:, None, :] * first[:, :1, None] - cross - cross.transpose(0, 2, 1)
+        square += (s @ (q[:, :, None] * q[:, None, :]).reshape(len(q), 9)).reshape(-1, 3, 3)
+        return b, tilt + tilt.transpose(0, 2, 1) + a[:, :1, None] * np.eye(3) - square
 
 
 def _turns(yaw: ArrayLike) -> tuple[Array, Array]:

@@ -1,6 +1,6 @@
 """Inversion of a survey: the dipoles, the uniform field and the platform that explain its readings.
 
-What is fitted are the moments of vertical dipoles on layers below the sensor (equivalent sources: Dampney
+What is fitted are the moments of dipoles on layers below and above the sensor (equivalent sources: Dampney
 1969; Blakely 1995, section 12.1), a uniform field and the robot's hard iron, soft iron and lever arm. The
 moments have normal priors, which is a Gaussian process with curl- and divergence-free covariance
 (Wahlstrom et al. 2013; Solin et al. 2018). Three things make it honest on a real floor:
@@ -12,10 +12,11 @@ moments have normal priors, which is a Gaussian process with curl- and divergenc
   around it in its layer, drawn a little towards the layer's.
 - All these figures follow from the readings: strengths by MacKay's (1992) fixed point of the evidence
   (Rasmussen & Williams 2006, section 5.4, with Laplace's approximation), noises and tail by
-  expectation-maximization.
+  expectation-maximization. How wide the intervals are is learnt from places left out in turn.
 
 The magnitude is not linear in the field; Gauss-Newton steps, halved until the posterior grows, solve it. Each
-costs one factorisation of a P x P matrix, whatever the number of readings N.
+costs one factorisation, of a matrix as large as the readings where they are few, so that layers may be
+fine, else as the unknowns.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,8 +27,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.bins import spacing_m as survey_spacing_m
-from magtwin.field.forward import Forward, Reading
+from magtwin.field.forward import SOFT, Forward, Reading
 from magtwin.field.harmonic import HarmonicField
+from magtwin.field.posterior import Posterior
 from magtwin.field.readings import Readings
 from magtwin.frames import wrap_angle
 from magtwin.names import RefusedError
@@ -35,32 +37,45 @@ from magtwin.names import RefusedError
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
 
-LADDER = (1.0, 2.0, 4.0)
-"""Depths of the layers below the sensor, in those of the first: each tells of sources twice as large."""
+LADDER = (1.0, 2.0, 4.0, -2.0)
+"""Depths of the layers below the sensor, in those of the first: each tells of sources twice as large. The
+last is above it, for what stands beside."""
 
-DEPTH_SPACINGS = 1.6
+WEAK = 0.1
+"""Strength of layers above in those of layers below, to begin with: what both can tell is below."""
+
+DEPTH_SPACINGS = 1.8
 """Depth of the first layer in spacings of the survey: a layer nearer than about one tells of
 waves that the readings do not resolve (Dampney 1969)."""
+
+DRIVE_SPACINGS = 0.9
+"""The same for a drive, whose readings are dense along it."""
 
 LEAST_DEPTH_M = 0.3
 """Least depth of the first layer below the sensor [m]; a robot's sensor is not nearer to the floor's iron."""
 
-SHEET = 0.5
-"""Distance of the dipoles of a layer in its depth: e^(-2 pi / 0.5) of their field is ripple, 3e-6."""
+SHEET = 0.6
+"""Distance of the dipoles of a layer in its depth: e^(-2 pi / 0.6) of their field is ripple, 3e-5."""
 
 MARGIN = 1.2
 """Width by which a layer goes beyond the readings, in its depth."""
 
-REACH = 0.8
+REACH = 0.6
 """Distance over which dipoles share one strength, in their layer's depth."""
 
-DRAWN = 0.02
+DRAWN = 0.005
 """Weight of the layer's strength beside that of the dipoles around, as a part of theirs."""
 
-MOST_DIPOLES = 2500
-"""Dipoles beyond which the layers are thinned: 50 MB a matrix."""
+MOST_DIPOLES = 1500
+"""Dipoles beyond which the layers are thinned."""
 
-MOST_CELLS = 4000
+FEW_ROWS = 2700
+"""Readings, parts of vectors counted each, up to which their matrix is factored; beyond, the unknowns' is."""
+
+DIPOLES_OF_MANY = 800
+"""Dipoles beyond which the layers are thinned where readings are many."""
+
+MOST_ROWS = 6000
 """Readings beyond which those of a drive are averaged over longer ways."""
 
 CELL = 1 / 6
@@ -77,7 +92,10 @@ EARTH_SD_NT = 1000.0
 HARD_IRON_SD_NT, SOFT_IRON_SD, LEVER_SD_M = 3000.0, 0.03, 0.05
 """How large the parts of a platform may be: one standard deviation of their priors, about 0."""
 
-TAILS = np.geomspace(3.0, 48.0, 13)
+ONE_HEADING = 0.99
+"""Length of the headings' mean vector from which they are one: they spread by 8 deg at most."""
+
+TAILS = np.geomspace(4.0, 48.0, 13)
 """Degrees of freedom of Student's t that are tried."""
 
 ROUNDS = 30
@@ -86,10 +104,22 @@ ROUNDS = 30
 LAYERWISE = 4
 """First rounds, in which a layer has one strength."""
 
-SETTLED = 0.05
+SETTLED = 0.2
 """Change of the logarithm of the posterior below which Gauss-Newton has arrived."""
 
 STEPS = 30
+
+FIRST_STEPS = 4
+"""Gauss-Newton steps under the first figures, before learning begins."""
+
+STILL = 0.03
+"""Change of the logarithms of figures in a round, in the mean over strengths, below which they are learnt."""
+
+WIDTHS = np.linspace(-np.log(16), np.log(16), 161)
+"""Logarithms of the widths of intervals that are tried, as factors of the posterior's variances."""
+
+WIDTH_SD = np.log(2)
+"""How far the width is thought to lie from 1, as a logarithm, before places are left out."""
 
 BLOCK = 512
 """Poses predicted at a time."""
@@ -112,7 +142,12 @@ class Figures:
     """Degrees of freedom of Student's t."""
 
     strength: Array
-    """Prior standard deviation of each dipole's moment [A m^2], shape (D,)."""
+    """Prior standard deviation of each part of each dipole's moment [A m^2], shape (D,)."""
+
+    def change(self, before: "Figures") -> float:
+        """How far the figures are from others, as a logarithm: the noise's, or the strengths' in the mean."""
+        moved = np.sqrt(np.mean(np.log(self.strength / before.strength) ** 2))
+        return float(max(abs(np.log(self.noise_nt / before.noise_nt)), moved))
 
     def variance(self, reading: Reading) -> Array:
         """Squared scale of each part of readings [nT^2], shape (N, C)."""
@@ -150,13 +185,17 @@ class HarmonicModel:
     prior_sd: Array
     """Standard deviations of their priors, shape (P,)."""
 
-    lower: Array
-    """Cholesky factor of the posterior's precision, of unknowns in units of `prior_sd`, shape (P, P)."""
+    learnt: Array
+    """What the readings tell of the unknowns, in units of `prior_sd`: the posterior's covariance is
+    1 - learnt learnt^T there, shape (P, K)."""
 
     @property
     def method(self) -> str:
         """Name of the method."""
         return "harmonic"
+
+    width: float
+    """Factor of the magnitude's posterior variance where that is large beside the noise, see `_widened`."""
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field magnitude as the survey's robot reads it, and its variance.
@@ -179,7 +218,7 @@ class HarmonicModel:
             part = slice(start, start + BLOCK)
             read = self.forward.read(self.unknowns, p[part], yaw[part], vectors=False)
             value[part] = read.values_nt[:, 0]
-            variance[part] = self._variance(read.jacobian[:, 0])
+            variance[part] = _widened(self._variance(read.jacobian[:, 0]), self.noise_nt2, self.width)
         return value.reshape(shape), variance.reshape(shape)
 
     def predict_vector(self, p_world: ArrayLike) -> tuple[Array, Array]:
@@ -203,10 +242,19 @@ class HarmonicModel:
 
     def _variance(self, jacobian: Array) -> Array:
         """Posterior variances of what changes by `jacobian` (N, P) with the unknowns, shape (N,)."""
-        from scipy.linalg import solve_triangular
+        scaled = jacobian * self.prior_sd
+        told = scaled @ self.learnt
+        left = np.einsum("np,np->n", scaled, scaled) - np.einsum("nk,nk->n", told, told)
+        return np.asarray(np.maximum(left, 0))
 
-        scaled = solve_triangular(self.lower, (jacobian * self.prior_sd).T, lower=True, check_finite=False)
-        return np.asarray(np.einsum("pn,pn->n", scaled, scaled))
+
+def _widened(variance_nt2: Array, noise_nt2: Array | float, width: Array | float) -> Array:
+    """Posterior variances as places left out in turn show them to be.
+
+    Beside readings, where the variance is small against the noise, the posterior is right. Away from
+    them it is too modest, or too bold, by a factor, for the prior's layers are not the floor's iron.
+    """
+    return np.asarray(variance_nt2 * (noise_nt2 + width * variance_nt2) / (noise_nt2 + variance_nt2))
 
 
 def fit_harmonic(
@@ -222,7 +270,8 @@ def fit_harmonic(
 ) -> HarmonicModel:
     """The field without curl or divergence, and the platform, that make a survey's readings likeliest.
 
-    Vectors are fitted where the survey has them, else magnitudes. Readings of a drive that follow each
+    Vectors are fitted where the survey has them, else magnitudes. A platform is fitted where the headings
+    differ; else it counts as part of the field. Readings of a drive that follow each
     other within a short way count as one, their mean.
 
     Magnitudes alone leave the field's sign open: B and -B read the same, with the hard iron turned too.
@@ -234,15 +283,16 @@ def fit_harmonic(
     Args:
         readings: A survey; those that are not `good` count for nothing.
         depth_m: Depth of the dipoles' layers below the sensor [m], negative for layers above. Unless
-            given, three: 1.6 spacings of the survey, no nearer than `LEAST_DEPTH_M` or the floor, twice
-            and four times that.
-        spacing_m: Distance between the dipoles of the first layer [m]; half of a layer's depth unless
+            given, 1.8 spacings of the survey (0.9 of a drive), no nearer than `LEAST_DEPTH_M` or the floor,
+            twice and four times that, and a layer above at twice that.
+        spacing_m: Distance between the dipoles of the first layer [m]; 0.6 of a layer's depth unless
             given, and in every layer in proportion to its depth.
         earth_nt: The Earth's field in world axes [nT].
         earth_sd_nt: How far the uniform part of the lab's may lie from it, each way [nT].
         height_m: Height of the sensor above the floor [m]; that of the readings unless given, and 0
             where unknown: heights then count from the sensor.
-        like: A model whose layers and figures are taken as they are; nothing but the field is learnt then.
+        like: A model whose layers and figures are taken as they are, and its field to begin with; nothing but
+            the field is learnt then.
         progress: Called as progress(done, total, what), once a round.
 
     Returns:
@@ -268,7 +318,7 @@ def fit_harmonic(
         layers = _of_model(like)
         height = like.forward.height_m
     problem = _Problem.of(good, layers, height, earth_nt, earth_sd_nt)
-    return problem.solve(None if like is None else like.figures, progress).model(good)
+    return problem.solve(like, progress).model(good)
 
 
 def _check(
@@ -287,7 +337,8 @@ def _check(
 
 def _depths(depth_m: float | Sequence[float] | None, good: Readings, height: float) -> tuple[float, ...]:
     if depth_m is None:
-        first = max(DEPTH_SPACINGS * survey_spacing_m(good), LEAST_DEPTH_M, height)
+        spacings = DRIVE_SPACINGS if good.grid is None else DEPTH_SPACINGS
+        first = max(spacings * survey_spacing_m(good), LEAST_DEPTH_M, height)
         return tuple(first * step for step in LADDER)
     depths = tuple(float(d) for d in np.atleast_1d(np.asarray(depth_m, float)))
     if not depths or not all(np.isfinite(d) and d != 0 for d in depths):
@@ -309,6 +360,9 @@ def _layers(good: Readings, depths: tuple[float, ...], spacing_m: float | None, 
     """Layers below the readings' bounding box; thinned alike where there are too many dipoles."""
     low, high = good.p_xy.min(axis=0), good.p_xy.max(axis=0)
     part = SHEET if spacing_m is None else spacing_m / abs(depths[0])
+    parts = 1 if good.b_body_nt is None else 3
+    rows = parts * (1 + int(_cells(good, CELL * min(map(abs, depths)), MOST_ROWS // parts).max()))
+    most = MOST_DIPOLES if rows <= FEW_ROWS else DIPOLES_OF_MANY
     while True:
         places, areas, layer = [], [], []
         for k, depth in enumerate(depths):
@@ -320,13 +374,13 @@ def _layers(good: Readings, depths: tuple[float, ...], spacing_m: float | None, 
             areas.append(np.full(len(grid), (x[1] - x[0]) * (y[1] - y[0])))
             layer.append(np.full(len(grid), k))
         count = sum(map(len, places))
-        if count <= MOST_DIPOLES:
+        if count <= most:
             return _Layers(np.concatenate(places), np.concatenate(areas), np.concatenate(layer), depths)
         if spacing_m is not None:
             raise RefusedError(
-                f"spacing_m {spacing_m:g} makes {count:,} dipoles, more than {MOST_DIPOLES:,}; widen it"
+                f"spacing_m {spacing_m:g} makes {count:,} dipoles, more than {most:,}; widen it"
             )
-        part *= max(np.sqrt(count / MOST_DIPOLES), 1.02)
+        part *= max(np.sqrt(count / most), 1.02)
 
 
 def _of_model(model: HarmonicModel) -> _Layers:
@@ -360,7 +414,7 @@ class _Problem:
         earth_sd_nt: float,
     ) -> "_Problem":
         read = good.b_nt[:, None] if good.b_body_nt is None else good.b_body_nt
-        cell = _cells(good, CELL * min(map(abs, layers.depths)))
+        cell = _cells(good, CELL * min(map(abs, layers.depths)), MOST_ROWS // read.shape[1])
         size = np.bincount(cell)
 
         def mean(values: Array) -> Array:
@@ -379,29 +433,45 @@ class _Problem:
             uniform = np.array([part.mean() for part in turned])
         forward = Forward(layers.p_world_dipole, height)
         prior = np.zeros(forward.size)
-        count = len(layers.p_world_dipole)
+        count = 3 * len(layers.p_world_dipole)
         prior[count : count + 3] = uniform
-        rest = np.repeat([sd, HARD_IRON_SD_NT, SOFT_IRON_SD, LEVER_SD_M], [3, 3, 9, 2])
+        rest = np.repeat([sd, HARD_IRON_SD_NT, SOFT_IRON_SD, LEVER_SD_M], [3, 3, 8, 2])
+        if abs(np.mean(np.exp(1j * yaw))) > ONE_HEADING:
+            rest[3:] = 0.0  # a platform that never turned cannot be told from the field
         return cls(forward, layers, p, yaw, read, cell, prior, rest)
 
     @property
     def vectors(self) -> bool:
         return self.read_nt.shape[1] == 3
 
+    def places(self) -> list[NDArray[np.intp]]:
+        """Rows of the parts of readings that lie together: at one node, or within a spacing."""
+        side = abs(self.layers.depths[0]) / DEPTH_SPACINGS
+        square = np.floor(self.p_xy / side + 0.5).astype(np.int64)
+        _, place = np.unique(square, axis=0, return_inverse=True)
+        rows = np.arange(self.read_nt.size).reshape(self.read_nt.shape)
+        order = np.argsort(place.ravel(), kind="stable")
+        ends = np.flatnonzero(np.diff(place.ravel()[order])) + 1
+        return [rows[part].ravel() for part in np.split(order, ends)]
+
     def at(self, unknowns: Array) -> Reading:
         return self.forward.read(unknowns, self.p_xy, self.yaw, vectors=self.vectors)
 
-    def solve(self, known: Figures | None, progress: Progress | None) -> "_State":
-        """Fit, and learn the figures unless they are known."""
-        figures = self._first() if known is None else known
-        state = _State.start(self, figures)
-        state = state.settle()
-        rounds = 0 if known is not None else ROUNDS
-        shares = None if known is not None else _shares(self.layers)
+    def solve(self, like: HarmonicModel | None, progress: Progress | None) -> "_State":
+        """Fit, and learn the figures unless a model brings them."""
+        if like is not None:
+            return _State(self, like.figures, like.unknowns, self.at(like.unknowns)).settle()
+        state = _State.start(self, self._first())
+        for _ in range(FIRST_STEPS):
+            state = state.step()
+        shares, rounds = _shares(self.layers), ROUNDS
         for done in range(rounds):
             if progress is not None:
                 progress(done, rounds, "learning")
+            before = state.figures
             state = state.learnt(shares if done >= LAYERWISE else None).step()
+            if done > LAYERWISE and state.figures.change(before) < STILL:
+                break
         state = state.settle()
         if progress is not None:
             progress(rounds, rounds, "learning")
@@ -410,19 +480,20 @@ class _Problem:
     def _first(self) -> Figures:
         """Figures to begin with: strengths that make the field's spread, noises of a small part of it."""
         spread = float(self.read_nt.std(axis=0).max())
-        depth = np.abs(np.array(self.layers.depths))[self.layers.layer]
+        depth = np.array(self.layers.depths)[self.layers.layer]
+        above = depth < 0
         # a white layer of density s per metre makes a field of variance 3 (1e2 s)^2 pi / (8 d^4) or so
         density = max(spread, 1.0) * depth**2 / 100
         return Figures(
             noise_nt=max(spread / 50, 1e-3),
             position_m=0.01,
-            heading_rad=0.02,
+            heading_rad=0.02 if np.any(self.rest_sd[3:]) else 0.0,
             freedom=8.0,
-            strength=density * np.sqrt(self.layers.area_m2),
+            strength=density * np.sqrt(self.layers.area_m2) * np.where(above, WEAK, 1.0),
         )
 
 
-def _cells(good: Readings, way_m: float) -> NDArray[np.intp]:
+def _cells(good: Readings, way_m: float, most: int) -> NDArray[np.intp]:
     """Which mean each reading belongs to: one a node, and along drives one a short way."""
     if good.node is not None:
         return np.arange(len(good))
@@ -434,7 +505,7 @@ def _cells(good: Readings, way_m: float) -> NDArray[np.intp]:
     while True:
         stretch = np.floor(way / way_m).astype(np.int64)
         new = (np.diff(stretch) != 0) | other
-        if np.count_nonzero(new) < MOST_CELLS:
+        if np.count_nonzero(new) < most:
             break
         way_m *= 1.1
     cell = np.empty(len(good), np.intp)
@@ -471,7 +542,7 @@ class _State:
 
     @property
     def prior_sd(self) -> Array:
-        return np.concatenate([self.figures.strength, self.problem.rest_sd])
+        return np.concatenate([np.repeat(self.figures.strength, 3), self.problem.rest_sd])
 
     @property
     def off(self) -> Array:
@@ -487,27 +558,25 @@ class _State:
         """Minus the logarithm of the posterior, but for a constant, for scales that are held."""
         freedom, parts = self.figures.freedom, variance.shape[1]
         surprise = np.log1p(np.sum(self.off**2 / variance, axis=1) / freedom)
-        moved = (self.unknowns - self.problem.mean) / self.prior_sd
+        moved = self._scaled()
         return float((freedom + parts) / 2 * surprise.sum() + moved @ moved / 2)
 
-    def factor(self, precision: Array) -> Array:
-        """Cholesky factor of the posterior's precision, in units of the priors, (P, P)."""
-        scaled = self._rows() * np.sqrt(precision).reshape(-1, 1)
-        whole = scaled.T @ scaled
-        whole[np.diag_indices(len(whole))] += 1
-        return np.asarray(np.linalg.cholesky(whole))
+    def posterior(self, precision: Array) -> Posterior:
+        """What the readings, of these precisions (N, C), tell of the unknowns in units of their priors."""
+        return Posterior.of(self._rows() * np.sqrt(precision).reshape(-1, 1))
 
     def _rows(self) -> Array:
         return self.reading.jacobian.reshape(-1, self.reading.jacobian.shape[-1]) * self.prior_sd
 
+    def _scaled(self) -> Array:
+        """The unknowns from their priors' means, in units of their standard deviations; 0 where held."""
+        sd = self.prior_sd
+        return np.divide(self.unknowns - self.problem.mean, sd, out=np.zeros_like(sd), where=sd > 0)
+
     def _towards(self, precision: Array) -> Array:
         """The unknowns that solve the problem made linear here."""
-        from scipy.linalg import cho_solve
-
-        moved = (self.unknowns - self.problem.mean) / self.prior_sd
-        rows = self._rows()
-        target = self.off.ravel() + rows @ moved
-        best = cho_solve((self.factor(precision), True), rows.T @ (precision.ravel() * target))
+        posterior, root = self.posterior(precision), np.sqrt(precision).ravel()
+        best = posterior.mean(root * self.off.ravel() + posterior.rows @ self._scaled())
         return np.asarray(self.problem.mean + self.prior_sd * best)
 
     def _moved(self, towards: Array, part: float) -> "_State":
@@ -541,17 +610,17 @@ class _State:
 
     def learnt(self, shares: list[Array] | None) -> "_State":
         """The same with figures that these unknowns make likely."""
-        from scipy.linalg import lapack
         from scipy.special import gammaln, psi
 
         figures, layers = self.figures, self.problem.layers
         variance = figures.variance(self.reading)
         weights = self.weights(variance)
-        inverse = np.asarray(lapack.dtrtri(self.factor(weights[:, None] / variance), lower=1)[0])
+        precision = weights[:, None] / variance
+        posterior = self.posterior(precision)
         count = len(figures.strength)
-        # how far the readings, not the prior, determine a moment: 1 - posterior over prior variance
-        known = np.clip(1 - np.sum(inverse**2, axis=0)[:count], 1e-9, 1)
-        square = self.unknowns[:count] ** 2 / layers.area_m2
+        known = posterior.known()[: 3 * count].reshape(count, 3).mean(axis=1)
+        known = np.clip(known, 1e-9, 1)
+        square = np.mean(self.unknowns[: 3 * count].reshape(count, 3) ** 2, axis=1) / layers.area_m2
         density = figures.strength**2 / layers.area_m2
         new = np.empty(count)
         for k in range(len(layers.depths)):
@@ -562,10 +631,11 @@ class _State:
                 drawn = DRAWN * shares[k].sum(axis=1).mean() * known[own].mean()
                 new[own] = (shares[k] @ square[own] + drawn * whole) / (shares[k] @ known[own] + drawn)
         new = np.clip(new, 0.3 * density, 3 * density)
-        left = np.sum((self._rows() @ inverse.T) ** 2, axis=1).reshape(variance.shape)
+        left = posterior.fitted().reshape(variance.shape) / precision
         size = (self.off**2 + left) * weights[:, None] / variance
         share = figures._terms(self.reading) / variance[..., None]
-        scale = np.sqrt(np.sum(share * size[..., None], axis=(0, 1)) / np.sum(share, axis=(0, 1)))
+        whole_share = np.maximum(np.sum(share, axis=(0, 1)), np.finfo(float).tiny)  # 0 for what is held at 0
+        scale = np.sqrt(np.sum(share * size[..., None], axis=(0, 1)) / whole_share)
         parts = variance.shape[1]
         old = (figures.freedom + parts) / 2
         tail = np.mean(np.log(weights) - weights) + psi(old) - np.log(old)
@@ -589,13 +659,15 @@ class _State:
         constant = gammaln((freedom + parts) / 2) - gammaln(freedom / 2) - parts / 2 * np.log(freedom * np.pi)
         fit = len(variance) * constant - np.log(variance).sum() / 2 - self.objective(variance)
         precision = self.weights(variance)[:, None] / variance
-        return float(fit - np.log(np.diag(self.factor(precision))).sum())
+        return float(fit - self.posterior(precision).half_log_det())
 
     def model(self, good: Readings) -> HarmonicModel:
         """The fitted model."""
         figures, problem = self.figures, self.problem
         variance = figures.variance(self.reading)
-        lower = self.factor(self.weights(variance)[:, None] / variance)
+        precision = self.weights(variance)[:, None] / variance
+        posterior = self.posterior(precision)
+        learnt, width = posterior.directions(), self._width(posterior, precision)
         field = problem.forward.field(self.unknowns)
         slopes = problem.forward.read(self.unknowns, problem.p_xy, problem.yaw, vectors=False)
         wide = figures.freedom / (figures.freedom - 2)
@@ -605,23 +677,38 @@ class _State:
         noise += float(np.mean(within**2))
         return HarmonicModel(
             field=field,
-            parameters=self._parameters(lower, len(good)),
+            parameters=self._parameters(learnt, width, len(good)),
             noise_nt2=noise,
             figures=figures,
             forward=problem.forward,
             unknowns=self.unknowns,
             prior_sd=self.prior_sd,
-            lower=lower,
+            learnt=learnt,
+            width=width,
         )
 
-    def _parameters(self, lower: Array, count: int) -> dict[str, Any]:
-        from scipy.linalg import solve_triangular
+    def _width(self, posterior: Posterior, precision: Array) -> float:
+        """See `HarmonicModel.width`.
 
+        The likeliest under Student's t, a place counting once; where readings tell nothing of it, near 1.
+        """
+        root, places = np.sqrt(precision).ravel(), self.problem.places()
+        target = root * self.off.ravel() + posterior.rows @ self._scaled()
+        off, field = posterior.left_out(target, places)
+        share = np.empty(len(root))
+        for rows in places:
+            share[rows] = 1 / len(rows)
+        noise, freedom = self.figures.variance(self.reading).ravel(), self.figures.freedom
+        square, field = (off / root) ** 2, field / root**2
+        scale = _widened(field, noise, np.exp(WIDTHS)[:, None]) + noise
+        surprise = (freedom + 1) / 2 * np.log1p(square / (freedom * scale)) + np.log(scale) / 2
+        return float(np.exp(WIDTHS[np.argmin(surprise @ share + (WIDTHS / WIDTH_SD) ** 2 / 2)]))
+
+    def _parameters(self, learnt: Array, width: float, count: int) -> dict[str, Any]:
         figures, problem = self.figures, self.problem
-        last = np.zeros((len(lower), len(problem.rest_sd)))
-        last[-len(problem.rest_sd) :] = np.diag(problem.rest_sd)
-        sd = np.linalg.norm(solve_triangular(lower, last, lower=True), axis=0)
-        uniform, hard, soft, lever = np.split(self.unknowns[-len(problem.rest_sd) :], [3, 6, 15])
+        last = learnt[-len(problem.rest_sd) :]
+        sd = problem.rest_sd * np.sqrt(np.maximum(1 - np.sum(last**2, axis=1), 0))
+        uniform, hard, soft, lever = np.split(self.unknowns[-len(problem.rest_sd) :], [3, 6, 14])
         layers = problem.layers
         density = [
             float(
@@ -644,9 +731,10 @@ class _State:
             "uniform field, sd [nT]": np.round(sd[:3], 1).tolist(),
             "hard iron [nT]": np.round(hard, 1).tolist(),
             "hard iron, sd [nT]": np.round(sd[3:6], 1).tolist(),
-            "soft iron": np.round(soft, 5).tolist(),
-            "soft iron, sd": np.round(sd[6:15], 5).tolist(),
+            "soft iron": np.round(np.tensordot(soft, SOFT, 1).ravel(), 5).tolist(),
+            "soft iron, sd": np.round(np.sqrt(np.tensordot(sd[6:14] ** 2, SOFT**2, 1)).ravel(), 5).tolist(),
             "lever arm [m]": np.round(lever, 5).tolist(),
-            "lever arm, sd [m]": np.round(sd[15:], 5).tolist(),
+            "lever arm, sd [m]": np.round(sd[14:], 5).tolist(),
+            "width of variances": round(width, 4),
             "log evidence": round(self.evidence(), 2),
         }
