@@ -37,9 +37,9 @@ from magtwin.names import RefusedError
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
 
-LADDER = (1.0, 2.0, 4.0, -2.0)
+LADDERS = ((1.0, 2.0, 4.0), (1.0, 2.0, 4.0, -2.0))
 """Depths of the layers below the sensor, in those of the first: each tells of sources twice as large. The
-last is above it, for what stands beside."""
+last of the second is above, for what stands beside; the likelier of the two is taken, by the evidence."""
 
 WEAK = 0.1
 """Strength of layers above in those of layers below, to begin with: what both can tell is below."""
@@ -75,7 +75,7 @@ FEW_ROWS = 2700
 DIPOLES_OF_MANY = 800
 """Dipoles beyond which the layers are thinned where readings are many."""
 
-MOST_ROWS = 6000
+MOST_ROWS = 2700
 """Readings beyond which those of a drive are averaged over longer ways."""
 
 CELL = 1 / 6
@@ -284,7 +284,7 @@ def fit_harmonic(
         readings: A survey; those that are not `good` count for nothing.
         depth_m: Depth of the dipoles' layers below the sensor [m], negative for layers above. Unless
             given, 1.8 spacings of the survey (0.9 of a drive), no nearer than `LEAST_DEPTH_M` or the floor,
-            twice and four times that, and a layer above at twice that.
+            twice and four times that, and, if the evidence is for it, a layer above at twice that.
         spacing_m: Distance between the dipoles of the first layer [m]; 0.6 of a layer's depth unless
             given, and in every layer in proportion to its depth.
         earth_nt: The Earth's field in world axes [nT].
@@ -309,16 +309,25 @@ def fit_harmonic(
         )
     height = height_m if height_m is not None else (readings.height_m or 0.0)
     _check(earth_nt, earth_sd_nt, height, spacing_m)
-    if like is None:
-        depths = _depths(depth_m, good, height if height > 0 else 0.0)
-        layers = _layers(good, depths, spacing_m, height)
-    else:
+    if like is not None:
         if depth_m is not None or spacing_m is not None:
             raise RefusedError("like brings its own layers; leave out depth_m and spacing_m")
-        layers = _of_model(like)
-        height = like.forward.height_m
-    problem = _Problem.of(good, layers, height, earth_nt, earth_sd_nt)
-    return problem.solve(like, progress).model(good)
+        problem = _Problem.of(good, _of_model(like), like.forward.height_m, earth_nt, earth_sd_nt)
+        return problem.solve(like, progress).model(good)
+    ladders = _ladders(depth_m, good, max(height, 0.0))
+    fits = []
+    for k, depths in enumerate(ladders):
+        problem = _Problem.of(good, _layers(good, depths, spacing_m, height), height, earth_nt, earth_sd_nt)
+        told = _part(progress, k, len(ladders))
+        fits.append(problem.solve(None, told))
+    return max(fits, key=_State.evidence).model(good)
+
+
+def _part(progress: Progress | None, k: int, count: int) -> Progress | None:
+    """Progress of the k-th of some fits, as a part of all."""
+    if progress is None:
+        return None
+    return lambda done, total, what: progress(k * total + done, count * total, what)
 
 
 def _check(
@@ -335,15 +344,18 @@ def _check(
         raise RefusedError(f"height_m must be a number, got {height!r}")
 
 
-def _depths(depth_m: float | Sequence[float] | None, good: Readings, height: float) -> tuple[float, ...]:
+def _ladders(
+    depth_m: float | Sequence[float] | None, good: Readings, height: float
+) -> list[tuple[float, ...]]:
+    """The sets of layers to try."""
     if depth_m is None:
         spacings = DRIVE_SPACINGS if good.grid is None else DEPTH_SPACINGS
         first = max(spacings * survey_spacing_m(good), LEAST_DEPTH_M, height)
-        return tuple(first * step for step in LADDER)
+        return [tuple(first * step for step in ladder) for ladder in LADDERS]
     depths = tuple(float(d) for d in np.atleast_1d(np.asarray(depth_m, float)))
     if not depths or not all(np.isfinite(d) and d != 0 for d in depths):
         raise RefusedError(f"depth_m must be depths below the sensor [m], other than 0, got {depth_m!r}")
-    return depths
+    return [depths]
 
 
 @dataclass(frozen=True, eq=False)

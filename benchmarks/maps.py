@@ -1,0 +1,127 @@
+"""How well each method tells what it was not shown, on two real data sets and in one process, with times.
+
+    python benchmarks/maps.py [--data FOLDER] [--only aprilab|magnetic-data] [--method NAME ...]
+
+The APRILab survey (4 x 375 nodes, |B|): every other node is left out at all its headings, then the others;
+latched nodes count on neither side. `harmonic` is told the Earth's field of the place; "harmonic, no Earth"
+is not. magnetic-data (Solin et al. 2018; vectors in world axes, so headings are 0 and no platform is fitted):
+runs 1, 3 and 5 tell of runs 2 and 4 within 10 cm of their readings. "harmonic, course" takes the direction of
+travel for the heading, which the data do not state: the platform then explains what turns with the robot.
+Seconds are of all turns together, on a machine as busy as it was; compare them within one run.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from magtwin.field.fit import METHODS, fit
+from magtwin.field.latch import mask_latched
+from magtwin.field.readings import Readings
+from magtwin.field.survey import read_grid
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+EARTH_NT = (-2_700.0, 24_000.0, -38_400.0)  # IGRF-14, Gainesville, Florida
+NINETY = 1.6448536269514722
+BRIDGED = {"trilinear": {"fill": True}, "cubic": {"fill": True}}  # as `magtwin map check` does
+NEAR_M = 0.1
+AHEAD = 15  # readings, 0.3 s, over which a direction of travel is taken
+
+
+def aprilab(folder):
+    """Readings to fit and to predict, a pair a turn."""
+    readings, _ = mask_latched(read_grid(folder / "aprilab" / "maps"))
+    parity = (readings.node[:, 1] + readings.node[:, 2]) % 2
+    return [
+        tuple(readings.take(readings.good & (parity == side)) for side in (kept, 1 - kept)) for kept in (0, 1)
+    ]
+
+
+def course(p):
+    row = np.arange(len(p))
+    way = p[np.minimum(row + AHEAD, len(p) - 1)] - p[np.maximum(row - AHEAD, 0)]
+    return np.arctan2(way[:, 1], way[:, 0])
+
+
+def runs(folder, numbers, *, headed):
+    t, p, b = (
+        [np.loadtxt(folder / "magnetic-data" / f"{n}-{what}.csv", delimiter=",") for n in numbers]
+        for what in ("time", "loc", "mag")
+    )
+    yaw = np.concatenate([course(q) if headed else np.zeros(len(q)) for q in p])
+    c, s = np.cos(yaw), np.sin(yaw)
+    world = 1e3 * np.concatenate(b)
+    body = np.column_stack(
+        [c * world[:, 0] + s * world[:, 1], c * world[:, 1] - s * world[:, 0], world[:, 2]]
+    )
+    return Readings(
+        p_xy=np.concatenate(p),
+        yaw=yaw,
+        b_body_nt=body,
+        t=np.concatenate(t),
+        run=np.repeat(np.arange(len(t)), [len(part) for part in t]),
+        runs=tuple(map(str, numbers)),
+        name="magnetic-data",
+    )
+
+
+def magnetic(folder, *, headed=False):
+    shown, rest = runs(folder, (1, 3, 5), headed=headed), runs(folder, (2, 4), headed=headed)
+    return [(shown, rest.take(cKDTree(shown.p_xy).query(rest.p_xy)[0] < NEAR_M))]
+
+
+def measure(turns, method, options):
+    """Misses [nT], whether they lie in the 90 % intervals, and seconds."""
+    off, inside, start = [], [], time.perf_counter()
+    for shown, rest in turns:
+        model = fit(shown, method, **options)
+        nominal = rest.grid is not None and method in BRIDGED
+        yaw = np.asarray(rest.grid.headings_rad)[rest.node[:, 0]] if nominal else rest.yaw
+        value, variance = model.predict(rest.p_xy, yaw)
+        off.append(rest.b_nt - value)
+        inside.append(np.abs(off[-1]) <= NINETY * np.sqrt(variance + model.noise_nt2))
+    return np.concatenate(off), np.concatenate(inside), time.perf_counter() - start
+
+
+def table(title, rows):
+    print(f"{title}\n  {'':22}{'RMSE':>8}{'MAE':>8}{'median':>8}{'in 90 %':>9}{'told':>8}{'s':>8}")
+    for name, turns, method, options in rows:
+        off, inside, seconds = measure(turns, method, options)
+        known = np.isfinite(off)
+        size = np.abs(off[known])
+        print(
+            f"  {name:22}{np.sqrt(np.mean(size**2)):8.0f}{size.mean():8.0f}{np.median(size):8.0f}"
+            f"{100 * inside[known].mean():8.1f}%{known.mean():8.1%}{seconds:8.1f}",
+            flush=True,
+        )
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of aprilab/ and magnetic-data/")
+    parser.add_argument("--only", choices=["aprilab", "magnetic-data"])
+    parser.add_argument("--method", nargs="+", choices=list(METHODS), default=list(METHODS))
+    options = parser.parse_args()
+    if not options.data.is_dir():
+        parser.exit(message=f"the real data are not at {options.data}; `magtwin fetch` gets the survey\n")
+    if options.only != "magnetic-data":
+        turns = aprilab(options.data)
+        rows = [(m, turns, m, {**BRIDGED.get(m, {})}) for m in options.method if m != "harmonic"]
+        if "harmonic" in options.method:
+            rows += [
+                ("harmonic", turns, "harmonic", {"earth_nt": EARTH_NT}),
+                ("harmonic, no Earth", turns, "harmonic", {}),
+            ]
+        table("APRILab, checkerboard, nT", rows)
+    if options.only != "aprilab":
+        turns = magnetic(options.data)
+        rows = [(m, turns, m, {}) for m in options.method]
+        if "harmonic" in options.method:
+            rows.append(("harmonic, course", magnetic(options.data, headed=True), "harmonic", {}))
+        table("magnetic-data, runs 2 and 4 from 1, 3 and 5, nT", rows)
+
+
+if __name__ == "__main__":
+    main()
