@@ -5,7 +5,10 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check -q install -c constraints.txt
 
-.PHONY: demo test simready lint bench wheel-test schema assets clean help
+# Two processes whose linear algebra has threads of its own wait for each other more than they work.
+ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
+
+.PHONY: demo test test-slow simready lint bench wheel-test schema assets clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -13,8 +16,11 @@ help:  ## Say what there is to make
 demo: $(VENV)/.installed  ## Author a lab and a robot, drive it, log the run to demo/
 	$(BIN)/magtwin demo --out demo --force
 
-test: $(VENV)/.dev  ## Run all tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+test: $(VENV)/.dev  ## Run the tests
+	$(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+
+test-slow: $(VENV)/.dev  ## Run the tests that take minutes: fits of large surveys
+	$(BIN)/python -m pytest -m slow
 
 simready: $(VENV)/.dev  ## Hold robots against NVIDIA's SimReady profiles, in an environment of its own
 	test -x build/simready/bin/simready-validate || $(PYTHON) -m venv build/simready
