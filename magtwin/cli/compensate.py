@@ -21,6 +21,7 @@ def fit(
     band_hz: tuple[float, float] = (0.1, 0.9),
     no_band: Annotated[bool, Parameter(negative="")] = False,
     ridge: float | None = None,
+    exact: Annotated[bool, Parameter(negative="")] = False,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -43,6 +44,9 @@ def fit(
         Fit all frequencies, slow ones too.
     ridge
         Penalty of the regression; by cross-validation unless given.
+    exact
+        Take the directions from the exact field of a simulated run, b_vector_nt, in place of what the vector
+        axes read, b_vector_measured_nt: shows what their errors cost.
     force
         Replace the file if it exists.
     json
@@ -55,7 +59,13 @@ def fit(
     check_suffix(out, (".json",), "a Tolles-Lawson model")
     check_free(out, force=force)
     names = tuple(name.strip() for name in terms.split(",") if name.strip())
-    model = fit_run(read_parquet(run), terms=names, band_hz=None if no_band else band_hz, ridge=ridge)
+    model = fit_run(
+        read_parquet(run),
+        vector="exact" if exact else "measured",
+        terms=names,
+        band_hz=None if no_band else band_hz,
+        ridge=ridge,
+    )
     with output(out, force=force) as aside:
         model.save(aside)
     print_report(model.report(f"Tolles-Lawson model of {run}"), json)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,6 +51,11 @@ eddy terms, y dy/dt goes in eight and only x dx/dt, y dy/dt, z dz/dt stay in thr
 DEFAULT_TERMS = ("permanent", "induced6", "eddy9")
 DEFAULT_BAND_HZ = (0.1, 0.9)
 """Manoeuvres lie in this band [Hz]; the Earth's field and the map vary slower as an aircraft flies."""
+
+Vector = Literal["measured", "exact"]
+VECTORS: Mapping[str, str] = MappingProxyType({"measured": "b_vector_measured_nt", "exact": "b_vector_nt"})
+"""Columns of a run that give the direction cosines: what the vector axes read, or, of a simulated run, the
+field itself, which no robot knows."""
 
 RIDGES = np.logspace(-12, 3, 31)
 """Ridge penalties that are tried, relative to the mean square of the standardised columns."""
@@ -138,6 +143,9 @@ class TollesLawson:
     residual_sd_nt: float
     """Standard deviation of what the fit left, in its band [nT]."""
 
+    vector: Vector = "measured"
+    """Which field of a run it was fitted to, a name of `VECTORS`; it compensates by the same."""
+
     def interference_nt(self, b_vector_nt: ArrayLike, rate_hz: float) -> Array:
         """What the platform adds to the magnitude, less its mean unless the terms have a bias.
 
@@ -176,7 +184,9 @@ class TollesLawson:
                 None if data["band_hz"] is None else (float(data["band_hz"][0]), float(data["band_hz"][1])),
                 float(data["ridge"]),
                 float(data["residual_sd_nt"]),
+                data.get("vector", "measured"),
             )
+            find("vector of a Tolles-Lawson model", str(model.vector), VECTORS)
         except (ValueError, KeyError, TypeError, IndexError, OSError, RecursionError) as error:
             raise RefusedError(
                 f"{file}: not a Tolles-Lawson model as `magtwin compensate fit` writes it "
@@ -200,7 +210,7 @@ class TollesLawson:
                 Figure("ridge", self.ridge),
                 Figure("residual", self.residual_sd_nt, "nT", note=f"standard deviation, {band}"),
             ),
-            {"terms": list(self.terms)},
+            {"terms": list(self.terms), "vector": VECTORS[self.vector]},
         )
 
 
@@ -257,31 +267,40 @@ def fit_tolles_lawson(
     return TollesLawson(tuple(terms), tuple(c.tolist()), band_hz, chosen, float(np.std(b - matrix @ c)))
 
 
-def fit_run(run: Run, **options: Any) -> TollesLawson:
-    """`fit_tolles_lawson` on a run: b_measured_nt less b_map_nt, against b_vector_nt.
+def fit_run(run: Run, *, vector: Vector = "measured", **options: Any) -> TollesLawson:
+    """`fit_tolles_lawson` on a run: b_measured_nt less b_map_nt, against its field vectors.
 
     The filter needs an unbroken series, so the longest stretch of rows with a map, a reading and a vector
     is used.
 
+    Args:
+        run: A calibration run.
+        vector: "measured" takes what the vector axes read, b_vector_measured_nt, with their errors and one
+            after the other; "exact" the b_vector_nt of a simulated run, which shows how much they cost.
+        options: Those of `fit_tolles_lawson`.
+
     Raises:
-        RefusedError: The run has no vector column, or nowhere enough of it.
+        RefusedError: The run has no such vectors, or nowhere enough of them.
     """
-    rows, rate = _unbroken(run)
+    b_vector, rows, rate = _unbroken(run, vector)
     b = run["b_measured_nt"][rows] - run["b_map_nt"][rows]
-    return fit_tolles_lawson(b, run["b_vector_nt"][rows], rate, **options)
+    return replace(fit_tolles_lawson(b, b_vector[rows], rate, **options), vector=vector)
 
 
 def compensate_run(run: Run, model: TollesLawson) -> tuple[Run, Report]:
     """A run whose b_measured_nt is free of what the model explains, and how much that was.
 
     Returns:
-        The run, with nan in b_measured_nt where there is no vector; and its report.
+        The run, with nan in b_measured_nt where there is no vector of the kind that the model was fitted
+        to; and its report.
     """
-    rows, rate = _unbroken(run)
+    b_vector, rows, rate = _unbroken(run, model.vector)
     interference = np.full(run.rows, np.nan)
-    interference[rows] = model.interference_nt(run["b_vector_nt"][rows], rate)
+    interference[rows] = model.interference_nt(b_vector[rows], rate)
     before = (run["b_measured_nt"] - run["b_map_nt"])[rows]
     after = before - interference[rows]
+    if not before.std() > 0:
+        raise RefusedError("b_measured_nt less b_map_nt never changes, so there is nothing to take out of it")
     figures = (
         Figure("readings", int(rows.stop - rows.start)),
         Figure("before", float(before.std()), "nT", note="standard deviation of measured less map"),
@@ -289,7 +308,8 @@ def compensate_run(run: Run, model: TollesLawson) -> tuple[Run, Report]:
         Figure("variance removed", float(1 - after.var() / before.var()), "", note="share, 1 is all of it"),
     )
     compensated = run.with_columns(b_measured_nt=run["b_measured_nt"] - interference)
-    return compensated.with_facts(tolles_lawson=" ".join(model.terms)), Report("Compensation", figures)
+    told = {"terms": list(model.terms), "vector": VECTORS[model.vector]}
+    return compensated.with_facts(tolles_lawson=" ".join(model.terms)), Report("Compensation", figures, told)
 
 
 def fit_platform(
@@ -433,8 +453,8 @@ def _least_squares(matrix: Array, iron: Array, b: Array) -> tuple[Array, Array]:
     return found, moments
 
 
-def platform_of_run(run: Run, scene: Scene) -> PlatformFieldSpec:
-    """`fit_platform` on a calibration run: its b_vector_nt, in a lab whose own field is known.
+def platform_of_run(run: Run, scene: Scene, *, vector: Vector = "exact") -> PlatformFieldSpec:
+    """`fit_platform` on a calibration run: its field vectors, in a lab whose own field is known.
 
     The run should turn on the spot both ways, as a motor that pulls one way all the time cannot be told from
     iron, and have the LiDAR on for a while.
@@ -442,6 +462,9 @@ def platform_of_run(run: Run, scene: Scene) -> PlatformFieldSpec:
     Args:
         run: What was recorded.
         scene: The lab, and the robot that the run is of; of its platform only the caster's place is used.
+        vector: "exact" takes b_vector_nt, as a magnetometer that reads its axes at once would give it;
+            "measured" takes b_vector_measured_nt, whose axes are read in turn and so too slowly for what
+            turns fast, such as the LiDAR's motor.
 
     Returns:
         The platform's figures.
@@ -450,7 +473,7 @@ def platform_of_run(run: Run, scene: Scene) -> PlatformFieldSpec:
         RefusedError: The run has no vectors, its readings are not evenly spaced, or the scene has no
             Earth's field.
     """
-    rows, rate = _unbroken(run)
+    b_vector, rows, rate = _unbroken(run, vector)
     robot = scene.robot
     wheels = wheel_rates(run["v_base"][rows, 0], run["w_base"][rows, 2], robot.drive)
     late = max(1, round(TORQUE_S * rate))
@@ -461,7 +484,7 @@ def platform_of_run(run: Run, scene: Scene) -> PlatformFieldSpec:
     ambient = rotate(quat_conjugate(quat_from_yaw(yaw)), ambient_field_nt(scene, p_world))
     return fit_platform(
         ambient,
-        rotate(np.array(robot.q_base_magnetometer_xyzw), run["b_vector_nt"][rows]),
+        rotate(np.array(robot.q_base_magnetometer_xyzw), b_vector[rows]),
         rate,
         motor_nm=wheel_torques_nm(robot.battery, robot.drive, wheels, gained),
         lidar_on=run["lidar_on"][rows],
@@ -512,14 +535,22 @@ def _cross_validated(matrix: Array, b: Array) -> float:
     return float(RIDGES[np.argmin(errors)])
 
 
-def _unbroken(run: Run) -> tuple[slice, float]:
-    """The longest stretch of rows with a map, a reading and a vector, and its rate [Hz]."""
-    if not np.isfinite(run["b_vector_nt"]).any():
-        raise RefusedError(
-            "the run has no field vectors in b_vector_nt, which direction cosines need; record a vector "
-            "magnetometer, or simulate a scene whose Earth field is known"
+def _unbroken(run: Run, vector: str) -> tuple[Array, slice, float]:
+    """Field vectors (N, 3) of a run, its longest stretch of rows with a map, a reading and such a vector,
+    and the rate [Hz].
+    """
+    name = find("vector", vector, VECTORS)
+    b_vector = run[name] if name in run else np.full((run.rows, 3), np.nan)
+    if not np.isfinite(b_vector).any():
+        other = next(o for o in VECTORS if o != vector)
+        there = VECTORS[other] in run and np.isfinite(run[VECTORS[other]]).any()
+        do = (
+            f'ask for the {other} ones of {VECTORS[other]} (vector="{other}")'
+            if there
+            else "record a vector magnetometer, or simulate a scene whose Earth field is known"
         )
-    fine = np.isfinite(run["b_measured_nt"] - run["b_map_nt"]) & np.isfinite(run["b_vector_nt"]).all(axis=1)
+        raise RefusedError(f"the run has no field vectors in {name}, which direction cosines need; {do}")
+    fine = np.isfinite(run["b_measured_nt"] - run["b_map_nt"]) & np.isfinite(b_vector).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], fine.astype(np.int8), [0]])))
     starts, stops = edges[::2], edges[1::2]
     k = int(np.argmax(stops - starts))
@@ -530,4 +561,4 @@ def _unbroken(run: Run) -> tuple[slice, float]:
     step = float(np.median(np.diff(t)))
     if not step > 0 or np.abs(np.diff(t) - step).max() > 0.5 * step:
         raise RefusedError("the run's readings are not evenly spaced in time; resample it first")
-    return rows, 1 / step
+    return b_vector, rows, 1 / step
