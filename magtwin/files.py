@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import hashlib
 import os
+import re
 import shutil
 import tempfile
 import tomllib
@@ -17,6 +18,8 @@ from typing import Any, TypeVar
 from magtwin.names import RefusedError, hint
 
 T = TypeVar("T")
+
+_COMMIT = re.compile("[0-9a-f]{40}|[0-9a-f]{64}")
 
 
 def shipped(*parts: str) -> Path:
@@ -107,6 +110,46 @@ def sha256(path: str | os.PathLike[str]) -> str:
     """SHA-256 of a file, lower-case hex."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def git_revision(folder: str | os.PathLike[str]) -> str:
+    """The commit that the Git checkout around a folder is at, or "" where there is no checkout.
+
+    Read from `.git` itself: no program is started, and no setting of the checkout is obeyed.
+    """
+    for place in (here := Path(folder).resolve(), *here.parents):
+        git = place / ".git"
+        try:
+            if git.is_file():  # a worktree or a submodule, whose own folder lies elsewhere
+                git = place / git.read_text(encoding="utf-8").removeprefix("gitdir:").strip()
+            elif not git.is_dir():
+                continue
+            return _commit_of(git)
+        except (OSError, UnicodeDecodeError):
+            return ""
+    return ""
+
+
+def _commit_of(git: Path) -> str:
+    """The commit that HEAD of a repository names, "" where it names none yet."""
+    head = (git / "HEAD").read_text(encoding="utf-8").strip()
+    if _COMMIT.fullmatch(head):
+        return head
+    name = head.removeprefix("ref:").strip()
+    if not re.fullmatch(r"refs(/[^/\s]+)+", name) or ".." in name:
+        return ""
+    shared = git / "commondir"
+    common = git / shared.read_text(encoding="utf-8").strip() if shared.is_file() else git
+    for place in (git, common):
+        if (place / name).is_file():
+            commit = (place / name).read_text(encoding="utf-8").strip()
+            return commit if _COMMIT.fullmatch(commit) else ""
+    packed = common / "packed-refs"
+    for line in packed.read_text(encoding="utf-8").splitlines() if packed.is_file() else ():
+        commit, _, ref = line.partition(" ")
+        if ref == name and _COMMIT.fullmatch(commit):
+            return commit
+    return ""
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -37,6 +37,9 @@ class Path:
     closed: bool = False
     """Whether it can be driven round and round."""
 
+    file: str = ""
+    """The file that it was read from, as that was named; "" for one that came from no file."""
+
     s: Array = field(init=False, repr=False)
     """Arc length at each point, from 0 [m], shape (N,)."""
 
@@ -430,7 +433,7 @@ def read_path_csv(file: str | os.PathLike[str]) -> Path:
     p = _without_repeats(np.array(points))
     if len(p) < 2:
         raise RefusedError(f"{file}: only one point in it; a path needs two that differ")
-    return Path(file.name, p, closed=len(p) > 2 and math.dist(p[0], p[-1]) < _SAME_M)
+    return Path(file.name, p, len(p) > 2 and math.dist(p[0], p[-1]) < _SAME_M, file.as_posix())
 
 
 def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> None:

@@ -1,7 +1,8 @@
 """Twin: a scene opened for running, with the map and the network that its prims name."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 import magtwin
 from magtwin.field.map import AnomalyMap
-from magtwin.files import sha256
+from magtwin.files import git_revision, sha256
 from magtwin.names import RefusedError, find
 from magtwin.obstacles import Obstacles
 from magtwin.path import Path, resolve_path
@@ -19,6 +20,7 @@ from magtwin.run import Run
 from magtwin.spec import RobotSpec, Scene
 
 Kind = Literal["physical", "neural", "map-only"]
+Facts = dict[str, str | int | float | bool]
 
 if TYPE_CHECKING:
     from magtwin.learn.magnetometer import NeuralMagnetometer
@@ -47,6 +49,9 @@ class Twin:
     obstacles: Obstacles = dataclasses.field(default_factory=Obstacles)
     """What stands in the scene."""
 
+    facts: Mapping[str, str | int | float | bool] = dataclasses.field(default_factory=dict)
+    """What a run is to say of the files that were opened: their names as they were given, and checksums."""
+
 
 def open_twin(
     scene_file: str | FilePath, *, net: str | FilePath | None = None, magnetometer: Kind | None = None
@@ -63,6 +68,7 @@ def open_twin(
         RefusedError: The stage, its map or its weights are missing, broken, or not what the stage's
             checksums say.
     """
+    from magtwin.usd.layers import stage_sha256
     from magtwin.usd.maps import load_map
     from magtwin.usd.obstacles import read_obstacles
     from magtwin.usd.scene import read_scene
@@ -76,8 +82,61 @@ def open_twin(
     if magnetometer is not None:
         spec = dataclasses.replace(spec, kind=magnetometer)
     scene = dataclasses.replace(scene, robot=dataclasses.replace(scene.robot, magnetometer=spec))
-    obstacles = read_obstacles(scene_file)
-    return Twin(scene, scene_file, load_map(scene.map_layer), _magnetometer(scene), obstacles)
+    obstacles, field, network = read_obstacles(scene_file), load_map(scene.map_layer), _magnetometer(scene)
+    facts: Facts = {"scene_file": scene_file.as_posix(), "scene_sha256": stage_sha256(scene_file)}
+    if revision := git_revision(scene_file.parent):
+        facts["git_revision"] = revision
+    facts |= {"map": field.name, "map_sha256": sha256(scene.map_layer)}
+    facts |= network.facts if network else {}
+    if network and net is not None:
+        facts["network_file"] = FilePath(net).as_posix()
+    return Twin(scene, scene_file, field, network, obstacles, facts)
+
+
+def twin_of(
+    run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None, check: bool = True
+) -> Twin:
+    """The twin that a run came from: the scene that its facts name, with their network and magnetometer.
+
+    Args:
+        run: A run that `simulate` made, from any file that keeps its facts.
+        scene: Where the scene lies now; None looks for it where the facts say.
+        near: The run's own file: names are taken from its folder too, where they lead nowhere from here.
+        check: Whether what is found must be what the run came from, by the checksums of its facts.
+
+    Raises:
+        RefusedError: The facts name no scene, or it or its network is not there, or is not what it was.
+    """
+    facts = run.facts
+    if scene is None:
+        if "scene_file" not in facts:
+            raise RefusedError("the run does not say which scene it came from; name one")
+        scene = locate(str(facts["scene_file"]), near)
+        if scene is None:
+            raise RefusedError(f"{facts['scene_file']}: the scene of the run is not there; say where it is")
+    kind: Any = facts.get("magnetometer")
+    network = str(facts["network_file"]) if "network_file" in facts else None
+    twin = open_twin(
+        scene,
+        net=network if network is None else locate(network, near) or network,
+        magnetometer=kind if network is None else None,
+    )
+    for name, what in _CHECKSUMS.items() if check else ():
+        if facts.get(name, "") != twin.facts.get(name, ""):
+            raise RefusedError(
+                f"{scene}: {what} is not what the run came from: {name} is "
+                f"{twin.facts.get(name, 'none')}, the run says {facts.get(name, 'none')}"
+            )
+    return twin
+
+
+_CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_sha256": "the scene"}
+
+
+def locate(file: str, near: str | FilePath | None = None) -> FilePath | None:
+    """A file that facts name, as seen from here or from the folder of `near`; None where neither has it."""
+    places = [FilePath(file), *([] if near is None else [FilePath(near).parent / file])]
+    return next((place for place in places if place.exists()), None)
 
 
 def scene_from_toml(
@@ -190,9 +249,11 @@ def simulate(
 
     twin, seed = _opened(twin, net, magnetometer, "simulate"), _seed(seed)
     network = twin.magnetometer
+    if path != "random" and isinstance(path, str | FilePath):
+        path = resolve_path(path)
     run = run_scene(
         twin.scene,
-        path if path == "random" or not isinstance(path, str | FilePath) else resolve_path(path),
+        path,
         anomaly_map=twin.field,
         rng=np.random.default_rng(seed),
         speed=speed,
@@ -207,7 +268,7 @@ def simulate(
     )
     outside_training = network.outside_training(run) if network else None
     return run.with_columns(**_known(twin.scene, run, network, outside_training)).with_facts(
-        **_facts(twin, seed, sha256(twin.scene.map_layer))
+        **_facts(twin, seed, path, duration_s, _config_sha256(twin.scene))
     )
 
 
@@ -285,7 +346,8 @@ def simulate_many(
             scenes[id(robot)] = dataclasses.replace(twin.scene, robot=robot)
         scene = twin.scene if robot is None else scenes[id(robot)]
         jobs.append(Job(scene, path if isinstance(path, Path) else resolved[path], seed, speed))
-    network, checksum = twin.magnetometer, sha256(twin.scene.map_layer)
+    network = twin.magnetometer
+    configs = {id(scene): _config_sha256(scene) for scene in (twin.scene, *scenes.values())}
 
     def finish(jobs: Sequence[Job], sensed: Sequence["Sensed"]) -> list[Run]:
         read = network.read([one.run for one in sensed]) if network else [(None, None)] * len(sensed)
@@ -294,7 +356,8 @@ def simulate_many(
             run = one.read(disturbance)
             known = _known(job.scene, run, network, outside_training)
             run = run.with_columns(**{name: known[name] for name in known.keys() & run.keys()})
-            runs.append(run.with_facts(**_facts(twin, job.seed, checksum)))
+            config = configs[id(job.scene)]
+            runs.append(run.with_facts(**_facts(twin, job.seed, job.path, duration_s, config)))
         return runs
 
     conditions = Conditions(
@@ -361,16 +424,41 @@ def _known(
     return {"b_sd_nt": sd, "flag_out_of_distribution": outside_training}
 
 
-def _facts(twin: Twin, seed: int, map_sha256: str) -> dict[str, str | int | float | bool]:
-    """What a twin adds to the facts of a run."""
-    facts: dict[str, str | int | float | bool] = {
-        "magtwin": magtwin.__version__,
-        "numpy": np.__version__,
-        "seed": seed,
-        "map": twin.field.name,
-        "map_sha256": map_sha256,
-    }
-    return facts | dict(twin.magnetometer.facts) if twin.magnetometer else facts
+def _facts(
+    twin: Twin, seed: int, path: "Path | Commands | Run | str", duration_s: float | None, config_sha256: str
+) -> Facts:
+    """What a twin adds to the facts of a run, beside what its motion and sensors say of themselves."""
+    facts: Facts = {"magtwin": magtwin.__version__, "numpy": np.__version__, "seed": seed}
+    if duration_s is not None:
+        facts["asked_duration_s"] = float(duration_s)
+    return facts | _driven(path) | dict(twin.facts) | {"config_sha256": config_sha256}
+
+
+def _driven(path: "Path | Commands | Run | str") -> Facts:
+    """Where what was driven came from, and its checksum."""
+    if isinstance(path, str):
+        return {}
+    if isinstance(path, Run):
+        arrays: Iterable[NDArray[Any]] = (array for _, array in sorted(path.items()))
+        what, file = "replay", ""
+    elif isinstance(path, Path):
+        arrays, what, file = (path.p_xy, np.array([path.closed])), "path", path.file
+    else:
+        arrays, what, file = (path.rows,), "commands", path.file
+    facts: Facts = {f"{what}_file": file} if file else {}
+    checksum = hashlib.sha256()
+    for array in arrays:
+        checksum.update(np.ascontiguousarray(array).tobytes())
+    return {**facts, f"{what}_sha256": checksum.hexdigest()}
+
+
+def _config_sha256(scene: Scene) -> str:
+    """Checksum of every figure of a scene as it was run; files count with checksums of their own."""
+    robot = scene.robot
+    sensor = dataclasses.replace(robot.magnetometer, network=None, network_sha256="", inputs=())
+    robot = dataclasses.replace(robot, asset=FilePath(), magnetometer=sensor)
+    scene = dataclasses.replace(scene, map_layer=FilePath(), map_sha256="", robot=robot)
+    return hashlib.sha256(repr(scene).encode()).hexdigest()
 
 
 def scan(twin: Twin, run: Run, *, seed: int = 0) -> "Scans":

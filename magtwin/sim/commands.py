@@ -26,6 +26,9 @@ class Commands:
     rows: Array
     """Time since the start [s], forward speed [m/s], yaw rate [rad/s], shape (K, 3), in order of time."""
 
+    file: str = ""
+    """The file that they were read from, as that was named; "" where they came from none."""
+
     def beyond(self, drive: DriveSpec) -> str:
         """What of it a drive will not do, in a line; "" where it keeps the drive's limits."""
         parts = []
@@ -79,7 +82,7 @@ def read_commands(file: str | os.PathLike[str]) -> Commands:
         rows.append((t, v, w))
     if not rows:
         raise RefusedError(f"{file}: no commands in it; one t,v,w a line is wanted")
-    return Commands(file.name, np.array(rows))
+    return Commands(file.name, np.array(rows), file.as_posix())
 
 
 def write_commands(commands: Commands, file: str | os.PathLike[str], *, force: bool = False) -> None:

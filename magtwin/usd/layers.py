@@ -1,5 +1,6 @@
 """Layers: new ones with units and defaults said, old ones opened, files named relative to them."""
 
+import hashlib
 import os
 import re
 from collections.abc import Iterator
@@ -8,7 +9,7 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
-from magtwin.files import existing, output
+from magtwin.files import existing, output, sha256
 from magtwin.names import RefusedError
 
 WORLD = Sdf.Path("/World")
@@ -87,6 +88,40 @@ def layer_files(path: str | os.PathLike[str]) -> list[Path]:
     stage = open_stage(path)  # held in a name: its layers go with it
     layers = stage.GetLayerStack(includeSessionLayers=False)
     return [Path(layer.realPath) for layer in layers if layer.realPath]
+
+
+def stage_sha256(path: str | os.PathLike[str]) -> str:
+    """Checksum of a stage: of its root layer and of every file that it names, and those in turn.
+
+    A layer that names no file counts with its bytes. One that does counts with its text, in which the
+    checksum of each file stands in the place of its name. So the checksum is of what the files hold, not of
+    where they lie.
+
+    Raises:
+        RefusedError: No such file, or it or a layer that it names is not USD.
+    """
+    return _content_sha256(existing(path, "USD file").resolve(), ())
+
+
+def _content_sha256(file: Path, above: tuple[Path, ...]) -> str:
+    """Checksum of a file, layer or not, that the files `above` name."""
+    if file in above:
+        return "circle"  # which composition refuses; here it must only end
+    if file.suffix not in SUFFIXES:
+        return sha256(file)
+    try:
+        if not any(UsdUtils.ExtractExternalReferences(str(file))):
+            return sha256(file)
+        layer = Sdf.Layer.OpenAsAnonymous(str(file))
+    except Tf.ErrorException as error:
+        raise RefusedError(f"{file}: cannot be opened as USD: {_reason(error)}") from error
+
+    def checksum(asset: str) -> str:
+        named = file.parent / asset
+        return _content_sha256(named.resolve(), (*above, file)) if named.is_file() else asset
+
+    UsdUtils.ModifyAssetPaths(layer, checksum)
+    return hashlib.sha256(layer.ExportToString().encode()).hexdigest()
 
 
 def _reason(error: Tf.ErrorException) -> str:
