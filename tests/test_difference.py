@@ -172,18 +172,20 @@ def test_surveys_on_other_grids_meet_on_the_coarser_one_in_the_fewer_headings():
     [
         ({"origin_m": (100.0, 0.0)}, "maps 'a' and 'a' have no valid node in common"),
         ({"valid": np.zeros((4, 15, 25), bool)}, "no valid node in common"),
+        ({"frame": "map"}, "map 'a' has the frame 'world' and 'a' 'map', so that one x and y are two places"),
+        ({"datum": "the door"}, "has the datum 'the wall' and 'a' 'the door', .* with one --datum"),
         ({"height_m": 0.5}, r"'a' is of 0\.35 m above the floor and 'a' of 0\.5 m; .*magtwin map continue"),
     ],
 )
 def test_surveys_that_cannot_be_compared_are_refused(change, said):
-    before, after = pair(height_m=0.35)
+    before, after = pair(height_m=0.35, frame="world", datum="the wall")
     with pytest.raises(RefusedError, match=said):
         difference(before, replace(after, **change))
 
 
 def test_the_report_tells_where_when_and_what_is_doubtful_and_is_json():
     before, after = pair(created="2026-01-01", frame="world", height_m=0.35)
-    after = replace(with_a_magnet(after), created="2026-02-01", frame="map", height_m=None)
+    after = replace(with_a_magnet(after), created="2026-02-01", height_m=None)
     report = difference(before, after).report()
     assert report.title == "difference a to b"
     assert report.facts["from"] == "a 2026-01-01"
@@ -194,8 +196,8 @@ def test_the_report_tells_where_when_and_what_is_doubtful_and_is_json():
     assert "about (1.0" in told.note
     assert told.note.endswith(" nodes")
     assert report.facts["caution"] == [
-        "the frame is 'world' in one map and 'map' in the other",
-        "the height of one map is unknown",
+        "height unknown in one map, taken for one",
+        "datum unknown in both maps, taken for one",
     ]
     told = json.loads(report.to_json())["figures"]["surest local change"]
     assert "at (1, -0.5) m, heading" in told["note"]

@@ -113,6 +113,19 @@ def test_the_field_is_that_of_the_coefficients_summed_another_way(where, day):
     assert_allclose(earth_field_nt(*where, day), synthesis(*where, day), rtol=0, atol=0.05)
 
 
+def test_a_day_is_its_first_moment_utc():
+    import ppigrf
+
+    latitude, longitude, height = GAINESVILLE
+    first, noon = (
+        [float(v.item()) for v in ppigrf.igrf(longitude, latitude, height / 1000, datetime.datetime(*when))]
+        for when in ((2026, 11, 21), (2026, 11, 21, 12))
+    )
+    assert_allclose(earth_field_nt(*GAINESVILLE, "2026-11-21"), first, rtol=0, atol=1e-9)
+    assert abs(first[2] - noon[2]) > 0.1  # so that one can tell
+    assert earth_field_nt(*GAINESVILLE, datetime.datetime(2026, 11, 21, 12)) == tuple(first)
+
+
 def test_the_field_turns_with_the_worlds_north():
     east, north, up = earth_field_nt(*GAINESVILLE, "2026-11-21")
     assert_allclose(earth_field_nt(*GAINESVILLE, "2026-11-21", north_deg=90), (-north, east, up), atol=1e-9)
@@ -141,6 +154,7 @@ def test_the_models_first_and_last_days_are_within_it(day):
         ((*GAINESVILLE, "2030-01-02"), "date 2030-01-02 lies beyond the IGRF-14.* 1900-01-01 to 2030-01-01"),
         ((*GAINESVILLE, "1899-12-31"), "date 1899-12-31 lies beyond"),
         ((*GAINESVILLE, "21.11.2026"), "date must be a day YYYY-MM-DD, got '21.11.2026'"),
+        ((*GAINESVILLE, "20261121"), "date must be a day YYYY-MM-DD, got '20261121'"),
         ((90.0, 0.0, 0.0, "2026-11-21"), "latitude must lie between -90 and 90"),
         ((np.nan, 0.0, 0.0, "2026-11-21"), "latitude must lie between -90 and 90"),
         ((0.0, np.inf, 0.0, "2026-11-21"), "longitude be a number"),

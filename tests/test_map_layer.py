@@ -286,14 +286,23 @@ def test_an_epoch_that_was_tampered_with_is_refused_when_it_is_asked_for(tmp_pat
         load_map(tmp_path / "m.usdc", "2026-01-10")
 
 
-def test_days_that_do_not_ascend_with_time_are_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("day", "said"),
+    [
+        (
+            "2026-01-11",
+            "its epoch at time 9506 must be of the day that many days after 2000-01-01, got .*11;",
+        ),
+        ("soon", "created of AnomalyMap must be a day YYYY-MM-DD, got 'soon'"),
+        ("", "at time 9506, created of map 'survey 1' must be a day YYYY-MM-DD, got ''"),
+    ],
+)
+def test_an_epoch_whose_day_is_not_that_of_its_time_is_refused_with_its_prim(tmp_path, day, said):
     save_map_series(epochs(), tmp_path / "m.usdc")
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "m.usdc"))
-    layer.SetTimeSample(MAP.AppendProperty("magtwin:anomalyMap:created"), 9506.0, "2027-01-01")
+    layer.SetTimeSample(MAP.AppendProperty("magtwin:anomalyMap:created"), 9506.0, day)
     layer.Save()
-    with pytest.raises(
-        RefusedError, match="the days of its epochs must ascend with time, got 2025-12-31, 2027"
-    ):
+    with pytest.raises(RefusedError, match=f"m.usdc </World/AnomalyMap>: .*{said}"):
         load_epochs(tmp_path / "m.usdc")
 
 
@@ -466,6 +475,31 @@ def test_a_stage_without_a_map_is_refused(tmp_path):
             "cell_m of AnomalyMap must",
         ),
         ("magtwin:anomalyMap:unit", Sdf.ValueTypeNames.Token, "uT", "the map is in 'uT', magtwin reads nT"),
+        (
+            "magtwin:anomalyMap:created",
+            Sdf.ValueTypeNames.String,
+            "last May",
+            "created of AnomalyMap must be a day YYYY-MM-DD, got 'last May'",
+        ),
+        (
+            "magtwin:anomalyMap:checksum",
+            Sdf.ValueTypeNames.String,
+            "none",
+            "must be a SHA-256, 64 digits 0-9a-f, got 'none'",
+        ),
+        (
+            "magtwin:anomalyMap:headings",
+            Sdf.ValueTypeNames.DoubleArray,
+            [0.0, 180.0, 90.0, 270.0],
+            r"headings must ascend in \[0, 360\) deg, got \[0.0, 180.0",
+        ),
+        (
+            "magtwin:anomalyMap:headings",
+            Sdf.ValueTypeNames.DoubleArray,
+            [0.0, 90.0],
+            r"headings_rad of AnomalyMap must have shape \(4,\), got \(2,\)",
+        ),
+        ("magtwin:anomalyMap:headings", Sdf.ValueTypeNames.DoubleArray, [], "must ascend in .* got \\[\\]"),
         (VALUES, Sdf.ValueTypeNames.String, "many", r"values must be a float\[\]"),
         (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": 1', "parameters is not JSON"),
         (PARAMETERS, Sdf.ValueTypeNames.String, '{"a": NaN}', r"not JSON \(NaN is no JSON number\)"),

@@ -153,6 +153,8 @@ def test_files_joined_by_a_plus_stand_side_by_side(tmp_path):
     assert_allclose(readings.b_body_nt[1], [12_000, 21_000, -38_000])
     assert_array_equal(readings.t, [5, 6])
     assert readings.source.count("sha256:") == 3
+    whole = "+".join(str(tmp_path / name) for name in ("1-t.csv", "1-p.csv", "1-m.csv"))
+    assert same(read_readings(whole, columns=columns), readings)
     with pytest.raises(RefusedError, match=r"1-x\.csv: no such file of readings"):
         read_readings(f"{tmp_path / '1-t.csv'}+1-x.csv", columns=columns)
     file(tmp_path, "0,0\n", "1-q.csv")
@@ -359,3 +361,17 @@ def test_columns_are_refused_for_sources_whose_columns_are_known(tmp_path):
 def test_a_gridded_survey_is_not_one_of_several_sources(tmp_path, real_data):
     with pytest.raises(RefusedError, match="survey 'maps' is gridded and cannot be one of several sources"):
         read_readings(real_data / "aprilab/maps", file(tmp_path, ROWS))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"created": "last May"}, "created of Readings must be a day YYYY-MM-DD, got 'last May'"),
+        ({"created": 20260102}, "created of Readings must be a text, got 20260102"),
+        ({"licence": None}, "licence of Readings must be a text, got None"),
+    ],
+)
+def test_what_a_survey_says_of_itself_has_its_form(changes, said):
+    given = {"p_xy": [[0.0, 0.0]], "yaw": [0.0], "b_nt": [4e4]}
+    with pytest.raises(RefusedError, match=said):
+        Readings(**{**given, **changes})

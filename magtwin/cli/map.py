@@ -43,10 +43,9 @@ class About:
 
     def given(self, out: Path) -> dict[str, Any]:
         """What it says, by the names that readings have; refused where the day is none."""
-        from magtwin.field.epochs import parse_day
+        from magtwin.field.days import check_day
 
-        if self.created:
-            parse_day(self.created, "--created")
+        check_day(self.created, "--created")
         return {
             "name": self.name or out.stem,
             "licence": self.licence,

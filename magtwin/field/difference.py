@@ -193,7 +193,8 @@ def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
         Changes, bias, z and the regions of changed nodes, neighbours at sides and corners.
 
     Raises:
-        RefusedError: The maps have no node in common, or their sensors stood at different heights.
+        RefusedError: The maps have no node in common, or differ in frame, datum or height; where one is
+            unknown, the report says so.
     """
     cautions = _compared(a, b)
     grid = _common(a, b)
@@ -231,19 +232,28 @@ def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
 
 
 def _compared(a: AnomalyMap, b: AnomalyMap) -> tuple[str, ...]:
-    """What is doubtful about comparing two maps."""
+    """What is doubtful about comparing two maps; refused where nodes of one name are other places."""
+    for name in ("frame", "datum"):
+        first, second = getattr(a, name), getattr(b, name)
+        if first != second and first and second:
+            raise RefusedError(
+                f"map {a.name!r} has the {name} {first!r} and {b.name!r} {second!r}, so that one x and y are two "
+                "places; bring the readings of one into the other's before its map is made, or, where both "
+                f"mean the same, make both with one --{name}"
+            )
     if a.height_m is not None and b.height_m is not None and abs(a.height_m - b.height_m) > GRAIN_M:
         raise RefusedError(
             f"map {a.name!r} is of {a.height_m:g} m above the floor and {b.name!r} of {b.height_m:g} m; take "
             "one to the other's height first (magtwin map continue)"
         )
     cautions = []
-    for name in ("frame", "datum"):
-        first, second = getattr(a, name), getattr(b, name)
-        if first != second and first and second:
-            cautions.append(f"the {name} is {first!r} in one map and {second!r} in the other")
-    if (a.height_m is None) != (b.height_m is None):
-        cautions.append("the height of one map is unknown")
+    unknown = {
+        name: (getattr(a, attribute) in ("", None)) + (getattr(b, attribute) in ("", None))
+        for name, attribute in {"frame": "frame", "datum": "datum", "height": "height_m"}.items()
+    }
+    for count, which in ((1, "one map"), (2, "both maps")):
+        if names := [name for name, maps in unknown.items() if maps == count]:
+            cautions.append(f"{', '.join(names)} unknown in {which}, taken for one")
     return tuple(cautions)
 
 

@@ -4,6 +4,7 @@ import datetime
 
 import numpy as np
 
+from magtwin.field.days import parse_day
 from magtwin.frames import quat_from_yaw, rotate
 from magtwin.names import RefusedError
 
@@ -27,7 +28,8 @@ def earth_field_nt(
         latitude_deg: Geodetic latitude [deg], -90 to 90, the poles themselves left out.
         longitude_deg: Longitude [deg], east of Greenwich.
         height_m: Height above the WGS 84 ellipsoid [m].
-        date: The day, or its name YYYY-MM-DD.
+        date: The day, or its name YYYY-MM-DD. Its field is that of its first moment, 00:00 UTC, as tables
+            of the IGRF have it; within a day it changes by some tenths of a nT.
         north_deg: Where true north lies in world: angle from world +y about world +z, counter-clockwise
             seen from above [deg].
 
@@ -39,10 +41,7 @@ def earth_field_nt(
     """
     import ppigrf  # its pandas takes 0.3 s
 
-    try:
-        day = datetime.date.fromisoformat(date) if isinstance(date, str) else date
-    except ValueError as error:
-        raise RefusedError(f"date must be a day YYYY-MM-DD, got {date!r}") from error
+    day = parse_day(date)
     first, last = SPAN
     if not first <= day <= last:
         raise RefusedError(f"date {day} lies beyond {MODEL}, which holds from {first} to {last}")
@@ -55,7 +54,7 @@ def earth_field_nt(
         raise RefusedError(f"north_deg must be a number, got {north_deg!r}")
     if not -10e3 <= height_m <= 1000e3:
         raise RefusedError(f"height must lie in -10,000..1,000,000 m above the ellipsoid, got {height_m!r}")
-    noon = datetime.datetime.combine(day, datetime.time())
-    east, north, up = ppigrf.igrf(longitude_deg, latitude_deg, height_m / 1000, noon)
+    midnight = datetime.datetime.combine(day, datetime.time())
+    east, north, up = ppigrf.igrf(longitude_deg, latitude_deg, height_m / 1000, midnight)
     x, y, z = rotate(quat_from_yaw(np.radians(north_deg)), [float(east[0]), float(north[0]), float(up[0])])
     return float(x), float(y), float(z)

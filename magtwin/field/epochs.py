@@ -8,42 +8,16 @@ from typing import Any
 
 import numpy as np
 
+from magtwin.field.days import day_number, parse_day
 from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
-
-ORIGIN = datetime.date(2000, 1, 1)
-"""Day 0 of `day_number`."""
 
 COMMON = ("headings_rad", "origin_m", "cell_m", "frame", "datum", "height_m")
 """What the epochs of a map must have in common, beside the number of nodes."""
 
 GRAIN = 1e-9
 """Lengths [m] and angles [rad] closer than this are one."""
-
-
-def parse_day(day: str | datetime.date, what: str = "date") -> datetime.date:
-    """A day, from its name YYYY-MM-DD.
-
-    Raises:
-        RefusedError: It is none; the text begins with `what`.
-    """
-    if isinstance(day, datetime.datetime):
-        return day.date()
-    if isinstance(day, datetime.date):
-        return day
-    try:
-        parsed = datetime.date.fromisoformat(day)
-    except ValueError:
-        parsed = None
-    if parsed is None or parsed.isoformat() != day:  # 20260102 and 2026-W01-5 are ISO's too
-        raise RefusedError(f"{what} must be a day YYYY-MM-DD, got {day!r}")
-    return parsed
-
-
-def day_number(day: datetime.date) -> int:
-    """Days from 2000-01-01 to `day`, UTC; below 0 before it."""
-    return (day - ORIGIN).days
 
 
 def day_of(field: AnomalyMap) -> datetime.date:

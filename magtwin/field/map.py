@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.field.days import check_texts
 from magtwin.field.grid import Grid
 from magtwin.field.harmonic import HarmonicField
 from magtwin.field.lookup import EDGE, Lookup
@@ -17,6 +18,9 @@ from magtwin.report import Figure, Report
 Array = NDArray[np.float64]
 
 TURN = 2 * np.pi
+TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")
+"""What a map says of itself in words."""
+
 Outside = Literal["nan", "clamp", "raise"]
 
 
@@ -107,6 +111,9 @@ class AnomalyMap:
         self._check_values()
 
     def _check_values(self) -> None:
+        check_texts(self, TEXTS)
+        if not isinstance(self.parameters, Mapping):
+            raise RefusedError(f"parameters of AnomalyMap must be figures by name, got {self.parameters!r}")
         if self.height_m is not None and not 0 <= self.height_m < np.inf:
             raise RefusedError(
                 f"height_m of AnomalyMap is a height above the floor, 0 m or more, got {self.height_m!r}"

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.field.days import check_texts
 from magtwin.field.grid import Grid
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
@@ -112,6 +113,7 @@ class Readings:
             raise RefusedError(
                 f"run of Readings must index runs ({len(self.runs)}), got {self.run.min()}..{self.run.max()}"
             )
+        check_texts(self, TEXTS)
         if (self.grid is None) != (self.node is None):
             raise RefusedError("Readings of a gridded survey need both grid and node, got one of them")
         if self.grid is None or self.node is None:
@@ -156,6 +158,9 @@ class Readings:
         """The same readings with other values of some fields, such as `good`."""
         return Readings(**{**{f.name: getattr(self, f.name) for f in fields(self)}, **changes})
 
+
+TEXTS = ("name", "source", "licence", "created", "frame", "datum")
+"""What readings say of themselves in words."""
 
 SHAPES: dict[str, tuple[int, type]] = {
     "p_xy": (2, float),

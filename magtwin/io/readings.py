@@ -223,7 +223,7 @@ def load_readings(path: Source) -> Readings:
 def _first(source: Source) -> Path:
     """The path of a source, or of the first of its joined files."""
     path = Path(source)
-    if path.exists() or "+" not in path.name:
+    if path.exists() or "+" not in str(source):
         return existing(path, "source of readings")
     return existing(Path(str(source).split("+")[0]), "source of readings")
 
@@ -247,11 +247,17 @@ def _of_file(source: str, path: Path, columns: Columns) -> Readings:
             return readings_of_run(read_parquet(path), name=path.stem, source=_sum(path))
     paths = [path]
     if path != Path(source):
-        paths += [path.parent / word for word in source.split("+")[1:]]
+        paths += [_beside(path, word) for word in source.split("+")[1:]]
     sheet = _sheet(paths[0])
     for other in paths[1:]:
         sheet = sheet.beside(_sheet(other))
     return _of_sheet(sheet, paths, columns)
+
+
+def _beside(first: Path, word: str) -> Path:
+    """A joined file: beside the first one, or at a path of its own."""
+    beside = first.parent / word
+    return existing(beside if beside.exists() or not Path(word).exists() else Path(word), "file of readings")
 
 
 def _sheet(path: Path) -> Sheet:

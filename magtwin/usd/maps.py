@@ -2,10 +2,10 @@
 
 import datetime
 import hashlib
-import itertools
 import json
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from magtwin.field.colours import COLOUR_MAP, colour_limits
-from magtwin.field.epochs import at_date, day_number, day_of, in_order
+from magtwin.field.days import ORIGIN, day_number
+from magtwin.field.epochs import at_date, day_of, in_order
 from magtwin.field.harmonic import SHAPES as HARMONIC
 from magtwin.field.harmonic import HarmonicField
 from magtwin.field.map import AnomalyMap
@@ -37,6 +38,9 @@ UNKNOWN_COLOUR = (0.2, 0.2, 0.2)
 
 MOST_QUADS = 60_000
 """Quads of the coloured floor; of a finer map it shows every second node, or third, ..."""
+
+SAID = 60
+"""Characters of an attribute that a refusal quotes."""
 
 UNIT = "nT"
 TEXTS = ("name", "method", "source", "licence", "created")
@@ -110,11 +114,16 @@ def load_epochs(path: str | os.PathLike[str]) -> tuple[AnomalyMap, ...]:
     epochs = tuple(_read(prim, sample) for sample in _samples(prim))
     if not epochs:
         return (read_map(prim),)
-    days = [day_of(m) for m in epochs]
-    if any(late <= early for early, late in itertools.pairwise(days)):
-        raise RefusedError(
-            f"{place(prim)}: the days of its epochs must ascend with time, got {', '.join(map(str, days))}"
-        )
+    for sample, epoch in zip(_samples(prim), epochs, strict=True):
+        try:
+            day = day_of(epoch)
+        except RefusedError as error:
+            raise RefusedError(f"{place(prim)}: at time {sample.time:g}, {error}") from error
+        if sample.time != day_number(day):
+            raise RefusedError(
+                f"{place(prim)}: its epoch at time {sample.time:g} must be of the day that many days after "
+                f"{ORIGIN}, got {attribute_name('anomalyMap', 'created')} {day}; make the map anew"
+            )
     return epochs
 
 
@@ -150,6 +159,11 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
     if (unit := _get(prim, "unit")) != UNIT:
         raise RefusedError(f"{place(prim)}: the map is in {unit!r}, magtwin reads {UNIT}; make the map anew")
     checksum = _get(prim, "checksum", sample)
+    if not re.fullmatch("[0-9a-f]{64}", checksum):
+        raise RefusedError(
+            f"{place(prim)}: {attribute_name('anomalyMap', 'checksum')} must be a SHA-256, 64 digits 0-9a-f, "
+            f"got {checksum[:SAID]!r}; make the map anew"
+        )
     values, valid, variance = (np.array(_get(prim, name, sample)) for name in ("values", "valid", "variance"))
     harmonic = _read_harmonic(prim, sample)
     if checksum != _checksum(values, valid, variance, harmonic):
@@ -163,6 +177,12 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
         )
     if variance.size not in (0, values.size):
         raise RefusedError(f"{place(prim)}: {values.size} values have {variance.size} variances")
+    headings = np.array(_get(prim, "headings"), float)
+    if not (headings.size and np.all(np.diff(headings) > 0) and headings[0] >= 0 and headings[-1] < 360):
+        raise RefusedError(
+            f"{place(prim)}: {attribute_name('anomalyMap', 'headings')} must ascend in [0, 360) deg, got "
+            f"{str(headings.tolist())[:SAID]}; make the map anew"
+        )
     try:
         return AnomalyMap(
             values_nt=values.reshape(shape).astype(float),
@@ -170,7 +190,7 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
             variance_nt2=variance.reshape(shape).astype(float) if variance.size else None,
             origin_m=tuple(_get(prim, "origin")),
             cell_m=tuple(_get(prim, "cellSize")),
-            headings_rad=np.deg2rad(np.array(_get(prim, "headings"), float)),
+            headings_rad=np.deg2rad(headings),
             height_m=_read_height(prim),
             parameters=_read_parameters(prim, _get(prim, "parameters", sample)),
             harmonic=None if harmonic is None else HarmonicField(**harmonic),
@@ -202,9 +222,9 @@ def _read_parameters(prim: Usd.Prim, text: str) -> dict[str, Any]:
         figures = json.loads(text, parse_constant=_no_number)
         json.dumps(figures, allow_nan=False)  # 1e999 is a number to JSON, and infinite
     except (ValueError, RecursionError) as error:
-        raise RefusedError(f"{name} is not JSON ({error}), got {text[:60]!r}; make the map anew") from error
+        raise RefusedError(f"{name} is not JSON ({error}), got {text[:SAID]!r}; make the map anew") from error
     if not isinstance(figures, dict):
-        raise RefusedError(f"{name} must be a JSON object, got {text[:60]!r}; make the map anew")
+        raise RefusedError(f"{name} must be a JSON object, got {text[:SAID]!r}; make the map anew")
     return figures
 
 

@@ -1,0 +1,57 @@
+"""Days: the dates of surveys, of epochs and of the Earth's field."""
+
+import datetime
+from collections.abc import Sequence
+
+from magtwin.names import RefusedError
+
+ORIGIN = datetime.date(2000, 1, 1)
+"""Day 0 of `day_number`."""
+
+
+def parse_day(day: str | datetime.date, what: str = "date") -> datetime.date:
+    """A day, from its name YYYY-MM-DD.
+
+    Raises:
+        RefusedError: It is none; the text begins with `what`.
+    """
+    if isinstance(day, datetime.datetime):
+        return day.date()
+    if isinstance(day, datetime.date):
+        return day
+    try:
+        parsed = datetime.date.fromisoformat(day)
+    except (TypeError, ValueError):
+        parsed = None
+    if parsed is None or parsed.isoformat() != day:  # 20260102 and 2026-W01-5 are ISO's too
+        raise RefusedError(f"{what} must be a day YYYY-MM-DD, got {day!r}")
+    return parsed
+
+
+def check_day(day: str, what: str) -> None:
+    """Refuse the text of a day that is neither YYYY-MM-DD nor empty.
+
+    Raises:
+        RefusedError: It is none; the text begins with `what`.
+    """
+    if day != "":
+        parse_day(day, what)
+
+
+def check_texts(survey: object, names: Sequence[str]) -> None:
+    """Refuse what a survey or a map says of itself where it is no text, or its day none.
+
+    Raises:
+        RefusedError: An attribute of `survey`, one of `names`, is no text, or `created` is no day.
+    """
+    kind = type(survey).__name__
+    for name in names:
+        text = getattr(survey, name)
+        if not isinstance(text, str):
+            raise RefusedError(f"{name} of {kind} must be a text, got {text!r}")
+    check_day(getattr(survey, "created", ""), f"created of {kind}")
+
+
+def day_number(day: datetime.date) -> int:
+    """Days from 2000-01-01 to `day`, UTC; below 0 before it."""
+    return (day - ORIGIN).days
