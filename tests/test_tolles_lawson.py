@@ -93,7 +93,7 @@ def figure_of_merit_flight(rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_figure_of_merit_flight_is_compensated_as_by_deinterfs_own_example():
-    """Its example, on a flight of our own, as its data must be fetched: container, 16 and 18 terms, band-pass of
+    """Its example, on a flight of our own, as its data are to be fetched: container, terms, a band-pass of
     0.1 to 0.6 Hz at 10 Hz, fit and transform. Its penalty is of other units than ours, so both go without.
     """
     pytest.importorskip("deinterf")

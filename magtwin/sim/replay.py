@@ -1,4 +1,11 @@
-"""Replay: a recorded Run driven once more, so that sensors set anew read what they would have read on it."""
+"""Replay: a recorded Run driven once more, so that sensors set anew read what they would have read on it.
+
+What follows from how speeds change, the motors' torque above all, is only as good as what is known of them
+between rows. Rows of the kinematic engine, with one or more in each control step and no first ones cut off,
+tell its steps, and the drive is itself again. Of others speeds go evenly from row to row.
+"""
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -6,6 +13,7 @@ from magtwin.frames import yaw_from_quat
 from magtwin.names import RefusedError
 from magtwin.run import Run
 from magtwin.sim.drive import wheel_rates
+from magtwin.sim.follow import CONTROL_RATE_HZ
 from magtwin.sim.sampled import SampledMotion
 from magtwin.spec import DriveSpec
 
@@ -43,6 +51,7 @@ def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
                 f"row {rows[0] + 1} of {run.rows} of the run to replay: {what} (t = {t[rows[0]]:g} s); leave "
                 "such rows out"
             )
+    from_start = t[0] == 0
     t = t - t[0]
     pose[:, 2] = np.unwrap(pose[:, 2])
     if "v_base" in run and "w_base" in run:
@@ -58,7 +67,7 @@ def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
         turned = np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(t)[:, None], axis=0)
         wheels = np.vstack([[0.0, 0.0], turned])
     unknown = np.full(len(t), np.nan)
-    return SampledMotion(
+    motion = SampledMotion(
         t=t,
         pose=pose,
         v=v,
@@ -69,3 +78,5 @@ def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
         bump=run["flag_bump"] if "flag_bump" in run else np.zeros(len(t), bool),
         duration_s=float(t[-1] * len(t) / (len(t) - 1)),
     )
+    step_s = 1 / CONTROL_RATE_HZ
+    return replace(motion, step_s=step_s) if from_start and motion.has_steps(step_s) else motion

@@ -6,9 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.names import RefusedError
-from magtwin.sim.drive import Moment
+from magtwin.sim.drive import Moment, advance
 
 Array = NDArray[np.float64]
+
+SAME = 1e-9
+"""Rounding that poses of a drive are forgiven [m, rad]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -17,7 +20,9 @@ class SampledMotion:
 
     At a sample it gives what was sampled, to the last bit; before the first and after the last the robot
     stands. Where the twist is constant between samples h apart, a cubic is v w^3 h^4 / 384 off the arc:
-    nothing to speak of at 135 Hz, 0.3 mm at 2 Hz and the drive's limits.
+    nothing to speak of at 135 Hz, 0.3 mm at 2 Hz and the drive's limits. Of a drive whose speeds were held
+    for control steps, each with a sample, it is that drive itself: speeds jump where the steps did, and
+    positions go on along arcs.
     """
 
     t: Array
@@ -47,6 +52,10 @@ class SampledMotion:
     duration_s: float
     """Time from the start to the end [s], at least that of the last sample."""
 
+    step_s: float | None = None
+    """Length of the control steps, the first from 0 on, in which speeds are held [s]; None where they go
+    evenly from sample to sample."""
+
     def __post_init__(self) -> None:
         count = len(self.t)
         shapes = {"pose": (count, 3), "wheel_angle": (count, 2)}
@@ -58,6 +67,10 @@ class SampledMotion:
                     f"got {array.shape}"
                 )
             object.__setattr__(self, name, array)
+        if self.step_s is not None and not self.has_steps(self.step_s):
+            raise RefusedError(
+                f"a motion has no sample, or speeds that change, in a step of {self.step_s:g} s"
+            )
         if count < 2 or self.t[0] != 0 or not np.all(np.diff(self.t) > 0):
             raise RefusedError("a motion needs two samples or more, the first at 0 s, in order of time")
         for name in ("t", "pose", "v", "w", "wheel_angle"):
@@ -71,6 +84,8 @@ class SampledMotion:
             t: Times since the start, from 0 [s], shape (N,).
         """
         t = np.asarray(t, float)
+        if self.step_s is not None:
+            return self._held(t, self.step_s)
         k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
         h = self.t[k + 1] - self.t[k]
         u = np.clip((t - self.t[k]) / h, 0.0, 1.0)
@@ -94,7 +109,55 @@ class SampledMotion:
             bump=self.bump[held],
         )
 
+    def has_steps(self, step_s: float) -> bool:
+        """Whether this is a drive whose speeds were held for steps from 0 on, with a sample in each.
+
+        Args:
+            step_s: Length of the steps [s].
+        """
+        step = _steps(self.t, step_s)
+        same = np.diff(step) == 0
+        if np.any(np.diff(step) > 1) or not np.any(same):
+            return False
+        held = all(np.all((np.diff(x) == 0)[same]) for x in (self.v, self.w))
+        along = advance(self.pose[:-1], self.v[:-1], self.w[:-1], np.diff(self.t)) - self.pose[1:]
+        return held and bool(np.all(np.abs(along[same]) < SAME))
+
+    def _held(self, t: Array, step_s: float) -> Moment:
+        """`at` of speeds that are held: each time takes the sample of its step that is next to it."""
+        step, of = _steps(t, step_s), _steps(self.t, step_s)
+        k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 1)
+        after = np.minimum(k + 1, len(self.t) - 1)
+        own = np.where(step > of[k], after, k)
+        moving = t <= self.t[-1]
+        first = np.flatnonzero(np.diff(of, prepend=-1))
+        a = np.diff(self.v[first], prepend=0.0) / step_s
+        # A wheel's rate is that between two samples of a step, or of a step with one, of both its sides.
+        rates = np.diff(self.wheel_angle, axis=0) / np.diff(self.t)[:, None]
+        before, behind = np.vstack([rates[:1], rates]), np.vstack([rates, rates[-1:]])
+        inside = np.diff(of) == 0
+        with_last, with_next = np.append(False, inside)[:, None], np.append(inside, False)[:, None]
+        rate = np.where(with_next, behind, np.where(with_last, before, (before + behind) / 2))
+        into = np.where(moving, t - self.t[own], 0.0)
+        v, w = self.v[own], self.w[own]
+        return Moment(
+            pose=advance(self.pose[own], v, w, into),
+            v=v * moving,
+            w=w * moving,
+            a=a[np.clip(step, 0, len(a) - 1)] * moving,
+            wheel_angle=self.wheel_angle[own] + rate[own] * into[:, None],
+            v_cmd=self.v_cmd[own] * moving,
+            w_cmd=self.w_cmd[own] * moving,
+            bump=self.bump[own],
+        )
+
     @property
     def acceleration(self) -> Array:
         """Forward acceleration at the samples, by central differences of the speed [m/s2], shape (K,)."""
         return np.gradient(self.v, self.t)
+
+
+def _steps(t: Array, step_s: float) -> NDArray[np.intp]:
+    """Which control step times fall into, as `magtwin.sim.drive.Motion.at` has it, shape (N,)."""
+    starts = np.arange(int(np.max(t, initial=0.0) / step_s) + 2) * step_s
+    return np.searchsorted(starts, t, side="right") - 1
