@@ -113,7 +113,7 @@ def twin_of(
             raise RefusedError("the run does not say which scene it came from; name one")
         scene = locate(str(facts["scene_file"]), near)
         if scene is None:
-            raise RefusedError(f"{facts['scene_file']}: the scene of the run is not there; say where it is")
+            raise RefusedError(f"{facts['scene_file']}: the scene of the run is not there; name it (--scene)")
     kind: Any = facts.get("magnetometer")
     network = str(facts["network_file"]) if "network_file" in facts else None
     twin = open_twin(
@@ -135,7 +135,9 @@ _CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_s
 
 def locate(file: str, near: str | FilePath | None = None) -> FilePath | None:
     """A file that facts name, as seen from here or from the folder of `near`; None where neither has it."""
-    places = [FilePath(file), *([] if near is None else [FilePath(near).parent / file])]
+    places = [FilePath(file)]
+    if near is not None:  # a run may be a folder of its own
+        places += [FilePath(near) / file, FilePath(near).parent / file]
     return next((place for place in places if place.exists()), None)
 
 

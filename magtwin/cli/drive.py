@@ -100,6 +100,7 @@ def drive(
             "commands.csv",
             folder,
             commands=folder / "commands.csv",
+            facts={"commands_file": "commands.csv"},
             steps=announcer(quiet=json),
             net=net,
             seed=seed,

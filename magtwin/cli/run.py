@@ -1,9 +1,11 @@
 """`magtwin run` and `magtwin demo`: drive a scene's robot and write what happened."""
 
 import sys
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 from magtwin.cli.app import app
@@ -44,7 +46,14 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
         scene = replace(scene, robot=replace(scene.robot, asset=asset))
         scene_file = author_scene(scene, folder / "scene")
         report = write_run(
-            scene_file, "figure8", folder, steps=steps, seed=seed, speed=0.2, title=f"Demo in {out}"
+            scene_file,
+            "figure8",
+            folder,
+            facts={"scene_file": scene_file.relative_to(folder).as_posix()},
+            steps=steps,
+            seed=seed,
+            speed=0.2,
+            title=f"Demo in {out}",
         )
         steps("Taking pictures")
         _picture(scene_file, folder / "lab.png")
@@ -202,9 +211,13 @@ def write_run(
     replay: Path | None = None,
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    facts: Mapping[str, str] = MappingProxyType({}),
     **options: Any,
 ) -> Any:
-    """Run a scene and write the outputs asked for; returns the run's report."""
+    """Run a scene and write the outputs asked for; returns the run's report.
+
+    `facts` say where files will lie as seen from the run's own, for those that move with it.
+    """
     from magtwin.io.rerun import write_rrd
     from magtwin.io.tables import read_parquet, write_parquet
     from magtwin.path import resolve_path
@@ -223,7 +236,9 @@ def write_run(
     if commands is not None and what.beyond(twin.scene.robot.drive):
         print(f"  {what.beyond(twin.scene.robot.drive)}", file=sys.stderr)  # noqa: T201
     steps(f"Driving {planned.name if planned else path}")
-    result = simulate(twin, what, **options)
+    if replay is not None:
+        facts = {"replay_file": replay.as_posix(), **facts}
+    result = simulate(twin, what, **options).with_facts(**facts)
     seen = None
     if scans:
         from magtwin.io.scans import write_scans

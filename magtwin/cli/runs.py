@@ -82,7 +82,7 @@ def runs(
     from magtwin.names import RefusedError
     from magtwin.path import resolve_path
     from magtwin.report import Figure, Report
-    from magtwin.sim.session import draw_session, draw_speed
+    from magtwin.sim.session import draw_speed, session_of
     from magtwin.twin import open_twin, simulate_many
 
     existing(scene, "scene")
@@ -96,12 +96,12 @@ def runs(
         paths = [resolve_path(name) for name in path or ["figure8"]]
         robot = twin.scene.robot
         days = [robot]
-        draws = np.random.default_rng((seed, 1)).spawn(2)  # none that a run draws from
         if sessions:
-            days = [draw_session(robot, rng) for rng in draws[0].spawn(min(sessions, count))]
+            days = [session_of(robot, seed, day) for day in range(min(sessions, count))]
         speeds = [0.2 if speed is None else speed] * count
         if sessions and speed is None:
-            speeds = [draw_speed(robot.drive, rng) for rng in draws[1].spawn(count)]
+            draws = np.random.default_rng((seed, 1)).spawn(2)[1]  # which no run draws from
+            speeds = [draw_speed(robot.drive, rng) for rng in draws.spawn(count)]
         made = simulate_many(
             twin,
             [paths[k % len(paths)] for k in range(count)],
@@ -125,7 +125,8 @@ def runs(
             for k, run in enumerate(made):
                 file = f"run_{k:05d}.parquet"
                 day: int | str = k % len(days) if sessions else ""
-                write_parquet(run.with_facts(session=day) if sessions else run, folder / file)
+                dealt = run.with_facts(session=k % len(days), session_seed=seed) if sessions else run
+                write_parquet(dealt, folder / file)
                 facts = run.facts
                 table.writerow((file, facts["path"], facts["seed"], day, facts["speed_m_s"], run.rows))
                 readings, seconds = readings + run.rows, seconds + float(facts["duration_s"])

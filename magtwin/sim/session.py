@@ -77,6 +77,19 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
     )
 
 
+def session_of(robot: RobotSpec, seed: int, day: int) -> RobotSpec:
+    """The robot as it is on one of the days of a data set, which its seed and the day's number decide.
+
+    Args:
+        robot: The robot as its asset has it.
+        seed: Seed of the data set.
+        day: Number of the day, from 0.
+    """
+    return draw_session(
+        robot, np.random.default_rng(np.random.SeedSequence((seed, 1), spawn_key=(0, day)))
+    )  # a child that no run draws from
+
+
 def draw_speed(drive: DriveSpec, rng: np.random.Generator) -> float:
     """A wanted speed for a run [m/s], as the real robot's runs had, within the drive's."""
     slowest, fastest = (min(speed, drive.v_max) for speed in SPEEDS)

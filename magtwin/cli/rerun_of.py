@@ -1,0 +1,61 @@
+"""`magtwin rerun-of`: a run made once more, and whether it is the same."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, Json, announcer, print_report, say
+
+
+@app.command
+def rerun_of(
+    file: Path,
+    *,
+    scene: Path | None = None,
+    out: Path | None = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Make a run once more from what it says of itself, and say whether it is equal, to the bit.
+
+    What changed since (scene, map, network, versions) is named first, then every column that differs and by
+    how much. Exit status 0 where all columns are equal, 1 where not.
+
+    Parameters
+    ----------
+    file
+        A run, in any format that magtwin writes.
+    scene
+        Where its scene lies now; looked for where the run says, from here and from the run's folder, unless
+        given.
+    out
+        Run to write what came out to, in the format of its name.
+    force
+        Replace what exists.
+    json
+        Print the verdict as JSON.
+    """
+    from magtwin.files import check_free
+    from magtwin.io.formats import read_run, write_run
+    from magtwin.io.provenance import repeat
+
+    if out is not None:
+        check_free(out, force=force)
+    steps = announcer(quiet=json)
+    steps("Reading the run")
+    run = read_run(file)
+    steps("Making it once more")
+    found = repeat(run, scene, near=file)
+    if out is not None:
+        write_run(found.again, out, force=force)
+    report = found.report(f"{file}, made once more")
+    if not json:
+        for cause in found.causes:
+            say(cause)
+        report = replace(report, facts={})
+    print_report(report, json)
+    if out is not None and not json:
+        say(f"Wrote {out}")
+    if not found.equal:
+        sys.exit(1)

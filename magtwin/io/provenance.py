@@ -1,0 +1,193 @@
+"""Provenance: a run made once more from what its facts say, and whether it is the same."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.names import RefusedError
+from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
+from magtwin.report import Figure, Report
+from magtwin.run import COLUMNS, Run
+from magtwin.twin import Twin, locate, simulate, twin_of
+
+CAUSES: Mapping[str, str] = {
+    "magtwin": "another version of magtwin",
+    "numpy": "another version of NumPy",
+    "scene_sha256": "the scene changed",
+    "config_sha256": "the settings of the scene or its robot changed",
+    "map_sha256": "the map changed",
+    "network_sha256": "the network changed",
+    "path_sha256": "the path changed",
+    "commands_sha256": "the commands changed",
+    "replay_sha256": "the run that was driven once more changed",
+}
+"""Facts that decide a run's columns, and what it means where they differ, likeliest cause first."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How a column differs between a run and its repetition."""
+
+    column: str
+    rows: int
+    """Rows that differ."""
+    first: int
+    """The first of them."""
+    greatest: float
+    """Greatest absolute difference, in the column's unit; nan where one is known and the other is not."""
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """A run made once more."""
+
+    original: Run
+    again: Run
+    causes: tuple[str, ...]
+    """Facts that differ and decide the columns, each with what was and what is."""
+    differences: tuple[Difference, ...]
+    """Columns of the original that are not the same to the bit."""
+
+    @property
+    def equal(self) -> bool:
+        """Whether every column of the original came out again, to the bit."""
+        return not self.differences
+
+    def report(self, title: str) -> Report:
+        """Columns that differ, and the verdict; the facts say what changed since."""
+        figures = []
+        for d in self.differences:
+            note = f"{d.rows} of {self.original.rows} rows, from row {d.first + 1} on"
+            unit = COLUMNS[d.column].unit if d.column in COLUMNS else ""
+            figures.append(Figure(d.column, d.greatest, unit if unit != "bool" else "", None, note))
+        count = len(self.original) - len(self.differences)
+        figures.append(Figure("equal columns", count, f"of {len(self.original)}"))
+        figures.append(Figure("equal", "yes, to the bit" if self.equal else "no"))
+        return Report(title, tuple(figures), {"changed": list(self.causes)} if self.causes else {})
+
+
+def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None) -> Repeat:
+    """Make a run once more, from what its facts say, and compare.
+
+    Args:
+        run: A run that `simulate`, `simulate_many` or a command made.
+        scene: Where its scene lies now; None looks where the facts say.
+        near: The run's own file: files that its facts name are looked for in its folder too.
+
+    Raises:
+        RefusedError: The facts do not say enough, a file is not there, or the run is of something that was
+            made in Python and is no longer at hand.
+    """
+    facts = run.facts
+    if "seed" not in facts:
+        raise RefusedError(
+            "the run does not say its seed, so it cannot be repeated; was it recorded elsewhere?"
+        )
+    twin = twin_of(run, scene, near=near, check=False)
+    twin = _on_its_day(twin, facts)
+    what = _driven(run, near)
+    try:
+        seed, rate = int(facts["seed"]), float(facts["rate_hz"])
+        asked = float(facts["asked_duration_s"]) if "asked_duration_s" in facts else None
+        speed = float(facts.get("speed_m_s", 0.2))
+    except (KeyError, ValueError) as error:
+        raise RefusedError(f"the facts of the run do not say how it was made: {error}") from error
+    engine: Any = facts.get("engine", "kinematic")
+    options: dict[str, Any] = {
+        "lidar": facts.get("lidar", "schedule"),
+        "outside": facts.get("outside", "nan"),
+    }
+    if isinstance(what, Path):
+        options["controller"] = facts.get("controller", "follower")
+    if engine not in ("kinematic", "newton", "replay"):
+        raise RefusedError(
+            f"the run was moved by an engine of its maker's own, {engine!r}, which is not here"
+        )
+    again = simulate(
+        twin,
+        what,
+        seed=seed,
+        speed=speed,
+        duration_s=asked,
+        rate_hz=rate,
+        engine="kinematic" if engine == "replay" else engine,
+        **options,
+    )
+    causes = [
+        f"{why}: {fact} was {run.facts.get(fact, 'none')}, is {again.facts.get(fact, 'none')}"
+        for fact, why in CAUSES.items()
+        if run.facts.get(fact) != again.facts.get(fact)
+    ]
+    return Repeat(run, again, tuple(causes), differences(run, again))
+
+
+def differences(run: Run, again: Run) -> tuple[Difference, ...]:
+    """The columns of a run that another does not have to the bit; nan is nan."""
+    found = []
+    for name, a in run.items():
+        b = again.columns.get(name)
+        if b is None:
+            found.append(Difference(name, run.rows, 0, np.nan))
+            continue
+        rows = min(len(a), len(b))
+        same = _same(a[:rows], b[:rows])
+        count = int(np.count_nonzero(~same)) + max(len(a), len(b)) - rows
+        if not count:
+            continue
+        first = int(np.argmin(same)) if not same.all() else rows
+        apart = np.abs(a[:rows].astype(float) - b[:rows].astype(float))
+        known = apart[np.isfinite(apart)]
+        found.append(Difference(name, count, first, float(known.max()) if known.any() else np.nan))
+    return tuple(found)
+
+
+def _same(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
+    """Rows that are the same, shape (N,)."""
+    same = (a == b) | ((a != a) & (b != b))
+    return same if same.ndim == 1 else same.all(axis=1)
+
+
+def _driven(run: Run, near: str | FilePath | None) -> Any:
+    """What was driven: a path, commands, a run, or "random" where a driver went where they liked."""
+    from magtwin.sim.commands import read_commands
+
+    facts = run.facts
+    for kind, read in (("path", read_path_csv), ("commands", read_commands), ("replay", _read_run)):
+        if f"{kind}_file" in facts:
+            file = str(facts[f"{kind}_file"])
+            place = locate(file, near)
+            if place is None:
+                raise RefusedError(f"{file}: the file that the run drove is not there; put it back")
+            return read(place)
+    name = str(facts.get("path", ""))
+    if "replay_sha256" in facts or "commands_sha256" in facts:
+        raise RefusedError(
+            f"the run drove {name!r}, which came from no file; it cannot be repeated from its facts"
+        )
+    if name == "random":
+        return name
+    if name not in PATHS and name not in CASES:
+        raise RefusedError(f"the run drove the path {name!r}, which came from no file; it cannot be repeated")
+    return path_named(name)
+
+
+def _read_run(file: FilePath) -> Run:
+    from magtwin.io.formats import read_run
+
+    return read_run(file)
+
+
+def _on_its_day(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> Twin:
+    """The twin with its robot as it was on the run's day, where `magtwin runs` dealt it to one."""
+    from dataclasses import replace
+
+    from magtwin.sim.session import session_of
+
+    if "session_seed" not in facts:
+        return twin
+    robot = session_of(twin.scene.robot, int(facts["session_seed"]), int(facts["session"]))
+    return replace(twin, scene=replace(twin.scene, robot=robot))
