@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import errno
 import hashlib
 import os
 import re
@@ -18,6 +19,9 @@ from typing import Any, TypeVar
 from magtwin.names import RefusedError, hint
 
 T = TypeVar("T")
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+"""What an operating system says of a disk that takes no more."""
 
 _COMMIT = re.compile("[0-9a-f]{40}|[0-9a-f]{64}")
 
@@ -74,7 +78,7 @@ def output(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Pat
         force: Whether one that exists is replaced.
 
     Raises:
-        RefusedError: It exists and `force` was not given, or its folder cannot be written.
+        RefusedError: It exists and `force` was not given, its folder cannot be written, or the disk is full.
     """
     path = check_free(path, force=force)
     place = Path.cwd() / path  # the working folder may itself be renamed
@@ -102,6 +106,10 @@ def output(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Pat
                 raise
         else:
             new.replace(place)
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        raise RefusedError(f"{path}: cannot be written ({os.strerror(error.errno)})") from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)
 
