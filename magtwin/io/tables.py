@@ -1,168 +1,89 @@
-"""Tables: a Run as a Parquet file, a pandas DataFrame, an xarray Dataset.
+"""Tables: a Run as Parquet, CSV or npz, whole files or, while it goes on, Parquet part after part.
 
-A vector column of a Run becomes one table column a part (`p_world_base_x`, `p_world_base_y`, ...), not
-a column of lists: pandas then holds plain float64 (lists would be Python objects), SQL in DuckDB and
-expressions in polars need no indexing, one part can be read alone, and byte-stream-split coding works.
-What a flat table cannot say stands in the metadata: on every Arrow field `column`, `part`, `unit`,
-`frame` and `doc`; on the file `magtwin_facts`, the Run's facts in JSON, which any Parquet reader shows.
+All three give a Run back to the last bit. Parquet is the one to keep: small, typed, every column with its
+unit and frame. CSV is for spreadsheets and eyes: what it says of the run stands in lines that begin with #.
+npz is for numpy alone: the columns of the Run as they are.
 """
 
-import importlib
+import io
 import json
 import os
+import shutil
+import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import TracebackType
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from magtwin.files import existing, output
+from magtwin.files import check_free, existing, output
+from magtwin.io.arrow import (
+    FACTS,
+    check_clock,
+    facts_from_json,
+    facts_to_json,
+    run_of,
+    said_of,
+    spec_said,
+    table_of,
+)
 from magtwin.names import RefusedError
-from magtwin.run import COLUMNS, Column, Run
+from magtwin.run import COLUMNS, Run
 
-if TYPE_CHECKING:
-    import pandas as pd
-    import xarray as xr
-
-_FACTS = b"magtwin_facts"
 _MAGIC = b"PAR1"
+_ABOUT = "magtwin"
+"""Name of the member of an npz that tells of the run, and first word of a CSV's first line."""
+
+_CSV_LINE = 1 << 20
+"""Bytes that a line of a CSV may have; a header of ten thousand columns has fewer."""
 
 
 def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
     """Write a run as Parquet; the same run gives the same bytes.
 
     Args:
-        run: The run; it must have a column `t`.
+        run: The run; it must have a column `t`, which ascends.
         path: The file to make.
         force: Whether one that exists is replaced.
 
     Raises:
-        RefusedError: The file exists and `force` was not given, or a column cannot stand in a table.
+        RefusedError: The file exists and `force` was not given, or cannot be written, or a column cannot
+            stand in a table.
     """
-    _check_clock(run, "the run to write")
-    flat = _flat(run)
-    fields = [
-        pa.field(name, pa.from_numpy_dtype(values.dtype), nullable=False, metadata=_metadata(column, part))
-        for name, (column, part, values) in flat.items()
-    ]
-    schema = pa.schema(fields, metadata={_FACTS: json.dumps(dict(run.facts), ensure_ascii=False)})
-    table = pa.Table.from_arrays([pa.array(values) for _, _, values in flat.values()], schema=schema)
-    split = {f.name: "BYTE_STREAM_SPLIT" for f in fields if pa.types.is_floating(f.type)}
+    table = table_of(run)
+    split = {f.name: "BYTE_STREAM_SPLIT" for f in table.schema if pa.types.is_floating(f.type)}
     with output(path, force=force) as aside:
         pq.write_table(table, aside, compression="zstd", use_dictionary=False, column_encoding=split)
 
 
 def read_parquet(path: str | os.PathLike[str]) -> Run:
-    """The run that `write_parquet` wrote, to the last bit.
+    """The run that `write_parquet` wrote, to the last bit; or that a folder of parts holds.
 
     A file that another program wrote is read too where it has the column names: without the metadata
     it just brings no facts.
 
     Args:
-        path: The file.
+        path: The file; or the folder that a `ParquetParts` left when its program ended before its time.
 
     Raises:
         RefusedError: The file is missing, is not Parquet, was cut short, or holds no run.
     """
     path = existing(path, "Parquet file")
-    check_parquet(path)
-    try:
-        table = pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise RefusedError(f"{path}: damaged Parquet ({reason}); write it again") from error
-    columns = {}
-    for name, members in _members(table.schema, path).items():
-        parts = [_numpy(table, member, path) for member in members]
-        vector = COLUMNS[name].width > 1 if name in COLUMNS else _is_part(table.schema.field(members[0]))
-        columns[name] = np.column_stack(parts) if vector else parts[0]
-    run = Run(columns, _read_facts(table.schema, path))
-    _check_clock(run, str(path))
-    return run
-
-
-def to_pandas(run: Run) -> "pd.DataFrame":
-    """A DataFrame with a column a part, one row a reading.
-
-    `attrs["units"]` gives the unit of every column, `attrs["facts"]` the run's facts.
-
-    Raises:
-        RefusedError: pandas is not installed, or a column cannot stand in a table.
-    """
-    pandas = _optional("pandas")
-    flat = _flat(run)
-    frame = pandas.DataFrame({name: values for name, (_, _, values) in flat.items()})
-    units = {name: _column(column).unit for name, (column, _, _) in flat.items()}
-    frame.attrs = {"units": units, "facts": dict(run.facts)}
-    return frame
-
-
-def to_xarray(run: Run) -> "xr.Dataset":
-    """A Dataset along the coordinate `t` [s]; vectors keep a second dimension of named parts.
-
-    The dimensions of parts are called after them (`x_y_z`, `left_right`); `units`, `frame` and
-    `long_name` are attributes of each variable, the run's facts those of the dataset.
-
-    Raises:
-        RefusedError: xarray is not installed, or the run has no column `t`.
-    """
-    xarray = _optional("xarray")
-    _check_clock(run, "the run")
-    variables: dict[str, Any] = {}
-    coords: dict[str, Any] = {}
-    for name, values in run.items():
-        column = _column(name)
-        attrs = {"units": column.unit, "frame": column.frame, "long_name": column.doc}
-        dims: tuple[str, ...] = ("t",)
-        if values.ndim > 1:
-            parts = _parts(name, values)
-            dims = ("t", "_".join(parts))
-            coords[dims[1]] = list(parts)
-        variables[name] = (dims, values, {key: text for key, text in attrs.items() if text})
-    coords["t"] = variables.pop("t")
-    return xarray.Dataset(variables, coords, dict(run.facts))
-
-
-def _check_clock(run: Run, what: str) -> None:
-    if "t" not in run.columns:
-        known = ", ".join(list(run.columns)[:5]) or "none"
-        raise RefusedError(f"{what}: not a Run: column 't' is missing (columns: {known}, ...)")
-
-
-def _column(name: str) -> Column:
-    return COLUMNS.get(name, Column("", "", ""))
-
-
-def _parts(name: str, values: NDArray[Any]) -> tuple[str, ...]:
-    """Names of the numbers of a row: those of COLUMNS, else 0, 1, ...; none for a scalar."""
-    if values.ndim == 1:
-        return ()
-    return _column(name).parts or tuple(str(i) for i in range(values.shape[1]))
-
-
-def _flat(run: Run) -> dict[str, tuple[str, str, NDArray[Any]]]:
-    """Columns of the table: by name, the Run's column, the part ("" for a scalar), contiguous values (N,)."""
-    flat: dict[str, tuple[str, str, NDArray[Any]]] = {}
-    for name, values in run.items():
-        if values.ndim > 2 or values.dtype.kind not in "bfiu":
-            raise RefusedError(
-                f"column {name!r} cannot stand in a table: numbers or flags of shape (N,) or (N, width) "
-                f"can, got {values.dtype} of shape {values.shape}"
-            )
-        rows = {f"{name}_{part}": (name, part, values[:, i]) for i, part in enumerate(_parts(name, values))}
-        for key, (column, part, array) in (rows or {name: (name, "", values)}).items():
-            if key in flat:
-                raise RefusedError(f"columns {flat[key][0]!r} and {column!r} would both be called {key!r}")
-            flat[key] = (column, part, np.ascontiguousarray(array))
-    return flat
-
-
-def _metadata(name: str, part: str) -> dict[str, str]:
-    column = _column(name)
-    said = {"column": name, "part": part, "unit": column.unit, "frame": column.frame, "doc": column.doc}
-    return {key: text for key, text in said.items() if text}
+    if not path.is_dir():
+        return run_of(_table(path), path)
+    parts = sorted(path.glob("part-*.parquet"))
+    if not parts:
+        raise RefusedError(f"{path}: a folder without Parquet parts; name the file in it")
+    tables = [_table(part) for part in parts]
+    for part, table in zip(parts, tables, strict=True):
+        if table.schema != tables[0].schema:
+            raise RefusedError(f"{part}: has other columns than {parts[0].name}; it is of another run")
+    metadata = tables[-1].schema.metadata  # what is known last
+    return run_of(pa.concat_tables(tables).replace_schema_metadata(metadata), path)
 
 
 def check_parquet(path: Path) -> None:
@@ -179,50 +100,308 @@ def check_parquet(path: Path) -> None:
         raise RefusedError(f"{path}: Parquet cut short: its end is missing; write it again, or copy it again")
 
 
-def _members(schema: pa.Schema, path: Path) -> dict[str, list[str]]:
-    """For each column of the Run the table columns that hold it, in the order of its parts."""
-    known = {f"{name}_{part}": name for name, column in COLUMNS.items() for part in column.parts}
-    members: dict[str, list[str]] = {}
-    for field in schema:
-        said = (field.metadata or {}).get(b"column")
-        home = said.decode() if said else known.get(field.name, field.name)
-        members.setdefault(home, []).append(field.name)
-    for name in members.keys() & COLUMNS.keys():
-        wanted = [f"{name}_{part}" for part in COLUMNS[name].parts] or [name]
-        missing = [key for key in wanted if key not in members[name]]
-        if missing:
-            raise RefusedError(f"{path}: column {missing[0]!r} is missing beside {members[name][0]!r}")
-        members[name] = wanted
-    return members
-
-
-def _is_part(field: pa.Field) -> bool:
-    return b"part" in (field.metadata or {})
-
-
-def _numpy(table: pa.Table, name: str, path: Path) -> NDArray[Any]:
-    column = table.column(name)
-    kind = column.type
-    if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)):
-        raise RefusedError(f"{path}: column {name!r} must hold numbers or flags, got {kind}")
-    if column.null_count:
-        row = column.is_null().to_numpy().argmax()
-        raise RefusedError(f"{path}: column {name!r}, row {row}: no value; write nan where nothing is known")
-    return column.to_numpy()
-
-
-def _read_facts(schema: pa.Schema, path: Path) -> dict[str, str | int | float | bool]:
+def _table(path: Path) -> pa.Table:
+    check_parquet(path)
     try:
-        facts = json.loads((schema.metadata or {}).get(_FACTS, b"{}"))
-    except ValueError as error:
-        raise RefusedError(f"{path}: metadata {_FACTS.decode()!r} is not JSON: {error}") from error
-    return facts
+        return pq.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise RefusedError(f"{path}: damaged Parquet ({reason}); write it again") from error
 
 
-def _optional(module: str) -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
+class ParquetParts:
+    """A Parquet file that grows: each block becomes a file of its own, and at the end all become one.
+
+    Until then the blocks lie in a folder beside it, `F.parquet.parts`, whole and readable at any time by
+    `read_parquet`; a program that is killed loses the block that it had not yet given. The one file has
+    the bytes that `write_parquet` gives for the whole run.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Begin a file.
+
+        Args:
+            path: The Parquet file to make at the end.
+            force: Whether what exists of it is replaced, parts that another program left included.
+
+        Raises:
+            RefusedError: It exists and `force` was not given, or its folder cannot be written.
+        """
+        self.path = check_free(path, force=force)
+        self.folder = Path(f"{self.path}.parts")
+        """Where the parts lie."""
+        if self.folder.exists() and not force:
+            raise RefusedError(
+                f"{self.folder}: parts of a run that did not end; magtwin convert reads them; then give "
+                "--force to replace them, or another name"
+            )
+        self._force, self._count, self._last = force, 0, -np.inf
+        try:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            self.folder.mkdir(parents=True)
+        except OSError as error:
+            raise RefusedError(f"{self.folder}: cannot be written ({error.strerror})") from error
+
+    def append(self, run: Run) -> None:
+        """Add the rows of a block; it is on the disk when this returns.
+
+        Raises:
+            RefusedError: Its clock does not run on from the block before, or the disk is full.
+        """
+        if not run.rows:
+            return
+        check_clock(run, "the block to append")
+        if run["t"][0] <= self._last:
+            raise RefusedError(
+                f"the block to append begins at {run['t'][0]:.9g} s, and the last ended at {self._last:.9g} s"
+            )
+        write_parquet(run, self.folder / f"part-{self._count:06d}.parquet")
+        self._count, self._last = self._count + 1, run["t"][-1]
+
+    def close(self) -> None:
+        """Make the one file of all parts, and remove them; without a part nothing is left."""
+        if self._count:
+            write_parquet(read_parquet(self.folder), self.path, force=self._force)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def __enter__(self) -> "ParquetParts":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:  # after a fault the parts stay, for whoever wants them
+            self.close()
+
+
+def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
+    """Write a run as CSV: lines beginning with # that tell of it, a line of names, a line a row.
+
+    Numbers are in the fewest digits that give the same bits back, flags are true and false. pandas reads
+    it with `read_csv(F, comment="#")`, to the bit with `float_precision="round_trip"` beside; DuckDB with
+    `read_csv('F', comment='#')`; polars with `read_csv(F, comment_prefix="#")`.
+
+    Args:
+        run: The run; it must have a column `t`, which ascends.
+        path: The file to make.
+        force: Whether one that exists is replaced.
+
+    Raises:
+        RefusedError: As for `write_parquet`.
+    """
+    table = table_of(run)
+    lines = [f"# {_ABOUT} run: facts, then columns by name with unit, frame and meaning, in JSON"]
+    lines.append(f"# facts {_line_safe(facts_to_json(run))}")
+    for field in table.schema:
+        said = {key.decode(): text.decode() for key, text in field.metadata.items()}
+        lines.append(f"# column {field.name} {_line_safe(_json({'type': str(field.type), **said}))}")
+    for name in table.column_names:
+        if not name.isprintable() or set(name) & set('",# '):
+            raise RefusedError(f"column {name!r} cannot stand in a CSV file; use letters, digits and _")
+    lines.append(",".join(table.column_names))
+    with output(path, force=force) as aside, open(aside, "wb") as file:
+        file.write(("\n".join(lines) + "\n").encode())
+        pa.csv.write_csv(table, file, pa.csv.WriteOptions(include_header=False, quoting_style="none"))
+
+
+def read_csv(path: str | os.PathLike[str]) -> Run:
+    """The run that `write_csv` wrote, to the last bit.
+
+    A file that another program wrote is read too where its columns have the names of a Run's, a vector's
+    as `odom_p_x`.
+
+    Args:
+        path: The file.
+
+    Raises:
+        RefusedError: The file is missing, is no CSV of numbers, was cut short, or holds no run.
+    """
+    path = existing(path, "CSV file")
+    if path.is_dir():
+        raise RefusedError(f"{path}: a folder, not a CSV file; name the file in it")
+    with open(path, "rb") as file:
+        about, names, skipped = _csv_head(file, path)
+        file.seek(-1, os.SEEK_END)
+        cut = file.read(1) != b"\n"
+    facts, said = _csv_about(about, path)
+    types = {name: pa.bool_() if _is_flag(name) else pa.float64() for name in names}
+    for name in said.keys() & types.keys():
+        try:
+            types[name] = pa.type_for_alias(said[name].pop("type", str(types[name])))
+        except ValueError as error:
+            raise RefusedError(f"{path}: column {name!r} has no such type: {error}") from error
+    if cut and said:
         raise RefusedError(
-            f"{module} is not installed; install it with: pip install 'magtwin[{module}]'"
-        ) from error
+            f"{path}: CSV cut short: its last line has no end; write it again, or copy it again"
+        )
+    try:
+        table = pa.csv.read_csv(
+            path,
+            pa.csv.ReadOptions(column_names=names, skip_rows=skipped),
+            pa.csv.ParseOptions(),
+            pa.csv.ConvertOptions(
+                column_types=types,
+                null_values=[""],
+                true_values=["true", "True", "TRUE", "1", "1.0"],
+                false_values=["false", "False", "FALSE", "0", "0.0"],
+            ),
+        )
+    except (pa.ArrowException, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise RefusedError(f"{path}: not a CSV file of a run: {_short(reason)}") from error
+    fields = [f.with_metadata(said.get(f.name) or None) for f in table.schema]
+    return run_of(table.cast(pa.schema(fields, metadata={FACTS: facts})), path)
+
+
+def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str], int]:
+    """The lines of a CSV that begin with #, the names of its columns, and how many lines these are."""
+    about: list[str] = []
+    for count, line in enumerate(iter(lambda: file.readline(_CSV_LINE), b""), 1):
+        try:
+            text = line.decode("utf-8-sig" if count == 1 else "utf-8").rstrip("\r\n")
+        except UnicodeDecodeError as error:
+            raise RefusedError(f"{path}: line {count} is not text in UTF-8; it is no CSV file") from error
+        if len(line) == _CSV_LINE or "\0" in text:
+            raise RefusedError(f"{path}: line {count} is no line of a CSV file")
+        if text.startswith("#"):
+            about.append(text)
+        elif text.strip():
+            return about, [name.strip().strip('"') for name in text.split(",")], count
+    raise RefusedError(f"{path}: has no line of column names; it is empty, or cut short")
+
+
+def _csv_about(lines: list[str], path: Path) -> tuple[str, dict[str, dict[str, str]]]:
+    """The facts of a CSV in JSON, and what it says of its columns."""
+    facts, said = "{}", {}
+    for number, line in enumerate(lines, 1):
+        kind, _, rest = line[1:].strip().partition(" ")
+        if kind == "facts":
+            facts = rest
+        elif kind == "column":
+            name, _, text = rest.partition(" ")
+            said[name] = _texts(text, f"{path}:{number}")
+    return facts, said
+
+
+def _texts(text: str, where: str) -> dict[str, str]:
+    """A JSON object of texts."""
+    try:
+        said = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise RefusedError(f"{where}: what it says of a column is not JSON: {error}") from error
+    if not isinstance(said, dict) or not all(isinstance(value, str) for value in said.values()):
+        raise RefusedError(f"{where}: what it says of a column must be an object of texts, got {text[:40]!r}")
+    return said
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _line_safe(text: str) -> str:
+    """JSON on one line for every reader: those that also end lines at other signs included."""
+    return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 200 else text[:200] + " ..."
+
+
+def _is_flag(name: str) -> bool:
+    return name in COLUMNS and COLUMNS[name].unit == "bool"
+
+
+def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
+    """Write a run as npz: an array a column, and `magtwin`, a text in JSON with facts, units and frames.
+
+    The arrays are not compressed, so that they are read as fast as the disk is; nothing is pickled. The
+    same run gives the same bytes.
+
+    Args:
+        run: The run; it must have a column `t`, which ascends.
+        path: The file to make.
+        force: Whether one that exists is replaced.
+
+    Raises:
+        RefusedError: As for `write_parquet`.
+    """
+    check_clock(run, "the run to write")
+    run.members()  # refuses what is no number
+    if _ABOUT in run:
+        raise RefusedError(f"column {_ABOUT!r} has the name of what tells of the run; rename it")
+    columns = {
+        name: {**said_of(run.spec(name), name), "parts": ",".join(run.spec(name).parts)} for name in run
+    }
+    about = _json({"facts": json.loads(facts_to_json(run)), "columns": columns})
+    with output(path, force=force) as aside, open(aside, "wb") as file:
+        np.savez(file, allow_pickle=False, **{_ABOUT: np.array(about)}, **run.columns)
+
+
+def read_npz(path: str | os.PathLike[str]) -> Run:
+    """The run that `write_npz` wrote, to the last bit; or any npz whose arrays have the names of a Run's.
+
+    Args:
+        path: The file.
+
+    Raises:
+        RefusedError: The file is missing, is no npz, is damaged or cut short, holds pickled objects, which
+            could run anything and are not read, or holds no run.
+    """
+    path = existing(path, "npz file")
+    if path.is_dir():
+        raise RefusedError(f"{path}: a folder, not an npz file; name the file in it")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [info.filename for info in archive.infolist()]
+            if twice := sorted({name for name in names if names.count(name) > 1}):
+                raise RefusedError(f"{path}: two arrays are called {twice[0]!r}; write it again")
+            arrays = {name.removesuffix(".npy"): _array(archive, name, path) for name in names}
+    except (zipfile.BadZipFile, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+        raise RefusedError(f"{path}: not an npz file, damaged, or cut short ({error})") from error
+    facts, said = _npz_about(arrays.pop(_ABOUT, np.array("{}")), path)
+    specs = {
+        name: spec_said(told, tuple(filter(None, told.get("parts", "").split(","))))
+        for name, told in said.items()
+        if name not in COLUMNS
+    }
+    for name, values in arrays.items():
+        if values.dtype.kind not in "bfiu":
+            raise RefusedError(f"{path}: column {name!r} must hold numbers or flags, got {values.dtype}")
+    try:
+        run = Run(arrays, facts, specs)
+    except (RefusedError, TypeError) as error:
+        raise RefusedError(f"{path}: {error}") from error
+    check_clock(run, str(path))
+    return run
+
+
+def _array(archive: zipfile.ZipFile, name: str, path: Path) -> NDArray[Any]:
+    """An array of an npz; memory is taken for what is there, not for what a header claims."""
+    data = archive.read(name)
+    file = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(file)
+        header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+        shape, fortran, dtype = header[version](file)
+    except (ValueError, KeyError) as error:
+        reason = " ".join(str(error).split())
+        raise RefusedError(f"{path}: {name} is not a numpy array ({_short(reason)})") from error
+    if dtype.hasobject:
+        raise RefusedError(f"{path}: {name} holds pickled objects, which are not read; save plain numbers")
+    body = data[file.tell() :]
+    if len(body) != dtype.itemsize * int(np.prod(shape, dtype=object)):
+        raise RefusedError(
+            f"{path}: {name} is cut short: {len(body)} bytes for {dtype} of shape {shape}; write it again"
+        )
+    return np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def _npz_about(about: NDArray[Any], path: Path) -> tuple[Any, dict[str, dict[str, str]]]:
+    """Facts, and what is said of columns."""
+    try:
+        told = json.loads(str(about))
+        facts, columns = told.get("facts", {}), told.get("columns", {})
+        said = {str(name): _texts(json.dumps(text), str(path)) for name, text in columns.items()}
+    except (ValueError, AttributeError, RecursionError) as error:
+        raise RefusedError(f"{path}: array {_ABOUT!r} tells nothing of a run ({error})") from error
+    return facts_from_json(json.dumps(facts), path), said
