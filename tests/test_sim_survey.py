@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from magtwin.field.difference import difference
 from magtwin.field.sources import dipole_field_nt
 from magtwin.frames import quat_from_yaw, rotate
 from magtwin.names import RefusedError
 from magtwin.sim.interference import ambient_gradient_nt_m
-from magtwin.sim.survey import field_at_rest_nt, survey, survey_readings
+from magtwin.sim.survey import field_at_rest_nt, pose_error_nt2, survey, survey_readings
 from magtwin.spec import (
     EarthFieldSpec,
     LabSpec,
@@ -284,3 +285,82 @@ def test_a_sensor_that_loses_lock_latches_along_its_rows():
         steep = ambient_gradient_nt_m(scene(), p)
         assert latched[layer][steep > 4e3].all()
         assert not latched[layer][steep < 3e3].any()
+
+
+# Variance, and what a difference makes of it
+
+ERRORS = {"position_error_m": 0.01, "heading_error_rad": np.radians(2)}
+TWO = (0.0, np.pi)
+
+
+def test_the_variance_of_a_node_is_the_mean_square_of_what_errors_of_the_pose_do_there():
+    errors = {"position_error_m": 0.03, "heading_error_rad": np.radians(8)}
+    iron = PlatformFieldSpec(hard_iron_nt=(400.0, -250.0, 900.0))
+    grid = survey(scene(), rng=rng(), spacing_m=0.8).grid
+    got = pose_error_nt2(scene(platform=iron), grid, 0.4, **errors)
+    p, yaw = grid.poses()
+    draw, times = np.random.default_rng(1), 1000
+    stands = p + errors["position_error_m"] * draw.standard_normal((times, *p.shape))
+    looks = yaw + errors["heading_error_rad"] * draw.standard_normal((times, *yaw.shape))
+    off = field_at_rest_nt(scene(platform=iron), stands, looks) - field_at_rest_nt(
+        scene(platform=iron), p, yaw
+    )
+    ratio = np.mean(off**2, axis=0) / got
+    assert ratio.mean() == pytest.approx(1, abs=0.03)
+    assert np.abs(ratio - 1).max() < 5 * np.sqrt(2 / times)  # as known as a mean of squares of normals
+
+
+def test_errors_of_the_pose_are_in_the_maps_variance_and_none_where_there_are_none():
+    noise = MagnetometerSpec(noise_density_nt=5.0 / np.sqrt(135 / 2), resolution_nt=0.0)
+    plain, wandering = (survey(scene(magnetometer=noise), rng=rng(), **e) for e in ({}, ERRORS))
+    assert_allclose(plain.variance_nt2, 25, rtol=1e-12)
+    want = pose_error_nt2(scene(), wandering.grid, 0.4, **ERRORS) + 25
+    assert_allclose(wandering.variance_nt2, want, rtol=1e-12)
+    assert wandering.parameters["position_error_m"] == 0.01
+
+
+def test_nodes_where_the_sensor_lost_lock_are_masked():
+    sensor = MagnetometerSpec(gradient_max_nt_m=4e3, gradient_relock_nt_m=3e3)
+    field = survey(scene(magnetometer=sensor), rng=rng())
+    read = survey_readings(scene(magnetometer=sensor), rng=rng())
+    assert 0 < np.count_nonzero(~field.valid) < 0.2 * field.valid.size
+    assert np.abs(field.values_nt[~field.valid] - 35_650).max() < 5 * 50
+    assert read.good.all()  # nobody tells a robot; magtwin.field.latch finds them
+
+
+@pytest.fixture(scope="module")
+def lab(lab_scene):
+    from magtwin.usd.scene import read_scene
+
+    return read_scene(lab_scene, check_network=False)
+
+
+@pytest.fixture(scope="module")
+def surveys(lab):
+    return [survey(lab, rng=np.random.default_rng(seed), headings_rad=TWO, **ERRORS) for seed in range(5)]
+
+
+def test_two_surveys_of_one_lab_differ_by_their_variance_and_raise_no_more_false_alarms_than_said(surveys):
+    found = [difference(a, b) for k, b in enumerate(surveys) for a in surveys[:k]]
+    spread = [np.sqrt(np.nanmean(d.z**2)) for d in found]
+    assert np.mean(spread) == pytest.approx(1, abs=0.05)
+    # with no change at all, the false-discovery rate is how often a node is called changed: 5 % of 10 pairs
+    assert sum(d.changed.any() for d in found) <= 2
+
+
+def test_a_desk_that_was_moved_is_marked_and_the_rest_of_the_lab_is_not(lab, surveys):
+    moved = replace(
+        lab,
+        furniture=tuple(
+            replace(f, p_world=(f.p_world[0] + 0.6, *f.p_world[1:])) if f.name == "desk_0" else f
+            for f in lab.furniture
+        ),
+    )
+    found = difference(surveys[0], survey(moved, rng=np.random.default_rng(99), headings_rad=TWO, **ERRORS))
+    desk = np.array([-1.9, 2.3])  # beyond the floor's edge at y = 1.75, 1.5 m wide before and after
+    p, _ = found.grid.poses()
+    near = np.linalg.norm(np.maximum(np.abs(p - desk - [0.3, 0]) - [1.05, 0.4], 0), axis=-1) < 1.5
+    assert found.changed[near].sum() >= 10
+    assert found.changed[~near].sum() <= 0.1 * found.changed.sum() + 3
+    assert max(abs(r.peak_m[0] - desk[0]) for r in found.regions[:2]) < 1.0
+    assert min(r.peak_m[1] for r in found.regions[:2]) > 1.0

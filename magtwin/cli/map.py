@@ -237,8 +237,8 @@ def map_survey(
     headings: str = "0,90,180,270",
     readings: int = 135,
     height: float | None = None,
-    heading_error: float = 0.0,
-    position_error: float = 0.0,
+    heading_error: float = 2.0,
+    position_error: float = 0.01,
     seed: Seed = 0,
     name: str | None = None,
     licence: str = "",
@@ -246,9 +246,10 @@ def map_survey(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Survey a scene as its robot would, from node to node, with its sensor's noise.
+    """Survey a scene as its robot would, from node to node, with its sensor's noise and its own errors.
 
-    What the stage holds now makes the field: move a desk in it, survey again, and the map changes.
+    What the stage holds now makes the field: move a desk in it, survey again, and `magtwin map diff` finds
+    it. The map's variance is that of noise and errors; nodes where the sensor lost lock are masked.
 
     Parameters
     ----------
@@ -265,9 +266,11 @@ def map_survey(
     height
         Height of the sensor above the floor [m]; the robot's own unless given.
     heading_error
-        Standard deviation of the robot's heading about the node's, which is recorded as it is [deg].
+        Standard deviation of the robot's heading about the node's [deg]; readings record it, a map takes
+        the node's. 0 for a map of the scene itself.
     position_error
-        Standard deviation of where the robot stands about the node, which is recorded [m].
+        Standard deviation of where the robot stands about the node, along x and y [m]; the node is
+        recorded. 0 for a map of the scene itself.
     seed
         Seed of the noise and of the errors.
     name

@@ -1,5 +1,6 @@
 """Survey of the twin: what the robot itself would read of the lab, and the map that it would make."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -107,6 +108,27 @@ def survey_readings(
     Raises:
         RefusedError: The Earth's field is unknown, the grid has no cell, or a figure is out of range.
     """
+    about: dict[str, Any] = {"source": source, "licence": licence, "created": created}
+    about |= {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
+    return _visit(scene, rng, spacing_m, headings_rad, readings, height_m, progress, **about)[0]
+
+
+def _visit(
+    scene: Scene,
+    rng: np.random.Generator,
+    spacing_m: float = 0.25,
+    headings_rad: Sequence[float] = QUARTERS,
+    readings: int = 1,
+    height_m: float | None = None,
+    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
+    *,
+    heading_error_rad: float = 0.0,
+    position_error_m: float = 0.0,
+    source: str = "",
+    licence: str = "",
+    created: str = "",
+) -> tuple[Readings, NDArray[np.bool_]]:
+    """The readings, and at which nodes the sensor had lost lock, shape (H, Y, X)."""
     if readings < 1:
         raise RefusedError(f"readings must be at least 1, got {readings!r}")
     for name, sd in {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}.items():
@@ -138,7 +160,7 @@ def survey_readings(
     if lost.any():
         value = rounded(latched_nt(sensor, lost.ravel(), latch), sensor.resolution_nt).reshape(grid.shape)
         total[lost] = value[lost] * readings
-    return Readings(
+    read = Readings(
         p_xy=node.reshape(-1, 2),
         yaw=yaw.ravel(),
         b_nt=(total / readings).ravel(),
@@ -152,6 +174,7 @@ def survey_readings(
         frame=_frame(scene),
         datum=_datum(scene),
     )
+    return read, lost
 
 
 def survey(
@@ -166,6 +189,9 @@ def survey(
 ) -> AnomalyMap:
     """Map the lab as the robot would, by `survey_readings`: the values at the nodes are its readings.
 
+    The variance of a node is that of the sensor's noise and resolution, and the mean square by which
+    the field where the robot stands, looking where it does, misses that of the node.
+
     Args:
         scene: As there.
         rng: As there.
@@ -176,23 +202,25 @@ def survey(
         options: The others of `survey_readings`.
 
     Returns:
-        The map, with the variance that the sensor's noise and resolution leave; what the errors of the
-        poses add is not in it.
+        The map, with its variance; nodes at which the sensor had lost lock are not valid.
 
     Raises:
         RefusedError: As for `survey_readings`.
     """
     errors: dict[str, Any] = {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
-    read = survey_readings(scene, rng=rng, readings=readings, **errors, **options)
+    read, lost = _visit(scene, rng, readings=readings, **errors, **options)
     assert read.grid is not None
+    assert read.height_m is not None
     sensor, grid = scene.robot.magnetometer, read.grid
     variance = (sensor.noise_std_nt**2 + sensor.resolution_nt**2 / 12) / readings
+    missed = pose_error_nt2(scene, grid, read.height_m, **errors)
     return AnomalyMap(
         values_nt=read.b_nt.reshape(grid.shape),
         origin_m=grid.origin_m,
         cell_m=grid.cell_m,
         headings_rad=np.array(grid.headings_rad),
-        variance_nt2=np.full(grid.shape, variance),
+        valid=~lost,
+        variance_nt2=variance + missed,
         name=scene.name if name is None else name,
         method=f"survey of the twin, {readings} reading{'s' * (readings > 1)} a node and heading, at rest",
         source=read.source,
@@ -208,6 +236,80 @@ def survey(
             **{name: error for name, error in errors.items() if error},
         },
     )
+
+
+def pose_error_nt2(
+    scene: Scene, grid: Grid, height_m: float, *, heading_error_rad: float, position_error_m: float
+) -> Array:
+    """Mean square of what a robot that stands and looks a little off a node reads off the node's field.
+
+    E[(B(node + e) - B(node))^2] over normal errors e, by a rule of degree 5 (McNamee and Stenger 1967;
+    2 n^2 + 1 points for n errors), which is exact where B bends as a parabola does. The vector field around
+    a node is one for all headings: quadratic in x and y, through 3 x 3 points.
+
+    Args:
+        scene: A scene whose Earth's field is known.
+        grid: The nodes.
+        height_m: Height of the magnetometer above the floor [m].
+        heading_error_rad: Standard deviation of the heading [rad].
+        position_error_m: Standard deviation of the place, along x and y [m].
+
+    Returns:
+        Mean square [nT^2], shape (H, Y, X).
+    """
+    total = np.zeros(grid.shape)
+    spread = np.array([position_error_m, position_error_m, heading_error_rad])
+    if not spread.any():
+        return total
+    lever = np.asarray(scene.robot.p_base_magnetometer)[:2]
+    around = _parabola(scene, grid, height_m, float(np.hypot(*lever)) + 2 * position_error_m)
+
+    def field(off: Array, yaw: float) -> Array:
+        """Magnitude with base_link `off` its nodes [nT], shape (Y, X)."""
+        c, s = np.cos(yaw), np.sin(yaw)
+        dx, dy = off[0] + c * lever[0] - s * lever[1], off[1] + s * lever[0] + c * lever[1]
+        world = np.tensordot([1, dx, dy, dx * dx / 2, dx * dy, dy * dy / 2], around, axes=1)
+        body = rotate(quat_conjugate(quat_from_yaw(yaw)), world).reshape(-1, 3)
+        read = platform_field_nt(scene.robot.platform, body)
+        return np.asarray(np.linalg.norm(read, axis=-1)).reshape(world.shape[:-1])
+
+    active = np.flatnonzero(spread)
+    for k, heading in enumerate(grid.headings_rad):
+        node = field(np.zeros(2), heading)
+        for point, weight in _rule(len(active)):
+            e = np.zeros(3)
+            e[active] = point * spread[active]
+            total[k] += weight * (field(e[:2], heading + e[2]) - node) ** 2
+    return total
+
+
+def _parabola(scene: Scene, grid: Grid, height_m: float, step: float) -> Array:
+    """Vector field around each node: value, d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2, shape (6, Y, X, 3)."""
+    node = grid.poses()[0][0]
+    at = np.empty((3, 3, grid.rows, grid.columns, 3))
+    at[..., 2] = height_m
+    for i, j in np.ndindex(3, 3):
+        at[i, j, ..., :2] = node + step * np.array([i - 1, j - 1])
+    b = ambient_field_nt(scene, at)
+    return np.stack(
+        [
+            b[1, 1],
+            (b[2, 1] - b[0, 1]) / (2 * step),
+            (b[1, 2] - b[1, 0]) / (2 * step),
+            (b[2, 1] - 2 * b[1, 1] + b[0, 1]) / step**2,
+            (b[2, 2] - b[2, 0] - b[0, 2] + b[0, 0]) / (4 * step**2),
+            (b[1, 2] - 2 * b[1, 1] + b[1, 0]) / step**2,
+        ]
+    )
+
+
+def _rule(n: int) -> list[tuple[Array, float]]:
+    """Points and weights of degree 5 for n standard normals, without the middle, where nothing is missed."""
+    axes, root = np.eye(n), np.sqrt(3)
+    points = [(sign * root * axis, (4 - n) / 18) for axis in axes for sign in (1, -1)]
+    for i, j in itertools.combinations(range(n), 2):
+        points += [(root * (a * axes[i] + b * axes[j]), 1 / 36) for a in (1, -1) for b in (1, -1)]
+    return points
 
 
 def _frame(scene: Scene) -> str:
