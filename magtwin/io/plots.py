@@ -119,7 +119,7 @@ def plot_map(
         legend.append(_patch(quantity.unknown, facecolor=MASKED, hatch=HATCH, edgecolor=MASKED_INK))
     _legend(figure, legend)
     figure.suptitle(_summary(field, 112 if len(shown) > 1 else 52), fontsize=11)
-    _save(figure, out, force)
+    save(figure, out, force)
 
 
 def plot_difference(found: MapDifference, out: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -169,7 +169,7 @@ def plot_difference(found: MapDifference, out: str | os.PathLike[str], *, force:
             _patch("not known to both surveys", facecolor=MASKED, hatch=HATCH, edgecolor=MASKED_INK)
         )
     _legend(figure, legend)
-    _save(figure, out, force)
+    save(figure, out, force)
 
 
 def plot_run(
@@ -195,11 +195,11 @@ def plot_run(
     if not run.rows:
         raise RefusedError("the run has no rows to draw")
     t, total = run["t"], run["b_total_nt"] / 1000
-    figure = _figure(13.5, 7.0)
+    figure = new_figure(13.5, 7.0)
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.15, 1))[0]
     ax = left.subplots()
     ax.set_title(_title(run), fontsize=11)
-    _draw_path(ax, run["p_world_base"][:, :2], total, field, planned)
+    draw_path(ax, run["p_world_base"][:, :2], total, field, planned)
     axes = right.subplots(4, 1, sharex=True, height_ratios=(2, 2, 1, 1))
     axes[0].plot(t, run["b_map_nt"] / 1000, color=MAP_INK, lw=1.2, label="map")
     axes[0].plot(t, total, color=INK, lw=0.8, label="total")
@@ -213,15 +213,16 @@ def plot_run(
         ax.set_ylabel(label, fontsize=9)
         ax.margins(x=0)
         ax.tick_params(labelsize=8)
-        _shade(ax, t, run["lidar_on"])
+        shade(ax, t, run["lidar_on"])
     right.align_ylabels(axes)
     axes[3].set_xlabel("time [s]; shaded while the LiDAR is on", fontsize=9)
-    _save(figure, out, force)
+    save(figure, out, force)
 
 
-def _draw_path(
+def draw_path(
     ax: "Axes", p_xy: Array, total: Array, field: AnomalyMap | None, planned: ArrayLike | None
 ) -> None:
+    """The path over the map, coloured by the field along it."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -307,7 +308,7 @@ def _panels(extent: tuple[float, float, float, float], count: int) -> "tuple[Fig
     rows = -(-count // columns)
     x0, x1, y0, y1 = extent
     tall = float(np.clip((y1 - y0) / (x1 - x0), 0.3, 2))
-    figure = _figure(4.9 * columns + 1.3, (4.4 * tall + 0.55) * rows + 1.3)
+    figure = new_figure(4.9 * columns + 1.3, (4.4 * tall + 0.55) * rows + 1.3)
     figure.set_layout_engine("constrained", h_pad=0.08)  # so that no title touches the one above
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     for k, ax in enumerate(axes[:count]):
@@ -530,34 +531,40 @@ def _title(run: Run) -> str:
     return f"{', '.join(facts) or 'run'}\n{run.rows:,} readings, {run.duration_s:.1f} s, {length:.1f} m"
 
 
-def _shade(ax: "Axes", t: Array, on: NDArray[np.bool_]) -> None:
+def shade(ax: "Axes", t: Array, on: NDArray[np.bool_]) -> None:
     """Mark the spans of time in which a flag is set."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int)))
     for first, last in edges.reshape(-1, 2):
         ax.axvspan(t[first], t[min(last, len(t) - 1)], color=LIDAR_INK, lw=0, zorder=-1)
 
 
-def _figure(width_in: float, height_in: float) -> "Figure":
+def new_figure(width_in: float, height_in: float) -> "Figure":
+    """An empty figure on a canvas of its own."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained", facecolor="white")
 
 
-def _save(figure: "Figure", out: str | os.PathLike[str], force: bool) -> None:
+def save(figure: "Figure", out: str | os.PathLike[str], force: bool) -> None:
+    """Write a figure as its name ends."""
+    suffix = Path(out).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise RefusedError(f"{out}: a picture ends in {' or '.join(SUFFIXES)}")
+    picture = drawn(figure, suffix)
+    with output(out, force=force) as path:
+        path.write_bytes(picture)
+
+
+def drawn(figure: "Figure", suffix: str) -> bytes:
+    """A figure as the bytes of a .png or .svg file."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    suffix = Path(out).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise RefusedError(f"{out}: a picture ends in {' or '.join(SUFFIXES)}")
     picture = io.BytesIO()
     if suffix == ".png":
         FigureCanvasAgg(figure).print_png(picture, metadata={"Software": None})  # no version, no date
-    else:
-        with rc_context(
-            {"svg.hashsalt": "magtwin", "svg.fonttype": "none"}
-        ):  # names of its parts; text as text
+    else:  # names of its parts; text as text
+        with rc_context({"svg.hashsalt": "magtwin", "svg.fonttype": "none"}):
             FigureCanvasSVG(figure).print_svg(picture, metadata={"Date": None, "Creator": None})
-    with output(out, force=force) as path:
-        path.write_bytes(picture.getvalue())
+    return picture.getvalue()
