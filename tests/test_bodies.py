@@ -189,24 +189,6 @@ def test_what_a_point_is_told_does_not_depend_on_its_company():
     assert_array_equal(some.field_nt(p), together)
 
 
-def test_many_points_at_one_height_are_interpolated_to_a_thousandth_of_a_nanotesla():
-    rng = np.random.default_rng(7)
-    some = Bodies(
-        [body(p_world=rng.uniform((-3, -2, -1), (3, 2, -0.6))) for _ in range(30)],
-        rng.uniform((-3, -2, -1), (3, 2, -0.2), (50, 3)),
-        rng.normal(scale=5, size=(50, 3)),
-    )
-    p = np.column_stack([rng.uniform(-0.5, 0.5, (5_000, 2)), np.full(5_000, 0.41)])
-    v = np.column_stack([rng.normal(size=(5_000, 2)), np.zeros(5_000)])
-    one_by_one = np.array([some.field_and_rate_nt(q, w) for q, w in zip(p[:50], v[:50], strict=True)])
-    field, rate = some.field_and_rate_nt(p, v)
-    assert_array_equal(some.field_nt(p), field)
-    assert 0 < np.abs(field[:50] - one_by_one[:, 0]).max() < 1e-3
-    assert 0 < np.abs(rate[:50] - one_by_one[:, 1]).max() < 1e-2
-    assert np.abs(field).max() > 5_000
-    assert np.abs(rate).max() > 50_000
-
-
 def test_bodies_add_and_turn_with_their_magnetization():
     things = list(KINDS.values())
     p = np.random.default_rng(3).uniform(-3, 3, (100, 3))

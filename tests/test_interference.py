@@ -7,12 +7,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.field.sources import dipole_field_nt
 from magtwin.names import RefusedError
+from magtwin.sim import interference
 from magtwin.sim.drive import Motion
 from magtwin.sim.interference import (
     ambient_field_nt,
     ambient_gradient_nt_m,
     draw_platform,
     field_at_sensor_nt,
+    level_field_nt,
+    level_gradient_nt_m,
     platform_field_nt,
     rest_current_a,
     turning_iron_nt,
@@ -98,6 +101,27 @@ def test_the_gradient_is_that_of_the_magnitude():
     assert_allclose(ambient_gradient_nt_m(LAB, p), want, rtol=1e-5)
     assert ambient_gradient_nt_m(LAB, p[0]).shape == ()
     assert_array_equal(ambient_gradient_nt_m(replace(SCENE, earth=EARTH), p), 0)
+
+
+def test_what_is_looked_up_at_one_height_is_the_exact_field_and_gradient_there():
+    p = np.column_stack([np.random.default_rng(2).uniform(-0.9, 0.9, (200, 2)), np.full(200, 0.35)])
+    field, slopes = level_field_nt(LAB, p[:, :2], 0.35)
+    assert_allclose(field, ambient_field_nt(LAB, p), rtol=0, atol=0.01)
+    assert slopes.shape == (200, 2, 3)
+    gradient = level_gradient_nt_m(LAB, p[:, :2], 0.35)
+    assert_allclose(gradient, ambient_gradient_nt_m(LAB, p), rtol=1e-4)  # what dipoles for bodies leave
+    assert gradient.max() > 3 * gradient.min() > 0
+
+
+def test_a_floor_full_of_points_is_looked_up(monkeypatch):
+    p = np.column_stack([np.random.default_rng(2).uniform(-0.9, 0.9, (200, 2)), np.full(200, 0.35)])
+    exact = ambient_field_nt(LAB, p)
+    monkeypatch.setattr(interference, "MANY", 200)
+    many = ambient_field_nt(LAB, p.reshape(10, 20, 3))
+    assert_array_equal(many.reshape(-1, 3), level_field_nt(LAB, p[:, :2], 0.35)[0])
+    assert 0 < np.abs(many.reshape(-1, 3) - exact).max() < 0.01
+    p[0, 2] = 0.36  # not at one height
+    assert_array_equal(ambient_field_nt(LAB, p)[1:], exact[1:])
 
 
 def test_a_robot_without_magnetism_adds_nothing():

@@ -172,7 +172,7 @@ def test_the_field_is_that_at_the_magnetometer_not_at_base_link():
     p = run["p_world_base"] + rotate(run["q_world_base_xyzw"], lever)
     places, moments = zip(*((s.p_world, s.m_world) for s in SOURCES), strict=True)
     field = dipole_field_nt(p, np.array(places), np.array(moments)) + EARTH_NT
-    assert_allclose(run["b_truth_nt"], np.linalg.norm(field, axis=1), rtol=1e-12)
+    assert_allclose(run["b_truth_nt"], np.linalg.norm(field, axis=1), rtol=0, atol=1e-3)
 
 
 def test_eddy_currents_see_the_fields_rate_in_turning_axes():

@@ -38,10 +38,6 @@ LADDER, RUNGS = 1.25, 48
 CELL_M = 0.25
 """Side of the cells of space in which one set of dipoles is used [m]."""
 
-MANY, NODES, CLEAR_M = 300, 10, 0.35
-"""Points in a cell, all at one height, from which on what is farther away than `CLEAR_M` [m] is computed at
-`NODES` x `NODES` points and interpolated."""
-
 FARTHEST_CELL = 1 << 19
 """Cells beyond this one, 130 km from the origin, count as it does."""
 
@@ -455,12 +451,6 @@ class Bodies:
 
         def add(work: list[tuple[Rows, Array, Array]]) -> None:
             for rows, places, moments in work:
-                if len(rows) >= MANY and not np.ptp(p[rows, 2]) and (v is None or not v[rows, 2].any()):
-                    level, moving = p[rows], None if v is None else v[rows]
-                    clear, b, change = _interpolated(level, moving, places, moments)
-                    field[rows] += b
-                    rate[rows] += change
-                    places, moments = places[~clear], moments[~clear]
                 for some in in_blocks(len(rows), len(places)):
                     k = rows[some]
                     b, change = dipole_block(p[k], None if v is None else v[k], places, moments)
@@ -477,10 +467,20 @@ class Bodies:
                     rate[k] += _difference(cut.body, p[k], v[k])
         return field, rate
 
-    def _work(
-        self, p: Array, rows: Rows, centre: Array, exact: list[list[Rows]]
-    ) -> list[tuple[Rows, Array, Array]]:
-        """The dipoles to add up for the points of a cell; notes in `exact` who is near which body."""
+    def seen_from(self, centre: Array) -> tuple[Array, Array, list[Body]]:
+        """What the field in a cell of space, of side `CELL_M`, is made of.
+
+        Args:
+            centre: Middle of the cell [m], shape (3,).
+
+        Returns:
+            Places [m] and moments [A m2] in world, each of shape (D, 3), of all dipoles and of those that
+            stand for the bodies that are far enough; and the bodies that are not.
+        """
+        places, moments, near = self._seen_from(centre)
+        return places, moments, [self._cuts[k].body for k in near]
+
+    def _seen_from(self, centre: Array) -> tuple[Array, Array, list[int]]:
         turned = np.einsum("bij,bi->bj", self._rotation, centre - self._middle)
         beyond = np.maximum(np.abs(turned) - self._half, 0)
         apart = np.sqrt(np.square(beyond).sum(axis=1)) - math.sqrt(0.75) * CELL_M
@@ -493,8 +493,16 @@ class Bodies:
             for cut, rung in zip(compress(self._cuts, far), rungs[far].tolist(), strict=True)
         ]
         whole.append(self._dipoles)
+        places, moments = (np.concatenate(part) for part in zip(*whole, strict=True))
+        return places, moments, np.flatnonzero(~far).tolist()
+
+    def _work(
+        self, p: Array, rows: Rows, centre: Array, exact: list[list[Rows]]
+    ) -> list[tuple[Rows, Array, Array]]:
+        """The dipoles to add up for the points of a cell; notes in `exact` who is near which body."""
+        places, moments, close = self._seen_from(centre)
         work = []
-        for k in np.flatnonzero(~far):
+        for k in close:
             cut = self._cuts[k]
             clearance = cut.body.clearance(p[rows])
             near = clearance < cut.near if cut.near else clearance == 0
@@ -502,7 +510,6 @@ class Bodies:
                 exact[k].append(rows[near])
             if not near.all():
                 work.append((rows[~near], *cut.dipoles(0)))
-        places, moments = (np.concatenate(part) for part in zip(*whole, strict=True))
         return [(rows, places, moments), *work]
 
 
@@ -519,40 +526,6 @@ def _cells(p: Array, known: Rows) -> Iterator[tuple[Rows, Array]]:
     for rows in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
         if len(rows):
             yield known[rows], CELL_M * (cell[rows[0]] + 0.5)
-
-
-def _interpolated(
-    p: Array, v: Array | None, places: Array, moments: Array
-) -> tuple[NDArray[np.bool_], Array, Array]:
-    """Which dipoles are clear of the cell that level points lie in, and their field and its rate there.
-
-    Interpolated between Chebyshev nodes of the cell's square. The error falls as rho^-n, with
-    rho = d / a + sqrt(1 + (d / a)^2), a half the square's side (Trefethen 2013, theorem 8.2).
-    """
-    half = CELL_M / 2
-    middle = np.append((np.floor(p[0, :2] / CELL_M) + 0.5) * CELL_M, p[0, 2])
-    clear = np.sqrt(np.square(places - middle).sum(axis=1)) >= CLEAR_M + math.sqrt(2) * half
-    node = np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
-    x, y = np.meshgrid(middle[0] + half * node, middle[1] + half * node, indexing="ij")
-    square = np.stack([x, y, np.full_like(x, middle[2])], axis=-1).reshape(-1, 3)
-    values = np.concatenate(
-        [
-            dipole_block(square[some], None, places[clear], moments[clear])[0]
-            for some in in_blocks(len(square), int(np.count_nonzero(clear)))
-        ]
-    )
-    waves = np.linalg.inv(np.polynomial.chebyshev.chebvander(node, NODES - 1))
-    sums = np.einsum("ki,lj,ijc->klc", waves, waves, values.reshape(NODES, NODES, 3))
-    u, w = (np.polynomial.chebyshev.chebvander((p[:, k] - middle[k]) / half, NODES - 1) for k in (0, 1))
-
-    def at(sums: Array) -> Array:
-        part = (u[:, : len(sums)] @ sums.reshape(len(sums), -1)).reshape(len(p), -1, 3)
-        return np.einsum("nj,njc->nc", w[:, : part.shape[1]], part)
-
-    if v is None:
-        return clear, at(sums), np.zeros(p.shape)
-    slopes = [at(np.polynomial.chebyshev.chebder(sums, axis=axis)) / half for axis in (0, 1)]
-    return clear, at(sums), v[:, :1] * slopes[0] + v[:, 1:2] * slopes[1]
 
 
 def _difference(body: Body, p: Array, v: Array) -> Array:

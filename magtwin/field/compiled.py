@@ -1,6 +1,7 @@
 """Loops over poses, compiled with numba: what `lookup.py` opens where they pay, and nobody else.
 
-They do, operation by operation, what the numpy and the plain Python of `lookup.py` do, so that all give
+They do, operation by operation, what the numpy and the plain Python of `lookup.py` and the numpy of
+`plane.py` do, so that all give
 the same bytes: no fused multiplication, no reordered sum, nothing shared between poses. Machine code is
 kept where numba keeps it, in `__pycache__` beside this file or, where that cannot be written to, in the
 user's cache folder; where neither can, each process compiles anew.
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Nodes = NDArray[np.int32]
+Numbers = NDArray[np.int64]
 
 TURN = 2 * np.pi
 
@@ -28,6 +30,7 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 _IN = types.Array(types.float64, 1, "C", readonly=True)
 _OUT = types.Array(types.float64, 1, "C")
+_CUBE, _CUBE_OUT = types.Array(types.float64, 3, "C", readonly=True), types.Array(types.float64, 3, "C")
 _NEXT = np.uint64(1)  # unsigned: numba would else look for indices from the end, and not vectorise
 
 
@@ -279,3 +282,36 @@ def at_with_gradient(table: Array, x: float, y: float, yaw: float) -> tuple[floa
         by = np.nan if hy > table[5] else by
         bh = np.nan if (hh > table[5]) & (sh != 0) else bh
     return _one(table, np.uint64(values + n), r, up, wx, wy, wh), bx, by, bh
+
+
+@compiled(_CUBE, types.Array(types.int64, 1, "C", readonly=True), _IN, _IN, types.float64, _CUBE_OUT)
+def polynomials(table: Array, slot: Numbers, u: Array, w: Array, scale: float, out: Array) -> None:
+    """Polynomials in two variables, three at a time, and their slopes, all by Horner's rule.
+
+    Args:
+        table: Coefficients of each square by the power of u, and in a row by the power of w and by which of
+            the three it is, shape (S, K, 3 K).
+        slot: Which square each point is in, shape (N,).
+        u: First variable, shape (N,).
+        w: Second variable, shape (N,).
+        scale: What the slopes are multiplied by.
+        out: Takes the three values, their slopes along u and those along w, shape (N, 3, 3).
+    """
+    powers, width = table.shape[1], table.shape[2]
+    a, slope = np.empty(width), np.empty(width)
+    for n in range(slot.shape[0]):
+        square, x, y = table[slot[n]], u[n], w[n]
+        for k in range(width):
+            a[k], slope[k] = square[powers - 1, k], 0.0
+        for i in range(powers - 2, -1, -1):
+            row = square[i]
+            for k in range(width):
+                slope[k] = slope[k] * x + a[k]
+                a[k] = a[k] * x + row[k]
+        for c in range(3):
+            f, along_u, along_w = a[width - 3 + c], slope[width - 3 + c], 0.0
+            for k in range(width - 6 + c, -1, -3):
+                along_w = along_w * y + f
+                f = f * y + a[k]
+                along_u = along_u * y + slope[k]
+            out[n, 0, c], out[n, 1, c], out[n, 2, c] = f, along_u * scale, along_w * scale

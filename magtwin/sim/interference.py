@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.bodies import Bodies
+from magtwin.field.plane import Plane
 from magtwin.field.sources import dipole_field_nt
 from magtwin.names import RefusedError
 from magtwin.sim.battery import current_a
@@ -33,6 +34,10 @@ TORQUE_S = 0.05
 CREEP = 0.05
 """Rate of a wheel from which its friction is whole [rad/s]; below, it is in proportion."""
 
+MANY = 20_000
+"""Points at one height from which on their field is looked up, as `level_field_nt` does: so many take as long
+as the floor of a lab."""
+
 NEAREST_M = 1e-3
 """Distance from the middle of a wheel within which no magnetometer can be [m]."""
 
@@ -51,26 +56,56 @@ def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
         RefusedError: The scene has no Earth's field, so only its map is known; or a shape is not as above.
     """
     earth, bodies = _known(scene)
-    return bodies.field_nt(p_world) + earth
+    p = np.asarray(p_world, float)
+    if p.size >= 3 * MANY and p.shape[-1] == 3 and not np.ptp(p[..., 2]):
+        level = p.reshape(-1, 3)
+        return level_field_nt(scene, level[:, :2], level[0, 2])[0].reshape(p.shape)
+    return bodies.field_nt(p) + earth
 
 
-def ambient_field_and_rate_nt(scene: Scene, p_world: ArrayLike, v_world: ArrayLike) -> tuple[Array, Array]:
-    """`ambient_field_nt` at points that move, and how fast it changes there.
+def level_field_nt(scene: Scene, p_xy: ArrayLike, height_m: float) -> tuple[Array, Array]:
+    """`ambient_field_nt` at one height, to 1e-3 nT, and how it changes along x and y: for robots that drive.
 
     Args:
         scene: A scene whose Earth's field is known.
-        p_world: Points [m], shape (..., 3).
-        v_world: Their velocities [m/s], shape (..., 3).
+        p_xy: Points [m], shape (N, 2).
+        height_m: Their height above the floor [m].
 
     Returns:
-        Field [nT] and its rate of change [nT/s], both in world axes, each of shape (..., 3).
+        Field [nT], shape (N, 3), and dB/dx, dB/dy [nT/m], shape (N, 2, 3), in world axes.
 
     Raises:
         RefusedError: As for `ambient_field_nt`.
     """
-    earth, bodies = _known(scene)
-    field, rate = bodies.field_and_rate_nt(p_world, v_world)
-    return field + earth, rate
+    earth, _ = _known(scene)
+    field, slopes = _plane(scene.magnets, scene.earth, float(height_m)).field_and_slopes_nt(p_xy)
+    return field + earth, slopes
+
+
+def level_gradient_nt_m(scene: Scene, p_xy: ArrayLike, height_m: float) -> Array:
+    """`ambient_gradient_nt_m` at one height.
+
+    How the field changes upwards follows from how it does along x and y, as curl B = 0 and div B = 0 outside
+    of what is magnetised.
+
+    Args:
+        scene: A scene whose Earth's field is known.
+        p_xy: Points [m], shape (N, 2).
+        height_m: Their height above the floor [m].
+
+    Returns:
+        Gradient [nT/m], shape (N,).
+
+    Raises:
+        RefusedError: As for `ambient_field_nt`.
+    """
+    total, slopes = level_field_nt(scene, p_xy, height_m)
+    (xx, xy, xz), (yx, yy, yz) = np.moveaxis(slopes, 0, -1)
+    bx, by, bz = total.T
+    along = np.stack(
+        [bx * xx + by * xy + bz * xz, bx * yx + by * yy + bz * yz, bx * xz + by * yz - bz * (xx + yy)]
+    )
+    return np.asarray(np.sqrt(np.sum(along * along, axis=0) / (bx * bx + by * by + bz * bz)))
 
 
 def ambient_gradient_nt_m(scene: Scene, p_world: ArrayLike) -> Array:
@@ -115,6 +150,12 @@ def _bodies(magnets: tuple[SourceSpec, ...], earth: EarthFieldSpec) -> Bodies:
         [source.p_world for source in points],
         [source.m_world for source in points],
     )
+
+
+@lru_cache(maxsize=8)
+def _plane(magnets: tuple[SourceSpec, ...], earth: EarthFieldSpec, height_m: float) -> Plane:
+    """Where a robot's magnetometer comes by."""
+    return Plane(_bodies(magnets, earth), height_m)
 
 
 def platform_field_nt(
@@ -263,15 +304,10 @@ def field_at_sensor_nt(
     robot, t = scene.robot, np.asarray(t, float)
     cos, sin = np.cos(true.pose[:, 2]), np.sin(true.pose[:, 2])
     p_world = sensor_places(robot, true.pose)
-    x, y = true.pose[:, 0], true.pose[:, 1]
-    v_world = np.column_stack(
-        [
-            true.v * cos - true.w * (p_world[:, 1] - y),
-            true.v * sin + true.w * (p_world[:, 0] - x),
-            np.zeros(len(t)),
-        ]
-    )
-    b_world, change = ambient_field_and_rate_nt(scene, p_world, v_world)
+    vx = true.v * cos - true.w * (p_world[:, 1] - true.pose[:, 1])
+    vy = true.v * sin + true.w * (p_world[:, 0] - true.pose[:, 0])
+    b_world, slopes = level_field_nt(scene, p_world[:, :2], p_world[0, 2])
+    change = vx[:, None] * slopes[:, 0] + vy[:, None] * slopes[:, 1]
     b_base = _into_base(b_world, cos, sin)
     b_rate = _into_base(change, cos, sin)
     b_rate[:, 0] += true.w * b_base[:, 1]

@@ -27,9 +27,6 @@ LOCK_RATE_HZ = 5.0
 """How often it is seen whether the field is too steep [Hz]: every 6 cm at the TurtleBot 4's top speed, over
 which fields of things that lie half a metre away hardly change."""
 
-LOCK_STEP_M = 0.02
-"""Spacing of the places where that is seen [m]; over half of it gradients change by some per cent."""
-
 FLICKER_LOWEST_HZ = 1e-3
 """Frequency below which 1/f noise is flat: a run of a quarter of an hour [Hz]."""
 

@@ -23,9 +23,9 @@ from magtwin.sim.driver import Driver
 from magtwin.sim.engine import Engine, Kinematic, Travel
 from magtwin.sim.follow import follow, play
 from magtwin.sim.imu import sense_imu
-from magtwin.sim.interference import ambient_gradient_nt_m, field_at_sensor_nt, sensor_places
+from magtwin.sim.interference import field_at_sensor_nt, level_gradient_nt_m, sensor_places
 from magtwin.sim.lidar import lidar_on
-from magtwin.sim.magnetometer import LOCK_RATE_HZ, LOCK_STEP_M, feels_direction, lost_in, sense_magnetometer
+from magtwin.sim.magnetometer import LOCK_RATE_HZ, feels_direction, lost_in, sense_magnetometer
 from magtwin.sim.mocap import sense_mocap
 from magtwin.sim.odometry import sense_odometry
 from magtwin.sim.replay import replayed
@@ -417,11 +417,8 @@ def _steep(scene: Scene, anomaly_map: AnomalyMap, motion: Moving, t: Array) -> N
     if scene.earth is None:
         gradient = np.hypot(*anomaly_map.gradient(pose[:, :2], pose[:, 2])[:, :2].T)
     else:
-        # Laps come by the same places: each is asked for once, to within LOCK_STEP_M.
         places = sensor_places(scene.robot, pose)
-        nodes, which = np.unique(np.rint(places[:, :2] / LOCK_STEP_M), axis=0, return_inverse=True)
-        points = np.column_stack([nodes * LOCK_STEP_M, np.full(len(nodes), places[0, 2])])
-        gradient = ambient_gradient_nt_m(scene, points)[which.ravel()]
+        gradient = level_gradient_nt_m(scene, places[:, :2], places[0, 2])
     return lost_in(spec, gradient)[seen]
 
 
