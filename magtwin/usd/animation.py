@@ -1,0 +1,436 @@
+"""Animation: a Run as a layer of time samples over its scene, which any viewer of USD plays, and back.
+
+The layer moves the robot and turns its wheels, and gives what the sensors read on their prims. Time code 0 is
+the run's first row, and `timeCodesPerSecond` of them are a second. Beside what is played, the prim `Run`
+holds every column whole, one array each, at full rate and to the last bit: those are what `read_animation`
+reads, and what the samples' rate does not touch.
+
+Samples are authored on the layer itself: a stage would compose anew for each.
+"""
+
+import json
+import os
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import repeat
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
+
+from magtwin.files import existing, output
+from magtwin.frames import quat_conjugate, quat_multiply, rotate
+from magtwin.names import RefusedError
+from magtwin.resample import check_instants, grid
+from magtwin.run import COLUMNS, Column, Run
+from magtwin.spec import Quat, Vec3
+from magtwin.usd.figures import read_pose, target
+from magtwin.usd.geometry import BASE_LINK, read_links
+from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_stage
+from magtwin.usd.schema import attribute_name, only_prim_with, place, prims_with
+from magtwin.usd.sensors import JOINT_FIELDS
+
+FPS = 30.0
+"""Frames a second unless told otherwise."""
+
+MOST_FPS = 10_000.0
+
+RUN = "Run"
+"""Name of the prim that holds the columns."""
+
+POSES = (
+    ("p_world_base", "q_world_base_xyzw"),
+    ("mocap_p", "mocap_q_xyzw"),
+    ("odom_p", "odom_q_xyzw"),
+)
+"""Where the robot is: the truth, or what came nearest to it in a recording without."""
+
+READINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "magnetometer": (
+            "b_map_nt",
+            "b_disturbance_nt",
+            "b_total_nt",
+            "b_measured_nt",
+            "b_vector_nt",
+            "flag_outside_map",
+            "flag_out_of_distribution",
+            "flag_lost_lock",
+        ),
+        "battery": ("battery_v", "battery_fraction"),
+        "lidar": ("lidar_on",),
+        "robot": ("flag_bump", "flag_pose_lost"),
+    }
+)
+"""Columns that are sampled on the prim of a sensor: `b_total_nt` as `magtwin:magnetometer:bTotalNt`."""
+
+_BARE = WORLD.AppendChild("robot")
+"""What stands for the robot where there is no scene."""
+
+_FACTS = "magtwinFacts"
+_KINDS = {
+    "f8": Sdf.ValueTypeNames.DoubleArray,
+    "f4": Sdf.ValueTypeNames.FloatArray,
+    "f2": Sdf.ValueTypeNames.HalfArray,
+    "i4": Sdf.ValueTypeNames.IntArray,
+    "i8": Sdf.ValueTypeNames.Int64Array,
+    "u1": Sdf.ValueTypeNames.UCharArray,
+    "u4": Sdf.ValueTypeNames.UIntArray,
+    "u8": Sdf.ValueTypeNames.UInt64Array,
+    "b1": Sdf.ValueTypeNames.BoolArray,
+}
+"""USD's arrays by numpy's dtypes."""
+
+
+@dataclass(frozen=True)
+class _Stand:
+    """Where in a scene a robot's prims are."""
+
+    world: Sdf.Path = WORLD
+    robot: Sdf.Path = _BARE
+    p_root_base: Vec3 = (0.0, 0.0, 0.0)
+    """Origin of the base link in the robot's root [m]."""
+    q_root_base_xyzw: Quat = (0.0, 0.0, 0.0, 1.0)
+    wheels: tuple[tuple[Sdf.Path, Vec3, Quat, Vec3], ...] = ()
+    """Of the left and the right wheel: prim, place [m] and turn in its parent, and axis in its own frame."""
+    sensors: Mapping[str, Sdf.Path] = field(
+        default_factory=lambda: {"magnetometer": _BARE.AppendChild("magnetometer"), "robot": _BARE}
+    )
+
+
+def write_animation(
+    run: Run,
+    path: str | os.PathLike[str],
+    scene_file: str | os.PathLike[str] | None = None,
+    *,
+    fps: float | None = FPS,
+    force: bool = False,
+) -> None:
+    """Write a run as a layer of time samples over its scene.
+
+    Poses and readings are sampled `fps` times a second, as `Run.resample` reads them; flags and the battery
+    where they change.
+    Bodies are moved by their transforms: to look at, not for a physics engine to simulate.
+
+    Args:
+        run: What happened; the robot is where `p_world_base` has it, or else motion capture or odometry.
+        path: The .usd, .usda or .usdc file to make; the first and last are small, text is not.
+        scene_file: The stage that it happened in, which becomes a sublayer, named relative to `path`.
+            Without it, bare Xforms called robot and magnetometer stand for them.
+        fps: Frames a second; none samples at every row.
+        force: Whether a file that exists is replaced.
+
+    Raises:
+        RefusedError: The file exists and `force` was not given, cannot be written or is a part of the scene;
+            the run has no clock or no pose, or a column cannot stand in USD; or the scene has no robot.
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise RefusedError(f"{path}: a USD file ends in {', '.join(SUFFIXES)}")
+    if fps is not None and not 0 < fps <= MOST_FPS:
+        raise RefusedError(f"fps must be above 0 and at most {MOST_FPS:g}, got {fps!r}")
+    t = check_instants(run["t"], "the run to write")
+    if not len(t):
+        raise RefusedError("the run has no rows, there is nothing to play")
+    rate = fps or (round(1 / float(np.median(np.diff(t))), 6) if len(t) > 1 else 1.0)
+    frames = run if fps is None else _frames(run, grid(t[0], t[-1], fps))
+    codes = (frames["t"] - t[0]) * rate if fps is None else np.arange(frames.rows, dtype=float)
+    stand = _Stand()
+    if scene_file is not None:
+        stage = open_stage(scene_file)
+        _check_apart(path, stage)
+        stand = _stand(stage)
+    with output(path, force=force) as aside:
+        layer = Sdf.Layer.CreateNew(str(aside))
+        if layer is None:
+            raise RefusedError(f"{path}: cannot be made as a USD layer")
+        _describe(layer, run, stand, rate, (t[-1] - t[0]) * rate)
+        if scene_file is not None:
+            layer.subLayerPaths = [_relative(Path(scene_file), path)]
+        else:
+            _define_bare(layer, stand)
+        _animate(layer, stand, frames, codes.tolist())
+        _sample_readings(layer, stand, run, frames, codes.tolist(), rate)
+        _store(layer, stand.world.AppendChild(RUN), run)
+        try:
+            layer.Save()
+        except Tf.ErrorException as error:
+            raise RefusedError(f"{path}: cannot be written; is the disk full?") from error
+
+
+def read_animation(path: str | os.PathLike[str]) -> Run:
+    """The run that `write_animation` wrote, to the last bit; its scene need not be there.
+
+    Raises:
+        RefusedError: The file is missing, is not USD, is cut short, or plays no run of magtwin's.
+    """
+    layer = _open_layer(path)
+    prim = layer.GetPrimAtPath(_run_path(layer))
+    if not prim:
+        raise RefusedError(f"{path}: plays no run: it has no prim {_run_path(layer)} that holds one")
+    columns, specs = {}, {}
+    for attribute in sorted(prim.properties, key=_number):
+        name = attribute.name.removeprefix("magtwin:run:")
+        if name == attribute.name:
+            continue
+        columns[name] = _array(attribute, path)
+        if name not in COLUMNS:
+            specs[name] = _spec_said(attribute)
+    try:
+        facts = json.loads(layer.customLayerData.get(_FACTS, "{}"))
+        run = Run(columns, {key: value for key, value in facts.items() if _is_fact(value)}, specs)
+    except (ValueError, AttributeError, TypeError) as error:
+        raise RefusedError(f"{path}: holds a damaged run: {error}") from error
+    if "t" not in run:
+        raise RefusedError(f"{path}: plays no run: <{prim.path}> has no column 't'")
+    check_instants(run["t"], str(path))
+    return run
+
+
+def is_animation(path: str | os.PathLike[str]) -> bool:
+    """Whether a USD file plays a run of magtwin's.
+
+    Raises:
+        RefusedError: The file is missing, or is not USD.
+    """
+    layer = _open_layer(path)
+    return bool(layer.GetAttributeAtPath(_run_path(layer).AppendProperty("magtwin:run:t")))
+
+
+def _open_layer(path: str | os.PathLike[str]) -> Sdf.Layer:
+    """A layer as it is on disk now, and nothing that it names."""
+    path = existing(path, "USD file")
+    if path.is_dir():
+        raise RefusedError(f"{path}: a folder; give a USD file in it")
+    try:
+        layer = Sdf.Layer.OpenAsAnonymous(str(path))
+    except Tf.ErrorException as error:
+        raise RefusedError(
+            f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD"
+        ) from error
+    if layer is None:
+        raise RefusedError(f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD")
+    return layer
+
+
+def _run_path(layer: Sdf.Layer) -> Sdf.Path:
+    world = WORLD
+    if layer.defaultPrim and Sdf.Path.IsValidIdentifier(layer.defaultPrim):
+        world = Sdf.Path.absoluteRootPath.AppendChild(layer.defaultPrim)
+    return world.AppendChild(RUN)
+
+
+def _frames(run: Run, at: NDArray[np.float64]) -> Run:
+    """What is played of a run, at the instants of the frames [s]."""
+    pose = _pose_columns(run)
+    sampled = (n for names in READINGS.values() for n in names if COLUMNS[n].interpolation != "hold")
+    wanted = [name for name in (*pose, "wheel_angle", *sampled) if name in run]
+    rules: Any = {pose[0]: "linear", pose[1]: "quaternion"}  # of a recording: it moved between the fixes
+    return run.select(*wanted).resample(at, interpolation=rules)
+
+
+def _pose_columns(run: Run) -> tuple[str, str]:
+    for p, q in POSES:
+        if p in run and q in run and np.isfinite(run[p]).all(axis=1).any():
+            return p, q
+    known = "; ".join(" and ".join(pair) for pair in POSES)
+    raise RefusedError(f"the run says nowhere where the robot is; it needs {known}")
+
+
+def _stand(stage: Usd.Stage) -> _Stand:
+    """Where a scene's robot is, and how it is made."""
+    prim = only_prim_with(stage.GetPseudoRoot(), "robot")
+    default = stage.GetDefaultPrim()
+    if not default or prim.GetParent() != default:
+        raise RefusedError(
+            f"{place(prim)}: the robot must stand directly under the default prim of its scene"
+        )
+    if prim.IsInstance() or prim.IsInstanceProxy():
+        raise RefusedError(f"{place(prim)}: the robot is an instance, whose wheels cannot turn; make it none")
+    cache = UsdGeom.XformCache()
+    if cache.GetLocalToWorldTransform(default) != Gf.Matrix4d(1):
+        raise RefusedError(f"{place(default)}: is moved or scaled; magtwin plays runs in scenes that are not")
+    to_root = cache.ComputeRelativeTransform(_base(prim), prim)[0].RemoveScaleShear()
+    turn, offset = to_root.ExtractRotationQuat(), to_root.ExtractTranslation()
+    sensors = {}
+    for noun in READINGS:
+        found = prims_with(prim, noun)
+        if found:
+            sensors[noun] = found[0].GetPath()
+    x, y, z = map(float, offset)
+    return _Stand(
+        world=default.GetPath(),
+        robot=prim.GetPath(),
+        p_root_base=(x, y, z),
+        q_root_base_xyzw=(*map(float, turn.GetImaginary()), float(turn.GetReal())),  # type: ignore[arg-type]
+        wheels=tuple(_wheel(prim, field_, stage) for field_ in JOINT_FIELDS),
+        sensors=sensors,
+    )
+
+
+def _base(robot: Usd.Prim) -> Usd.Prim:
+    """The body of a robot whose pose a run tells: base_link, or its root where there is none."""
+    return next((prim for prim in Usd.PrimRange(robot) if prim.GetName() == BASE_LINK), robot)
+
+
+def _wheel(robot: Usd.Prim, joint_field: str, stage: Usd.Stage) -> tuple[Sdf.Path, Vec3, Quat, Vec3]:
+    joint = target(robot, attribute_name("drive", joint_field))
+    body = target(joint, "physics:body1")
+    axis = next(
+        (link.axis_link for link in read_links(stage).values() if link.joint == joint.GetName()), None
+    )
+    if axis is None:
+        raise RefusedError(f"{place(joint)}: is no revolute joint between two bodies; a wheel turns on one")
+    return body.GetPath(), *read_pose(body), axis
+
+
+def _check_apart(path: Path, stage: Usd.Stage) -> None:
+    """Refuse to replace a part of the scene by what plays in it."""
+    for layer in stage.GetUsedLayers():
+        if layer.realPath and Path(layer.realPath).resolve() == path.resolve():
+            raise RefusedError(f"{path}: is a part of the scene; give another name")
+
+
+def _relative(scene_file: Path, path: Path) -> str:
+    """The scene's file, as seen from the place that the layer will have."""
+    relative = Path(os.path.relpath(scene_file.resolve(), path.resolve().parent)).as_posix()
+    return relative if relative.startswith("../") else f"./{relative}"
+
+
+def _describe(layer: Sdf.Layer, run: Run, stand: _Stand, rate: float, end: float) -> None:
+    stage = Usd.Stage.Open(layer)
+    describe_stage(stage, "A run of magtwin's: its robot moved, its sensors read; play it over time")
+    layer.customLayerData = {"creator": "magtwin", _FACTS: json.dumps(dict(run.facts), ensure_ascii=False)}
+    layer.defaultPrim = stand.world.name
+    layer.startTimeCode, layer.endTimeCode = 0.0, float(end)
+    layer.timeCodesPerSecond = layer.framesPerSecond = float(rate)
+
+
+def _define_bare(layer: Sdf.Layer, stand: _Stand) -> None:
+    """The Xforms that stand for a scene which is not there."""
+    for path in (stand.world, stand.robot, stand.sensors["magnetometer"]):
+        spec = Sdf.CreatePrimInLayer(layer, path)
+        spec.specifier, spec.typeName = Sdf.SpecifierDef, "Xform"
+
+
+def _animate(layer: Sdf.Layer, stand: _Stand, frames: Run, codes: list[float]) -> None:
+    """The robot's root and wheels, moved."""
+    p_name, q_name = _pose_columns(frames)
+    known = np.isfinite(frames[p_name]).all(axis=1) & np.isfinite(frames[q_name]).all(axis=1)
+    p, q = frames[p_name][known], frames[q_name][known]
+    at = [code for code, there in zip(codes, known, strict=True) if there]
+    q = quat_multiply(q, quat_conjugate(stand.q_root_base_xyzw))
+    p = p - rotate(q, stand.p_root_base)
+    _move(layer, stand.robot, at, Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(p)), q)
+    if "wheel_angle" not in frames or not stand.wheels:
+        return
+    for (path, p_rest, q_rest, axis), angle in zip(stand.wheels, frames["wheel_angle"].T, strict=True):
+        half = angle[:, None] / 2
+        turn = np.hstack([np.sin(half) * axis, np.cos(half)])
+        _move(layer, path, codes, Gf.Vec3d(p_rest), quat_multiply(q_rest, turn))
+
+
+def _move(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], p: Any, q: NDArray[np.float64]) -> None:
+    """Place an Xform at each time code; `p` is an array, or one place for all of them."""
+    prim = Sdf.CreatePrimInLayer(layer, path)
+    translate = Sdf.AttributeSpec(prim, "xformOp:translate", Sdf.ValueTypeNames.Double3)
+    orient = Sdf.AttributeSpec(prim, "xformOp:orient", Sdf.ValueTypeNames.Quatd)
+    order = Sdf.AttributeSpec(prim, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
+    order.default = Vt.TokenArray([translate.name, orient.name])
+    if isinstance(p, Gf.Vec3d):
+        translate.default = p
+    else:
+        _sample(layer, translate.path, codes, p)
+    _sample(layer, orient.path, codes, Vt.QuatdArray.FromNumpy(np.ascontiguousarray(q)))
+
+
+def _sample(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], values: Iterable[Any]) -> None:
+    """Samples of an attribute, as fast as Python calls a function."""
+    deque(map(layer.SetTimeSample, repeat(path), codes, values), maxlen=0)
+
+
+def _sample_readings(
+    layer: Sdf.Layer, stand: _Stand, run: Run, frames: Run, codes: list[float], rate: float
+) -> None:
+    """What sensors read, on their prims: at every frame, or, if it is held, where it changes."""
+    t, kinds = run["t"], Sdf.ValueTypeNames
+    for noun, names in READINGS.items():
+        for name in names:
+            if name not in run or noun not in stand.sensors:
+                continue
+            prim, spec = Sdf.CreatePrimInLayer(layer, stand.sensors[noun]), COLUMNS[name]
+            kind = {"bool": kinds.Bool}.get(spec.unit, kinds.Double3 if spec.width == 3 else kinds.Double)
+            attribute = Sdf.AttributeSpec(prim, attribute_name(noun, name), kind, declaresCustom=True)
+            attribute.documentation = spec.doc
+            attribute.customData = {key: v for key, v in (("unit", spec.unit), ("frame", spec.frame)) if v}
+            if spec.interpolation == "hold":
+                values = run[name]
+                rows = np.flatnonzero(np.append(True, values[1:] != values[:-1]))
+                _sample(layer, attribute.path, ((t[rows] - t[0]) * rate).tolist(), values[rows].tolist())
+            elif spec.width == 3:
+                vectors = Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(frames[name]))
+                _sample(layer, attribute.path, codes, vectors)
+            else:
+                _sample(layer, attribute.path, codes, frames[name].tolist())
+
+
+def _store(layer: Sdf.Layer, path: Sdf.Path, run: Run) -> None:
+    """Every column of a run as an array."""
+    prim = Sdf.CreatePrimInLayer(layer, path)
+    prim.specifier, prim.typeName = Sdf.SpecifierDef, "Scope"
+    prim.documentation = "Every column of the run, a row a reading; rows of vectors lie one after the other"
+    for number, (name, values) in enumerate(run.items()):
+        kind = _KINDS.get(values.dtype.str[1:])
+        if kind is None or values.ndim > 2 or not Sdf.Path.IsValidIdentifier(name):
+            raise RefusedError(
+                f"column {name!r} cannot stand in USD: numbers or flags can, under a name of letters, digits "
+                f"and _, got {values.dtype} of shape {values.shape}"
+            )
+        spec = run.spec(name)
+        attribute = Sdf.AttributeSpec(
+            prim, f"magtwin:run:{name}", kind, Sdf.VariabilityUniform, declaresCustom=True
+        )
+        attribute.documentation = spec.doc
+        said: dict[str, Any] = {"unit": spec.unit, "frame": spec.frame, "parts": ",".join(spec.parts)}
+        if name not in COLUMNS:
+            said["interpolation"] = spec.interpolation
+        said = {key: value for key, value in said.items() if value}
+        attribute.customData = {**said, "number": number}  # text sorts attributes by name
+        attribute.default = kind.type.pythonClass.FromNumpy(np.ascontiguousarray(values).reshape(-1))
+
+
+def _number(attribute: Sdf.PropertySpec) -> float:
+    """Where in the order of the table a column stands."""
+    number = attribute.customData.get("number")
+    return float(number) if isinstance(number, int) else np.inf
+
+
+def _array(attribute: Sdf.AttributeSpec, path: str | os.PathLike[str]) -> NDArray[Any]:
+    """The values of a column."""
+    dtype = next((dtype for dtype, kind in _KINDS.items() if kind == attribute.typeName), None)
+    if dtype is None or attribute.default is None:
+        raise RefusedError(
+            f"{path}: <{attribute.path}> must be an array of numbers, got {attribute.typeName}"
+        )
+    values = np.array(attribute.default, dtype)
+    parts = str(attribute.customData.get("parts", ""))
+    width = len(parts.split(","))
+    if len(values) % width:
+        raise RefusedError(f"{path}: <{attribute.path}> has {len(values)} numbers in rows of {width}")
+    return values.reshape(-1, width) if parts else values
+
+
+def _spec_said(attribute: Sdf.AttributeSpec) -> Column:
+    said = {key: str(value) for key, value in attribute.customData.items()}
+    parts = tuple(filter(None, said.get("parts", "").split(",")))
+    rule: Any = said.get("interpolation", "linear")
+    unit, frame = said.get("unit", ""), said.get("frame", "")
+    return Column(unit, frame, attribute.documentation, len(parts) or 1, parts, rule)
+
+
+def _is_fact(value: Any) -> bool:
+    return isinstance(value, str | int | float | bool)
