@@ -104,15 +104,7 @@ def whole_job(twin: Twin, folder: Path) -> dict[str, float]:
     simulated = time.perf_counter()
     write_parquet(run, folder / "run.parquet", force=True)
     tabled = time.perf_counter()
-    write_rrd(
-        run,
-        folder / "run.rrd",
-        scene=twin.scene,
-        scene_file=twin.scene_file,
-        field=twin.field,
-        planned=path,
-        force=True,
-    )
+    write_rrd(run, folder / "run.rrd", twin, planned=path, force=True)
     end = time.perf_counter()
     return {
         "run": simulated - start,

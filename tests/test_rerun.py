@@ -12,14 +12,15 @@ from rerun.chunk import RrdReader
 
 from magtwin.field.map import AnomalyMap
 from magtwin.frames import quat_from_rpy, quat_from_yaw, rotate
-from magtwin.io.layout import PANELS, STATES
-from magtwin.io.rerun import view, write_rrd
+from magtwin.io.rerun import read_run, view, write_rrd
+from magtwin.io.series import STATES
 from magtwin.io.tables import write_parquet
 from magtwin.io.viewer import headless_viewer, screenshot
 from magtwin.names import RefusedError
 from magtwin.path import figure8
 from magtwin.run import COLUMNS, Run
 from magtwin.spec import MagnetometerSpec, RobotSpec, Scene
+from magtwin.twin import Twin
 
 HEADER = """#usda 1.0
 (
@@ -164,8 +165,7 @@ def parts(tmp_path_factory):
     stage = tmp_path_factory.mktemp("stage") / "lab.usda"
     stage.write_text(a_stage())
     field = a_field()
-    rest = {"scene": a_scene(stage), "scene_file": stage, "field": field, "planned": figure8()}
-    return a_run(field), rest
+    return a_run(field), {"twin": Twin(a_scene(stage), stage, field, None), "planned": figure8()}
 
 
 @pytest.fixture(scope="module")
@@ -185,34 +185,40 @@ def columns_of(rrd, entity):
             if "sim_time" in batch.schema.names:
                 times += batch.column("sim_time").cast("int64").to_pylist()
             for name in batch.schema.names:
-                if ":" in name:
+                if name not in ("sim_time", "rerun.controls.RowId"):
                     values.setdefault(name, []).extend(batch.column(name).to_pylist())
     return np.array(times), values
 
 
-def test_every_series_equals_its_column_at_full_rate(parts, written):
+def test_every_column_is_a_component_under_its_own_name_at_full_rate(parts, written):
     run, _ = parts
-    for panel in PANELS:
-        times, values = columns_of(written, panel.entity)
-        assert np.array_equal(times, np.rint(run["t"] * 1e9))  # Rerun's clock counts nanoseconds
-        names = values["SeriesLines:names"][0]
-        scalars = np.array(values["Scalars:scalars"])
-        assert scalars.shape == (run.rows, len(names))
-        for series in panel.series:
-            column = run[series.column].reshape(run.rows, -1)[:, series.part]
-            if series.name in names:
-                assert np.array_equal(scalars[:, names.index(series.name)], column, equal_nan=True)
-            else:
-                assert np.isnan(column).all(), series
+    times, values = columns_of(written, "run")
+    assert np.array_equal(times, np.rint(run["t"] * 1e9))  # Rerun's clock counts nanoseconds
+    for name, column in COLUMNS.items():
+        rows = [row[0] for row in values[name]]
+        if column.parts:
+            assert list(rows[0]) == list(column.parts)
+            rows = [list(row.values()) for row in rows]
+        assert np.array_equal(np.array(rows), run[name], equal_nan=column.unit != "bool"), name
+
+
+def test_a_run_comes_back_to_the_bit_with_its_facts_and_the_order_of_its_columns(parts, written):
+    run, _ = parts
+    back = read_run(written)
+    assert list(back) == list(run)
+    assert dict(back.facts) == dict(run.facts)
+    for name in run:
+        assert back[name].dtype == run[name].dtype
+        assert back[name].tobytes() == np.ascontiguousarray(run[name]).tobytes(), name
 
 
 def test_states_hold_from_each_change_of_a_flag_to_the_next(parts, written):
     run, _ = parts
-    for column, (name, false, true) in STATES.items():
-        times, values = columns_of(written, f"states/{name}")
+    for column, state in STATES.items():
+        times, values = columns_of(written, f"states/{state.name}")
         words = np.array([state[0] for state in values["StateChange:state"]])
         held = words[np.searchsorted(times, np.rint(run["t"] * 1e9), side="right") - 1]
-        assert np.array_equal(held, np.where(run[column], true, false)), column
+        assert np.array_equal(held, np.where(run[column], state.up, state.down)), column
 
 
 def test_the_robot_stands_where_the_run_has_it_at_fifty_hertz_or_less_to_the_last_row(parts, written):
@@ -252,12 +258,13 @@ def test_what_stands_still_and_each_link_is_one_mesh_of_the_stages_triangles(wri
     assert (np.ptp(x), np.ptp(y), z.max()) == pytest.approx((6, 3.5, 0), abs=1e-6)
 
 
-def test_readings_float_where_the_sensor_was_and_the_plan_lies_on_the_floor(parts, written):
+def test_the_ribbon_of_readings_goes_where_the_sensor_was_and_the_plan_lies_on_the_floor(parts, written):
     run, rest = parts
     times, values = columns_of(written, "world/readings")
-    p = np.array(values["Points3D:positions"])[:, 0]
+    strips = np.array(values["LineStrips3D:strips"])[:, 0]
     rows = np.searchsorted(run["t"], times / 1e9 - 1e-6)
-    np.testing.assert_allclose(p, run["p_world_base"][rows] + [0, 0, 0.33], atol=1e-6)
+    np.testing.assert_allclose(strips[:, 1], run["p_world_base"][rows] + [0, 0, 0.33], atol=1e-6)
+    np.testing.assert_array_equal(strips[1:, 0], strips[:-1, 1])  # a ribbon without a gap
     _, plan = columns_of(written, "world/planned")
     strip = np.array(plan["LineStrips3D:strips"][0][0])
     np.testing.assert_allclose(strip[:, :2], rest["planned"].p_xy, atol=1e-6)
@@ -282,7 +289,7 @@ def test_the_field_arrow_goes_through_the_sensor_and_is_there_only_where_the_vec
     b = run["b_vector_nt"][0]
     np.testing.assert_allclose(arrow / np.linalg.norm(arrow), b / np.linalg.norm(b), atol=1e-6)
     np.testing.assert_allclose(tail, -arrow / 2, atol=1e-6)
-    write_rrd(a_run(rest["field"], rows=50, vector=False), tmp_path / "run.rrd", **rest)
+    write_rrd(a_run(rest["twin"].field, rows=50, vector=False), tmp_path / "run.rrd", **rest)
     assert not columns_of(tmp_path / "run.rrd", "world/robot/magnetometer/field")[1]
 
 
@@ -290,13 +297,13 @@ def test_the_arrow_is_at_the_sensor_though_its_link_is_a_mere_frame(parts, tmp_p
     run, rest = parts
     turn = tuple(quat_from_rpy([0.1, 0.2, 0.3]).tolist())
     robot = dataclasses.replace(
-        rest["scene"].robot,
+        rest["twin"].scene.robot,
         p_base_magnetometer=(0.05, -0.02, 0.4),
         q_base_magnetometer_link_xyzw=turn,
         magnetometer=MagnetometerSpec(link="a_frame_without_mass_or_shape"),
     )
-    scene = dataclasses.replace(rest["scene"], robot=robot)
-    write_rrd(run, tmp_path / "run.rrd", **rest | {"scene": scene})
+    twin = dataclasses.replace(rest["twin"], scene=dataclasses.replace(rest["twin"].scene, robot=robot))
+    write_rrd(run, tmp_path / "run.rrd", **rest | {"twin": twin})
     _, values = columns_of(tmp_path / "run.rrd", "world/robot/magnetometer")
     np.testing.assert_allclose(values["Transform3D:translation"][0][0], [0.05, -0.02, 0.4], atol=1e-6)
     np.testing.assert_allclose(values["Transform3D:quaternion"][0][0], turn, atol=1e-6)
@@ -307,18 +314,19 @@ def test_a_run_of_a_few_rows_is_recorded_too(parts, rows, tmp_path):
     run, rest = parts
     few = Run({name: values[:rows] for name, values in run.items()}, {"note": "a | b"})
     write_rrd(few, tmp_path / "run.rrd", **rest)
-    times, _ = columns_of(tmp_path / "run.rrd", "series/speed")
+    times, _ = columns_of(tmp_path / "run.rrd", "run")
     assert len(times) == rows
     assert r"| note | a \| b |" in columns_of(tmp_path / "run.rrd", "facts")[1]["TextDocument:text"][0][0]
 
 
 def test_a_map_and_a_run_that_know_no_field_are_recorded_too(parts, tmp_path):
     run, rest = parts
-    field = dataclasses.replace(rest["field"], valid=np.zeros(rest["field"].values_nt.shape, bool))
+    field = dataclasses.replace(rest["twin"].field, valid=np.zeros(rest["twin"].field.values_nt.shape, bool))
     nothing = np.full(run.rows, np.nan)
     run = run.with_columns(b_map_nt=nothing, b_total_nt=nothing, b_measured_nt=nothing)
-    write_rrd(run, tmp_path / "run.rrd", **{**rest, "field": field})
-    assert not columns_of(tmp_path / "run.rrd", "series/field")[1]
+    twin = dataclasses.replace(rest["twin"], field=field)
+    write_rrd(run, tmp_path / "run.rrd", **{**rest, "twin": twin})
+    assert np.isnan(read_run(tmp_path / "run.rrd")["b_total_nt"]).all()
 
 
 def test_the_facts_are_properties_of_the_recording_and_a_page_in_it(parts, written):
@@ -345,7 +353,7 @@ def test_reruns_own_tool_verifies_the_file(written):
 
 def test_two_recordings_of_one_run_are_the_same_recording(parts, tmp_path):
     run, rest = parts
-    run = run.with_columns(b_map_nt=run["t"], b_total_nt=run["t"], b_measured_nt=run["t"])  # nan != nan
+    run = Run({name: np.nan_to_num(values) for name, values in run.items()}, run.facts)  # nan != nan
     for name in ("a.rrd", "b.rrd"):
         write_rrd(run, tmp_path / name, **rest)
     a, b = (RrdReader(tmp_path / name).recordings()[0].recording_id for name in ("a.rrd", "b.rrd"))
@@ -380,7 +388,11 @@ def test_a_stage_that_is_missing_is_refused_and_nothing_is_left(parts, tmp_path)
     run, rest = parts
     strict = rr.strict_mode()
     with pytest.raises(RefusedError, match=r"none\.usda: no such USD file"):
-        write_rrd(run, tmp_path / "run.rrd", **{**rest, "scene_file": tmp_path / "none.usda"})
+        write_rrd(
+            run,
+            tmp_path / "run.rrd",
+            **{**rest, "twin": dataclasses.replace(rest["twin"], scene_file=tmp_path / "none.usda")},
+        )
     assert not list(tmp_path.iterdir())
     assert rr.strict_mode() == strict
 
@@ -405,9 +417,9 @@ def test_rerun_switched_off_by_the_environment_is_said_rather_than_nothing_writt
 def test_view_refuses_what_is_missing_or_of_another_kind(tmp_path):
     with pytest.raises(RefusedError, match=r"none\.rrd: no such recording"):
         view(tmp_path / "none.rrd")
-    (tmp_path / "run.csv").touch()
-    with pytest.raises(RefusedError, match=r"no kind of recording '\.csv'; known: \.parquet, \.rrd"):
-        view(tmp_path / "run.csv")
+    (tmp_path / "run.xyz").touch()
+    with pytest.raises(RefusedError, match=r"run\.xyz: no known kind of run file"):
+        view(tmp_path / "run.xyz")
 
 
 @pytest.fixture
@@ -440,14 +452,13 @@ def test_view_of_a_parquet_file_shows_its_series(parts, tmp_path, monkeypatch):
     seen = tmp_path / "seen.rrd"
     monkeypatch.setattr("magtwin.io.rerun.show", lambda rrd, **_: shutil.copy(rrd, seen))
     view(tmp_path / "run.parquet")
-    _, values = columns_of(seen, "series/disturbance")
-    assert np.array_equal(np.ravel(values["Scalars:scalars"]), run["b_disturbance_nt"])
+    assert np.array_equal(read_run(seen)["b_disturbance_nt"], run["b_disturbance_nt"])
 
 
 def test_view_of_a_parquet_file_with_nothing_to_plot_is_refused(tmp_path):
     write_parquet(Run({"t": np.arange(3.0), "est_bias_nt": np.zeros(3)}), tmp_path / "run.parquet")
     with pytest.raises(
-        RefusedError, match=r"run\.parquet: holds none of the columns that are plotted: b_total"
+        RefusedError, match=r"run\.parquet: holds none of the columns that are plotted, such as b_total"
     ):
         view(tmp_path / "run.parquet")
 

@@ -8,8 +8,9 @@ from numpy.testing import assert_array_equal
 from rerun.chunk import RrdReader
 
 from magtwin.cli import main
-from magtwin.io.rerun import SCAN, write_rrd
+from magtwin.io.rerun import write_rrd
 from magtwin.io.scans import read_scans, write_scans
+from magtwin.io.world import SCAN
 from magtwin.names import RefusedError
 from magtwin.path import path_named
 from magtwin.sim.lidar import Scans
@@ -81,15 +82,7 @@ def test_what_is_no_table_of_scans_is_refused(scans, tmp_path):
 def test_the_recording_holds_every_scan_and_is_cleared_when_the_lidar_stops(twin, run, tmp_path):
     on = (run["t"] < 2.0) | (run["t"] > 4.0)
     scans = scan(twin, run.with_columns(lidar_on=on))
-    write_rrd(
-        run,
-        tmp_path / "run.rrd",
-        scene=twin.scene,
-        scene_file=twin.scene_file,
-        field=twin.field,
-        planned=path_named("figure8"),
-        scans=scans,
-    )
+    write_rrd(run, tmp_path / "run.rrd", twin, planned=path_named("figure8"), scans=scans)
     sizes = []
     for chunk in RrdReader(tmp_path / "run.rrd").stream().to_chunks():
         batch = chunk.to_record_batch()

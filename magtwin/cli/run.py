@@ -254,15 +254,7 @@ def write_run(
             write_parquet(result, target)
     for target in (folder / "run.rrd" if folder else None, rrd):
         if target is not None:
-            write_rrd(
-                result,
-                target,
-                scene=twin.scene,
-                scene_file=twin.scene_file,
-                field=twin.field,
-                planned=planned,
-                scans=seen,
-            )
+            write_rrd(result, target, twin, planned=planned, scans=seen)
     if folder:
         from magtwin.io.plots import plot_run
 

@@ -1,6 +1,7 @@
 """Layout: which plots and views a recording opens with, and what they show."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,14 +9,13 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
+from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
-from magtwin.run import Run
+from magtwin.io.series import COLUMNS_ENTITY, DERIVED, DERIVED_ENTITY, STATES, TIMELINE, derived, entity_of
+from magtwin.run import COLUMNS, Run
 from magtwin.spec import LabSpec, Vec3
 
 Array = NDArray[np.float64]
-
-TIMELINE = "sim_time"
-"""Name of the timeline that a recording runs on."""
 
 _ROOM = 0.08
 """Room beyond the values and the ticks of an axis, as a share of the values' range."""
@@ -26,111 +26,248 @@ _LEGEND_ROW, _LEGEND_MOST = 0.1, 0.6
 _LEGEND_WIDTH, _LEGEND_LETTER = 0.07, 0.01
 """Width of a legend without text, and of a letter, as shares of a plot's."""
 
+_LOOKED_AT = 4000
+"""Readings of a series by which its legend is placed."""
+
+Colour = tuple[int, int, int]
+
+RUN_COLOURS: tuple[Colour, ...] = (
+    (86, 156, 255),
+    (255, 158, 64),
+    (92, 200, 120),
+    (226, 92, 160),
+    (170, 130, 255),
+    (224, 208, 80),
+    (80, 210, 214),
+    (240, 98, 82),
+)
+"""Colours of runs that are compared, over again where there are more."""
+
 
 @dataclass(frozen=True)
 class Series:
-    """A line of a plot: one part of a column."""
+    """A line of a plot: a column, or one part of it."""
 
     column: str
     name: str
-    colour: tuple[int, int, int]
-    part: int = 0
+    colour: Colour
+    part: str = ""
+    """Name of the part, such as x, of a column that has several."""
     width: float = 1.5
     """Width of the line [points]; wide ones stand under narrow ones that they would hide."""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A plot: series of one unit, in one entity of the recording."""
+    """A plot: series of one unit."""
 
-    entity: str
     title: str
     series: tuple[Series, ...]
 
 
 _BLUE, _ORANGE, _GREEN, _GREY = (86, 156, 255), (255, 158, 64), (92, 200, 120), (165, 165, 165)
+_DIM = (118, 106, 150)
 
+FIELD_PANEL = Panel(
+    "Total field [nT]",
+    (
+        Series("b_total_nt", "total = map + disturbance", _ORANGE, width=4.0),
+        Series("b_measured_nt", "measured", _GREEN, width=1.0),
+        Series("b_map_nt", "map", _BLUE),
+        Series("b_truth_nt", "truth", _GREY),
+        Series("interval_low_nt", "90 % interval", _DIM),
+        Series("interval_high_nt", "90 % interval", _DIM),
+    ),
+)
+DISTURBANCE_PANEL = Panel("Disturbance [nT]", (Series("b_disturbance_nt", "disturbance", _ORANGE),))
+ERROR_PANEL = Panel(
+    "Error [nT]",
+    (
+        Series("error_nt", "total - truth", _ORANGE, width=3.0),
+        Series("measured_error_nt", "measured - truth", _GREEN, width=1.0),
+        Series("error_low_nt", "90 % interval", _DIM),
+        Series("error_high_nt", "90 % interval", _DIM),
+    ),
+)
+SPEED_PANEL = Panel(
+    "Speed [m/s]",
+    (
+        Series("odom_v", "odometry", _GREY, "x", width=3.0),
+        Series("v_base", "true", _BLUE, "x"),
+        Series("v_cmd", "commanded", _ORANGE),
+    ),
+)
+YAW_RATE_PANEL = Panel(
+    "Yaw rate [rad/s]",
+    (
+        Series("imu_w", "gyroscope", _GREY, "z", width=3.0),
+        Series("w_base", "true", _BLUE, "z"),
+        Series("w_cmd", "commanded", _ORANGE),
+    ),
+)
+ACCELERATION_PANEL = Panel(
+    "Accelerometer [m/s2]",
+    (
+        Series("imu_a", "forward", _BLUE, "x"),
+        Series("imu_a", "left", _ORANGE, "y"),
+        Series("imu_a", "up", _GREY, "z"),
+    ),
+)
+TILT_PANEL = Panel(
+    "Gyroscope, tilting [rad/s]",
+    (Series("imu_w", "roll", _BLUE, "x"), Series("imu_w", "pitch", _ORANGE, "y")),
+)
+BATTERY_PANELS = (
+    Panel("Battery voltage [V]", (Series("battery_v", "voltage", _GREEN),)),
+    Panel("Battery current [A]", (Series("battery_a", "current", _ORANGE),)),
+    Panel("Battery charge [0..1]", (Series("battery_fraction", "charge", _GREEN),)),
+)
 PANELS = (
-    Panel(
-        "series/field",
-        "Total field [nT]",
-        (
-            Series("b_total_nt", "total = map + disturbance", _ORANGE, width=4.0),
-            Series("b_measured_nt", "measured", _GREEN, width=1.0),
-            Series("b_map_nt", "map", _BLUE),
-            Series("b_truth_nt", "truth", _GREY),
-        ),
-    ),
-    Panel("series/disturbance", "Disturbance [nT]", (Series("b_disturbance_nt", "disturbance", _ORANGE),)),
-    Panel(
-        "series/speed",
-        "Speed [m/s]",
-        (
-            Series("odom_v", "odometry", _GREY, 0, width=3.0),
-            Series("v_base", "true", _BLUE, 0),
-            Series("v_cmd", "commanded", _ORANGE),
-        ),
-    ),
-    Panel(
-        "series/yaw_rate",
-        "Yaw rate [rad/s]",
-        (
-            Series("imu_w", "gyroscope", _GREY, 2, width=3.0),
-            Series("w_base", "true", _BLUE, 2),
-            Series("w_cmd", "commanded", _ORANGE),
-        ),
-    ),
-    Panel("series/battery_voltage", "Battery voltage [V]", (Series("battery_v", "voltage", _GREEN),)),
-    Panel("series/battery_charge", "Battery charge [0..1]", (Series("battery_fraction", "charge", _GREEN),)),
+    FIELD_PANEL,
+    DISTURBANCE_PANEL,
+    ERROR_PANEL,
+    SPEED_PANEL,
+    YAW_RATE_PANEL,
+    ACCELERATION_PANEL,
+    TILT_PANEL,
+    *BATTERY_PANELS,
 )
 """Every plot of the recording; series that a run has not got, or that are nan throughout, are left out."""
 
-STATES = {
-    "lidar_on": ("LiDAR", "off", "on"),
-    "flag_bump": ("bump", "no", "bump"),
-    "flag_outside_map": ("map", "inside", "outside"),
-    "flag_pose_lost": ("mocap", "seen", "lost"),
-    "flag_out_of_distribution": ("network", "in distribution", "out of distribution"),
-    "flag_lost_lock": ("lock", "held", "lost"),
-}
-"""Lanes of states: column, name, and what false and true are called."""
+_COMPARED = (
+    ("Total field [nT]", "b_total_nt", ""),
+    ("Disturbance [nT]", "b_disturbance_nt", ""),
+    ("Error, total - truth [nT]", "error_nt", ""),
+    ("Speed [m/s]", "v_base", "x"),
+    ("Heading [rad]", "yaw", ""),
+    ("Battery voltage [V]", "battery_v", ""),
+)
+"""Plots of runs that are compared: title, column, part; a line a run."""
 
 
-def known_series(run: Run, panel: Panel) -> list[Series]:
-    """The series of a panel that the run has."""
-    return [s for s in panel.series if s.column in run.columns and np.isfinite(run[s.column]).any()]
+@dataclass(frozen=True)
+class Shown:
+    """A run whose series are plotted."""
+
+    run: Run
+    """Its columns, with those that are derived for the plots."""
+
+    name: str = ""
+    """What it is called among others; "" where it is alone."""
+
+    offset_s: float = 0.0
+    """What is added to its times [s]."""
+
+    colour: Colour = _ORANGE
+
+    @classmethod
+    def of(cls, run: Run, **rest: Any) -> "Shown":
+        """A run, with what is derived from it."""
+        return cls(run.with_columns(**derived(run)), **rest)
+
+    def values(self, series: Series) -> Array | None:
+        """What a series shows, shape (N,); none where the run has nothing of it."""
+        column = self.run.columns.get(series.column)
+        if column is None:
+            return None
+        if series.part:
+            column = column[:, COLUMNS[series.column].parts.index(series.part)]
+        return column if np.isfinite(column).any() else None
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """First and last time on the timeline [s]."""
+        t = self.run["t"]
+        return float(t[0]) + self.offset_s, float(t[-1]) + self.offset_s
 
 
-def layout(run: Run, lab: LabSpec | None = None, *, heading: float = 0.0) -> rrb.Blueprint:
+def plotted(run: Run) -> bool:
+    """Whether a run has anything that a plot shows."""
+    shown = Shown.of(run)
+    return any(shown.values(series) is not None for panel in PANELS for series in panel.series)
+
+
+def layout(
+    run: Run,
+    lab: LabSpec | None = None,
+    *,
+    planned: bool = False,
+    heading: float = 0.0,
+    events: Sequence[str] | None = None,
+) -> rrb.Blueprint:
     """The views of a run, on its timeline; the lab and the robot in 3D first, where a lab is given.
 
     Args:
         run: What its plots show.
         lab: The room; none for plots only.
+        planned: Whether there is a path that was to be driven.
         heading: Heading of the map on its floor [rad], for the title.
+        events: Flags that may yet be raised, of a run that goes on; none takes those that the run raised.
     """
-    whole = rrb.TimeAxis(
-        view_range=rr.TimeRange(
-            start=rrb.TimeRangeBoundary.absolute(seconds=float(run["t"][0])),
-            end=rrb.TimeRangeBoundary.absolute(seconds=float(run["t"][-1])),
+    shown = Shown.of(run)
+    whole = _whole([shown])
+    series = _stacked(
+        [(shown, FIELD_PANEL)], [(shown, DISTURBANCE_PANEL)], [(shown, ERROR_PANEL)], whole=whole, tall=0
+    )
+    tabs = [
+        rrb.Vertical(*views, name=name)
+        for name, panels in (
+            ("Drive", (SPEED_PANEL, YAW_RATE_PANEL)),
+            ("IMU", (ACCELERATION_PANEL, TILT_PANEL)),
+            ("Battery", BATTERY_PANELS),
         )
+        if (views := _stacked(*([(shown, panel)] for panel in panels), whole=whole))
+    ]
+    shares = [2.2, 1.2, 1.2][: len(series)]
+    side = rrb.Vertical(
+        *series, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=[*shares, *([2.6] if tabs else [])]
     )
-    plots = [_plot(run, panel, series, whole) for panel in PANELS if (series := known_series(run, panel))]
-    wide, narrow = plots[:4], plots[4:]
-    column: list[Any] = [*wide, *([rrb.Horizontal(*narrow)] if narrow else [])]
-    shares = [2.6, 1.3, 1.7, 1.7, 1.0]
-    side = rrb.Vertical(*column, row_shares=shares[: len(column)])
-    raised = [name for key, (name, *_) in STATES.items() if key == "lidar_on" or _raised(run, key)]
+    if events is None:
+        events = [key for key in STATES if _raised(run, key)]
+    lanes = [STATES[key].name for key in STATES if key == "lidar_on" or key in events]
     states = rrb.StateTimelineView(
-        origin="states", contents=[f"$origin/{name}" for name in raised], name="States", time_view=whole
+        origin="states", contents=[f"$origin/{name}" for name in lanes], name="States", time_view=whole
     )
-    about = rrb.Vertical(states, rrb.TextDocumentView(origin="facts", name="Run"), row_shares=[1.0, 1.5])
+    pages = rrb.Tabs(_event_view(), rrb.TextDocumentView(origin="facts", name="Run"))
+    about = rrb.Vertical(states, pages, row_shares=[1.2, 1.4])
     if lab is None:
         root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
     else:
-        below = rrb.Horizontal(_robot_view(), about)
-        left = rrb.Vertical(_lab_view(lab, heading), below, row_shares=[2.2, 1.0])
+        below = rrb.Horizontal(_robot_view(), _floor_view(lab, [""]), about, column_shares=[1.0, 1.3, 1.3])
+        left = rrb.Vertical(_lab_view(lab, heading, [""]), below, row_shares=[2.0, 1.0])
         root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
+    return _blueprint(root)
+
+
+def comparison_layout(
+    runs: Sequence[Shown], lab: LabSpec | None = None, *, heading: float = 0.0
+) -> rrb.Blueprint:
+    """The views of several runs on a common timeline, a colour each.
+
+    Args:
+        runs: What is compared.
+        lab: The room that they were driven in; none for plots only.
+        heading: Heading of the map on its floor [rad], for the title.
+    """
+    whole = _whole(runs)
+    rows = [
+        [(one, Panel(title, (Series(column, one.name, one.colour, part),))) for one in runs]
+        for title, column, part in _COMPARED
+    ]
+    side = rrb.Vertical(*_stacked(*rows, whole=whole, tall=0))
+    facts = [rrb.TextDocumentView(origin=entity_of("facts", one.name), name=one.name) for one in runs]
+    about = rrb.Tabs(_event_view(), *facts)
+    if lab is None:
+        root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
+    else:
+        names = [one.name for one in runs]
+        below = rrb.Horizontal(_floor_view(lab, names), about)
+        left = rrb.Vertical(_lab_view(lab, heading, names), below, row_shares=[1.6, 1.0])
+        root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
+    return _blueprint(root)
+
+
+def _blueprint(root: Any) -> rrb.Blueprint:
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
@@ -139,26 +276,88 @@ def layout(run: Run, lab: LabSpec | None = None, *, heading: float = 0.0) -> rrb
     )
 
 
+def _whole(runs: Sequence[Shown]) -> rrb.TimeAxis:
+    """The axis on which all of the runs are seen."""
+    ends = np.array([one.ends for one in runs])
+    return rrb.TimeAxis(
+        view_range=rr.TimeRange(
+            start=rrb.TimeRangeBoundary.absolute(seconds=float(ends.min())),
+            end=rrb.TimeRangeBoundary.absolute(seconds=float(ends.max())),
+        )
+    )
+
+
 def _raised(run: Run, column: str) -> bool:
     return column in run.columns and bool(run[column].any())
 
 
-def _plot(run: Run, panel: Panel, series: list[Series], whole: rrb.TimeAxis) -> rrb.TimeSeriesView:
-    """The series of a panel, its legend in the corner where it needs least room of its own."""
-    values = np.column_stack([run[s.column].reshape(run.rows, -1)[:, s.part] for s in series])
-    legend = len(series) > 1
-    corner, ends = rrb.Corner2D.LeftTop, value_range(values)
+def _stacked(
+    *rows: Sequence[tuple[Shown, Panel]], whole: rrb.TimeAxis, tall: int | None = None
+) -> list[rrb.TimeSeriesView]:
+    """A plot each of the panels that have a series; the one of number `tall` has the room of two."""
+    plots = []
+    for number, row in enumerate(rows):
+        lines = [
+            (one, series, values)
+            for one, panel in row
+            for series in panel.series
+            if (values := one.values(series)) is not None
+        ]
+        if lines:
+            plots.append(_plot(row[0][1].title, lines, whole, tall=number == tall))
+    return plots
+
+
+def _plot(
+    title: str, lines: Sequence[tuple[Shown, Series, Array]], whole: rrb.TimeAxis, *, tall: bool
+) -> rrb.TimeSeriesView:
+    """Lines of one unit, the legend in the corner where it needs least room of its own."""
+    legend = len(lines) > 1
+    corner = rrb.Corner2D.LeftTop
+    ends = value_range(np.array([(np.nanmin(values), np.nanmax(values)) for _, _, values in lines]))
     if legend and ends:
-        height = min(_LEGEND_MOST, len(series) * _LEGEND_ROW * (1.0 if panel is PANELS[0] else 1.6))
-        width = _LEGEND_WIDTH + _LEGEND_LETTER * max(len(s.name) for s in series)
-        corner, ends = legend_corner(values, run["t"], ends, (width, height))
+        height = min(
+            _LEGEND_MOST, len({series.name for _, series, _ in lines}) * _LEGEND_ROW * (1.0 if tall else 1.6)
+        )
+        width = _LEGEND_WIDTH + _LEGEND_LETTER * max(len(series.name) for _, series, _ in lines)
+        t, values = [], []
+        for one, _, line in lines:
+            step = max(1, len(line) // _LOOKED_AT)
+            t.append(one.run["t"][::step] + one.offset_s)
+            values.append(line[::step])
+        order = np.argsort(np.concatenate(t), kind="stable")
+        corner, ends = legend_corner(
+            np.concatenate(values)[order, None], np.concatenate(t)[order], ends, (width, height)
+        )
+    overrides: dict[str, list[rrb.Visualizer]] = {}
+    for one, series, _ in lines:
+        overrides.setdefault(_entity_of(one, series), []).append(_line(series))
     return rrb.TimeSeriesView(
-        origin=panel.entity,
-        name=panel.title,
+        origin="/",
+        contents=[f"/{entity}" for entity in overrides],
+        name=title,
         axis_x=whole,
         axis_y=rrb.ScalarAxis(range=ends) if ends else None,
         plot_legend=rrb.PlotLegend(corner, visible=legend),
+        overrides={f"/{entity}": lines for entity, lines in overrides.items()},
     )
+
+
+def _entity_of(shown: Shown, series: Series) -> str:
+    """The entity whose component a series shows."""
+    return entity_of(DERIVED_ENTITY if series.column in DERIVED else COLUMNS_ENTITY, shown.name)
+
+
+def _line(series: Series) -> rrb.Visualizer:
+    """How the component of a column is drawn."""
+    source = VisualizerComponentMapping(
+        "Scalars:scalars",
+        ComponentSourceKind.SourceComponent,
+        source_component=series.column,
+        selector=f".{series.part}" if series.part else None,
+    )
+    style = rr.SeriesLines(names=[series.name], colors=[series.colour], widths=[series.width])
+    return style.visualizer(mappings=[source])
 
 
 def value_range(values: Array) -> tuple[float, float] | None:
@@ -231,12 +430,14 @@ def lab_eye(lab: LabSpec) -> tuple[Vec3, Vec3]:
     return (0, -0.45 * y, height), (0, -0.09 * y, 0)
 
 
-def _lab_view(lab: LabSpec, heading: float) -> rrb.Spatial3DView:
-    """The lab seen whole."""
+def _lab_view(lab: LabSpec, heading: float, names: Sequence[str]) -> rrb.Spatial3DView:
+    """The lab seen whole, with what each of the runs named left in it."""
     position, target = lab_eye(lab)
     return _view_3d(
         "world",
         f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, readings along the path",
+        names,
+        without="world/robot/sensors",
         position=position,
         look_target=target,
     )
@@ -244,24 +445,61 @@ def _lab_view(lab: LabSpec, heading: float) -> rrb.Spatial3DView:
 
 def _robot_view() -> rrb.Spatial3DView:
     """The robot from behind its left shoulder; the view's axes are the robot's, so that it stays in sight."""
-    return _view_3d("world/robot", "Robot", position=(-0.62, 0.42, 0.55), look_target=(0.08, 0, 0.17))
+    return _view_3d(
+        "world/robot",
+        "Robot and its sensors",
+        [""],
+        without="world/scale",
+        position=(-0.62, 0.42, 0.55),
+        look_target=(0.08, 0, 0.17),
+    )
+
+
+def _floor_view(lab: LabSpec, names: Sequence[str]) -> rrb.Spatial2DView:
+    """The map from above, with the paths on it; x to the right and y up, in metres."""
+    x, y = (0.5 * side + lab.wall_thickness_m for side in lab.floor_m)
+    return rrb.Spatial2DView(
+        origin="floor",
+        name="Map from above [m]",
+        background=(24, 26, 31),
+        visual_bounds=rrb.VisualBounds2D(x_range=(-x, x), y_range=(-y, y)),
+        overrides={entity_of("floor/paths/driven", name): _visible(all_time=True) for name in names},
+    )
+
+
+def _event_view() -> rrb.TextLogView:
+    return rrb.TextLogView(
+        origin="events",
+        name="Events",
+        columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]),
+    )
+
+
+def _visible(*, all_time: bool) -> rrb.VisibleTimeRanges:
+    """What is seen of an entity that piles up: all of it at once, or what has come by the time shown."""
+    infinite = rrb.TimeRangeBoundary.infinite()
+    end = infinite if all_time else rrb.TimeRangeBoundary.cursor_relative()
+    return rrb.VisibleTimeRanges(rrb.VisibleTimeRange(TIMELINE, start=infinite, end=end))
 
 
 def _view_3d(
-    origin: str, name: str, *, position: tuple[float, ...], look_target: tuple[float, ...]
+    origin: str,
+    title: str,
+    names: Sequence[str],
+    *,
+    without: str,
+    position: tuple[float, ...],
+    look_target: tuple[float, ...],
 ) -> rrb.Spatial3DView:
     """The world in the axes of `origin`, from a position [m]; readings appear as time goes on."""
-    so_far = rrb.VisibleTimeRange(
-        TIMELINE,
-        start=rrb.TimeRangeBoundary.infinite(),
-        end=rrb.TimeRangeBoundary.cursor_relative(),
-    )
+    piling_up: dict[Any, Any] = {entity_of("world/driven", name): _visible(all_time=True) for name in names}
+    piling_up |= {entity_of("world/readings", name): _visible(all_time=False) for name in names}
     return rrb.Spatial3DView(
         origin=origin,
-        contents="/world/**",
-        name=name,
+        contents=["/world/**", f"- /{without}/**"],
+        name=title,
         background=(24, 26, 31),
         line_grid=False,
         eye_controls=rrb.EyeControls3D(position=position, look_target=look_target, eye_up=(0, 0, 1)),
-        overrides={"world/readings": rrb.VisibleTimeRanges(so_far)},
+        overrides=piling_up,
     )

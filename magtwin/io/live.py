@@ -8,9 +8,11 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
-from magtwin.io.layout import TIMELINE, lab_eye
-from magtwin.io.rerun import APPLICATION, mesh_of
+from magtwin.io.layout import lab_eye
+from magtwin.io.recording import APPLICATION
+from magtwin.io.series import TIMELINE
 from magtwin.io.viewer import live_viewer
+from magtwin.io.world import mesh_of
 from magtwin.spec import Scene
 from magtwin.usd.geometry import open_stage, read_links, read_shapes
 from magtwin.usd.maps import HEAT_MAP

@@ -19,7 +19,7 @@ import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient
 
 from magtwin.files import existing, output
-from magtwin.io.layout import TIMELINE
+from magtwin.io.series import TIMELINE
 from magtwin.names import RefusedError
 
 LOCALHOST = "127.0.0.1"

@@ -1,0 +1,199 @@
+"""Recording: a Run on its way into a Rerun stream, whole or block by block, to a file, a viewer, or both."""
+
+import hashlib
+import json
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from magtwin.io.series import Flags, entity_of, send_columns, send_facts, send_rows
+from magtwin.io.world import Robot, Scale, bodies_of, heading_of, send_planned, send_room, send_scans
+from magtwin.names import RefusedError
+from magtwin.path import Path
+from magtwin.run import Run
+from magtwin.sim.lidar import Scans
+from magtwin.twin import Twin
+
+APPLICATION = "magtwin"
+
+END = b"RRF2FOOT"
+"""What stands at the end of a file that Rerun finished."""
+
+POSED = frozenset(("p_world_base", "q_world_base_xyzw"))
+"""Columns that place a robot."""
+
+
+@contextmanager
+def stream(
+    recording_id: str,
+    name: str,
+    views: rrb.Blueprint,
+    *,
+    file: FilePath | None = None,
+    address: str | None = None,
+    said: FilePath | None = None,
+) -> Iterator[rr.RecordingStream]:
+    """A stream to a file, to the viewer at an address, or to both; complete and closed at the end.
+
+    Args:
+        recording_id: Recordings of one id are one to the viewer.
+        name: What the viewer calls it.
+        views: What it opens with.
+        file: The file to make; it can be read at any time up to the last flush.
+        address: Where a viewer listens.
+        said: The file that a refusal names, where that is another.
+
+    Raises:
+        RefusedError: Rerun is switched off, or the file cannot be written.
+    """
+    said = said or file
+    strict = rr.strict_mode()
+    rec = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
+    if not rr.is_enabled(rec):
+        raise RefusedError(f"{said}: Rerun is switched off by the environment variable RERUN; unset it")
+    rr.set_strict_mode(True)
+    try:
+        sinks: list[Any] = [] if file is None else [rr.FileSink(str(file))]
+        sinks += [] if address is None else [rr.GrpcSink(address)]
+        rec.set_sinks(*sinks, default_blueprint=views)
+        rec.send_recording_name(name)
+        yield rec
+        rec.flush()
+    except RuntimeError as error:
+        raise RefusedError(_unwritten(said, error)) from error
+    finally:
+        rr.set_strict_mode(strict)
+        with suppress(RuntimeError):
+            rec.disconnect()
+    if file is not None:
+        with open(file, "rb") as written:  # Rerun does not say when its last bytes met a full disk
+            written.seek(-min(64, file.stat().st_size), 2)
+            if END not in written.read():
+                raise RefusedError(_unwritten(said, "its end is missing"))
+
+
+def _unwritten(path: FilePath | None, why: object) -> str:
+    return f"{path}: cannot be written ({why}); is the disk full, or a limit on file sizes reached?"
+
+
+@dataclass
+class Recording:
+    """One run in a stream. Append its rows, once or as they come, then close it."""
+
+    rec: rr.RecordingStream
+    name: str = ""
+    """What it is called among others in the same recording; "" where it is alone."""
+    offset_s: float = 0.0
+    """What is added to its times [s]."""
+    robot: Robot | None = None
+    """Its robot, in the room; none for series only."""
+
+    _rows: int = 0
+    _last: Run | None = None
+    _flags: Flags = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._flags = Flags(self.rec, self.name, self.offset_s)
+
+    def append(self, run: Run) -> None:
+        """The next rows."""
+        if not run.rows:
+            return
+        if not self._rows:
+            send_facts(self.rec, run, self.name)
+        send_columns(self.rec, run, run["t"] + self.offset_s, self.name)
+        self._flags.append(run)
+        if self.robot is not None and run.keys() >= POSED:
+            self.robot.append(run)
+        self._rows += run.rows
+        self._last = Run({name: run[name][-1:] for name in run}, run.facts)
+
+    def close(self) -> None:
+        """No rows come any more."""
+        if self._last is None:
+            return
+        self._flags.close()
+        if self.robot is not None and self._last.keys() >= POSED:
+            self.robot.close(self._last)
+        send_rows(self.rec, self._rows, self.name)
+        self.rec.log(entity_of("facts", self.name), facts_page(self._last.facts, self._rows), static=True)
+
+
+def enter_room(
+    rec: rr.RecordingStream,
+    twin: Twin,
+    known: Run,
+    *,
+    planned: Path | None = None,
+    scans: Scans | None = None,
+) -> Robot:
+    """Send what stands still, and give the robot that will drive there.
+
+    Args:
+        rec: Where to.
+        twin: What the run happens in.
+        known: What is known of it: readings for the scale of colours, the heading that it begins with.
+        planned: The path that is to be driven.
+        scans: What the LiDAR saw.
+
+    Raises:
+        RefusedError: The stage cannot be read.
+    """
+    shapes, links = bodies_of(twin)
+    scale = Scale.over(twin.field, known.get("b_total_nt", np.empty(0)))
+    send_room(rec, twin, shapes, scale, heading_of(twin.field, known))
+    if planned is not None:
+        send_planned(rec, planned)
+    if scans is not None and len(scans.t):
+        send_scans(rec, scans)
+    rate = known.facts.get("rate_hz", 0.0)
+    return Robot(
+        rec, twin.scene.robot, shapes, links, scale, rate_hz=rate if isinstance(rate, float) else 0.0
+    )
+
+
+def send_properties(rec: rr.RecordingStream, facts: Mapping[str, Any]) -> None:
+    """The facts of a run as properties of the recording, for the viewer and for catalogs."""
+    known: dict[str, Any] = {key: [value] for key, value in facts.items() if not _too_large(value)}
+    if known:
+        rec.send_property("run", rr.AnyValues(**known))
+
+
+def _too_large(value: object) -> bool:
+    return isinstance(value, int) and not -(2**63) <= value < 2**63
+
+
+def title_of(run: Run) -> str:
+    """What the viewer calls a run: path and seed."""
+    return ", ".join(f"{key} {run.facts[key]}" for key in ("path", "seed") if key in run.facts)
+
+
+def content_id(*runs: Run) -> str:
+    """An id that the same runs always get, and no others."""
+    digest = hashlib.sha256()
+    for run in runs:
+        sums = {
+            name: (str(values.dtype), values.shape, zlib.crc32(np.ascontiguousarray(values).data))
+            for name, values in run.items()
+        }
+        digest.update(json.dumps([sums, dict(run.facts)], sort_keys=True).encode())
+    return digest.hexdigest()[:32]
+
+
+def facts_page(facts: Mapping[str, Any], rows: int | None = None) -> rr.TextDocument:
+    """The facts of a run as a page with a table."""
+    said = {**({} if rows is None else {"readings": f"{rows:,}"}), **facts}
+    cells = [(_cell(key), _cell(value)) for key, value in said.items()]
+    lines = ["| fact | value |", "|---|---|", *(f"| {key} | {value} |" for key, value in cells)]
+    return rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
+
+
+def _cell(value: object) -> str:
+    return " ".join(str(value).replace("|", r"\|").split())
