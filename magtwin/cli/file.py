@@ -1,54 +1,123 @@
-"""`magtwin info`, `view` and `fetch`: what a file holds, how it looks, where the originals come from."""
+"""`magtwin info`, `view`, `convert` and `fetch`: what a file holds, how it looks, in another format."""
 
+import sys
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, print_report, progress, say
-from magtwin.names import RefusedError
+from magtwin.names import RefusedError, hint
+
+if TYPE_CHECKING:
+    from magtwin.run import Run
+    from magtwin.twin import Twin
+
+_STAGES = (".usd", ".usda", ".usdc", ".usdz")
+_NETS = (".safetensors", ".pth")
 
 
 @app.command
 def info(file: Path, *, json: Json = False) -> None:
-    """Say what a stage, a map, a run or a network holds.
+    """Say what a run, a stage, a map or a network holds; of a run also what it came from.
 
     Parameters
     ----------
     file
-        A .usd, .usda, .usdc, .usdz, .parquet, .safetensors or .pth file.
+        A run (.parquet, .rrd, .mcap, .db3, .csv, .npz, .usd, or the folder of a bag, of Parquet parts, or of
+        magtwin run), a stage (.usd, .usda, .usdc, .usdz), or a network (.safetensors, .pth).
     json
         Print it as JSON.
     """
     from magtwin.files import existing
-    from magtwin.names import find
+    from magtwin.io.formats import FORMATS
 
     existing(file, "file")
-    suffixes: dict[str, Any] = {
-        ".usd": _info_of_usd,
-        ".usda": _info_of_usd,
-        ".usdc": _info_of_usd,
-        ".usdz": _info_of_usd,
-        ".parquet": _info_of_run,
-        ".safetensors": _info_of_net,
-        ".pth": _info_of_net,
-    }
-    if file.is_dir():
-        raise RefusedError(f"{file}: a folder; name a file in it, or use `magtwin map info` for a survey")
-    print_report(find("kind of file", file.suffix, suffixes)(file), json)
+    if not file.is_dir() and file.suffix not in {*FORMATS, *_STAGES, *_NETS}:
+        kinds = hint(file.suffix, {*FORMATS, *_STAGES, *_NETS})
+        raise RefusedError(f"{file}: no kind of file {file.suffix!r} that magtwin knows; {kinds}")
+    if file.suffix in _NETS:
+        report = _info_of_net(file)
+    elif file.suffix in _STAGES and not file.is_dir():
+        report = _info_of_usd(file)
+    else:
+        report = _info_of_run(file)
+    print_report(report, json)
 
 
 @app.command
-def view(file: Path) -> None:
-    """Open a recording, or the series of a run, in the Rerun viewer.
+def view(*files: Path, scene: Path | None = None) -> None:
+    """Show a run, several of them together, or a stage.
+
+    Runs are shown in the Rerun viewer: in their lab where their scene is found, else as series; several on
+    one timeline, each in its colour. A stage is shown in usdview where that is installed, else in a window.
 
     Parameters
     ----------
-    file
-        A .rrd file, or a .parquet file of a run.
+    files
+        Runs in any format that magtwin writes, or a stage.
+    scene
+        Stage to show runs in, in place of the one that they name.
     """
-    from magtwin.io.rerun import view as view_rrd
+    if not files:
+        raise RefusedError("view needs a file; name a run or a stage")
+    if len(files) > 1:
+        _view_together(files, scene)
+    elif files[0].suffix in _STAGES and not files[0].is_dir():
+        _view_stage(files[0])
+    else:
+        _view_run(files[0], scene)
 
-    view_rrd(file)
+
+@app.command
+def convert(
+    run: Path,
+    out: Path,
+    *,
+    scene: Path | None = None,
+    storage: Literal["mcap", "sqlite3"] | None = None,
+    units: Literal["T", "nT"] | None = None,
+    usd_fps: Annotated[float | None, Parameter(name="--usd-fps")] = None,
+    force: Force = False,
+) -> None:
+    """Write a run in another format.
+
+    Parameters
+    ----------
+    run
+        A run in any format that magtwin reads; also one that did not end, as its parts lie there.
+    out
+        File to make: .parquet, .csv, .npz, .rrd, .mcap, .usd, .usda or .usdc; or, for a name without an
+        ending, the folder of a rosbag2.
+    scene
+        Stage that it happened in, in place of the one that it names; .rrd, bags and USD show it.
+    storage
+        How a bag is stored: mcap unless given.
+    units
+        Unit of the field in a bag: T, as ROS has it, unless given; nT, as the released package publishes it.
+    usd_fps
+        Frames a second in USD [Hz]; 30 unless given, 0 for one at every reading.
+    force
+        Replace what exists.
+    """
+    from magtwin.files import check_free
+    from magtwin.io.formats import format_of, read_run, write_run
+
+    check_free(out, force=force)
+    options: dict[str, Any] = {"storage": storage, "units": units, "fps": usd_fps}
+    options = {name: value for name, value in options.items() if value is not None}
+    if usd_fps == 0:
+        options["fps"] = None
+    takes = format_of(out).takes
+    if scene is not None and not takes & {"twin", "scene_file"}:
+        raise RefusedError(f"{out}: a table shows no scene; drop --scene")
+    if out.resolve() == run.resolve():
+        raise RefusedError(f"{out}: is the run itself; name another file")
+    result = read_run(run)
+    twin = _twin(result, run, scene) if takes & {"twin", "scene_file"} else None
+    write_run(result, out, twin, force=force, **options)
+    say(f"Wrote {out}: {result.rows:,} rows, {len(result)} columns, {result.duration_s:g} s")
 
 
 @app.command
@@ -82,18 +151,124 @@ def fetch(
 
 
 def _info_of_usd(file: Path) -> Any:
+    from dataclasses import replace
+
+    from magtwin.usd.animation import is_animation
     from magtwin.usd.info import info_of_stage
 
-    return info_of_stage(file)
+    if file.suffix == ".usdz" or not is_animation(file):
+        return info_of_stage(file)
+    run = _info_of_run(file)
+    try:
+        return replace(run, figures=(*run.figures, *info_of_stage(file).figures))
+    except RefusedError as error:  # the run is whole without its scene
+        return replace(run, facts={**run.facts, "stage": str(error)})
 
 
 def _info_of_run(file: Path) -> Any:
-    from magtwin.io.tables import read_parquet
+    """Rows, what was driven and read, what it came from, and every column with its unit."""
+    from dataclasses import replace
 
-    return read_parquet(file).report(str(file))
+    from magtwin.io.formats import read_run
+    from magtwin.report import Figure
+
+    run = read_run(file)
+    report = run.report(str(file))
+    columns = {}
+    for name, values in run.items():
+        spec = run.spec(name)
+        shape = f" x {values.shape[1]}" if values.ndim > 1 else ""
+        columns[name + shape] = "  ".join(
+            filter(None, (spec.unit or "-", spec.frame and f"in {spec.frame}", spec.doc))
+        )
+    figures = [*report.figures[:2], Figure("columns", len(run)), *report.figures[2:]]
+    return replace(report, figures=tuple(figures), facts={**report.facts, "columns": columns})
 
 
 def _info_of_net(file: Path) -> Any:
     from magtwin.learn.model import load_net
 
     return load_net(file).report(str(file))
+
+
+def _twin(run: "Run", file: Path, scene: Path | None) -> "Twin | None":
+    """The scene to show a run in; where it is not there and was not asked for, says so and goes on."""
+    from magtwin.twin import open_twin, scene_of
+
+    try:
+        twin = open_twin(scene_of(run, scene, near=file), magnetometer="map-only")  # needs no network
+    except RefusedError as error:
+        if scene is not None:
+            raise
+        _note(f"without a scene: {error}")
+        return None
+    then = run.facts.get("scene_sha256")
+    if then is not None and then != twin.facts.get("scene_sha256"):
+        _note(f"{twin.scene_file}: has changed since the run; it is shown as it is now")
+    return twin
+
+
+def _note(text: str) -> None:
+    print(f"  {text}", file=sys.stderr)  # noqa: T201
+
+
+def _view_run(file: Path, scene: Path | None) -> None:
+    import tempfile
+
+    from magtwin.files import existing
+    from magtwin.io.formats import read_run
+    from magtwin.io.rerun import view as view_recording
+    from magtwin.io.rerun import write_rrd
+    from magtwin.io.viewer import show
+
+    existing(file, "run")
+    if file.suffix == ".rrd" and scene is None:
+        view_recording(file)
+        return
+    run = read_run(file)
+    twin = _twin(run, file, scene)
+    if twin is None:
+        view_recording(file)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        rrd = Path(folder) / f"{file.stem}.rrd"
+        write_rrd(run, rrd, twin)
+        show(rrd, shown=file)
+
+
+def _view_together(files: tuple[Path, ...], scene: Path | None) -> None:
+    import tempfile
+
+    from magtwin.io.formats import read_run
+    from magtwin.io.rerun import write_comparison
+    from magtwin.io.viewer import show
+
+    alike = len({file.stem for file in files}) < len(files)
+    runs = {str(file) if alike else file.stem: read_run(file) for file in files}
+    if len(runs) < len(files):
+        raise RefusedError("one run is named twice; name each once")
+    twin = _twin(next(iter(runs.values())), files[0], scene)
+    with tempfile.TemporaryDirectory() as folder:
+        rrd = Path(folder) / "runs.rrd"
+        write_comparison(runs, rrd, twin)
+        show(rrd, shown=files[0])
+
+
+def _view_stage(file: Path) -> None:
+    import shutil
+    import subprocess
+
+    from magtwin.files import existing
+    from magtwin.usd.animation import is_animation
+
+    existing(file, "stage")
+    if usdview := shutil.which("usdview"):
+        result = subprocess.run([usdview, str(file)], check=False)
+        if result.returncode:
+            raise RefusedError(f"{file}: usdview ended with status {result.returncode}")
+    elif file.suffix != ".usdz" and is_animation(file):
+        _view_run(file, file)
+    else:
+        from magtwin.io.pictures import show_stage
+
+        show_stage(file)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from magtwin.files import existing
 from magtwin.names import RefusedError, hint
+from magtwin.resample import check_instants
 from magtwin.run import Run
 
 if TYPE_CHECKING:
@@ -93,8 +94,10 @@ def read_run(path: str | os.PathLike[str]) -> Run:
         RefusedError: The file is missing, of no known kind, damaged, or holds no run.
     """
     path = existing(path, "run")
-    file, format_ = _found(path) if path.is_dir() else (path, _format(path))
-    return format_.reader()(file)
+    file, format_ = _found(path) if path.is_dir() else (path, format_of(path))
+    run = format_.reader()(file)
+    check_instants(run["t"], str(path))
+    return run
 
 
 def write_run(
@@ -123,7 +126,7 @@ def write_run(
             `force` was not given, or it cannot be written.
     """
     path = Path(path)
-    format_ = _format(path) if path.suffix else _BAG
+    format_ = format_of(path)
     if unknown := sorted(options.keys() - format_.takes):
         raise RefusedError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
     scene_file = None if twin is None else twin.scene_file
@@ -132,7 +135,14 @@ def write_run(
     format_.writer()(run, path, force=force, **given, **options)
 
 
-def _format(path: Path) -> Format:
+def format_of(path: Path) -> Format:
+    """The format that a file's name asks for; a bag's folder where it has no ending.
+
+    Raises:
+        RefusedError: It ends in no known way.
+    """
+    if not path.suffix:
+        return _BAG
     if path.suffix not in FORMATS:
         raise RefusedError(f"{path}: no known kind of run file; {hint(path.suffix, FORMATS)}")
     return FORMATS[path.suffix]

@@ -98,7 +98,50 @@ def picture_of_stage(
         raise RefusedError(f"{out}: pictures are PNG; give it the suffix .png")
     if not (min(size) >= 16 and max(size) <= 16384):
         raise RefusedError(f"size must lie in 16..16384 pixels each way, got {size[0]} x {size[1]}")
-    camera = camera or Camera()
+    with output(out, force=force) as aside:
+        plotter = _plotter(size)
+        try:
+            _draw(plotter, path, size, camera or Camera(), legend=legend, ground=ground)
+            if title:
+                plotter.add_text(
+                    title, position=(0.02, 0.93), viewport=True, font_size=round(size[1] / 80), color=INK
+                )
+            plotter.screenshot(str(aside), window_size=list(size))
+        finally:
+            plotter.close()
+    return out
+
+
+def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1000)) -> None:
+    """Show a stage as it stands in a window, to be turned by the mouse; returns when it is closed.
+
+    Args:
+        path: USD file.
+        size: Width and height of the window [pixel].
+
+    Raises:
+        RefusedError: The stage is missing, is not USD or shows nothing; or there is no display.
+    """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise RefusedError(f"{path}: there is no display to show it on; magtwin picture draws it to a file")
+    plotter = _plotter(size, window=True)
+    try:
+        _draw(plotter, path, size, Camera())
+        plotter.show(title=str(path))
+    finally:
+        plotter.close()
+
+
+def _draw(
+    plotter: Any,
+    path: str | os.PathLike[str],
+    size: tuple[int, int],
+    camera: Camera,
+    *,
+    legend: bool = True,
+    ground: bool | None = None,
+) -> None:
+    """A stage as it stands, lit, before a camera; arguments as for `picture_of_stage`."""
     stage = open_stage(path)
     shapes = read_shapes(stage)
     if not shapes:
@@ -110,29 +153,18 @@ def picture_of_stage(
         else s.vertices.astype(float)
         for s in shapes
     ]
+    everything = np.vstack(worlds)
+    for shape, vertices in zip(shapes, worlds, strict=True):
+        _add(plotter, shape, vertices)
+    if ground is None:
+        ground = camera.elevation_deg > 0 and all(s.link for s in shapes)
+    if ground:
+        _add_ground(plotter, everything)
+    _light(plotter, everything)
+    _aim(plotter, camera, everything, size)
     scale = read_colour_scale(stage) if legend else None
-    with output(out, force=force) as aside:
-        plotter = _plotter(size)
-        try:
-            everything = np.vstack(worlds)
-            for shape, vertices in zip(shapes, worlds, strict=True):
-                _add(plotter, shape, vertices)
-            if ground is None:
-                ground = camera.elevation_deg > 0 and all(s.link for s in shapes)
-            if ground:
-                _add_ground(plotter, everything)
-            _light(plotter, everything)
-            _aim(plotter, camera, everything, size)
-            if scale is not None:
-                _add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
-            if title:
-                plotter.add_text(
-                    title, position=(0.02, 0.93), viewport=True, font_size=round(size[1] / 80), color=INK
-                )
-            plotter.screenshot(str(aside), window_size=list(size))
-        finally:
-            plotter.close()
-    return out
+    if scale is not None:
+        _add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
 
 
 def view_distance(
@@ -157,8 +189,8 @@ def view_distance(
     return float(np.max(b + np.maximum(np.abs(r) / np.tan(h), np.abs(u) / np.tan(v))))
 
 
-def _plotter(size: tuple[int, int]) -> Any:
-    """An off-screen plotter.
+def _plotter(size: tuple[int, int], *, window: bool = False) -> Any:
+    """A plotter, off screen or in a window.
 
     Raises:
         RefusedError: There is nothing to draw with. VTK itself would end the process.
@@ -173,13 +205,13 @@ def _plotter(size: tuple[int, int]) -> Any:
     if sys.platform == "linux" and not _loads("libX11.so", "libX11.so.6"):  # screen or none
         raise refusal
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it tells of each way to draw that is not there
-    window = vtkRenderWindow()  # VTK picks the first that works: a screen, EGL, at last OSMesa, untried
-    software = isinstance(window, vtkmodules.vtkRenderingOpenGL2.vtkOSOpenGLRenderWindow)
+    drawn_by = vtkRenderWindow()  # VTK picks the first that works: a screen, EGL, at last OSMesa, untried
+    software = isinstance(drawn_by, vtkmodules.vtkRenderingOpenGL2.vtkOSOpenGLRenderWindow)
     if software and not _loads("libOSMesa.so", "libOSMesa.so.8", "libOSMesa.so.6"):
         raise refusal
     import pyvista
 
-    plotter = pyvista.Plotter(off_screen=True, window_size=list(size), lighting="none")
+    plotter = pyvista.Plotter(off_screen=not window, window_size=list(size), lighting="none")
     plotter.set_background(BACKGROUND)
     plotter.enable_anti_aliasing("ssaa")
     return plotter
