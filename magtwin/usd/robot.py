@@ -8,7 +8,7 @@ from typing import Any
 
 from pxr import Sdf, Usd, UsdPhysics
 
-from magtwin.files import existing, from_table, read_toml
+from magtwin.files import existing, from_table, read_toml, sha256
 from magtwin.names import RefusedError, hint
 from magtwin.spec import (
     BatterySpec,
@@ -140,6 +140,18 @@ def read_robot(asset: str | os.PathLike[str]) -> RobotSpec:
     if not stage.GetDefaultPrim():
         raise RefusedError(f"{path}: has no default prim, so no robot; make the asset with `magtwin robot`")
     return read_robot_prim(stage.GetDefaultPrim(), path)
+
+
+def read_description(asset: str | os.PathLike[str]) -> str:
+    """The URDF that an asset was converted from, if it still lies beside it, unchanged; else ""."""
+    stage = open_stage(
+        existing(asset, "robot asset")
+    )  # held in a name: a layer does not keep its stage alive
+    said = stage.GetRootLayer().customLayerData.get("magtwin", {})
+    source = Path(asset).parent / Path(str(said.get("source", ""))).name
+    if source.suffix != ".urdf" or not source.is_file() or sha256(source) != said.get("sourceSha256"):
+        return ""
+    return source.read_text(encoding="utf-8")
 
 
 def robot_of(prim: Usd.Prim) -> RobotSpec:
