@@ -37,8 +37,9 @@ class Newton:
     """A robot in Newton on the CPU; the same commands give the same bits.
 
     Commands are limited, and followed by the wheels' set speeds with the motors' lag, as in the kinematic
-    engine; what comes of them is physics. Wheels are as the stage has them, without the errors of a
-    session, and slip as its contact says.
+    engine; what comes of them is physics. Wheels slip as the stage's contact says, and scrub on curves as
+    wide as it has them; where the drive's `yaw_slip` is 0 they roll on the middle of their treads. Errors of
+    radius and separation are the kinematic engine's: wheels turn as much more as they should roll farther.
     """
 
     stage: FilePath
@@ -68,6 +69,7 @@ class Newton:
         left = math.exp(-step / drive.motor_lag_s) if drive.motor_lag_s else 0.0
         in_mean = drive.motor_lag_s / step * (1.0 - left)
         told, wheels, last, age = (0.0, 0.0), (0.0, 0.0), (0.0, 0.0), 0.0
+        radius, separation = (1.0 + error for error in course.wheel_errors)
         rest_w = REST_M_S * 2 / drive.wheel_separation_m
         asked: list[tuple[float, float]] = []
         with _Process(self, course, step) as world:
@@ -90,7 +92,8 @@ class Newton:
                 for _ in range(parts):
                     mean = [b + in_mean * (a - b) for a, b in zip(wheels, told, strict=True)]
                     wheels = told[0] + left * (wheels[0] - told[0]), told[1] + left * (wheels[1] - told[1])
-                    rates.append(wheel_rates(mean[0], mean[1], drive).tolist())
+                    rolls = mean[0] * radius, mean[1] * radius / separation
+                    rates.append(wheel_rates(*rolls, drive).tolist())
                 if told == (0.0, 0.0) and abs(wheels[0]) < REST_M_S and abs(wheels[1]) < rest_w:
                     wheels = 0.0, 0.0
                 rows.append(world.step(rates))
@@ -105,13 +108,14 @@ class Newton:
                     break
         seen = np.array(rows)
         commands = np.array([*asked, asked[-1]])
+        both, apart = (seen[:, 5] + seen[:, 6]) / radius, (seen[:, 6] - seen[:, 5]) * separation / radius
         distance, _ = obstacles.clearance(seen[:, :2], reach_m=course.footprint_radius_m + 1.0)
         return SampledMotion(
             t=np.arange(len(seen), dtype=float) * dt,
             pose=np.column_stack([seen[:, :2], np.unwrap(seen[:, 2])]),
             v=seen[:, 3],
             w=seen[:, 4],
-            wheel_angle=seen[:, 5:7],
+            wheel_angle=np.column_stack([both - apart, both + apart]) / 2,
             v_cmd=commands[:, 0],
             w_cmd=commands[:, 1],
             bump=distance < course.footprint_radius_m + TOUCH_M,
@@ -142,6 +146,7 @@ class _Process:
             "joints": [drive.left_wheel_joint, drive.right_wheel_joint],
             "start": list(course.pose0),
             "step_s": step_s,
+            "scrub": drive.yaw_slip > 0,
         }
 
     def __enter__(self) -> "_Process":
