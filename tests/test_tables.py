@@ -1,4 +1,12 @@
+import io
 import json
+import resource
+import signal
+import subprocess
+import sys
+import zipfile
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -7,10 +15,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magtwin.io.tables import read_parquet, write_parquet
+from magtwin.io.formats import read_run
+from magtwin.io.tables import (
+    ParquetParts,
+    read_csv,
+    read_npz,
+    read_parquet,
+    write_csv,
+    write_npz,
+    write_parquet,
+)
 from magtwin.names import RefusedError
-from magtwin.run import COLUMNS, Run
+from magtwin.run import COLUMNS, Column, Run
 
+TABLES = [
+    (write_parquet, read_parquet, "run.parquet"),
+    (write_csv, read_csv, "run.csv"),
+    (write_npz, read_npz, "run.npz"),
+]
+NAMES = [name for _, _, name in TABLES]
 FACTS = {"path": "figure8", "seed": 7, "speed": 0.2, "quick": True, "network": "größe"}
 
 
@@ -200,3 +223,308 @@ def test_a_run_that_no_table_can_hold_is_refused_and_nothing_is_written(columns,
     with pytest.raises(RefusedError, match=message):
         write_parquet(Run(columns), tmp_path / "run.parquet")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("write", "read", "name"), TABLES, ids=NAMES)
+def test_a_run_comes_back_from_every_table_to_the_last_bit_in_the_same_order(write, read, name, tmp_path):
+    write(some_run(), tmp_path / name)
+    assert_same(some_run(), read(tmp_path / name))
+
+
+@pytest.mark.parametrize(("write", "read", "name"), TABLES, ids=NAMES)
+def test_every_table_of_the_same_run_has_the_same_bytes(write, read, name, tmp_path):
+    write(some_run(), tmp_path / name)
+    write(some_run(), tmp_path / f"again-{name}")
+    assert (tmp_path / name).read_bytes() == (tmp_path / f"again-{name}").read_bytes()
+    write(some_run().with_facts(seed=8), tmp_path / f"other-{name}")
+    assert (tmp_path / name).read_bytes() != (tmp_path / f"other-{name}").read_bytes()
+
+
+@pytest.mark.parametrize(("write", "read", "name"), TABLES, ids=NAMES)
+def test_a_users_own_columns_keep_dtype_width_unit_and_facts_of_any_text(write, read, name, tmp_path):
+    spec = Column("K", "head", "temperature", 2, ("in", "out"), "hold")
+    run = Run(
+        {
+            "t": np.arange(3.0),
+            "head_k": np.arange(6.0).reshape(3, 2),
+            "est_n": np.arange(3, dtype=np.int32),
+            "est_small": np.array([0.1, np.nan, np.inf], np.float32),
+            "flag_own": np.array([True, False, True]),
+        },
+        {"note": 'a "quoted", \u2028 # line\nand, another', "big": 2**70, "tiny": 5e-324, "": "no name"},
+        {"head_k": spec},
+    )
+    write(run, tmp_path / name)
+    again = read(tmp_path / name)
+    assert_same(run, again)
+    assert again.spec("head_k") == spec
+    assert {key: type(value) for key, value in again.facts.items()} == {
+        "note": str,
+        "big": int,
+        "tiny": float,
+        "": str,
+    }
+
+
+@pytest.mark.parametrize(("write", "read", "name"), TABLES, ids=NAMES)
+def test_a_run_of_no_rows_comes_back_from_every_table(write, read, name, tmp_path):
+    run = some_run().take(slice(0))
+    write(run, tmp_path / name)
+    assert_same(run, read(tmp_path / name))
+
+
+@settings(max_examples=30, deadline=None)
+@given(values=st.lists(st.floats(width=64), min_size=1, max_size=20))
+def test_any_float_comes_back_from_csv_to_the_bit(values, tmp_path_factory):
+    path = tmp_path_factory.mktemp("csv") / "run.csv"
+    run = Run({"t": np.arange(len(values), dtype=float), "est_x": np.array(values)})
+    write_csv(run, path)
+    again = read_csv(path)["est_x"]
+    assert np.array_equal(again, run["est_x"], equal_nan=True)
+    assert np.array_equal(np.signbit(again[again == 0]), np.signbit(run["est_x"][run["est_x"] == 0]))
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tables")
+    for write, _, name in TABLES:
+        write(some_run(), folder / name)
+    return folder
+
+
+def test_pandas_reads_the_csv_to_the_bit(tables):
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.read_csv(tables / "run.csv", comment="#", float_precision="round_trip")
+    flat = some_run().flat()
+    assert list(frame.columns) == list(flat)
+    for name, values in flat.items():
+        assert frame[name].dtype == values.dtype, name
+        assert np.array_equal(frame[name], values, equal_nan=True), name
+
+
+def test_polars_reads_the_csv_and_the_parquet(tables):
+    polars = pytest.importorskip("polars")
+    flat = some_run().flat()
+    read = polars.read_csv(tables / "run.csv", comment_prefix="#", infer_schema_length=None)
+    assert read.columns == list(flat)
+    for name in ("t", "p_world_base_y", "flag_bump"):
+        assert np.array_equal(read[name].to_numpy(), flat[name]), name
+    frame = polars.read_parquet(tables / "run.parquet")
+    for name, values in flat.items():
+        assert np.array_equal(frame[name].to_numpy(), values, equal_nan=values.dtype != bool), name
+
+
+def test_duckdb_asks_the_csv_and_the_parquet_in_sql(tables):
+    duckdb = pytest.importorskip("duckdb")
+    run = some_run()
+    bumps = int(run["flag_bump"].sum())
+    for source in (f"read_csv('{tables}/run.csv', comment='#')", f"'{tables}/run.parquet'"):
+        wanted = "count(*), sum(flag_bump::int), max(p_world_base_y), count(*) filter (isnan(b_sd_nt))"
+        ((rows, flags, most, unknown),) = duckdb.sql(f"select {wanted} from {source}").fetchall()
+        assert (rows, flags, unknown) == (run.rows, bumps, np.isnan(run["b_sd_nt"]).sum())
+        assert most == run["p_world_base"][:, 1].max()
+
+
+def test_numpy_reads_the_npz_without_pickle(tables):
+    with np.load(tables / "run.npz", allow_pickle=False) as arrays:
+        assert np.array_equal(arrays["p_world_base"], some_run()["p_world_base"])
+        told = json.loads(str(arrays["magtwin"]))
+    assert told["facts"] == FACTS
+    assert told["columns"]["b_total_nt"]["unit"] == "nT"
+
+
+def test_a_csv_tells_people_facts_units_and_frames_before_its_rows(tables):
+    lines = (tables / "run.csv").read_text().splitlines()
+    assert lines[1].startswith('# facts {"path": "figure8", "seed": 7')
+    assert any(line.startswith("# column odom_v_y {") and '"frame": "base_link"' in line for line in lines)
+
+
+def test_a_csv_of_a_spreadsheet_is_a_run_where_the_names_are(tmp_path):
+    (tmp_path / "run.csv").write_text('\ufeff"t","b_total_nt","flag_bump"\r\n0,41000,0\r\n0.5,nan,TRUE\r\n')
+    run = read_csv(tmp_path / "run.csv")
+    assert list(run) == ["t", "b_total_nt", "flag_bump"]
+    assert np.array_equal(run["b_total_nt"], [41000, np.nan], equal_nan=True)
+    assert np.array_equal(run["flag_bump"], [False, True])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"", "has no line of column names; it is empty"),
+        (b"# facts {}\n", "has no line of column names"),
+        (b"t,yaw\n0,1\n1\n", "Expected 2 columns, got 1"),
+        (b"t,yaw\n0,1\n1,2,3\n", "Expected 2 columns, got 3"),
+        (b"t,yaw\n0,1\n1,north\n", "invalid value 'north'"),
+        (b"t,yaw\n0,1\n1,\n", "column 'yaw', row 1: no value; write nan"),
+        (b"t,yaw,yaw\n0,1,2\n", "two columns are called 'yaw'"),
+        (b"time,yaw\n0,1\n", "not a Run: column 't' is missing"),
+        (b"t,yaw\n0,1\n0,2\n", "row 1 has 0 s after 0 s"),
+        (b"t,yaw\n2,1\n1,2\n", "t must ascend from row to row, but row 1 has 1 s after 2 s"),
+        (b"t\nnan\n", "t must be finite, got nan in row 0"),
+        (b"t,odom_p_x\n0,1\n", "column 'odom_p_y' is missing beside 'odom_p_x'"),
+        (b"t,flag_bump\n0,2\n", "'2'"),
+        (b"\xff\xfe\x00t\n", "is not text in UTF-8"),
+        (b"a" * (1 << 21), "line 1 is no line of a CSV file"),
+        (b"# facts [1]\nt\n0\n", "must be an object"),
+        (b"# facts {\nt\n0\n", "is not JSON"),
+        (b'# facts {"a": [1]}\nt\n0\n', "fact 'a' must be a text, a number"),
+        (b"# column t nonsense\nt\n0\n", "csv:1: what it says of a column is not JSON"),
+        (b'# column t {"type": "tensor"}\nt\n0\n', "column 't' has no such type"),
+        (b'# column t {"type": "double", "column": "t"}\nt\n0\n1', "cut short: its last line has no end"),
+    ],
+)
+def test_a_csv_that_holds_no_run_is_refused_in_one_line(text, message, tmp_path):
+    (tmp_path / "run.csv").write_bytes(text)
+    with pytest.raises(RefusedError, match=message) as refused:
+        read_csv(tmp_path / "run.csv")
+    assert "run.csv" in str(refused.value)
+    assert len(str(refused.value)) < 500
+
+
+def npz(path, **arrays):
+    np.savez(path, **arrays)
+    return path
+
+
+class Danger:
+    """Runs when it is unpickled."""
+
+    def __reduce__(self):
+        return (Path("ran").touch, ())
+
+
+def test_pickled_objects_in_an_npz_are_refused_and_never_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.savez(tmp_path / "run.npz", t=np.arange(1.0), yaw=np.array([Danger()], dtype=object))
+    with pytest.raises(RefusedError, match=r"yaw\.npy holds pickled objects, which are not read"):
+        read_npz(tmp_path / "run.npz")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_damaged_or_foreign_npz_is_refused(tables, tmp_path):
+    path, whole = tmp_path / "run.npz", (tables / "run.npz").read_bytes()
+    for content in (b"", b"PK\x03\x04 nothing", whole[:-300], whole[: len(whole) // 2]):
+        path.write_bytes(content)
+        with pytest.raises(RefusedError, match=r"run\.npz: not an npz file, damaged, or cut short"):
+            read_npz(path)
+    changed = bytearray(whole)
+    changed[len(whole) // 2] ^= 255
+    path.write_bytes(changed)
+    with pytest.raises(RefusedError, match=r"run\.npz: "):
+        read_npz(path)
+
+
+def test_an_array_whose_header_claims_more_than_is_there_takes_no_memory(tmp_path):
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**15,)})
+    with zipfile.ZipFile(tmp_path / "run.npz", "w") as archive:
+        archive.writestr("t.npy", header.getvalue() + bytes(16))
+    with pytest.raises(RefusedError, match=r"t\.npy is cut short: 16 bytes for float64 of shape"):
+        read_npz(tmp_path / "run.npz")
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"yaw": np.zeros(2)}, "not a Run: column 't' is missing"),
+        ({"t": np.array([1.0, 0.0])}, "row 1 has 0 s after 1 s"),
+        ({"t": np.arange(2.0), "yaw": np.zeros(3)}, "equally long"),
+        ({"t": np.arange(2.0), "odom_p": np.zeros((2, 2))}, "'odom_p' must have shape"),
+        ({"t": np.arange(2.0), "name": np.array(["a", "b"])}, "'name' must hold numbers or flags"),
+        ({"t": np.arange(2.0), "yaw": np.zeros(2, complex)}, "'yaw' must hold numbers or flags"),
+        ({"t": np.arange(2.0), "est_n": np.array(3)}, "column 'est_n' must hold numbers or flags in rows"),
+        ({"t": np.arange(2.0), "magtwin": np.zeros(2)}, "tells nothing of a run"),
+        ({"t": np.arange(2.0), "magtwin": np.array('{"columns": {"t": 1}}')}, "object of texts"),
+    ],
+)
+def test_an_npz_that_holds_no_run_is_refused(arrays, message, tmp_path):
+    with pytest.raises(RefusedError, match=message):
+        read_npz(npz(tmp_path / "run.npz", **arrays))
+
+
+def test_parquet_whose_clock_or_flags_are_wrong_is_refused_with_the_row(tmp_path):
+    path = tmp_path / "run.parquet"
+    pq.write_table(pa.table({"t": [0.0, 2.0, 1.0]}), path)
+    with pytest.raises(RefusedError, match="row 2 has 1 s after 2 s; sort the rows"):
+        read_parquet(path)
+    pq.write_table(pa.table({"t": [0.0, 1.0], "flag_bump": [0.0, 0.5]}), path)
+    with pytest.raises(RefusedError, match=r"column 'flag_bump', row 1: a flag is 0 or 1, got 0\.5"):
+        read_parquet(path)
+    twice = pa.Table.from_arrays([pa.array([0.0]), pa.array([1.0]), pa.array([2.0])], ["t", "yaw", "yaw"])
+    pq.write_table(twice, path)
+    with pytest.raises(RefusedError, match=r"two columns are called 'yaw'|damaged"):
+        read_parquet(path)
+
+
+def test_blocks_become_the_same_bytes_as_the_whole_written_at_once(tables, tmp_path):
+    run = some_run()
+    with ParquetParts(tmp_path / "run.parquet") as parts:
+        for first in range(0, run.rows, 17):
+            parts.append(run.take(slice(first, first + 17)))
+            assert_same(read_run(tmp_path / "run.parquet.parts"), run.take(slice(0, first + 17)))
+        parts.append(run.take(slice(0)))  # a block of nothing adds nothing
+        assert not (tmp_path / "run.parquet").exists()
+    assert (tmp_path / "run.parquet").read_bytes() == (tables / "run.parquet").read_bytes()
+    assert [p.name for p in tmp_path.iterdir()] == ["run.parquet"]
+
+
+def test_a_program_that_is_killed_leaves_parts_that_are_read_and_not_overwritten_unasked(tmp_path):
+    code = """
+import os, signal, sys
+from test_tables import some_run
+from magtwin.io.tables import ParquetParts
+parts, run = ParquetParts(sys.argv[1]), some_run()
+parts.append(run.take(slice(0, 20)))
+parts.append(run.take(slice(20, 40)))
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    command = [sys.executable, "-c", code, str(tmp_path / "run.parquet")]
+    killed = subprocess.run(command, check=False, cwd=Path(__file__).parent)
+    assert killed.returncode == -signal.SIGKILL
+    left = tmp_path / "run.parquet.parts"
+    assert_same(read_run(left), some_run().take(slice(0, 40)))
+    with pytest.raises(RefusedError, match="parts of a run that did not end; magtwin convert reads them"):
+        ParquetParts(tmp_path / "run.parquet")
+    assert_same(read_run(left), some_run().take(slice(0, 40)))
+    with ParquetParts(tmp_path / "run.parquet", force=True) as parts:
+        parts.append(some_run(seed=1))
+    assert_same(read_run(tmp_path / "run.parquet"), some_run(seed=1))
+
+
+def test_blocks_that_do_not_run_on_or_are_of_another_run_are_refused(tmp_path):
+    run = some_run()
+    parts = ParquetParts(tmp_path / "run.parquet")
+    parts.append(run.take(slice(0, 20)))
+    with pytest.raises(RefusedError, match=r"the block to append begins at .* s, and the last ended at"):
+        parts.append(run.take(slice(10, 30)))
+    parts.append(run.select("yaw").take(slice(20, 30)))
+    with pytest.raises(RefusedError, match=r"part-000001\.parquet: has other columns than part-000000"):
+        parts.close()
+
+
+@pytest.mark.parametrize(("write", "read", "name"), TABLES, ids=NAMES)
+def test_a_full_disk_is_refused_and_what_was_there_stays(write, read, name, tmp_path):
+    path = tmp_path / name
+    path.write_text("earlier")
+    with few_bytes(20_000), pytest.raises(RefusedError, match=rf"{name}: cannot be written \(File too large"):
+        write(some_run(2000), path, force=True)
+    assert path.read_text() == "earlier"
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize(("write", "read", "name"), TABLES, ids=NAMES)
+def test_a_folder_that_cannot_be_written_is_refused(write, read, name, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(RefusedError, match="cannot be written"):
+        write(some_run(), tmp_path / "file" / name)
+
+
+@contextmanager
+def few_bytes(limit):
+    """A process whose files may have no more bytes, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

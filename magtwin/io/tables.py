@@ -365,8 +365,11 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
         if name not in COLUMNS
     }
     for name, values in arrays.items():
-        if values.dtype.kind not in "bfiu":
-            raise RefusedError(f"{path}: column {name!r} must hold numbers or flags, got {values.dtype}")
+        if values.dtype.kind not in "bfiu" or values.ndim not in (1, 2):
+            raise RefusedError(
+                f"{path}: column {name!r} must hold numbers or flags in rows, got {values.dtype} "
+                f"of shape {values.shape}"
+            )
     try:
         run = Run(arrays, facts, specs)
     except (RefusedError, TypeError) as error:
