@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import magtwin
 from magtwin.field.map import AnomalyMap
-from magtwin.files import git_revision, sha256
+from magtwin.files import existing, git_revision, sha256
 from magtwin.names import RefusedError, find
 from magtwin.obstacles import Obstacles
 from magtwin.path import Path, resolve_path
@@ -107,13 +107,7 @@ def twin_of(
     Raises:
         RefusedError: The facts name no scene, or it or its network is not there, or is not what it was.
     """
-    facts = run.facts
-    if scene is None:
-        if "scene_file" not in facts:
-            raise RefusedError("the run does not say which scene it came from; name one")
-        scene = locate(str(facts["scene_file"]), near)
-        if scene is None:
-            raise RefusedError(f"{facts['scene_file']}: the scene of the run is not there; name it (--scene)")
+    facts, scene = run.facts, scene_of(run, scene, near=near)
     kind: Any = facts.get("magnetometer")
     network = str(facts["network_file"]) if "network_file" in facts else None
     twin = open_twin(
@@ -131,6 +125,24 @@ def twin_of(
 
 
 _CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_sha256": "the scene"}
+
+
+def scene_of(
+    run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None
+) -> FilePath:
+    """The file of the scene that a run came from; arguments as for `twin_of`.
+
+    Raises:
+        RefusedError: The facts name none, or it is not there.
+    """
+    if scene is not None:
+        return existing(scene, "scene")
+    if "scene_file" not in run.facts:
+        raise RefusedError("the run does not say which scene it came from; name it (--scene)")
+    found = locate(str(run.facts["scene_file"]), near)
+    if found is None:
+        raise RefusedError(f"{run.facts['scene_file']}: the scene of the run is not there; name it (--scene)")
+    return found
 
 
 def locate(file: str, near: str | FilePath | None = None) -> FilePath | None:
@@ -433,10 +445,10 @@ def _facts(
     facts: Facts = {"magtwin": magtwin.__version__, "numpy": np.__version__, "seed": seed}
     if duration_s is not None:
         facts["asked_duration_s"] = float(duration_s)
-    return facts | _driven(path) | dict(twin.facts) | {"config_sha256": config_sha256}
+    return facts | path_facts(path) | dict(twin.facts) | {"config_sha256": config_sha256}
 
 
-def _driven(path: "Path | Commands | Run | str") -> Facts:
+def path_facts(path: "Path | Commands | Run | str") -> Facts:
     """Where what was driven came from, and its checksum."""
     if isinstance(path, str):
         return {}

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError
 from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
 from magtwin.report import Figure, Report
 from magtwin.run import COLUMNS, Run
-from magtwin.twin import Twin, locate, simulate, twin_of
+from magtwin.twin import Twin, locate, path_facts, scene_of, simulate, twin_of
 
 CAUSES: Mapping[str, str] = {
     "magtwin": "another version of magtwin",
@@ -123,6 +124,40 @@ def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePat
         if run.facts.get(fact) != again.facts.get(fact)
     ]
     return Repeat(run, again, tuple(causes), differences(run, again))
+
+
+def map_of(
+    run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None
+) -> AnomalyMap:
+    """The map that a run read, where its scene is at hand and the map is what it was.
+
+    Args:
+        run: The run.
+        scene: Where its scene lies now; None looks where the facts say.
+        near: The run's own file: files that its facts name are looked for in its folder too.
+
+    Raises:
+        RefusedError: The scene is not there, or its map is another.
+    """
+    from magtwin.files import sha256
+    from magtwin.usd.maps import load_map
+    from magtwin.usd.scene import read_scene
+
+    layer = read_scene(scene_of(run, scene, near=near), check_network=False).map_layer
+    if "map_sha256" in run.facts and run.facts["map_sha256"] != sha256(layer):
+        raise RefusedError(f"{layer}: is not the map that the run read")
+    return load_map(layer)
+
+
+def planned_of(run: Run, *, near: str | FilePath | None = None) -> NDArray[np.float64] | None:
+    """The path that a run was to drive [m], shape (M, 2); none where it is not at hand, or drove none."""
+    try:
+        path = _driven(run, near)
+    except RefusedError:
+        return None
+    if not isinstance(path, Path) or run.facts.get("path_sha256") != path_facts(path)["path_sha256"]:
+        return None
+    return path.p_xy
 
 
 def differences(run: Run, again: Run) -> tuple[Difference, ...]:

@@ -1,0 +1,63 @@
+"""`magtwin report`: a run, or a set of runs, as one page."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, check_suffix, progress, say
+
+
+@app.command
+def report(
+    *runs: Annotated[Path, Parameter(required=True)],
+    out: Path = Path("report.html"),
+    scene: Path | None = None,
+    force: Force = False,
+) -> None:
+    """Write what happened in a run, or in a set of runs, as one page with its pictures inside.
+
+    What was run, the map with the path, time series, errors by their address, events, and provenance.
+    Several runs get an overview first.
+
+    Parameters
+    ----------
+    runs
+        Runs, in any format that magtwin reads.
+    out
+        Page to write: .html, which needs nothing else to be shown; .md; or .json.
+    scene
+        Where the scene lies whose map is drawn below the paths; looked for where each run says unless given.
+    force
+        Replace what exists.
+    """
+    from magtwin.files import check_free
+    from magtwin.io.formats import read_run
+    from magtwin.io.pages import WRITERS, Told, page_of_runs, write_page
+    from magtwin.io.provenance import map_of, planned_of
+    from magtwin.names import RefusedError
+
+    check_suffix(out, tuple(WRITERS), "a report")
+    check_free(out, force=force)
+    told = []
+    names = [file.name for file in runs]
+    for file in runs:
+        run = read_run(file)
+        note, field = "", None
+        try:
+            field = map_of(run, scene, near=file)
+        except RefusedError as error:
+            note = f"Its map is not shown: {error}."
+        name = file.name if names.count(file.name) == 1 else str(file)
+        told.append(Told(name, run, field, planned_of(run, near=file), note))
+    start = time.monotonic()
+    with progress("Drawing") as advance:
+        page = page_of_runs(
+            told,
+            pictures=out.suffix == ".html",
+            advance=lambda done: advance(done, len(told), f"{done / (time.monotonic() - start):.2g} runs/s"),
+        )
+    write_page(page, out, force=force)
+    say(f"Wrote {out}")
