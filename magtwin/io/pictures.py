@@ -99,7 +99,7 @@ def picture_of_stage(
     if not (min(size) >= 16 and max(size) <= 16384):
         raise RefusedError(f"size must lie in 16..16384 pixels each way, got {size[0]} x {size[1]}")
     with output(out, force=force) as aside:
-        plotter = _plotter(size)
+        plotter = plotter_of(size)
         try:
             _draw(plotter, path, size, camera or Camera(), legend=legend, ground=ground)
             if title:
@@ -124,7 +124,7 @@ def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise RefusedError(f"{path}: there is no display to show it on; magtwin picture draws it to a file")
-    plotter = _plotter(size, window=True)
+    plotter = plotter_of(size, window=True)
     try:
         _draw(plotter, path, size, Camera())
         plotter.show(title=str(path))
@@ -160,11 +160,11 @@ def _draw(
         ground = camera.elevation_deg > 0 and all(s.link for s in shapes)
     if ground:
         _add_ground(plotter, everything)
-    _light(plotter, everything)
-    _aim(plotter, camera, everything, size)
+    light(plotter, everything)
+    aim(plotter, camera, everything, size)
     scale = read_colour_scale(stage) if legend else None
     if scale is not None:
-        _add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
+        add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
 
 
 def view_distance(
@@ -189,7 +189,7 @@ def view_distance(
     return float(np.max(b + np.maximum(np.abs(r) / np.tan(h), np.abs(u) / np.tan(v))))
 
 
-def _plotter(size: tuple[int, int], *, window: bool = False) -> Any:
+def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
     """A plotter, off screen or in a window.
 
     Raises:
@@ -256,7 +256,7 @@ def _add_ground(plotter: Any, everything: NDArray) -> None:
     plotter.add_mesh(floor, color=BACKGROUND, ambient=1.0, diffuse=0.0, specular=0.0)
 
 
-def _light(plotter: Any, everything: NDArray) -> None:
+def light(plotter: Any, everything: NDArray) -> None:
     """Light from four sides, the strongest from the upper left, and soft shadow in corners."""
     import pyvista
 
@@ -276,7 +276,7 @@ def _light(plotter: Any, everything: NDArray) -> None:
     plotter.enable_ssao(radius=0.08 * reach, bias=0.002 * reach, kernel_size=64, blur=True)
 
 
-def _aim(plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int]) -> None:
+def aim(plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int]) -> None:
     """Set the camera, at the distance from which everything is seen unless it gives its own."""
     target = (everything.min(axis=0) + everything.max(axis=0)) / 2
     target = target if camera.target is None else np.array(camera.target)
@@ -294,7 +294,7 @@ def _aim(plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int
     plotter.renderer.ResetCameraClippingRange()
 
 
-def _add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: str) -> None:
+def add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: str) -> None:
     """A colour bar, in µT where the map is in nT."""
     import pyvista
 
