@@ -191,23 +191,23 @@ def layout(
     run: Run,
     lab: LabSpec | None = None,
     *,
-    planned: bool = False,
     heading: float = 0.0,
     events: Sequence[str] | None = None,
+    whole: bool = True,
 ) -> rrb.Blueprint:
     """The views of a run, on its timeline; the lab and the robot in 3D first, where a lab is given.
 
     Args:
         run: What its plots show.
         lab: The room; none for plots only.
-        planned: Whether there is a path that was to be driven.
         heading: Heading of the map on its floor [rad], for the title.
         events: Flags that may yet be raised, of a run that goes on; none takes those that the run raised.
+        whole: Whether the run is whole; of one that goes on, axes grow with it.
     """
     shown = Shown.of(run)
-    whole = _whole([shown])
+    axis = _whole([shown]) if whole else None
     series = _stacked(
-        [(shown, FIELD_PANEL)], [(shown, DISTURBANCE_PANEL)], [(shown, ERROR_PANEL)], whole=whole, tall=0
+        [(shown, FIELD_PANEL)], [(shown, DISTURBANCE_PANEL)], [(shown, ERROR_PANEL)], whole=axis, tall=0
     )
     tabs = [
         rrb.Vertical(*views, name=name)
@@ -216,7 +216,7 @@ def layout(
             ("IMU", (ACCELERATION_PANEL, TILT_PANEL)),
             ("Battery", BATTERY_PANELS),
         )
-        if (views := _stacked(*([(shown, panel)] for panel in panels), whole=whole))
+        if (views := _stacked(*([(shown, panel)] for panel in panels), whole=axis))
     ]
     shares = [2.2, 1.2, 1.2][: len(series)]
     side = rrb.Vertical(
@@ -226,7 +226,7 @@ def layout(
         events = [key for key in STATES if _raised(run, key)]
     lanes = [STATES[key].name for key in STATES if key == "lidar_on" or key in events]
     states = rrb.StateTimelineView(
-        origin="states", contents=[f"$origin/{name}" for name in lanes], name="States", time_view=whole
+        origin="states", contents=[f"$origin/{name}" for name in lanes], name="States", time_view=axis
     )
     pages = rrb.Tabs(_event_view(), rrb.TextDocumentView(origin="facts", name="Run"))
     about = rrb.Vertical(states, pages, row_shares=[1.2, 1.4])
@@ -292,7 +292,7 @@ def _raised(run: Run, column: str) -> bool:
 
 
 def _stacked(
-    *rows: Sequence[tuple[Shown, Panel]], whole: rrb.TimeAxis, tall: int | None = None
+    *rows: Sequence[tuple[Shown, Panel]], whole: rrb.TimeAxis | None, tall: int | None = None
 ) -> list[rrb.TimeSeriesView]:
     """A plot each of the panels that have a series; the one of number `tall` has the room of two."""
     plots = []
@@ -309,7 +309,7 @@ def _stacked(
 
 
 def _plot(
-    title: str, lines: Sequence[tuple[Shown, Series, Array]], whole: rrb.TimeAxis, *, tall: bool
+    title: str, lines: Sequence[tuple[Shown, Series, Array]], whole: rrb.TimeAxis | None, *, tall: bool
 ) -> rrb.TimeSeriesView:
     """Lines of one unit, the legend in the corner where it needs least room of its own."""
     legend = len(lines) > 1
@@ -337,7 +337,7 @@ def _plot(
         contents=[f"/{entity}" for entity in overrides],
         name=title,
         axis_x=whole,
-        axis_y=rrb.ScalarAxis(range=ends) if ends else None,
+        axis_y=rrb.ScalarAxis(range=ends) if ends and whole else None,
         plot_legend=rrb.PlotLegend(corner, visible=legend),
         overrides={f"/{entity}": lines for entity, lines in overrides.items()},
     )
@@ -435,7 +435,8 @@ def _lab_view(lab: LabSpec, heading: float, names: Sequence[str]) -> rrb.Spatial
     position, target = lab_eye(lab)
     return _view_3d(
         "world",
-        f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, readings along the path",
+        f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, "
+        + ("readings along the path" if names == [""] else "a robot and its path for each run"),
         names,
         without="world/robot/sensors",
         position=position,

@@ -1,19 +1,29 @@
-"""Live: a robot that is being driven, in the Rerun viewer while it goes on."""
+"""Live: a run that goes on, in a Rerun file that grows and in the viewer."""
 
 import math
+import socket
+import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import rerun as rr
 import rerun.blueprint as rrb
 
-from magtwin.io.layout import lab_eye
-from magtwin.io.recording import APPLICATION
-from magtwin.io.series import TIMELINE
+from magtwin.files import check_free
+from magtwin.io.layout import lab_eye, layout
+from magtwin.io.recorder import partial_of
+from magtwin.io.recording import APPLICATION, Recording, facts_page, send_properties, stream, title_of
+from magtwin.io.series import STATES, TIMELINE
 from magtwin.io.viewer import live_viewer
-from magtwin.io.world import mesh_of
+from magtwin.io.world import Room, heading_of, mesh_of
+from magtwin.names import RefusedError
+from magtwin.path import Path as Planned
+from magtwin.run import Run
+from magtwin.sim.lidar import Scans
 from magtwin.spec import Scene
+from magtwin.twin import Twin
 from magtwin.usd.geometry import open_stage, read_links, read_shapes
 from magtwin.usd.maps import HEAT_MAP
 
@@ -22,6 +32,200 @@ Show = Callable[[float, tuple[float, float, float]], None]
 
 TRAIL_M = 0.02
 """Way between the points of the line that a robot draws on the floor [m]."""
+
+
+class RrdWriter:
+    """A recording that grows while its run goes on: a sink of a `Recorder`.
+
+    Its layout is that of `write_rrd`. The file lies beside its place under the name `run.partial.rrd` until
+    `close`; whatever ends the process, it can be read up to the last rows.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        twin: Twin | None = None,
+        *,
+        expected: Run | None = None,
+        planned: Planned | None = None,
+        scans: Scans | None = None,
+        force: bool = False,
+    ) -> None:
+        """Begin a file.
+
+        Args:
+            path: The .rrd file to make at the end.
+            twin: As for `write_rrd`, as what follows.
+            expected: The run, where it is known beforehand: it sets axes and colours.
+            planned: The path that is to be driven.
+            scans: What the LiDAR saw, or will have seen.
+            force: Whether a file that exists is replaced, and what another recording left unfinished.
+
+        Raises:
+            RefusedError: The file exists and `force` was not given, or it cannot be written.
+        """
+        self.path, self._force = check_free(path, force=force), force
+        self.partial = check_free(partial_of(self.path), force=force)
+        """Where it lies while it grows."""
+        try:
+            self.partial.parent.mkdir(parents=True, exist_ok=True)
+            self.partial.write_bytes(b"")
+        except OSError as error:
+            raise RefusedError(f"{self.path}: cannot be written ({error.strerror})") from error
+        self._growing = _Growing(twin, expected, planned, scans, file=self.partial, said=self.path)
+
+    def append(self, run: Run) -> None:
+        """The next rows; they are in the file when this returns.
+
+        Raises:
+            RefusedError: The disk is full, or the stage cannot be read.
+        """
+        self._growing.append(run)
+
+    def close(self) -> None:
+        """Complete the file and give it its name; without rows there is none."""
+        rows = self._growing.close()
+        if not rows:
+            self.partial.unlink()
+            return
+        check_free(self.path, force=self._force)
+        self.partial.replace(self.path)
+
+    def abort(self) -> None:
+        """Leave what there is under the name that says that it did not end."""
+        self._growing.abort()
+
+
+class LiveViewer:
+    """A viewer that shows a run while it goes on: a sink of a `Recorder`; when it is gone, the run goes on."""
+
+    def __init__(
+        self,
+        address: str,
+        twin: Twin | None = None,
+        *,
+        expected: Run | None = None,
+        planned: Planned | None = None,
+        scans: Scans | None = None,
+    ) -> None:
+        """Begin.
+
+        Args:
+            address: Where it listens, such as rerun+http://127.0.0.1:9876/proxy.
+            twin: As for `RrdWriter`, as what follows.
+            expected: The run, where it is known beforehand.
+            planned: The path that is to be driven.
+            scans: What the LiDAR saw, or will have seen.
+
+        Raises:
+            RefusedError: Nothing listens there.
+        """
+        _check_listens(address)
+        self._address = address
+        self._growing: _Growing | None = _Growing(twin, expected, planned, scans, address=address)
+
+    @property
+    def shown(self) -> bool:
+        """Whether it is still there."""
+        return self._growing is not None
+
+    def append(self, run: Run) -> None:
+        """The next rows."""
+        if self._growing is None:
+            return
+        try:
+            self._growing.append(run)
+        except RefusedError:
+            self.abort()
+
+    def close(self) -> None:
+        """Say that no rows come any more; the viewer stays as it is."""
+        if self._growing is not None:
+            with suppress(RefusedError):
+                self._growing.close()
+
+    def abort(self) -> None:
+        """Let go of it."""
+        if self._growing is not None:
+            growing, self._growing = self._growing, None
+            growing.abort()
+
+
+class _Growing:
+    """A stream that gets its rows bit by bit; it begins with the first of them."""
+
+    def __init__(
+        self,
+        twin: Twin | None,
+        expected: Run | None,
+        planned: Planned | None,
+        scans: Scans | None,
+        *,
+        file: Path | None = None,
+        address: str | None = None,
+        said: Path | None = None,
+    ) -> None:
+        self._twin, self._expected, self._planned, self._scans = twin, expected, planned, scans
+        self._file, self._address, self._said = file, address, said or Path(str(address))
+        self._stack = ExitStack()
+        self._recording: Recording | None = None
+        self._rows = 0
+
+    def append(self, run: Run) -> None:
+        if self._recording is None:
+            self._recording = self._begun(run)
+        try:
+            self._recording.append(run)
+            self._recording.rec.flush(timeout_sec=10.0)
+        except RuntimeError as error:
+            raise RefusedError(f"{self._said}: cannot be written ({error}); is the disk full?") from error
+        self._rows += run.rows
+
+    def close(self) -> int:
+        """Complete it; gives the rows that it has."""
+        if self._recording is not None:
+            self._recording.close()
+        self._stack.close()
+        return self._rows
+
+    def abort(self) -> None:
+        with suppress(RefusedError):
+            self._stack.close()
+
+    def _begun(self, run: Run) -> Recording:
+        twin, known = self._twin, self._expected or run
+        lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, known))
+        events = None if self._expected else list(STATES)
+        views = layout(known, lab, heading=heading, events=events, whole=self._expected is not None)
+        rec = self._stack.enter_context(
+            stream(
+                uuid.uuid4().hex,
+                title_of(run) or "live run",
+                views,
+                file=self._file,
+                address=self._address,
+                said=self._said,
+            )
+        )
+        send_properties(rec, run.facts)
+        rec.log("facts", facts_page(run.facts), static=True)
+        robot = None
+        if twin is not None:
+            rate = run.facts.get("rate_hz", 0.0)
+            room = Room.enter(rec, twin, known, planned=self._planned)
+            robot = room.robot(rate if isinstance(rate, float) else 0.0)
+        return Recording(rec, robot=robot, scans=self._scans)
+
+
+def _check_listens(address: str) -> None:
+    """Refuse an address at which no viewer listens: Rerun itself would wait for it."""
+    parts = urlsplit(address)
+    try:
+        if not parts.scheme.startswith("rerun") or not parts.hostname or not parts.port:
+            raise RefusedError(f"{address}: no address of a viewer; give one as rerun+http://HOST:PORT/proxy")
+        socket.create_connection((parts.hostname, parts.port), timeout=5).close()
+    except (OSError, ValueError) as error:
+        raise RefusedError(f"{address}: no viewer listens there ({error}); start one with: rerun") from error
 
 
 @contextmanager

@@ -1,10 +1,13 @@
 """Recorder: a run that goes on, appended block by block to files and a live viewer at once."""
 
-from collections.abc import Sequence
-from contextlib import suppress
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from threading import Event
 from types import TracebackType
 from typing import Protocol
+
+import numpy as np
 
 from magtwin.names import RefusedError
 from magtwin.run import Run
@@ -13,10 +16,10 @@ PARTIAL = ".partial"
 """What stands before the ending of a file's name until the run in it has ended."""
 
 FLUSH_S = 0.5
-"""Length of the blocks that are appended [s]: what a process that is killed loses at most, and then some."""
+"""How long files wait for their next rows [s]: what a process that is killed loses at most."""
 
-LIVE_S = 0.05
-"""Length of the blocks that a viewer is shown [s]."""
+TICK_S = 0.05
+"""Time between blocks of a run that is emitted in step with the clock [s]."""
 
 
 def partial_of(path: Path) -> Path:
@@ -25,49 +28,115 @@ def partial_of(path: Path) -> Path:
 
 
 class Sink(Protocol):
-    """What takes a run as it comes."""
+    """What takes a run as it comes, such as RrdWriter, ParquetParts, BagWriter."""
 
     def append(self, run: Run) -> None:
-        """The next rows, with the facts; what they hold can be read from then on, whatever happens."""
+        """Take the next rows, with the facts; whatever happens, they can be read from then on."""
 
     def close(self) -> None:
-        """No rows come any more: complete what is written, and give it its name."""
+        """Complete what was written, and give it its name: no rows come any more."""
 
 
 class Recorder:
-    """A run on its way to several sinks. The end of the block completes them, also one by Ctrl-C.
+    """A run on its way into several sinks at once.
 
-    Whatever else ends it leaves the files as they are, under names that tell that they are unfinished; they
-    can be read up to the last block.
+    The end of the `with` block completes them. Any fault leaves the files as they are, under names that
+    tell that they are unfinished; they can be read up to their last rows.
     """
 
-    def __init__(self, sinks: Sequence[Sink]) -> None:
-        self._sinks = list(sinks)
+    def __init__(self, files: Sequence[Sink], viewers: Sequence[Sink] = ()) -> None:
+        """Begin.
+
+        Args:
+            files: Those that are given rows every `FLUSH_S`, for what each block costs them.
+            viewers: Those that are given every block at once.
+        """
+        self._files, self._viewers = list(files), list(viewers)
+        self._waiting: list[Run] = []
+        self._flushed = time.monotonic()
         self.rows = 0
         """Rows appended so far."""
 
-    def __enter__(self) -> "Recorder":
-        return self
-
     def append(self, run: Run) -> None:
-        """The next rows, to every sink.
+        """The next rows, a slice of the run: its columns and facts.
 
         Raises:
             RefusedError: A sink cannot take them; the text says which and why.
         """
         if not run.rows:
             return
-        for sink in self._sinks:
-            sink.append(run)
         self.rows += run.rows
+        self._waiting.append(run)
+        for viewer in self._viewers:
+            viewer.append(run)
+        if time.monotonic() - self._flushed >= FLUSH_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Give the files what they have not got yet.
+
+        Raises:
+            RefusedError: As for `append`.
+        """
+        self._flushed = time.monotonic()
+        waiting, self._waiting = self._waiting, []
+        if not waiting:
+            return
+        first = waiting[0]
+        block = Run({name: np.concatenate([run[name] for run in waiting]) for name in first}, first.facts)
+        for file in self._files:
+            file.append(block)
+
+    def __enter__(self) -> "Recorder":
+        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None or issubclass(kind, KeyboardInterrupt):
-            for sink in self._sinks:
-                sink.close()
-            return
-        for sink in self._sinks:
-            with suppress(RefusedError, OSError, AttributeError):
-                sink.abandon()  # type: ignore[attr-defined]
+        sinks = [*self._files, *self._viewers][::-1]
+        if kind is None:
+            try:
+                self.flush()
+                for sink in list(sinks):
+                    sink.close()
+                    sinks.remove(sink)
+                return
+            finally:
+                self._abort(sinks)
+        self._abort(sinks)
+
+    def _abort(self, sinks: Sequence[Sink]) -> None:
+        """Let go of what cannot be completed any more."""
+        for sink in sinks:
+            abort = getattr(sink, "abort", None)  # a folder of whole parts needs none
+            if abort is not None:
+                try:
+                    abort()
+                except (RefusedError, OSError, RuntimeError):
+                    continue
+
+
+def in_step(run: Run, pace: float = 1.0, *, stop: Event | None = None) -> Iterator[Run]:
+    """A run in blocks, each at its time on the clock.
+
+    Args:
+        run: What happened.
+        pace: Simulated seconds a second of the clock, above 0; inf waits for nothing.
+        stop: Ends it when set, at once.
+
+    Raises:
+        RefusedError: The pace is not above 0.
+    """
+    if not pace > 0:
+        raise RefusedError(f"pace must be above 0 simulated seconds a second, got {pace:g}")
+    stop = stop or Event()
+    t, begun, sent = run["t"], time.monotonic(), 0
+    while sent < run.rows and not stop.is_set():
+        now = time.monotonic() - begun
+        end = int(np.searchsorted(t, t[0] + now * pace, side="right")) if np.isfinite(pace) else run.rows
+        if end == sent:
+            stop.wait(max(TICK_S / 5, (t[sent] - t[0]) / pace - now))
+            continue
+        yield Run({name: values[sent:end] for name, values in run.items()}, run.facts)
+        sent = end
+        stop.wait(TICK_S)

@@ -14,12 +14,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from magtwin.io.series import Flags, entity_of, send_columns, send_facts, send_rows
-from magtwin.io.world import Robot, Scale, bodies_of, heading_of, send_planned, send_room, send_scans
+from magtwin.io.world import Feed, Robot
 from magtwin.names import RefusedError
-from magtwin.path import Path
 from magtwin.run import Run
 from magtwin.sim.lidar import Scans
-from magtwin.twin import Twin
 
 APPLICATION = "magtwin"
 
@@ -94,13 +92,18 @@ class Recording:
     """What is added to its times [s]."""
     robot: Robot | None = None
     """Its robot, in the room; none for series only."""
+    scans: Scans | None = None
+    """What its LiDAR saw; shown where there is a robot."""
 
     _rows: int = 0
     _last: Run | None = None
     _flags: Flags = field(init=False)
+    _feed: Feed | None = None
 
     def __post_init__(self) -> None:
         self._flags = Flags(self.rec, self.name, self.offset_s)
+        if self.robot is not None and self.scans is not None and len(self.scans.t):
+            self._feed = Feed(self.rec, self.scans)
 
     def append(self, run: Run) -> None:
         """The next rows."""
@@ -112,6 +115,8 @@ class Recording:
         self._flags.append(run)
         if self.robot is not None and run.keys() >= POSED:
             self.robot.append(run)
+        if self._feed is not None:
+            self._feed.send_until(float(run["t"][-1]))
         self._rows += run.rows
         self._last = Run({name: run[name][-1:] for name in run}, run.facts)
 
@@ -122,41 +127,10 @@ class Recording:
         self._flags.close()
         if self.robot is not None and self._last.keys() >= POSED:
             self.robot.close(self._last)
+        if self._feed is not None:
+            self._feed.clear(float(self._last["t"][-1]))
         send_rows(self.rec, self._rows, self.name)
         self.rec.log(entity_of("facts", self.name), facts_page(self._last.facts, self._rows), static=True)
-
-
-def enter_room(
-    rec: rr.RecordingStream,
-    twin: Twin,
-    known: Run,
-    *,
-    planned: Path | None = None,
-    scans: Scans | None = None,
-) -> Robot:
-    """Send what stands still, and give the robot that will drive there.
-
-    Args:
-        rec: Where to.
-        twin: What the run happens in.
-        known: What is known of it: readings for the scale of colours, the heading that it begins with.
-        planned: The path that is to be driven.
-        scans: What the LiDAR saw.
-
-    Raises:
-        RefusedError: The stage cannot be read.
-    """
-    shapes, links = bodies_of(twin)
-    scale = Scale.over(twin.field, known.get("b_total_nt", np.empty(0)))
-    send_room(rec, twin, shapes, scale, heading_of(twin.field, known))
-    if planned is not None:
-        send_planned(rec, planned)
-    if scans is not None and len(scans.t):
-        send_scans(rec, scans)
-    rate = known.facts.get("rate_hz", 0.0)
-    return Robot(
-        rec, twin.scene.robot, shapes, links, scale, rate_hz=rate if isinstance(rate, float) else 0.0
-    )
 
 
 def send_properties(rec: rr.RecordingStream, facts: Mapping[str, Any]) -> None:

@@ -17,7 +17,6 @@ from magtwin.io.recorder import PARTIAL
 from magtwin.io.recording import (
     Recording,
     content_id,
-    enter_room,
     facts_page,
     send_properties,
     stream,
@@ -25,7 +24,7 @@ from magtwin.io.recording import (
 )
 from magtwin.io.series import COLUMNS_ENTITY, entity_of, table_of
 from magtwin.io.viewer import show
-from magtwin.io.world import Robot, heading_of
+from magtwin.io.world import Room, heading_of
 from magtwin.names import RefusedError
 from magtwin.path import Path
 from magtwin.run import Run
@@ -71,8 +70,10 @@ def write_rrd(
     ):
         send_properties(rec, run.facts)
         rec.log("facts", facts_page(run.facts, run.rows), static=True)
-        robot = None if twin is None else enter_room(rec, twin, run, planned=planned, scans=scans)
-        recording = Recording(rec, robot=robot)
+        robot = None
+        if twin is not None:
+            robot = Room.enter(rec, twin, run, planned=planned).robot()
+        recording = Recording(rec, robot=robot, scans=scans)
         recording.append(run)
         recording.close()
 
@@ -137,20 +138,11 @@ def write_comparison(
             said=FilePath(path),
         ) as rec,
     ):
-        room = None if twin is None else enter_room(rec, twin, first, planned=planned)
+        room = None if twin is None else Room.enter(rec, twin, first, planned=planned)
         for one in shown:
             robot = None
             if room is not None:
-                robot = Robot(
-                    rec,
-                    room.spec,
-                    room.shapes,
-                    room.links,
-                    None,
-                    name=one.name,
-                    offset_s=one.offset_s,
-                    colour=one.colour,
-                )
+                robot = room.one_of_several(one.name, one.colour, one.offset_s)
             recording = Recording(rec, one.name, one.offset_s, robot)
             recording.append(runs[one.name])
             recording.close()
@@ -195,8 +187,7 @@ def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
         try:
             found = RrdReader(file).stream().filter(content=f"/{COLUMNS_ENTITY}/**").to_chunks()
             for chunk in found:
-                name = chunk.entity_path.removeprefix(f"/{COLUMNS_ENTITY}").strip("/") or COLUMNS_ENTITY
-                chunks.setdefault(name, []).append(chunk.to_record_batch())
+                chunks.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
         except (RuntimeError, ValueError, OSError) as error:
             raise RefusedError(
                 f"{path}: not a Rerun recording that can be read ({_first_line(error, file)}); write it again"
@@ -206,8 +197,8 @@ def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
             f"{path}: a Rerun recording without a run of magtwin's: the entity /{COLUMNS_ENTITY} is missing"
         )
     runs = {}
-    for name, batches in chunks.items():
-        run, rows = table_of(batches, str(path))
+    for batches in chunks.values():
+        name, run, rows = table_of(batches, str(path))
         if rows != run.rows and not partial:
             raise RefusedError(
                 f"{path}: was cut short: it holds {run.rows:,} rows of "

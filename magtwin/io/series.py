@@ -33,8 +33,9 @@ BLOCK = 4096
 COLUMNS_ENTITY, DERIVED_ENTITY = "run", "derived"
 """Entities of a run's columns, and of what plots show beside them."""
 
-FACTS, NAMES, ROWS = "magtwin_facts", "magtwin_columns", "magtwin_rows"
-"""Components beside the columns, without time: facts and columns in JSON; the rows of a run that ended."""
+FACTS, NAMES, NAME, ROWS = "magtwin_facts", "magtwin_columns", "magtwin_name", "magtwin_rows"
+"""Components beside the columns, without time: facts and columns in JSON; the name of the run among others;
+the rows of a run that ended."""
 
 INTERVAL = 1.645
 """Half the width of the 90 % prediction interval, in standard deviations."""
@@ -148,7 +149,7 @@ def send_facts(rec: rr.RecordingStream, run: Run, name: str) -> None:
     }
     texts = {FACTS: dict(run.facts), NAMES: told}
     as_json: dict[str, Any] = {key: [json.dumps(value, ensure_ascii=False)] for key, value in texts.items()}
-    rec.log(entity_of(COLUMNS_ENTITY, name), rr.AnyValues(**as_json), static=True)
+    rec.log(entity_of(COLUMNS_ENTITY, name), rr.AnyValues(**as_json, **{NAME: [name]}), static=True)
 
 
 def send_rows(rec: rr.RecordingStream, rows: int, name: str) -> None:
@@ -193,8 +194,8 @@ def _arrow(name: str, values: NDArray[Any]) -> pa.Array:
     return pa.StructArray.from_arrays([pa.array(row) for row in np.ascontiguousarray(values.T)], names=parts)
 
 
-def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[Run, int | None]:
-    """The run that chunks of its entity hold, and the rows that it ended with, if it did.
+def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | None]:
+    """The run that chunks of its entity hold: its name, itself, and the rows that it ended with, if it did.
 
     Args:
         chunks: Every chunk of the entity, in any order.
@@ -209,7 +210,7 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[Run, int | None]:
         if TIMELINE in batch.schema.names:
             tables.append(batch)
         else:
-            known = [key for key in (FACTS, NAMES, ROWS) if key in batch.schema.names]
+            known = [key for key in (FACTS, NAMES, NAME, ROWS) if key in batch.schema.names]
             told |= {key: batch.column(key)[0][0].as_py() for key in known}
     try:
         facts, names = (json.loads(told[key]) for key in (FACTS, NAMES))
@@ -227,7 +228,7 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[Run, int | None]:
             f"{what}: a Rerun recording, but not one of a run that magtwin can read "
             f"({type(error).__name__}: {error}); read the run's Parquet, or record it again"
         ) from error
-    return Run(columns, facts), rows
+    return str(told.get(NAME) or COLUMNS_ENTITY), Run(columns, facts), rows
 
 
 def _values(column: pa.Array) -> NDArray[Any]:

@@ -84,19 +84,61 @@ def heading_of(field: AnomalyMap, run: Run) -> float:
     return float(field.headings_rad[np.argmin(away)])
 
 
-def send_room(
-    rec: rr.RecordingStream, twin: Twin, shapes: Sequence[Shape], scale: Scale, heading: float
-) -> None:
-    """What stands still: the map at a heading [rad] on the floor, its legend, walls and furniture."""
-    rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    _send_map(rec, twin.field, scale, heading)
-    _send_scale(rec, twin.field, scale)
-    for shape in shapes:
-        if not shape.link and shape.prim != str(HEAT_MAP):  # the map is drawn finer, see _send_map
-            rec.log(f"world/lab/{_entity(shape.prim)}", mesh_of([shape]), static=True)
+@dataclass(frozen=True)
+class Room:
+    """A twin's lab in a recording, in which robots can be set down."""
+
+    rec: rr.RecordingStream
+    spec: RobotSpec
+    shapes: Sequence[Shape]
+    links: dict[str, Link]
+    scale: Scale
+
+    @classmethod
+    def enter(
+        cls,
+        rec: rr.RecordingStream,
+        twin: Twin,
+        known: Run,
+        *,
+        planned: Path | None = None,
+    ) -> "Room":
+        """Send what stands still: the map on the floor, its legend, walls and furniture.
+
+        Args:
+            rec: Where to.
+            twin: Whose lab it is.
+            known: What is known of the run: readings for the scale of colours, and its first heading.
+            planned: The path that is to be driven.
+
+        Raises:
+            RefusedError: The stage cannot be read.
+        """
+        stage = open_stage(twin.scene_file)
+        shapes, links = list(read_shapes(stage)), read_links(stage)
+        scale = Scale.over(twin.field, known.get("b_total_nt", np.empty(0)))
+        rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        _send_map(rec, twin.field, scale, heading_of(twin.field, known))
+        _send_scale(rec, twin.field, scale)
+        for shape in shapes:
+            if not shape.link and shape.prim != str(HEAT_MAP):  # the map is drawn finer, see _send_map
+                rec.log(f"world/lab/{_entity(shape.prim)}", mesh_of([shape]), static=True)
+        if planned is not None:
+            _send_planned(rec, planned)
+        return cls(rec, twin.scene.robot, shapes, links, scale)
+
+    def robot(self, rate_hz: float = 0.0) -> "Robot":
+        """The robot of a run that is alone, its readings in the colours of the map."""
+        return Robot(self.rec, self.spec, self.shapes, self.links, self.scale, rate_hz=rate_hz)
+
+    def one_of_several(self, name: str, colour: Colour, offset_s: float) -> "Robot":
+        """The robot of one of several runs, its path in a colour of its own."""
+        return Robot(
+            self.rec, self.spec, self.shapes, self.links, None, name=name, colour=colour, offset_s=offset_s
+        )
 
 
-def send_planned(rec: rr.RecordingStream, planned: Path) -> None:
+def _send_planned(rec: rr.RecordingStream, planned: Path) -> None:
     """The path that is to be driven, on the floor."""
     strip = np.column_stack([planned.p_xy, np.full(len(planned.p_xy), 0.012)])
     rec.log("world/planned", rr.LineStrips3D([strip], colors=(255, 255, 255), radii=0.008), static=True)
@@ -171,24 +213,41 @@ def _send_image(
     )
 
 
-def send_scans(rec: rr.RecordingStream, scans: Scans) -> None:
-    """What each scan hit, at its moment, until the next; cleared when the LiDAR stops."""
-    rec.log(SCAN, rr.Points3D.from_fields(radii=[0.012], colors=[(255, 90, 90)]), static=True)
-    points = scans.points_world()
-    turn = float(np.diff(scans.t).min(initial=1.0))
-    last = np.append(np.diff(scans.t) > 1.5 * turn, True)
-    t = np.concatenate([scans.t, scans.t[last] + turn])
-    order = np.argsort(t, kind="stable")
-    points += [np.empty((0, 3))] * int(last.sum())
-    for start in range(0, len(t), SCANS):
-        rows = order[start : start + SCANS]
-        part = [points[row] for row in rows]
-        columns = rr.Points3D.columns(positions=np.concatenate(part).astype(np.float32))
-        rec.send_columns(
-            SCAN,
-            [rr.TimeColumn(TIMELINE, duration=nanoseconds(t[rows]))],
-            columns.partition([len(p) for p in part]),
-        )
+class Feed:
+    """What the LiDAR saw, sent as its time comes: each scan until the next, cleared when the LiDAR stops."""
+
+    def __init__(self, rec: rr.RecordingStream, scans: Scans) -> None:
+        self._rec, self._points = rec, scans.points_world()
+        self._turn = turn = float(np.diff(scans.t).min(initial=1.0))
+        last = np.append(np.diff(scans.t) > 1.5 * turn, True)[: len(scans.t)]
+        t = np.concatenate([scans.t, scans.t[last] + turn])
+        self._order = np.argsort(t, kind="stable")
+        self._t = t[self._order]
+        self._points += [np.empty((0, 3))] * int(last.sum())
+        self._sent = 0
+        rec.log(SCAN, rr.Points3D.from_fields(radii=[0.012], colors=[(255, 90, 90)]), static=True)
+
+    def send_until(self, t: float) -> None:
+        """All that there is up to a time [s] and was not sent yet."""
+        end = int(np.searchsorted(self._t, t, side="right"))
+        for start in range(self._sent, end, SCANS):
+            rows = slice(start, min(end, start + SCANS))
+            part = [self._points[k] for k in self._order[rows]]
+            columns = rr.Points3D.columns(positions=np.concatenate(part).astype(np.float32))
+            self._rec.send_columns(
+                SCAN,
+                [rr.TimeColumn(TIMELINE, duration=nanoseconds(self._t[rows]))],
+                columns.partition([len(p) for p in part]),
+            )
+        self._sent = max(self._sent, end)
+
+    def clear(self, t: float) -> None:
+        """Take the last scan away, after its turn or at time t [s], whichever is later: the run has ended."""
+        if self._sent and len(self._points[self._order[self._sent - 1]]):
+            end = max(t, float(self._t[self._sent - 1]) + self._turn)
+            self._rec.set_time(TIMELINE, duration=np.timedelta64(round(end * 1e9), "ns"))
+            self._rec.log(SCAN, rr.Points3D(np.empty((0, 3))))
+            self._rec.reset_time()
 
 
 @dataclass
@@ -235,7 +294,10 @@ class Robot:
                 self._wheels.append((entity, sides[link.joint], p, q, link.axis_link))
             else:
                 rec.log(entity, rr.Transform3D(translation=p, quaternion=rr.Quaternion(xyzw=q)), static=True)
-        if not self.name:
+        if self.name:
+            label = rr.Points3D([[0, 0, 0.5]], labels=[self.name], radii=0.0, colors=self.colour)
+            rec.log(f"{root}/name", label, static=True)
+        else:
             self._send_sensors(root)
 
     def _send_sensors(self, root: str) -> None:
@@ -327,7 +389,7 @@ class Robot:
         if before is None:
             paint: dict[str, Any] = {"colors": [self.colour]}
             for entity, style in (
-                ("world/driven", rr.LineStrips3D.from_fields(radii=[0.006], **paint)),
+                ("world/driven", rr.LineStrips3D.from_fields(radii=[0.012 if self.name else 0.006], **paint)),
                 ("floor/paths/driven", rr.LineStrips2D.from_fields(radii=[0.012], draw_order=2.0, **paint)),
                 ("floor/paths/robot", rr.Arrows2D.from_fields(radii=[0.05], draw_order=3.0, **paint)),
             ):
@@ -357,16 +419,6 @@ class Robot:
 def _stride(rate_hz: float, most_hz: float) -> int:
     """Every how many rows, of so many a second, make `most_hz` or less."""
     return max(1, math.ceil(rate_hz / most_hz - 1e-6))
-
-
-def bodies_of(twin: Twin) -> tuple[list[Shape], dict[str, Link]]:
-    """The shapes of a twin's stage, and the links that carry some of them.
-
-    Raises:
-        RefusedError: The stage cannot be read.
-    """
-    stage = open_stage(twin.scene_file)
-    return list(read_shapes(stage)), read_links(stage)
 
 
 def mesh_of(shapes: Sequence[Shape]) -> rr.Mesh3D:
