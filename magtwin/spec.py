@@ -17,7 +17,7 @@ from magtwin.field.bodies import SHAPES, Body, check_mesh, induced_magnetization
 from magtwin.field.earth import MODEL, SPAN
 from magtwin.frames import IDENTITY_XYZW, quat_multiply, rotate
 from magtwin.furniture import parts_of
-from magtwin.names import RefusedError, hint
+from magtwin.names import RefusedError, find, hint
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -902,8 +902,25 @@ def _steel(piece: FurnitureSpec) -> tuple[SourceSpec, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlacedRobot(Spec):
+    """A robot in a scene: what it is, where it begins, and what it drives."""
+
+    robot: RobotSpec
+
+    start: Vec3 = ZERO3
+    """First x [m], y [m] and yaw [rad] in world, where a path does not say."""
+
+    path: str | Path = ""
+    """What it drives unless told otherwise: a name of `magtwin.path.PATHS`, "random", or a CSV file; "" for
+    what whoever runs the scene takes."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Scene(Spec):
-    """A lab, its magnetic map, and a robot in it."""
+    """A lab, its magnetic map, and a robot in it, or several.
+
+    What is asked of a scene is asked of its first robot, `robot`; `led_by` makes another one the first.
+    """
 
     name: str
     """Name of the scene, and of its root layer."""
@@ -927,6 +944,33 @@ class Scene(Spec):
 
     start: Vec3 = ZERO3
     """Robot's first x [m], y [m] and yaw [rad] in world, where a path does not say."""
+
+    path: str | Path = ""
+    """What the robot drives unless told otherwise; see `PlacedRobot`."""
+
+    others: tuple[PlacedRobot, ...] = ()
+    """Further robots in the lab, each of a name of its own."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        names = [placed.robot.name for placed in self.robots]
+        twice = next((name for name in names if names.count(name) > 1), "")
+        self._require("others", not twice, "be robots of names of their own", f"{twice!r} twice")
+
+    @property
+    def robots(self) -> tuple[PlacedRobot, ...]:
+        """Every robot, `robot` first."""
+        return (PlacedRobot(robot=self.robot, start=self.start, path=self.path), *self.others)
+
+    def led_by(self, name: str) -> "Scene":
+        """The scene with the robot of that name as its first, the others after it in their order.
+
+        Raises:
+            UnknownNameError: No robot is called so; the text names the nearest one.
+        """
+        placed = find("robot", name, {placed.robot.name: placed for placed in self.robots})
+        rest = tuple(other for other in self.robots if other.robot.name != name)
+        return replace(self, robot=placed.robot, start=placed.start, path=placed.path, others=rest)
 
     @property
     def magnets(self) -> tuple[SourceSpec, ...]:

@@ -479,6 +479,111 @@ def test_what_is_no_network_is_refused(own_parts, name):
         magtwin.scene_from_toml(own_parts / "scene.toml", network=own_parts / name)
 
 
+# Several robots
+
+TWO = """
+name = "two"
+map = "map.usdc"
+
+[[robot]]
+name = "ann"
+asset = "robot/bot.usda"
+start = [-1, 0.5, 0]
+path = "figure8"
+
+[[robot]]
+name = "bob"
+asset = "robot/bot.usda"
+network = "net.pth"
+path = "there.csv"
+
+[[robot]]
+name = "cleo"
+asset = "other/bot.usda"
+start = [0, -1, 0]
+path = "random"
+"""
+
+
+def two_robots(parts: Path) -> Scene:
+    """Three robots of two assets that have one file name."""
+    (parts / "other").mkdir()
+    define_robot_asset(parts / "other" / "bot.usda")
+    (parts / "there.csv").write_text("0,0\n1,0\n")
+    (parts / "scene.toml").write_text(TWO)
+    return scene_from_toml(parts / "scene.toml")
+
+
+def test_a_toml_of_several_robots_gives_each_its_name_start_path_and_network(own_parts):
+    scene = two_robots(own_parts)
+    assert [p.robot.name for p in scene.robots] == ["ann", "bob", "cleo"]
+    assert [p.start for p in scene.robots] == [(-1.0, 0.5, 0.0), (0.0, 0.0, 0.0), (0.0, -1.0, 0.0)]
+    assert [p.path for p in scene.robots] == ["figure8", own_parts / "there.csv", "random"]
+    assert [p.robot.magnetometer.kind for p in scene.robots] == ["physical", "neural", "physical"]
+    assert (scene.robot, scene.start, scene.path) == (scene.robots[0].robot, (-1.0, 0.5, 0.0), "figure8")
+    led = scene.led_by("bob")
+    assert [p.robot.name for p in led.robots] == ["bob", "ann", "cleo"]
+    assert led.led_by("ann") == scene
+    with pytest.raises(RefusedError, match="no robot 'bobby'; did you mean 'bob'"):
+        scene.led_by("bobby")
+
+
+@pytest.mark.parametrize("by_reference", [True, False])
+def test_several_robots_survive_their_layers_each_a_prim_of_its_own(own_parts, tmp_path, by_reference, capfd):
+    scene = two_robots(own_parts)
+    root = author_scene(scene, tmp_path / "a" / "s", by_reference=by_reference)
+    stage = Usd.Stage.Open(str(root))
+    for name in ("ann", "bob", "cleo"):
+        assert stage.GetPrimAtPath(f"/World/{name}").HasAPI("MagtwinRobotAPI")
+    if by_reference:
+        assert read_scene(root) == scene
+    else:
+        (tmp_path / "a" / "s").rename(tmp_path / "moved")
+        shutil.rmtree(own_parts)
+        read = read_scene(tmp_path / "moved" / "two.usda")
+        files = [p.robot.asset.relative_to(tmp_path / "moved") for p in read.robots]
+        assert list(map(str, files)) == ["robot/bot.usda", "robot/bot.usda", "robot/cleo/bot.usda"]
+        assert read.robots[1].path == tmp_path / "moved" / "paths" / "there.csv"
+        for copy, original in ((read.robots[i], scene.robots[i]) for i in (0, 2)):
+            assert replace(copy.robot, asset=original.robot.asset) == original.robot
+    assert capfd.readouterr().err == ""
+
+
+def test_a_scene_of_several_robots_passes_the_gates(own_parts, tmp_path):
+    assert_valid(author_scene(two_robots(own_parts), tmp_path / "s"), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('name = "bob"', 'name = "ann"', "names of their own, got \"'ann' twice"),
+        ('name = "bob"\n', "", r"scene\.toml: \[\[robot\]\] '' needs name = "),
+        ('name = "bob"', 'name = "Lab"', "'Lab' has the name of a part of the scene"),
+        ('"figure8"', '"figure9"', r"\[\[robot\]\] 'ann' path: no path 'figure9'; did you mean"),
+        ('"there.csv"', '"their.csv"', r"'bob' path: .*their\.csv: no such path file; did you"),
+        ("start = [0, -1, 0]", "start = [0, -1]", r"start must be a list of 3"),
+        ("start = [0, -1, 0]", "strat = [0, -1, 0]", r"unknown key 'strat'; did you mean 'start'"),
+        ("start = [0, -1, 0]", "footprint_radius_m = 1", r"'cleo' footprint_radius_m goes with urdf"),
+    ],
+)
+def test_a_toml_of_several_robots_that_do_not_fit_is_refused(own_parts, tmp_path, old, new, said):
+    two_robots(own_parts)
+    (own_parts / "scene.toml").write_text(TWO.replace(old, new))
+    with pytest.raises(RefusedError, match=said):
+        author_scene(scene_from_toml(own_parts / "scene.toml"), tmp_path / "s")
+    assert not (tmp_path / "s").exists()
+
+
+def test_robots_that_read_different_maps_are_refused_by_prim(own_parts, tmp_path):
+    root = author_scene(two_robots(own_parts), tmp_path / "s")
+    stage = Usd.Stage.Open(str(root))
+    other = stage.GetPrimAtPath("/World/bob/magnetometer_link/magnetometer")
+    other.GetAttribute(sensors.MAP_CHECKSUM).Set("0" * 64)
+    stage.Save()
+    with pytest.raises(RefusedError, match="</World/bob/magnetometer_link/magnetometer>: reads another map"):
+        read_scene(root)
+
+
 # What ships
 
 
@@ -731,7 +836,7 @@ def test_a_twin_loads_a_network_only_for_a_neural_magnetometer(lab_scene, tmp_pa
 
 def test_a_robot_that_stands_nowhere_is_refused_by_prim(parts, tmp_path):
     root = broken(parts, tmp_path, lambda text: text.replace("translate = (1,", "translate = (inf,"))
-    with pytest.raises(RefusedError, match=r"</World/bot>: start of Scene must be finite, got \(inf"):
+    with pytest.raises(RefusedError, match=r"</World/bot>: start of PlacedRobot must be finite, got \(inf"):
         read_scene(root)
 
 

@@ -34,6 +34,7 @@ SPECS = (
         magnetization=(1.0, 0, 0),
     ),
     spec.FurnitureSpec(name="desk", kind="desk", p_world=(0.0, 0.0, 0.0), magnetization=(1e3,) * 6),
+    spec.PlacedRobot(robot=ROBOT),
     spec.Scene(name="lab", map_layer=Path("map.usdc"), robot=ROBOT),
 )
 

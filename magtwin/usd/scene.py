@@ -13,7 +13,18 @@ from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 from magtwin.files import existing, from_table, output, read_toml, sha256
 from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.names import RefusedError
-from magtwin.spec import ZERO3, EarthFieldSpec, FurnitureSpec, LabSpec, RobotSpec, Scene, SourceSpec, Vec3
+from magtwin.path import resolve_path
+from magtwin.spec import (
+    ZERO3,
+    EarthFieldSpec,
+    FurnitureSpec,
+    LabSpec,
+    PlacedRobot,
+    RobotSpec,
+    Scene,
+    SourceSpec,
+    Vec3,
+)
 from magtwin.usd.earth import checked, define_earth, read_earth
 from magtwin.usd.figures import check_prim_name, plain_value, read_pose, target, write_pose
 from magtwin.usd.furniture import FURNITURE, define_furniture, read_magnets
@@ -33,6 +44,8 @@ from magtwin.usd.sensors import (
     define_magnetometer,
     define_mocap,
     define_platform,
+    define_way,
+    read_way,
 )
 from magtwin.usd.sources import LOOKS, SOURCES, define_sources
 
@@ -54,7 +67,7 @@ def author_scene(
 ) -> Path:
     """Write a scene as a folder of layers.
 
-    `<name>.usda` places the robot and says what differs from its asset; it stands over `room.usda`,
+    `<name>.usda` places each robot and says what differs from its asset; it stands over `room.usda`,
     `furniture.usda` and `magnetics.usda` (the Earth's field and sources), where there are any, and the
     map's layer.
 
@@ -80,11 +93,13 @@ def author_scene(
         sublayers += [*_write_magnetics(scene, aside), placed.map_layer]
         root = Sdf.Layer.CreateNew(str(aside / f"{scene.name}.usda"))
         stage = Usd.Stage.Open(root)
-        describe_stage(stage, f"{scene.name}: a lab, its magnetic map and {scene.robot.name}, by magtwin")
+        names = ", ".join(placed.robot.name for placed in scene.robots)
+        describe_stage(stage, f"{scene.name}: a lab, its magnetic map and {names}, by magtwin")
         stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, WORLD).GetPrim())
         Usd.ModelAPI(stage.GetDefaultPrim()).SetKind(Kind.Tokens.assembly)
         root.subLayerPaths = [relative_asset(root, layer) for layer in sublayers]
-        _define_robot(stage, placed)
+        for robot in placed.robots:
+            _define_robot(stage, robot, scene.map_sha256)
         del stage  # what follows is right only at the layer's later place
         _settle(root, aside, Path(folder).resolve())
         root.Save()
@@ -108,45 +123,73 @@ def read_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> S
     _check_axes(stage, path)
     world = stage.GetPseudoRoot()
     lab = read_lab(only_prim_with(world, "lab"))
-    prim = only_prim_with(world, "robot")
-    robot = robot_of(prim)
-    magnetometer = only_prim_with(prim, "magnetometer")
-    field_map = require_api(target(magnetometer, MAP_RELATIONSHIP), "anomalyMap")
-    read_map(field_map)
-    network = robot.magnetometer.network
-    neural = robot.magnetometer.kind == "neural"
-    if check_network and neural and network is not None and not network.exists():
-        raise RefusedError(
-            f"{place(magnetometer)}: magtwin:magnetometer:network names {network}, which is not there"
-        )
+    prims = prims_with(world, "robot") or [only_prim_with(world, "robot")]  # refuses a scene of none
+    prim = prims[0]
+    robots = [_placed(prim, check_network) for prim in prims]
+    magnetometers = [only_prim_with(prim, "magnetometer") for prim in prims]
+    maps = [require_api(target(m, MAP_RELATIONSHIP), "anomalyMap") for m in magnetometers]
+    checksums = [plain_value(m.GetAttribute(MAP_CHECKSUM)) for m in magnetometers]
+    read_map(maps[0])
+    for magnetometer, own_map, checksum in zip(magnetometers, maps, checksums, strict=True):
+        if own_map != maps[0] or checksum != checksums[0]:
+            raise RefusedError(
+                f"{place(magnetometer)}: reads another map than {magnetometers[0].GetPath()}; the robots of "
+                "a scene share one"
+            )
     earths = prims_with(world, "earth")
     if len(earths) > 1:
         raise RefusedError(f"{place(earths[1])}: a second Earth's field; the first is {earths[0].GetPath()}")
-    p, q = read_pose(prim)
     earth = read_earth(earths[0]) if earths else None
     sources, furniture = read_magnets(stage)
     try:
         scene = Scene(
             name=Path(path).stem,
-            map_layer=_layer_of(field_map),
-            map_sha256=plain_value(magnetometer.GetAttribute(MAP_CHECKSUM)),
-            robot=robot,
+            map_layer=_layer_of(maps[0]),
+            map_sha256=checksums[0],
+            robot=robots[0].robot,
             lab=lab,
             earth=earth,
             sources=sources,
             furniture=furniture,
-            start=(p[0], p[1], float(yaw_from_quat(q))),
+            start=robots[0].start,
+            path=robots[0].path,
+            others=tuple(robots[1:]),
         )
     except RefusedError as error:
         raise RefusedError(f"{place(prim)}: {error}") from error
     if scene.map_layer != Path(path).resolve():  # a flattened stage is its own map, and knows no checksum
-        _check_map(scene, f"{place(magnetometer)}: ")
+        _check_map(scene, f"{place(magnetometers[0])}: ")
     return scene
+
+
+def _placed(prim: Usd.Prim, check_network: bool) -> PlacedRobot:
+    """The robot at a prim, where it begins, and what it drives."""
+    robot = robot_of(prim)
+    network = robot.magnetometer.network
+    neural = robot.magnetometer.kind == "neural"
+    if check_network and neural and network is not None and not network.exists():
+        raise RefusedError(
+            f"{place(only_prim_with(prim, 'magnetometer'))}: magtwin:magnetometer:network names {network}, "
+            "which is not there"
+        )
+    p, q = read_pose(prim)
+    start = p[0], p[1], float(yaw_from_quat(q))
+    try:
+        return PlacedRobot(robot=robot, start=start, path=read_way(prim))
+    except RefusedError as error:
+        raise RefusedError(f"{place(prim)}: {error}") from error
 
 
 @dataclass(frozen=True, kw_only=True)
 class _RobotTable(RobotSettings):
-    """[robot] of a scene's TOML: an asset, or a URDF with what a URDF cannot say."""
+    """[robot] of a scene's TOML: an asset, or a URDF with what a URDF cannot say.
+
+    Of several, a [[robot]] each, `name` is that of its prim.
+    """
+
+    start: Vec3 | None = None
+    path: str = ""
+    """What it drives: the name of a path, "random", or a CSV file."""
 
     asset: Path | None = None
     urdf: Path | None = None
@@ -195,7 +238,7 @@ class _SceneFile:
     """A scene's TOML; its tables have the keys of their specs."""
 
     name: str
-    robot: _RobotTable
+    robot: tuple[_RobotTable, ...]
     map: Path | None = None
     start: Vec3 = ZERO3
     lab: LabSpec = field(default_factory=LabSpec)
@@ -237,12 +280,87 @@ def scene_from_toml(
         RefusedError: A key is misspelt or missing, or a file is not there; with file and line.
     """
     table = read_toml(path)
+    alone = isinstance(table.get("robot"), dict)  # [robot], not [[robot]]
+    if alone:
+        table = table | {"robot": [table["robot"]]}
     given = from_table(_SceneFile, table, path)
+    if not given.robot:
+        raise RefusedError(f"{path}: has no robot; add a [robot] table")
     layer = Path(map_layer).resolve() if map_layer is not None else given.map
     if layer is None:
         raise RefusedError(f'{path}: names no map; add map = "FILE.usdc" to it, or give --map FILE.usdc')
-    robot = _robot(given.robot, table["robot"], path, workshop)
-    weights = Path(network).resolve() if network is not None else given.robot.network
+    robots: list[PlacedRobot] = []
+    for one, keys in zip(given.robot, table["robot"], strict=True):
+        where = f"{path}: [robot]" if alone else f"{path}: [[robot]] {one.name!r}"
+        robot = _robot(one, keys, where, workshop, named=not alone)
+        robot = _with_network(robot, one, network, where, inputs_of)
+        first = given.start if not robots else ZERO3
+        way = _way(one.path, Path(path).parent, where)
+        robots.append(PlacedRobot(robot=robot, start=first if one.start is None else one.start, path=way))
+    own_map = map_layer is None
+    sources, furniture = given.source, tuple(table.spec for table in given.furniture)
+    if given.sources and own_map:
+        listed = read_sources(given.sources.file)
+        sources, furniture = (*listed[0], *sources), (*listed[1], *furniture)
+    return Scene(
+        name=given.name,
+        map_layer=existing(layer, "map layer"),
+        map_sha256=sha256(layer),
+        robot=robots[0].robot,
+        lab=given.lab,
+        earth=_earth(given.earth, path) if given.earth and own_map else None,
+        sources=sources if own_map else (),
+        furniture=furniture if own_map else (),
+        start=robots[0].start,
+        path=robots[0].path,
+        others=tuple(robots[1:]),
+    )
+
+
+def _robot(
+    table: _RobotTable,
+    keys: Collection[str],
+    where: str,
+    workshop: str | os.PathLike[str] | None,
+    *,
+    named: bool,
+) -> RobotSpec:
+    """The robot of a table of a scene's TOML, built from its URDF where it names one, under its name."""
+    if named and not table.name:
+        raise RefusedError(f'{where} needs name = "NAME", that of its prim')
+    if table.asset is not None and table.urdf is None:
+        known = {"asset", "network", "kind", "start", "path", *(["name"] if named else [])}
+        if others := sorted(set(keys) - known):
+            raise RefusedError(f"{where} {others[0]} goes with urdf; the asset says it already")
+        robot = read_robot(table.asset)
+        return replace(robot, name=table.name) if named else robot
+    if table.urdf is None or table.asset is not None:
+        raise RefusedError(f'{where} needs asset = "FILE.usda" or urdf = "FILE.urdf", one of the two')
+    if workshop is None:
+        raise RefusedError(f"{where} names a URDF; name a workshop, a folder to build the robot in")
+    settings = RobotSettings(**{f.name: getattr(table, f.name) for f in fields(RobotSettings)})
+    if named:
+        settings = replace(settings, name="")  # takes any of the URDF's own
+    folder = Path(workshop) / table.name if named else Path(workshop)
+    asset = folder / f"{table.urdf.name.split('.')[0]}.usda"
+    asset.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        build_robot(table.urdf, settings, asset)
+    except RefusedError as error:
+        raise RefusedError(f"{where} {error}") from error
+    robot = read_robot(asset)
+    return replace(robot, name=table.name) if named else robot
+
+
+def _with_network(
+    robot: RobotSpec,
+    table: _RobotTable,
+    network: str | os.PathLike[str] | None,
+    where: str,
+    inputs_of: Callable[[Path], tuple[str, ...]],
+) -> RobotSpec:
+    """A robot with the weights of its table, or those given in their place, and the kind that it says."""
+    weights = Path(network).resolve() if network is not None else table.network
     if weights is not None:
         weights = existing(weights, "weights file")
         magnetometer = replace(
@@ -253,50 +371,24 @@ def scene_from_toml(
             inputs=inputs_of(weights),
         )
         robot = replace(robot, magnetometer=magnetometer)
-    if given.robot.kind is not None and network is None:
-        robot = replace(robot, magnetometer=replace(robot.magnetometer, kind=given.robot.kind))
+    if table.kind is not None and network is None:
+        robot = replace(robot, magnetometer=replace(robot.magnetometer, kind=table.kind))
     if robot.magnetometer.kind == "neural" and robot.magnetometer.network is None:
-        raise RefusedError(f'{path}: [robot] kind = "neural" needs network = "FILE" beside it')
-    own_map = map_layer is None
-    sources, furniture = given.source, tuple(table.spec for table in given.furniture)
-    if given.sources and own_map:
-        listed = read_sources(given.sources.file)
-        sources, furniture = (*listed[0], *sources), (*listed[1], *furniture)
-    return Scene(
-        name=given.name,
-        map_layer=existing(layer, "map layer"),
-        map_sha256=sha256(layer),
-        robot=robot,
-        lab=given.lab,
-        earth=_earth(given.earth, path) if given.earth and own_map else None,
-        sources=sources if own_map else (),
-        furniture=furniture if own_map else (),
-        start=given.start,
-    )
+        raise RefusedError(f'{where} kind = "neural" needs network = "FILE" beside it')
+    return robot
 
 
-def _robot(
-    table: _RobotTable,
-    keys: Collection[str],
-    path: str | os.PathLike[str],
-    workshop: str | os.PathLike[str] | None,
-) -> RobotSpec:
-    """The robot of a scene's TOML, built from its URDF where it names one."""
-    if table.asset is not None and table.urdf is None:
-        if others := sorted(set(keys) - {"asset", "network", "kind"}):
-            raise RefusedError(f"{path}: [robot] {others[0]} goes with urdf; the asset says it already")
-        return read_robot(table.asset)
-    if table.urdf is None or table.asset is not None:
-        raise RefusedError(f'{path}: [robot] needs asset = "FILE.usda" or urdf = "FILE.urdf", one of the two')
-    if workshop is None:
-        raise RefusedError(f"{path}: names a URDF; name a workshop, a folder to build the robot in")
-    settings = RobotSettings(**{f.name: getattr(table, f.name) for f in fields(RobotSettings)})
-    asset = Path(workshop) / f"{table.urdf.name.split('.')[0]}.usda"
+def _way(path: str, folder: Path, where: str) -> str | Path:
+    """What a robot is said to drive: a name, or a file from the TOML's folder; refused if it is neither."""
+    if path in ("", "random"):
+        return path
+    file = (folder / path).resolve()
+    named = not Path(path).suffix and not file.exists()
     try:
-        build_robot(table.urdf, settings, asset)
+        resolve_path(path if named else file)
     except RefusedError as error:
-        raise RefusedError(f"{path}: [robot] {error}") from error
-    return read_robot(asset)
+        raise RefusedError(f"{where} path: {error}") from error
+    return path if named else file
 
 
 def _earth(table: _EarthTable, path: str | os.PathLike[str]) -> EarthFieldSpec:
@@ -322,8 +414,9 @@ def _check(scene: Scene) -> None:
     """Refuse what would come out broken, before anything is written, by the names that the caller knows."""
     if not re.fullmatch(r"\w[\w .-]*", scene.name):
         raise RefusedError(f"scene {scene.name!r} cannot name a file; use letters, digits, - and _")
-    if check_prim_name(scene.robot.name, "robot") in TAKEN:
-        raise RefusedError(f"robot {scene.robot.name!r} has the name of a part of the scene; rename it")
+    for placed in scene.robots:
+        if check_prim_name(placed.robot.name, "robot") in TAKEN:
+            raise RefusedError(f"robot {placed.robot.name!r} has the name of a part of the scene; rename it")
     for what, things in (("sources", scene.sources), ("pieces of furniture", scene.furniture)):
         names = [thing.name for thing in things]
         if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -335,9 +428,12 @@ def _check(scene: Scene) -> None:
             source.body()  # refuses
     load_map(scene.map_layer)
     _check_map(scene)
-    read_robot(scene.robot.asset)
-    if scene.robot.magnetometer.network is not None:
-        existing(scene.robot.magnetometer.network, "weights file")
+    for placed in scene.robots:
+        read_robot(placed.robot.asset)
+        if placed.robot.magnetometer.network is not None:
+            existing(placed.robot.magnetometer.network, "weights file")
+        if isinstance(placed.path, Path):
+            existing(placed.path, "path file")
 
 
 def _check_map(scene: Scene, where: str = "") -> None:
@@ -358,14 +454,36 @@ def _check_axes(stage: Usd.Stage, path: str | os.PathLike[str]) -> None:
 
 
 def _with_copies(scene: Scene, folder: Path) -> Scene:
-    """The scene on copies of its files in `folder`."""
-    magnetometer = scene.robot.magnetometer
-    if magnetometer.network is not None:
-        magnetometer = replace(magnetometer, network=_copied(magnetometer.network, folder / "weights"))
-    robot = replace(
-        scene.robot, asset=_copied_asset(scene.robot.asset, folder / "robot"), magnetometer=magnetometer
+    """The scene on copies of its files in `folder`; what several robots share is copied once."""
+    copies: dict[Path, Path] = {}
+
+    def once(file: Path, kind: str, name: str, copy: Callable[[Path, Path], Path]) -> Path:
+        source = file.resolve()
+        if source not in copies:
+            # Files of further robots have a folder of their own, as others may have their names.
+            place = folder / kind / name if (folder / kind).exists() else folder / kind
+            copies[source] = copy(source, place)
+        return copies[source]
+
+    robots = []
+    for placed in scene.robots:
+        robot, path = placed.robot, placed.path
+        magnetometer = robot.magnetometer
+        if magnetometer.network is not None:
+            weights = once(magnetometer.network, "weights", robot.name, _copied)
+            magnetometer = replace(magnetometer, network=weights)
+        asset = once(robot.asset, "robot", robot.name, _copied_asset)
+        if isinstance(path, Path):
+            path = once(path, "paths", robot.name, _copied)
+        robot = replace(robot, asset=asset, magnetometer=magnetometer)
+        robots.append(PlacedRobot(robot=robot, start=placed.start, path=path))
+    return replace(
+        scene,
+        map_layer=_copied(scene.map_layer, folder / "map"),
+        robot=robots[0].robot,
+        path=robots[0].path,
+        others=tuple(robots[1:]),
     )
-    return replace(scene, map_layer=_copied(scene.map_layer, folder / "map"), robot=robot)
 
 
 def _copied(file: Path, folder: Path) -> Path:
@@ -415,14 +533,15 @@ def _write_furniture(scene: Scene, folder: Path) -> list[Path]:
     return [folder / "furniture.usda"]
 
 
-def _define_robot(stage: Usd.Stage, scene: Scene) -> None:
-    """The robot by reference, where it starts, with overs for what differs from its asset."""
-    robot, root = scene.robot, stage.GetRootLayer()
+def _define_robot(stage: Usd.Stage, placed: PlacedRobot, map_sha256: str) -> None:
+    """A robot by reference, where it starts, with overs for what differs from its asset."""
+    robot, root = placed.robot, stage.GetRootLayer()
     prim = UsdGeom.Xform.Define(stage, WORLD.AppendChild(robot.name)).GetPrim()
     prim.GetReferences().AddReference(relative_asset(root, robot.asset))
-    x, y, yaw = scene.start
+    x, y, yaw = placed.start
     write_pose(prim, (x, y, 0.0), tuple(map(float, quat_from_yaw(yaw))))  # type: ignore[arg-type]
     define_footprint(prim, robot.footprint_radius_m)
+    define_way(prim, placed.path)
     define_drive(prim, robot.drive)
     define_platform(prim, robot.platform)
     define_mocap(prim, robot.mocap)
@@ -431,8 +550,8 @@ def _define_robot(stage: Usd.Stage, scene: Scene) -> None:
     magnetometer = only_prim_with(prim, "magnetometer")
     map_prim = only_prim_with(stage.GetPrimAtPath(WORLD), "anomalyMap")
     magnetometer.GetRelationship(MAP_RELATIONSHIP).SetTargets([map_prim.GetPath()])
-    if scene.map_sha256:
-        magnetometer.GetAttribute(MAP_CHECKSUM).Set(scene.map_sha256)
+    if map_sha256:
+        magnetometer.GetAttribute(MAP_CHECKSUM).Set(map_sha256)
 
 
 def _settle(layer: Sdf.Layer, aside: Path, final: Path) -> None:

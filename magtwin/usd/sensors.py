@@ -5,6 +5,7 @@ magtwin still places it. A figure is authored where no layer says it yet, be it 
 or says otherwise, in the stage's edit target: layers over a robot hold only what they change.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -55,6 +56,14 @@ LIDAR_API = "OmniSensorGenericLidarCoreAPI"
 SINGLE_MAX = float(np.finfo(np.float32).max)
 
 FOOTPRINT = attribute_name("robot", "footprint_radius_m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Way:
+    """Attributes of a robot that say what it drives."""
+
+    path: str = ""
+    path_file: Path | None = None
 
 
 def define_magnetometer(stage: Usd.Stage, path: str | Sdf.Path, spec: MagnetometerSpec) -> Usd.Prim:
@@ -166,6 +175,18 @@ def define_footprint(prim: Usd.Prim, footprint_radius_m: float) -> Usd.Prim:
 def read_footprint(prim: Usd.Prim) -> float:
     """Radius of the circle that the robot rooted at `prim` needs clear [m]."""
     return float(require_api(prim, "robot").GetAttribute(FOOTPRINT).Get())
+
+
+def define_way(prim: Usd.Prim, path: str | Path) -> Usd.Prim:
+    """Say what the robot rooted at `prim` drives unless told otherwise: a name, a CSV file, or ""."""
+    way = _Way(path_file=path) if isinstance(path, Path) else _Way(path=path)
+    return write_figures(apply_api(prim, "robot"), "robot", way)
+
+
+def read_way(prim: Usd.Prim) -> str | Path:
+    """What the robot rooted at `prim` drives unless told otherwise; a file is named before a name is."""
+    way = read_figures(_Way, prim, "robot")
+    return way.path_file or way.path
 
 
 def define_drive(prim: Usd.Prim, spec: DriveSpec) -> Usd.Prim:
