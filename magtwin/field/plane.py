@@ -76,23 +76,30 @@ class Plane:
         p = np.asarray(p_xy, float)
         if p.ndim != 2 or p.shape[1] != 2:
             raise RefusedError(f"p_xy must have shape (N, 2), got {p.shape}")
-        out = np.full((len(p), 3, 3), np.nan)
-        known = np.flatnonzero(np.all(np.abs(p) < CELL_M * FARTHEST_CELL, axis=1))
-        for start in range(0, len(known), BLOCK):
-            rows = known[start : start + BLOCK]
-            out[rows] = self._evaluate(p[rows])
+        out = np.empty((len(p), 3, 3))
+        known = np.all(np.abs(p) < CELL_M * FARTHEST_CELL, axis=1)
+        if known.all():
+            for start in range(0, len(p), BLOCK):
+                self._evaluate(p[start : start + BLOCK], out[start : start + BLOCK])
+        else:
+            field, slopes = self.field_and_slopes_nt(p[known])
+            out[~known] = np.nan
+            out[known, 0], out[known, 1:] = field, slopes
         return out[:, 0], out[:, 1:]
 
-    def _evaluate(self, p: Array) -> Array:
-        """Field and slopes of points, shape (N, 3, 3)."""
+    def _evaluate(self, p: Array, out: Array) -> None:
+        """Field and slopes of points, into an array of shape (N, 3, 3)."""
         cell = np.floor(p / CELL_M)
         local = 2 * (p / CELL_M - cell) - 1  # exact, as CELL_M is a power of 2
         number = cell.astype(np.int64)
-        keys, which = np.unique((number[:, 0] << 32) + number[:, 1], return_inverse=True)
+        # Points come along a track: sought is one square for all that follow one another in it.
+        key = (number[:, 0] << 32) + number[:, 1]
+        first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+        keys, passed = np.unique(key[first], return_inverse=True)
+        which = np.repeat(passed, np.diff(first, append=len(key)))
         with self._lock:
             slots = self._slots_of(keys)
             table, close = self._table, self._close
-        out = np.empty((len(p), 3, 3))
         compiled = self._opened(len(p) + PER_SQUARE * len(keys))
         if compiled:
             u, w = np.ascontiguousarray(local.T)
@@ -112,7 +119,6 @@ class Plane:
                 field, out_of_near = close[int(slots[k])].field_and_rate_nt(at, along)
                 out[rows, 1 + axis] += out_of_near
             out[rows, 0] += field
-        return out
 
     def _slots_of(self, keys: Numbers) -> Numbers:
         """Where squares are in the table; those that are not there yet are computed."""

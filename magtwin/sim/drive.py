@@ -189,6 +189,10 @@ class Motion:
     wheel_angles: Array = field(init=False, repr=False)
     """Angle turned by left and right wheel at the start and after each step [rad], shape (K + 1, 2)."""
 
+    _steps: Array = field(init=False, repr=False)
+    """What holds in each step, to be taken at once: its first pose (3), wheel angles (2) and rates (2), v, w,
+    acceleration, v_cmd, w_cmd, whether an obstacle is touched; shape (K, 13)."""
+
     def __post_init__(self) -> None:
         v, w = np.asarray(self.v, float), np.asarray(self.w, float)
         if v.ndim != 1 or v.shape != w.shape or not len(v):
@@ -220,6 +224,8 @@ class Motion:
             "wheel_angles": np.vstack([[0.0, 0.0], np.cumsum(rates, axis=0) * self.dt]),
             "acceleration": np.diff(v, prepend=0.0) / self.dt,
         }
+        parts = (poses[:-1], known["wheel_angles"][:-1], rates, v, w, known["acceleration"])
+        known["_steps"] = np.column_stack([*parts, known["v_cmd"], known["w_cmd"], known["bump"]])
         for name, array in known.items():
             object.__setattr__(self, name, array)
 
@@ -234,25 +240,15 @@ class Motion:
         Args:
             t: Times since the start, from 0 [s], shape (N,).
         """
-        assert self.poses is not None
-        assert self.v_cmd is not None
-        assert self.w_cmd is not None
-        assert self.bump is not None
         t = np.asarray(t, float)
         starts = np.arange(len(self.v)) * self.dt
         k = np.searchsorted(starts, t, side="right") - 1
         into = np.clip(t - starts[k], 0.0, self.dt)
-        v, w = self.v[k], self.w[k]
-        pose = advance(self.poses[k], v, w, into)
-        turned = self.wheel_angles[k] + self.wheel_rates[k] * into[..., None]
+        then = self._steps.take(k, axis=0)
+        v, w, a, v_cmd, w_cmd, bump = then[:, 7:].T
+        pose = advance(then[:, :3], v, w, into)
+        turned = then[:, 3:5] + then[:, 5:7] * into[:, None]
         moving = t < self.duration_s
-        return Moment(
-            pose=pose,
-            v=v * moving,
-            w=w * moving,
-            a=self.acceleration[k] * moving,
-            wheel_angle=turned,
-            v_cmd=self.v_cmd[k] * moving,
-            w_cmd=self.w_cmd[k] * moving,
-            bump=self.bump[k],
-        )
+        if not moving.all():
+            v, w, a, v_cmd, w_cmd = (column * moving for column in (v, w, a, v_cmd, w_cmd))
+        return Moment(pose=pose, v=v, w=w, a=a, wheel_angle=turned, v_cmd=v_cmd, w_cmd=w_cmd, bump=bump > 0)

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.frames import canonical, matrix_from_quat, quat_from_rpy, quat_multiply
+from magtwin.frames import canonical, quat_from_rpy, quat_multiply
 from magtwin.sim.noise import gauss_markov, random_walk
-from magtwin.sim.sensors import Columns, Moving, held, into_sensor, moment_at
+from magtwin.sim.sensors import Columns, Moving, axes_in_base, held, into_sensor, moment_at
 from magtwin.spec import ImuSpec, Quat
 
 Array = NDArray[np.float64]
@@ -52,14 +52,14 @@ def sense_imu(
     acceleration = into_sensor(np.column_stack([true.a, true.v * true.w, zero]), q_base_imu_xyzw)
     acceleration += np.hypot(spec.accel_noise_std, shaking * np.array(spec.accel_vibration)) * noise[:, 6:]
 
-    ran_away = np.cumsum(bias @ matrix_from_quat(q_base_imu_xyzw)[2]) / spec.rate_hz
+    ran_away = np.cumsum(bias @ axes_in_base(q_base_imu_xyzw)[2]) / spec.rate_hz
     heading = true.pose[:, 2] - spec.yaw_zero + (ran_away - ran_away[0])
     tilt = spec.tilt + spec.tilt_std * gauss_markov(wander[:, 3:], spec.tilt_time_s, spec.rate_hz)
     q = quat_multiply(quat_from_rpy(np.column_stack([tilt, heading])), q_base_imu_xyzw)
     q = quat_multiply(quat_from_rpy([*spec.level_error, 0.0]), q)
     q = quat_multiply(q, quat_from_rpy(spec.orientation_noise_std * noise[:, :3]))
     return {
-        "imu_q_xyzw": canonical(q)[latest],
-        "imu_w": rates[latest],
-        "imu_a": acceleration[latest],
+        "imu_q_xyzw": canonical(q).take(latest, axis=0),
+        "imu_w": rates.take(latest, axis=0),
+        "imu_a": acceleration.take(latest, axis=0),
     }

@@ -237,16 +237,20 @@ def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
     ):
         if m:
             now = turned + phase
-            field += _times(np.column_stack([np.cos(now), np.sin(now)]), m * _unit_fields(robot, place))
+            field += _times(
+                np.column_stack([np.cos(now), np.sin(now)]),
+                m * _unit_fields(robot.name, robot.p_base_magnetometer, place),
+            )
     return field
 
 
-def _unit_fields(robot: RobotSpec, p_base: Vec3) -> Array:
+@lru_cache(maxsize=64)
+def _unit_fields(robot: str, p_base_magnetometer: Vec3, p_base: Vec3) -> Array:
     """Field at the magnetometer of 1 A m2 at a place in base_link, up and forwards [nT], shape (2, 3)."""
-    apart = np.subtract(robot.p_base_magnetometer, p_base)
+    apart = np.subtract(p_base_magnetometer, p_base)
     if not np.linalg.norm(apart) > NEAREST_M:
         raise RefusedError(
-            f"robot {robot.name!r}: its magnetometer, at {robot.p_base_magnetometer} of base_link, is in the "
+            f"robot {robot!r}: its magnetometer, at {p_base_magnetometer} of base_link, is in the "
             "middle of a wheel or of the caster, whose iron is magnetised; move one of them"
         )
     up_and_forwards = np.array([[[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]])

@@ -36,8 +36,8 @@ def sense_mocap(
     lost = dropouts(spec, stamps, gaps)
     seen = np.maximum.accumulate(np.where(lost, 0, np.arange(len(stamps))))[latest]
     return {
-        "mocap_p": (p + spec.p_noise_std_m * white[:, :3])[seen],
-        "mocap_q_xyzw": canonical(q)[seen],
+        "mocap_p": (p + spec.p_noise_std_m * white[:, :3]).take(seen, axis=0),
+        "mocap_q_xyzw": canonical(q).take(seen, axis=0),
         "flag_pose_lost": lost[latest],
     }
 

@@ -53,8 +53,8 @@ def sense_odometry(drive: DriveSpec, motion: Moving, t: ArrayLike, rng: np.rando
     twist[:, 0] += way * drive.odometry_rate_hz
     twist[:, 5] += turn * drive.odometry_rate_hz
     return {
-        "odom_p": p[latest],
-        "odom_q_xyzw": quat_from_yaw(wrap_angle(yaw))[latest],
-        "odom_v": twist[latest, :3],
-        "odom_w": twist[latest, 3:],
+        "odom_p": p.take(latest, axis=0),
+        "odom_q_xyzw": quat_from_yaw(wrap_angle(yaw)).take(latest, axis=0),
+        "odom_v": twist[:, :3].take(latest, axis=0),
+        "odom_w": twist[:, 3:].take(latest, axis=0),
     }

@@ -9,6 +9,7 @@ Noise is drawn sample by sample, so a longer run begins with the same numbers as
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -75,4 +76,12 @@ def moment_at(motion: Moving, stamps: Array) -> Moment:
 def into_sensor(v_base: Array, q_base_sensor_xyzw: Quat) -> Array:
     """Vectors (N, 3) turned from base_link's axes into those of a sensor."""
     # einsum, as a product of so few columns is no work for the threads of a BLAS that `@` wakes.
-    return np.einsum("ni,ij->nj", v_base, matrix_from_quat(q_base_sensor_xyzw))
+    return np.einsum("ni,ij->nj", v_base, axes_in_base(tuple(q_base_sensor_xyzw)))
+
+
+@lru_cache(maxsize=64)
+def axes_in_base(q_base_sensor_xyzw: Quat) -> Array:
+    """Matrix from a sensor's axes to base_link's, shape (3, 3), not to be written to."""
+    matrix = matrix_from_quat(q_base_sensor_xyzw)
+    matrix.flags.writeable = False
+    return matrix

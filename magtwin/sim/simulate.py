@@ -401,9 +401,10 @@ def _exact_field(
     if scene.earth is None:
         return {"b_vector_nt": np.full((len(t), 3), np.nan), "b_truth_nt": np.full(len(t), np.nan)}
     vector = field_at_sensor_nt(scene, motion, t, true=true, lidar_on=on, supply_a=supply_a)
+    x, y, z = vector.T
     return {
         "b_vector_nt": into_sensor(vector, scene.robot.q_base_magnetometer_xyzw),
-        "b_truth_nt": np.sqrt(np.sum(vector * vector, axis=1)),
+        "b_truth_nt": np.sqrt(x * x + y * y + z * z),
     }
 
 
@@ -424,9 +425,10 @@ def _steep(scene: Scene, anomaly_map: AnomalyMap, motion: Moving, t: Array) -> N
 
 def _flags(scene: Scene, true: Moment) -> dict[str, NDArray[Any]]:
     """Touching an obstacle, or the floor's border; and what only a caller with a network knows."""
-    half = np.array(scene.lab.floor_m) / 2
-    reach = np.abs(true.pose[:, :2]) + scene.robot.footprint_radius_m
+    x, y = np.abs(true.pose[:, 0]), np.abs(true.pose[:, 1])
+    most_x, most_y = np.array(scene.lab.floor_m) / 2 + 1e-9
+    radius = scene.robot.footprint_radius_m
     return {
-        "flag_bump": true.bump | np.any(reach > half + 1e-9, axis=1),
+        "flag_bump": true.bump | (x + radius > most_x) | (y + radius > most_y),
         "flag_out_of_distribution": np.zeros(len(true.v), bool),
     }
