@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from magtwin.field.survey import NT_PER, check_unit
 from magtwin.files import existing, sha256
 from magtwin.frames import quat_conjugate, rotate, yaw_from_quat
+from magtwin.io.arrow import spec_said
 from magtwin.io.bag import Heard
 from magtwin.io.bag_readings import poses_at, unit_of
 from magtwin.io.bag_writer import FACTS, NOTE
@@ -41,7 +42,7 @@ from magtwin.io.messages import (
     Topic,
 )
 from magtwin.names import RefusedError, find, hint
-from magtwin.run import COLUMNS, Run
+from magtwin.run import COLUMNS, Column, Run
 
 Array = NDArray[np.float64]
 Facts = dict[str, str | int | float | bool]
@@ -100,7 +101,7 @@ def read_bag(
     with _refusing(path), _Bag(path) as bag:
         if not bag.whole and not recover and ".partial" not in path.name:
             raise RefusedError(
-                f"{path}: cut short: its end is missing; copy it again, or read what is left with recover=True"
+                f"{path}: cut short: its end is missing; copy it again, or read what there is: recover=True"
             )
         if READING.name in bag.kinds and NAMES.name in bag.kinds and not topics:
             return _own(bag)
@@ -249,7 +250,8 @@ def _joined(parts: list[Messages]) -> Messages:
 def _own(bag: _Bag) -> Run:
     """The run that magtwin wrote."""
     _check_kinds(bag, (READING, NAMES))
-    told = bag.messages((READING.name, NAMES.name))
+    might = {name for name, topic in TOPICS.items() if topic.carries} & bag.kinds.keys()
+    told = bag.messages((READING.name, NAMES.name, *might))
     rows = told[READING.name]
     texts = decode(leaves(TYPES[NAMES.kind]), told[NAMES.name], ["data"])["data"]
     if not texts:
@@ -262,9 +264,10 @@ def _own(bag: _Bag) -> Run:
     }
     _check_kinds(bag, carriers.values())
     held: dict[str, NDArray[Any]] = {}
-    for name, messages in bag.messages(carriers).items():
-        held |= _held(carriers[name], messages, rows.received, unit)
+    for name, topic in carriers.items():
+        held |= _held(topic, told[name], rows.received, unit)
     columns: dict[str, NDArray[Any]] = {}
+    specs: dict[str, Column] = {}
     for column in table["columns"]:
         name, width = str(column["name"]), column["width"]
         if "topic" in column:
@@ -281,9 +284,12 @@ def _own(bag: _Bag) -> Run:
         if dtype not in _DTYPES:
             raise RefusedError(f"column {name!r} is of an unknown kind {dtype!r}")
         columns[name] = np.ascontiguousarray(values).astype(dtype, copy=False)
+        if column["own"]:
+            said = {key: str(column[key]) for key in ("unit", "frame", "doc", "interpolation")}
+            specs[name] = spec_said(said, tuple(map(str, column["parts"])))
     if "t" in columns:
         _check_order(bag.path, READING.name, columns["t"])
-    return Run(columns, bag.facts())
+    return Run(columns, bag.facts(), specs)
 
 
 def _held(topic: Topic, messages: Messages, rows: Index, unit: str) -> dict[str, NDArray[Any]]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import magtwin
 from magtwin.files import check_free, output
+from magtwin.io.arrow import check_clock, facts_to_json
 from magtwin.io.bag import ROOM, VERSION, Batch, Connection, Tally, metadata
 from magtwin.io.cdr import NS, Index, encode, leaves
 from magtwin.io.db3 import Db3Writer
@@ -37,8 +38,9 @@ from magtwin.io.messages import (
     sender_of,
     transforms,
 )
+from magtwin.io.recorder import PARTIAL, partial_of
 from magtwin.names import RefusedError, hint
-from magtwin.run import COLUMNS, Column, Run
+from magtwin.run import Run
 
 if TYPE_CHECKING:
     from magtwin.sim.lidar import Scans
@@ -99,8 +101,7 @@ def write_bag(
         sink = _Sink(aside, storage, who, live=False)
         try:
             for first in range(0, max(run.rows, 1), BLOCK):
-                rows = slice(first, first + BLOCK)
-                block = Run({name: values[rows] for name, values in run.items()}, run.facts)
+                block = run.take(slice(first, first + BLOCK))
                 arrived = None
                 if scans is not None:
                     last = run["t"][first + BLOCK] if first + BLOCK < run.rows else np.inf
@@ -152,7 +153,7 @@ class BagWriter:
         self._storage = _storage(self._path, storage)
         _check_units(units)
         check_free(self._path, force=force)
-        self.partial = partial_name(self._path)
+        self.partial = partial_of(self._path)
         """Where it lies while it grows."""
         self._sink: _Sink | None = None
         if self.partial.exists() and not force:
@@ -212,11 +213,6 @@ class BagWriter:
         return _Sink(self.partial, self._storage, who, live=True)
 
 
-def partial_name(path: Path) -> Path:
-    """Where a bag lies while it grows."""
-    return path.with_name(f"{path.stem}.partial{path.suffix}" if path.suffix else f"{path.name}.partial")
-
-
 def _storage(path: Path, storage: str | None) -> Storage:
     """The storage of a bag that is to be written to a path."""
     if storage is not None and storage not in STORAGES:
@@ -224,7 +220,7 @@ def _storage(path: Path, storage: str | None) -> Storage:
     told = next((name for name, suffix in STORAGES.items() if path.suffix == suffix), None)
     if told and storage and told != storage:
         raise RefusedError(f"{path}: ends as a file of {told}; drop storage {storage!r}, or name a folder")
-    if path.suffix and not told and path.suffix != ".partial":
+    if path.suffix and not told and path.suffix != PARTIAL:
         raise RefusedError(
             f"{path}: a bag is a folder, without an ending, or a file that ends in .mcap or .db3"
         )
@@ -295,7 +291,7 @@ class _Sink:
         self._folder = None if path.suffix in STORAGES.values() else path
         if self._folder is not None:
             path.mkdir()
-            path = path / f"{path.name.removesuffix('.partial')}_0{STORAGES[storage]}"
+            path = path / f"{path.name.removesuffix(PARTIAL)}_0{STORAGES[storage]}"
         self._file = path
         if storage == "mcap":
             self._store: _Store = McapWriter(path, f"magtwin {magtwin.__version__}")
@@ -315,7 +311,7 @@ class _Sink:
             raise RefusedError(
                 "scans came after rows without any; give them, or none, from the first rows on"
             )
-        facts = {name: json.dumps(value) for name, value in run.facts.items()}
+        facts = {name: json.dumps(value) for name, value in json.loads(facts_to_json(run)).items()}
         if facts != self._facts:
             self._facts = facts
             if isinstance(self._store, McapWriter):
@@ -408,7 +404,6 @@ class _Stream:
     """What a robot says as a run goes on; it remembers what it said last."""
 
     def __init__(self, run: Run, who: Sender, with_scans: bool) -> None:
-        _check_clock(run)
         self._who = who
         self._t = -np.inf
         self._last: dict[str, _Last] = {}
@@ -417,6 +412,7 @@ class _Stream:
         self._carried = {column: topic for topic in sent for column in topic.carries}
         self._rest = [name for name in run if name not in self._carried]
         self._columns = {name: (values.dtype, values.shape[1:]) for name, values in run.items()}
+        self._table = self._told(run)
         for name, values in run.items():
             if values.ndim > 2 or values.dtype.kind not in "bfiu":
                 raise RefusedError(
@@ -442,7 +438,7 @@ class _Stream:
             for topic in self._once:
                 fields = topic.write({}, stamps[:1], self._who)
                 if topic is NAMES:
-                    fields = {"data": self._table()}
+                    fields = {"data": self._table}
                 yield topic, stamps[:1], _form(topic, fields), fields
         for topic in self.topics:
             if topic.needs:
@@ -466,11 +462,10 @@ class _Stream:
 
     def _checked(self, run: Run) -> Array:
         """Times of rows, which rise."""
+        check_clock(run, "the run to write")
         t = np.asarray(run["t"], float)
-        bad = np.flatnonzero(~(np.diff(t, prepend=self._t) > 0))
-        if len(bad):
-            before = t[bad[0] - 1] if bad[0] else self._t
-            raise RefusedError(f"time runs backwards: t is {t[bad[0]]:.9g} s after {before:.9g} s")
+        if len(t) and t[0] <= self._t:
+            raise RefusedError(f"time runs backwards: rows of {t[0]:.9g} s after those of {self._t:.9g} s")
         if len(t) and not 0 <= t[0] <= t[-1] < LATEST_S:
             raise RefusedError(
                 f"t of {t[0]:.9g} to {t[-1]:.9g} s: stamps of ROS hold 0 to {LATEST_S:.0f} s; begin at 0"
@@ -516,13 +511,14 @@ class _Stream:
             sent &= np.all([np.isfinite(run[name]) for name in topic.needs], axis=0)
         return np.flatnonzero(sent)
 
-    def _table(self) -> str:
+    def _told(self, run: Run) -> str:
         """What columns there are, and where each is: the content of /magtwin/columns."""
         columns, first = [], 0
         for name, (dtype, shape) in self._columns.items():
-            spec = COLUMNS.get(name, Column("", "", ""))
+            spec = run.spec(name)
             told: dict[str, Any] = {"name": name, "unit": spec.unit, "frame": spec.frame, "doc": spec.doc}
-            told |= {"dtype": dtype.name, "width": shape[0] if shape else None}
+            told |= {"parts": spec.parts, "interpolation": spec.interpolation}
+            told |= {"dtype": dtype.name, "width": shape[0] if shape else None, "own": name in run.specs}
             if name in self._carried:
                 told["topic"] = self._carried[name].name
             else:
@@ -541,9 +537,3 @@ def _differ(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
     """Which rows are not the same; nan is as nan."""
     other = (a != b) & ~((a != a) & (b != b))
     return other if other.ndim == 1 else other.any(axis=1)
-
-
-def _check_clock(run: Run) -> None:
-    if "t" not in run.columns:
-        known = ", ".join(list(run.columns)[:5]) or "none"
-        raise RefusedError(f"the run to write: not a Run: column 't' is missing (columns: {known}, ...)")

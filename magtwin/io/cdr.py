@@ -178,7 +178,7 @@ def decode(form: Sequence[Leaf], messages: Messages, wanted: Iterable[str]) -> d
         if not left:
             break
         if leaf.kind == "text":
-            values, at = _texts(leaf, messages.buffer, body, room, at)
+            values, at = _texts(leaf, messages.buffer, body, room, at, leaf.name in left)
         elif leaf.kind == "none":
             count, at = _numbers("u4", 1, messages.buffer, body, room, at)
             if np.any(count):
@@ -231,11 +231,13 @@ def _leaf(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index, wanted
     return _numbers(leaf.kind, int(count[0]), buffer, body, room, at)
 
 
-def _texts(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index) -> tuple[list[Any], Index]:
-    """Strings of a leaf, and where what follows them stands."""
+def _texts(
+    leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index, wanted: bool
+) -> tuple[list[Any], Index]:
+    """Strings of a leaf, where they are wanted, and where what follows them stands."""
     if leaf.count:
-        content, begins, at = _text(leaf, buffer, body, room, at)
-        return _said(content, body + begins, body + at), at
+        begins, at = _text(leaf, buffer, body, room, at)
+        return _said(buffer, body + begins, body + at) if wanted else [], at
     counts, at = _numbers("u4", 1, buffer, body, room, at)
     count = counts[:, 0].astype(np.int64)
     most = int(count.max(initial=0))
@@ -244,20 +246,22 @@ def _texts(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index) -> tu
     words: list[list[str]] = [[] for _ in count]
     for k in range(most):
         rows = np.flatnonzero(count > k)
-        content, begins, after = _text(leaf, buffer, body[rows], room[rows], at[rows])
-        for row, word in zip(rows, _said(content, body[rows] + begins, body[rows] + after), strict=True):
-            words[row].append(word)
+        begins, after = _text(leaf, buffer, body[rows], room[rows], at[rows])
+        if wanted:
+            for row, word in zip(rows, _said(buffer, body[rows] + begins, body[rows] + after), strict=True):
+                words[row].append(word)
         at = at.copy()
         at[rows] = after
     return [tuple(w) for w in words], at
 
 
-def _text(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index) -> tuple[Bytes, Index, Index]:
+def _text(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index) -> tuple[Index, Index]:
+    """Where a string begins, and where what follows it stands."""
     lengths, at = _numbers("u4", 1, buffer, body, room, at)
     after = at + lengths[:, 0].astype(np.int64)
     if np.any(after > room):
         raise RefusedError(f"a message ends within its {leaf.name}")
-    return buffer, at, after
+    return at, after
 
 
 def _said(buffer: Bytes, first: Index, last: Index) -> list[str]:

@@ -44,7 +44,7 @@ class Db3Writer:
     def __init__(self, path: Path, *, live: bool) -> None:
         self._live = live
         self._database = sqlite3.connect(path, isolation_level=None)
-        self._run("PRAGMA page_size = 16384")
+        self._run("PRAGMA page_size = 32768")
         # The new file counts only once it is whole, or it keeps a log beside it that a crash leaves sound.
         self._run("PRAGMA journal_mode = WAL" if live else "PRAGMA journal_mode = OFF")
         self._run("PRAGMA synchronous = OFF")
@@ -67,11 +67,12 @@ class Db3Writer:
 
     def write(self, batches: Sequence[Batch]) -> None:
         """Write messages, in the order of their times."""
-        batches = [batch for batch in batches if len(batch.received)]
-        cut = [_cut(batch) for batch in batches]
-        ids = [batch.connection.id for batch in batches]
         times, which = in_time(batches)
-        rows = ((ids[k], t, next(cut[k])) for t, k in zip(times.tolist(), which.tolist(), strict=True))
+        ids = np.array([batch.connection.id for batch in batches], np.int64)[which]
+        messages = np.empty(len(times), object)
+        for k, batch in enumerate(batches):
+            messages[which == k] = _cut(batch)
+        rows = zip(ids.tolist(), times.tolist(), messages.tolist(), strict=True)
         self._run("BEGIN")
         self._database.executemany("INSERT INTO messages VALUES(NULL, ?, ?, ?)", rows)
         self._run("COMMIT")
@@ -96,11 +97,11 @@ class Db3Writer:
         self._database.execute(statement, values).close()
 
 
-def _cut(batch: Batch) -> Iterable[bytes]:
+def _cut(batch: Batch) -> list[bytes]:
     """The messages of a batch one after the other."""
     width = batch.rows.shape[1]
     raw = batch.rows.tobytes()
-    return (raw[at + ROOM : at + width] for at in range(0, len(raw), width))
+    return [raw[at + ROOM : at + width] for at in range(0, len(raw), width)]
 
 
 class Db3Reader:
@@ -123,6 +124,13 @@ class Db3Reader:
         else:
             place = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         self._database = sqlite3.connect(place, uri=True, isolation_level=None)
+        try:
+            self._learn()
+        except BaseException:
+            self.close()
+            raise
+
+    def _learn(self) -> None:
         for pragma in ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0"):
             self._database.execute(f"PRAGMA {pragma}").close()
         self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_BYTES)

@@ -236,11 +236,15 @@ class McapReader:
         self._channels: dict[int, tuple[int, str, str]] = {}
         self._chunks: list[tuple[int, int, dict[int, Any]]] = []
         self._loose: dict[int, list[tuple[int, int, int]]] = {}
-        if self._file.read(len(MAGIC)) != MAGIC:
-            raise RefusedError("it does not begin as MCAP does")
-        self._scan()
-        if self._chunks and not (self.whole and self._channels):
-            self._learn()
+        try:
+            if self._file.read(len(MAGIC)) != MAGIC:
+                raise RefusedError("it does not begin as MCAP does")
+            self._scan()
+            if self._chunks and not (self.whole and self._channels):
+                self._learn()
+        except BaseException:
+            self.close()
+            raise
         self.topics = [
             Heard(number, topic, self._schemas.get(schema, ""), encoding)
             for number, (schema, topic, encoding) in self._channels.items()

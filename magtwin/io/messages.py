@@ -196,7 +196,7 @@ def sender_of(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Topic:
     """A topic: what it is called, what its messages are, and which columns they carry."""
 
