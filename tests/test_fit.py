@@ -107,3 +107,19 @@ def test_a_map_has_its_surveys_frame_and_datum_and_a_height_only_where_the_surve
     for method in ("trilinear", "harmonic"):
         field = raster(fit(given, method), given, spacing_m=1.0, headings_rad=[0.0])
         assert (field.frame, field.datum, field.height_m) == ("world: x east", "the door", None)
+
+
+def test_a_latched_hole_is_masked_at_every_heading_and_a_node_read_at_one_is_not():
+    readings = survey()
+    node = readings.node
+    hole = (node[:, 1] >= 2) & (node[:, 1] <= 4) & (node[:, 2] >= 3) & (node[:, 2] <= 5)
+    latched = hole | ((node[:, 0] > 0) & (node[:, 1] == 5) & (node[:, 2] == 1))
+    readings = readings.with_(good=~latched)
+    field = raster(fit(readings, "gp"), readings, spacing_m=0.125)
+    assert field.values_nt.shape == (24, 13, 15)
+    masked = np.zeros((13, 15), bool)
+    masked[4:9, 6:11] = True  # half a spacing around its nodes, where these are the nearest
+    known = field.valid
+    assert not known[:, masked].any()
+    assert known[:, 10, 2].all()
+    assert known[:, ~masked].mean() > 0.9
