@@ -32,7 +32,7 @@ MOST_SQUARES = 40_000
 BLOCK = 32_768
 """Points worked on at a time; they lie in fewer squares than are kept."""
 
-PAYS, PER_SQUARE = 1_500_000, 100
+PAYS, PER_SQUARE = 800_000, 100
 """Points in numpy that take as long as opening the compiled code, and how many of them as long as a square
 does beside its points."""
 

@@ -11,6 +11,8 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.field import lookup
+from magtwin.field.lookup import Lookup
 from magtwin.names import RefusedError
 from magtwin.obstacles import Obstacles
 from magtwin.sim import loop
@@ -20,8 +22,11 @@ from magtwin.spec import DriveSpec
 
 Array = NDArray[np.float64]
 
-PAYS = 300_000
+PAYS = 140_000
 """Steps in plain Python that take as long as opening the compiled loop; whoever had as many has more."""
+
+NUMBA = 20
+"""How much less that is where numba is open already, for lookups of fields."""
 
 BLOCK = 8192
 """Steps that are recorded at a time, as most courses end long before their last step."""
@@ -46,8 +51,8 @@ class _Loop:
 def warm_up() -> None:
     """Have every course run compiled from now on, as pays before runs of hours, or of many robots.
 
-    Takes a second where the machine code has been kept from an earlier time, else some. It gives the same
-    bits.
+    Lookups of fields are so too: with numba open that is a fiftieth of a second. All of it takes a second
+    where the machine code has been kept from an earlier time, else some. It gives the same bits.
 
     Raises:
         ImportError: numba does not work here. Courses stay in plain Python then.
@@ -55,6 +60,7 @@ def warm_up() -> None:
     from magtwin.sim import compiled
 
     _Loop.compiled = compiled
+    lookup.warm_up()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -173,7 +179,10 @@ def run_courses(courses: Sequence[Course], obstacles: Obstacles | None = None) -
 
 def _opened(courses: Sequence[Course]) -> ModuleType | None:
     """The compiled loop, if it is open or is now worth opening."""
-    if _Loop.compiled is None and _Loop.made + sum(course.least_steps for course in courses) >= PAYS:
+    if _Loop.compiled is not None:
+        return _Loop.compiled
+    pays = PAYS if Lookup.compiled is None else PAYS / NUMBA
+    if _Loop.made + sum(course.least_steps for course in courses) >= pays:
         try:
             warm_up()
         except ImportError:
