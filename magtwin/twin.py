@@ -2,7 +2,7 @@
 
 import dataclasses
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
@@ -75,13 +75,14 @@ def open_twin(
 
     scene_file = FilePath(scene_file)
     scene = read_scene(scene_file, check_network=net is None and magnetometer in (None, "neural"))
-    spec = scene.robot.magnetometer
-    if net is not None:
-        kind, weights = ("physical", None) if str(net) == "none" else ("neural", FilePath(net).resolve())
-        spec = dataclasses.replace(spec, kind=kind, network=weights, network_sha256="", inputs=())  # type: ignore[arg-type]
-    if magnetometer is not None:
-        spec = dataclasses.replace(spec, kind=magnetometer)
-    scene = dataclasses.replace(scene, robot=dataclasses.replace(scene.robot, magnetometer=spec))
+    scene = dataclasses.replace(
+        scene,
+        robot=_with_magnetometer(scene.robot, net, magnetometer),
+        others=tuple(
+            dataclasses.replace(other, robot=_with_magnetometer(other.robot, net, magnetometer))
+            for other in scene.others
+        ),
+    )
     obstacles, field, network = read_obstacles(scene_file), load_map(scene.map_layer), _magnetometer(scene)
     facts: Facts = {"scene_file": scene_file.as_posix(), "scene_sha256": stage_sha256(scene_file)}
     if revision := git_revision(scene_file.parent):
@@ -91,6 +92,17 @@ def open_twin(
     if network and net is not None:
         facts["network_file"] = FilePath(net).as_posix()
     return Twin(scene, scene_file, field, network, obstacles, facts)
+
+
+def _with_magnetometer(robot: RobotSpec, net: str | FilePath | None, kind: Kind | None) -> RobotSpec:
+    """A robot whose magnetometer is of another network or kind; arguments as for `open_twin`."""
+    spec = robot.magnetometer
+    if net is not None:
+        of, weights = ("physical", None) if str(net) == "none" else ("neural", FilePath(net).resolve())
+        spec = dataclasses.replace(spec, kind=of, network=weights, network_sha256="", inputs=())  # type: ignore[arg-type]
+    if kind is not None:
+        spec = dataclasses.replace(spec, kind=kind)
+    return dataclasses.replace(robot, magnetometer=spec)
 
 
 def twin_of(
@@ -202,8 +214,16 @@ def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
     return magnetometer
 
 
-def engine_named(name: str, twin: Twin) -> "Engine":
+def engine_named(
+    name: str, twin: Twin, *, progress: Callable[[int, int, str], Any] | None = None
+) -> "Engine":
     """What moves a twin's robot: "kinematic" or "newton".
+
+    Args:
+        name: Which of them.
+        twin: What it moves in.
+        progress: Called where it takes long, as it goes on: with steps made, the most there can be, and the
+            time on the robot's clock in words.
 
     Raises:
         RefusedError: No such engine, or it is not installed; the text says how to get it.
@@ -215,7 +235,7 @@ def engine_named(name: str, twin: Twin) -> "Engine":
     if name == "kinematic":
         return Kinematic()
     check_installed()
-    return Newton(twin.scene_file, twin.scene.robot)
+    return Newton(twin.scene_file, twin.scene.robot, progress)
 
 
 def simulate(
@@ -232,6 +252,7 @@ def simulate(
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: "str | Controller" = "follower",
     engine: "Literal['kinematic', 'newton'] | Engine" = "kinematic",
+    progress: Callable[[int, int, str], Any] | None = None,
 ) -> Run:
     """Drive the scene's robot along a path and read every sensor.
 
@@ -252,6 +273,7 @@ def simulate(
             `magtwin.sim.controllers.Controller` of one's own.
         engine: What moves the robot: "kinematic"; "newton", physics in the stage itself (extra `physics`); or
             a `magtwin.sim.engine.Engine` of one's own.
+        progress: As for `engine_named`.
 
     Returns:
         A Run with every column of `magtwin.COLUMNS`; its facts tell how it came about.
@@ -278,7 +300,7 @@ def simulate(
         lidar=lidar,
         obstacles=twin.obstacles,
         controller=controller,
-        engine=engine_named(engine, twin) if isinstance(engine, str) else engine,
+        engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
     )
     outside_training = network.outside_training(run) if network else None
     return run.with_columns(**_known(twin.scene, run, network, outside_training)).with_facts(
@@ -286,9 +308,105 @@ def simulate(
     )
 
 
+def simulate_robots(
+    twin: Twin | str | FilePath,
+    paths: "Mapping[str, Path | Commands | Run | str | FilePath] | None" = None,
+    *,
+    robots: Iterable[str] | None = None,
+    meet: Literal["refuse", "flag"] = "refuse",
+    seed: int = 0,
+    speed: float = 0.2,
+    duration_s: float | None = None,
+    rate_hz: float | None = None,
+    net: str | FilePath | None = None,
+    magnetometer: Kind | None = None,
+    lidar: Literal["schedule", "on", "off"] = "schedule",
+    outside: Literal["nan", "clamp", "raise"] = "nan",
+    controller: str = "follower",
+) -> dict[str, Run]:
+    """Drive every robot of a scene at one time, a Run each.
+
+    They feel each other's iron, and must not run into each other; see `magtwin.sim.together`. The first
+    robot draws what `simulate` draws with the seed, each other one from a generator of its own, by its place
+    in the scene.
+
+    Args:
+        twin: What `open_twin` gave, or the file of a scene.
+        paths: What robots drive, by name, as for `simulate`; who is not named drives what the scene says,
+            or "figure8" where that says nothing.
+        robots: Names of those whose sensors are read; all unless given. All drive nevertheless.
+        meet: What becomes of robots whose footprints overlap: a refusal with time and place, or flag_bump in
+            both while it lasts; they drive through each other.
+        seed: As for `simulate`.
+        speed: As for `simulate`, of each.
+        duration_s: As for `simulate`, of each.
+        rate_hz: As for `simulate`.
+        net: As for `open_twin`, where `twin` is a file; of each robot.
+        magnetometer: As for `open_twin`, where `twin` is a file; of each robot.
+        lidar: As for `simulate`.
+        outside: As for `simulate`.
+        controller: A name of `magtwin.sim.controllers.CONTROLLERS`.
+
+    Returns:
+        Runs by the robots' names, in the scene's order. Beside what `simulate` says, facts name the robot,
+        and the one that came nearest with time and clearance.
+
+    Raises:
+        RefusedError: A name is none of a robot's, robots would meet, or `simulate` would refuse one.
+    """
+    from magtwin.sim.together import simulate_together
+
+    twin, seed = _opened(twin, net, magnetometer, "simulate_robots"), _seed(seed)
+    placed = {one.robot.name: one for one in twin.scene.robots}
+    for name in (*(paths or {}), *(robots or ())):
+        find("robot", name, placed)
+    ways: dict[str, Path | Commands | Run | str] = {}
+    for name, one in placed.items():
+        way = (paths or {}).get(name, one.path or "figure8")
+        ways[name] = resolve_path(way) if way != "random" and isinstance(way, str | FilePath) else way  # type: ignore[assignment]
+    wanted = [name for name in placed if robots is None or name in set(robots)]
+    led = {name: _led_by(twin, name) for name in placed}
+    networks = {name: one.magnetometer for name, one in led.items()}
+    runs = simulate_together(
+        twin.scene,
+        ways,
+        anomaly_map=twin.field,
+        rngs={name: np.random.default_rng((seed, 2, k) if k else seed) for k, name in enumerate(placed)},
+        wanted=wanted,
+        meet=meet,
+        speed=speed,
+        duration_s=duration_s,
+        rate_hz=rate_hz,
+        obstacles=twin.obstacles,
+        controller=controller,
+        disturbances_nt={name: net.disturbance_nt if net else None for name, net in networks.items()},
+        outside=outside,
+        lidar=lidar,
+    )
+    for name, run in runs.items():
+        own, network = led[name], networks[name]
+        outside_training = network.outside_training(run) if network else None
+        runs[name] = run.with_columns(**_known(own.scene, run, network, outside_training)).with_facts(
+            **_facts(own, seed, ways[name], duration_s, _config_sha256(own.scene))
+        )
+    return runs
+
+
+def _led_by(twin: Twin, name: str) -> Twin:
+    """The twin with another robot of its scene as the first."""
+    scene = twin.scene.led_by(name)
+    ours, its = twin.scene.robot.magnetometer, scene.robot.magnetometer
+    if (its.kind, its.network, its.network_sha256) == (ours.kind, ours.network, ours.network_sha256):
+        return dataclasses.replace(twin, scene=scene)
+    network = _magnetometer(scene)
+    facts = {k: v for k, v in twin.facts.items() if not (twin.magnetometer and k in twin.magnetometer.facts)}
+    facts |= network.facts if network else {}
+    return dataclasses.replace(twin, scene=scene, magnetometer=network, facts=facts)
+
+
 def simulate_many(
     twin: Twin | str | FilePath,
-    paths: Path | str | Iterable[Path | str],
+    paths: "Path | Commands | Run | str | FilePath | Iterable[Path | Commands | Run | str | FilePath]",
     seeds: Iterable[int],
     *,
     speeds: float | Iterable[float] = 0.2,
@@ -306,13 +424,13 @@ def simulate_many(
     """Many robots, each in the scene by itself; `simulate_many(twin, paths, seeds)[i]` is
     `simulate(twin, paths[i], seed=seeds[i])`, to the last bit, whatever the number, the order and the block.
 
-    All are driven at once by the compiled loop, and their readings go through the network in one stream of
-    blocks. Checked at once, made when asked for: iterate over the result to have bounded memory, `list` it to
+    All are driven at once by the compiled loop, but for those that somebody drives ("random"), and their
+    readings go through the network in one stream of blocks. Checked at once, made when asked for: iterate over the result to have bounded memory, `list` it to
     keep all.
 
     Args:
         twin: What `open_twin` gave, or the file of a scene.
-        paths: The path of each run, or one for all: a path, the name of one, or a CSV file of x, y [m].
+        paths: What is driven in each run, as for `simulate`, or one for all.
         seeds: A seed for each run; their number is that of the runs.
         speeds: Forward speed of each where its path is straight [m/s], or one for all.
         robots: What drives in each, such as `magtwin.sim.session.draw_session` gives, or one for all; None
@@ -345,7 +463,8 @@ def simulate_many(
         )
     count = len(numbers)
     given = _each("paths", paths, count)
-    resolved = {path: resolve_path(path) for path in given if not isinstance(path, Path)}
+    named = {path for path in given if isinstance(path, str | FilePath) and path != "random"}
+    resolved = {path: resolve_path(path) for path in named}
     scenes: dict[int, Scene] = {}
     jobs = []
     for seed, path, speed, robot in zip(
@@ -359,7 +478,7 @@ def simulate_many(
             _check_magnetometer(twin, robot)
             scenes[id(robot)] = dataclasses.replace(twin.scene, robot=robot)
         scene = twin.scene if robot is None else scenes[id(robot)]
-        jobs.append(Job(scene, path if isinstance(path, Path) else resolved[path], seed, speed))
+        jobs.append(Job(scene, resolved[path] if path in named else path, seed, speed))
     network = twin.magnetometer
     configs = {id(scene): _config_sha256(scene) for scene in (twin.scene, *scenes.values())}
 
@@ -408,7 +527,7 @@ def _seed(seed: object) -> int:
 
 def _each(name: str, values: Any, count: int) -> Sequence[Any]:
     """A value for each run, from as many, or from one for all."""
-    if isinstance(values, str) or not isinstance(values, Iterable):
+    if isinstance(values, str | Run) or not isinstance(values, Iterable):
         return [values] * count
     values = list(values)
     if len(values) != count:
@@ -468,10 +587,15 @@ def path_facts(path: "Path | Commands | Run | str") -> Facts:
 
 def _config_sha256(scene: Scene) -> str:
     """Checksum of every figure of a scene as it was run; files count with checksums of their own."""
-    robot = scene.robot
-    sensor = dataclasses.replace(robot.magnetometer, network=None, network_sha256="", inputs=())
-    robot = dataclasses.replace(robot, asset=FilePath(), magnetometer=sensor)
-    scene = dataclasses.replace(scene, map_layer=FilePath(), map_sha256="", robot=robot)
+
+    def bare(robot: RobotSpec) -> RobotSpec:
+        sensor = dataclasses.replace(robot.magnetometer, network=None, network_sha256="", inputs=())
+        return dataclasses.replace(robot, asset=FilePath(), magnetometer=sensor)
+
+    others = tuple(dataclasses.replace(other, robot=bare(other.robot), path="") for other in scene.others)
+    scene = dataclasses.replace(
+        scene, map_layer=FilePath(), map_sha256="", robot=bare(scene.robot), path="", others=others
+    )
     return hashlib.sha256(repr(scene).encode()).hexdigest()
 
 

@@ -1,6 +1,7 @@
 """The command line: what it writes, and how it refuses."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -313,6 +314,7 @@ def test_the_working_folder_and_devices_are_not_replaced(tmp_path, monkeypatch, 
     monkeypatch.chdir(tmp_path / "here")
     assert "working folder" in refused(capsys, "scene", "lab", "--out", ".", "--force")
     assert "working folder" in refused(capsys, "scene", "lab", "--out", "../here", "--force")
-    line = refused(capsys, "run", lab_scene, "--duration", "1", "--parquet", "/dev/null", "--force")
+    os.mkfifo("pipe.parquet")
+    line = refused(capsys, "run", lab_scene, "--duration", "1", "--parquet", "pipe.parquet", "--force")
     assert "a device or pipe" in line
     assert (tmp_path / "here").is_dir()

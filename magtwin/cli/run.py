@@ -1,16 +1,27 @@
 """`magtwin run` and `magtwin demo`: drive a scene's robot and write what happened."""
 
 import sys
-from collections.abc import Mapping
-from contextlib import ExitStack
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, Seed, announcer, print_report, say
+from magtwin.cli.terminal import Force, Json, Seed, announcer, check_suffix, print_report, progress, say
 from magtwin.names import RefusedError
+
+if TYPE_CHECKING:
+    from threading import Event
+
+    from magtwin.io.recorder import Sink
+    from magtwin.path import Path as Planned
+    from magtwin.run import Run
+    from magtwin.sim.lidar import Scans
+    from magtwin.twin import Twin
 
 
 @app.command
@@ -83,13 +94,21 @@ def run(
     out: Path | None = None,
     rrd: Path | None = None,
     parquet: Path | None = None,
+    bag: Path | None = None,
+    csv: Path | None = None,
+    usd: Path | None = None,
+    units: Literal["T", "nT"] | None = None,
+    usd_fps: Annotated[float | None, Parameter(name="--usd-fps")] = None,
     scans: bool = False,
+    live: Annotated[bool, Parameter(negative="")] = False,
+    viewer: str | None = None,
+    pace: float | None = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
     """Drive a scene's robot along a path and write what happened.
 
-    With none of --out, --rrd and --parquet, writes the folder "run".
+    With no output named, writes the folder "run".
 
     Parameters
     ----------
@@ -133,24 +152,58 @@ def run(
         Rerun recording to write.
     parquet
         Parquet table to write.
+    bag
+        rosbag2 to write: a .mcap file, or a folder.
+    csv
+        CSV table to write.
+    usd
+        Layer over the scene to write, in which the run plays: .usd, .usda or .usdc.
+    units
+        Unit of the field in the bag: T, as ROS has it, unless given; nT, as the released package publishes
+        it.
+    usd_fps
+        Frames a second in USD [Hz]; 30 unless given, 0 for one at every reading.
     scans
-        Cast the LiDAR's rays while it spins: into the recording, and into a table beside the run's, such as
-        run.scans.parquet beside run.parquet.
+        Cast the LiDAR's rays while it spins: into the recording and the bag, and into a table beside the
+        run's, such as run.scans.parquet beside run.parquet.
+    live
+        Show the run in a Rerun viewer as if it went on now, where a window can be opened; recordings, tables
+        and bags grow meanwhile, under names with "partial" or "parts" in them. Ctrl-C ends it, and what was
+        driven until then is kept.
+    viewer
+        Address of a Rerun viewer that shows it live, such as rerun+http://127.0.0.1:9876/proxy.
+    pace
+        Simulated seconds a second, where it is shown live; 1 unless given.
     force
         Replace what exists.
     json
         Print the summary as JSON.
     """
-    from magtwin.files import existing, output
+    from magtwin.files import existing
 
     existing(scene, "scene")
-    if out is rrd is parquet is None:
+    given = {"rrd": rrd, "parquet": parquet, "bag": bag, "csv": csv, "usd": usd}
+    files = {kind: file for kind, file in given.items() if file is not None}
+    if out is None and not files:
         out = Path("run")
     beside = parquet.with_suffix(".scans.parquet") if scans and parquet is not None else None
-    targets = (out, rrd, parquet, beside)
-    places = [target.resolve() for target in targets if target is not None]
-    if len(set(places)) < len(places):
+    targets = [target for target in (out, *files.values(), beside) if target is not None]
+    if len({target.resolve() for target in targets}) < len(targets):
         raise RefusedError("two outputs have one name; give each its own")
+    for kind, file in files.items():
+        if kind != "bag" or file.suffix:
+            check_suffix(file, _SUFFIXES[kind], f"what --{kind} writes")
+    for option, value, needs, there in (
+        ("units", units, "a bag; give --bag", bag),
+        ("usd-fps", usd_fps, "a layer; give --usd", usd),
+        ("pace", pace, "a run that is shown live; give --live", live or viewer),
+    ):
+        if value is not None and not there:
+            raise RefusedError(f"--{option} is for {needs}, or drop it")
+    if live and viewer:
+        raise RefusedError("--live opens a viewer and --viewer names one that is there; give one of them")
+    if pace is not None and not pace > 0:
+        raise RefusedError(f"--pace must be above 0 simulated seconds a second, got {pace:g}")
     way = _way(path, commands, engine, replay)
     if controller != "follower" and (commands or replay or path == "random"):
         raise RefusedError(f"--controller {controller} follows a path, and {way} is none; drop one")
@@ -164,7 +217,6 @@ def run(
         "commands": commands,
         "replay": replay,
         "engine": "newton" if engine == "newton" else "kinematic",
-        "steps": announcer(quiet=json),
         "net": net,
         "magnetometer": magnetometer,
         "seed": seed,
@@ -174,52 +226,81 @@ def run(
         "lidar": lidar,
         "outside": outside,
         "controller": controller,
-        "title": f"{way} in {scene}",
     }
-    with ExitStack() as stack:  # all are written, or none
-        asides = [t if t is None else stack.enter_context(output(t, force=force)) for t in targets]
-        if asides[0] is not None:
-            asides[0].mkdir()
-        out_aside, rrd_aside, parquet_aside, scans_aside = asides
-        report = write_run(
-            scene,
-            way,
-            out_aside,
-            rrd=rrd_aside,
-            parquet=parquet_aside,
-            scans=scans,
-            scans_parquet=scans_aside,
-            **options,
-        )
-    print_report(report, json)
+    wanted = _Outputs(out, files, beside, force=force, units=units, usd_fps=usd_fps)
+    shown = _Live(window=live, address=viewer, pace=pace or 1.0) if live or viewer else None
+    with ExitStack() as stack:
+        written = wanted.begun() if shown else stack.enter_context(wanted.aside())
+        what = _drive(scene, way, steps=announcer(quiet=json), scans=scans, **options)
+        if shown:
+            what = _show(what, shown, written, quiet=json)
+        written.write(what, steps=announcer(quiet=json), recorded=shown is not None)
+    print_report(what.run.report(f"{way} in {scene}"), json)
     if not json:
-        say("Wrote " + ", ".join(str(target) for target in targets if target is not None))
+        say("Wrote " + ", ".join(map(str, targets)))
+
+
+_SUFFIXES = {
+    "rrd": (".rrd",),
+    "parquet": (".parquet",),
+    "bag": (".mcap",),
+    "csv": (".csv",),
+    "usd": (".usd", ".usda", ".usdc"),
+}
+"""How the names of files end, by the option that names them; that of a bag may have no ending."""
+
+_RECORDED = ("rrd", "parquet", "bag")
+"""What grows while a run is shown live."""
 
 
 def write_run(
+    scene_file: Path, path: str, folder: Path, *, steps: Any, title: str, scans: bool = False, **options: Any
+) -> Any:
+    """Run a scene and write run.rrd, run.parquet and run.png into a folder; returns the run's report.
+
+    Args:
+        scene_file: The scene.
+        path: What is driven, in a word: a path, unless `commands` or `replay` are among the options.
+        folder: One that is there.
+        steps: Told what is being done.
+        title: Title of the report.
+        scans: Whether the LiDAR's rays are cast.
+        options: `commands`, `replay`, `facts` that say where files will lie as seen from the run's own, and
+            those of `open_twin` and `simulate`.
+    """
+    driven = _drive(scene_file, path, steps=steps, scans=scans, **options)
+    _Outputs(folder, {}, None).write(driven, steps=steps)
+    return driven.run.report(title)
+
+
+@dataclass(frozen=True)
+class _Driven:
+    """A run, and what belongs to it."""
+
+    run: "Run"
+    twin: "Twin"
+    planned: "Planned | None"
+    scans: "Scans | None"
+
+
+def _drive(
     scene_file: Path,
     path: str,
-    folder: Path | None,
     *,
     steps: Any,
-    title: str,
-    rrd: Path | None = None,
-    parquet: Path | None = None,
     scans: bool = False,
-    scans_parquet: Path | None = None,
     commands: Path | None = None,
     replay: Path | None = None,
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     facts: Mapping[str, str] = MappingProxyType({}),
     **options: Any,
-) -> Any:
-    """Run a scene and write the outputs asked for; returns the run's report.
+) -> _Driven:
+    """Run a scene: along `path`, unless commands or a run say otherwise.
 
     `facts` say where files will lie as seen from the run's own, for those that move with it.
     """
-    from magtwin.io.rerun import write_rrd
-    from magtwin.io.tables import read_parquet, write_parquet
+    from magtwin.io.formats import read_run
     from magtwin.path import resolve_path
     from magtwin.sim.commands import read_commands
     from magtwin.twin import open_twin, scan, simulate
@@ -229,7 +310,7 @@ def write_run(
     if commands is not None:
         what = read_commands(commands)
     elif replay is not None:
-        what = read_parquet(replay)
+        what = read_run(replay)
     elif path != "random":
         what = planned = resolve_path(path)
     twin = open_twin(scene_file, net=net, magnetometer=magnetometer)
@@ -238,28 +319,206 @@ def write_run(
     steps(f"Driving {planned.name if planned else path}")
     if replay is not None:
         facts = {"replay_file": replay.as_posix(), **facts}
-    result = simulate(twin, what, **options).with_facts(**facts)
+    slow = options.get("engine") == "newton" and sys.stderr.isatty()
+    with progress("  Newton") if slow else nullcontext() as advance:
+        result = simulate(twin, what, progress=advance, **options).with_facts(**facts)
     seen = None
     if scans:
-        from magtwin.io.scans import write_scans
-
         steps("Casting the LiDAR's rays")
         seen = scan(twin, result, seed=options["seed"])
-        for target in (folder / "run.scans.parquet" if folder else None, scans_parquet):
-            if target is not None:
-                write_scans(seen, target)
-    steps("Writing the run")
-    for target in (folder / "run.parquet" if folder else None, parquet):
-        if target is not None:
-            write_parquet(result, target)
-    for target in (folder / "run.rrd" if folder else None, rrd):
-        if target is not None:
-            write_rrd(result, target, twin, planned=planned, scans=seen)
-    if folder:
-        from magtwin.io.plots import plot_run
+    return _Driven(result, twin, planned, seen)
 
-        plot_run(result, twin.field, folder / "run.png", planned=planned.p_xy if planned else None)
-    return result.report(title)
+
+@dataclass(frozen=True)
+class _Outputs:
+    """What is to be written of a run, and where."""
+
+    folder: Path | None
+    """For run.rrd, run.parquet and run.png, and the LiDAR's scans where they are cast."""
+    files: Mapping[str, Path]
+    """Files by the option that names them."""
+    scans: Path | None
+    force: bool = False
+    units: Literal["T", "nT"] | None = None
+    usd_fps: float | None = None
+    """Frames a second in USD; 0 for one at every reading, none for as many as it has unless told."""
+
+    @contextmanager
+    def aside(self) -> Iterator["_Outputs"]:
+        """The same in places aside, which take those of the outputs at the end: all, or none."""
+        from magtwin.files import check_free, output
+
+        with ExitStack() as stack:
+            places: dict[Path, Path] = {}
+            for target in (self.folder, *self.files.values(), self.scans):
+                if target is not None and target != self.files.get("usd"):
+                    places[target] = stack.enter_context(output(target, force=self.force))
+            if (
+                "usd" in self.files
+            ):  # it names its scene by a relative path, and is written in its place, last
+                places[self.files["usd"]] = check_free(self.files["usd"], force=self.force)
+            if self.folder is not None:
+                places[self.folder].mkdir()
+            try:
+                yield replace(
+                    self,
+                    folder=None if self.folder is None else places[self.folder],
+                    files={kind: places[file] for kind, file in self.files.items()},
+                    scans=None if self.scans is None else places[self.scans],
+                )
+            except RefusedError as error:
+                text = str(error)
+                for target, place in places.items():
+                    text = text.replace(str(place), str(target))
+                raise RefusedError(text) from error
+
+    def begun(self) -> "_Outputs":
+        """The same, in place: files grow there, under names that tell so."""
+        from magtwin.files import check_free
+
+        for target in (self.folder, *self.files.values(), self.scans):
+            if target is not None:
+                check_free(target, force=self.force)
+        if self.folder is not None:
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise RefusedError(f"{self.folder}: cannot be written ({error.strerror})") from error
+        return self
+
+    def of(self, kind: str) -> list[Path]:
+        """Where a kind of file goes."""
+        inside = self.folder is not None and kind in ("rrd", "parquet")
+        first = [self.folder / f"run.{kind}"] if inside and self.folder else []
+        return first + ([self.files[kind]] if kind in self.files else [])
+
+    def sinks(self, driven: _Driven) -> list["Sink"]:
+        """What takes the run as it comes."""
+        from magtwin.io.live import RrdWriter
+        from magtwin.io.rosbag import BagWriter
+        from magtwin.io.tables import ParquetParts
+
+        known: dict[str, Any] = {"expected": driven.run, "planned": driven.planned, "scans": driven.scans}
+        recordings = [RrdWriter(path, driven.twin, **known, force=self.force) for path in self.of("rrd")[:1]]
+        tables = [ParquetParts(path, force=self.force) for path in self.of("parquet")[:1]]
+        units = self.units or "T"
+        bags = [BagWriter(path, driven.twin, units=units, force=self.force) for path in self.of("bag")]
+        return [*recordings, *tables, *bags]
+
+    def write(self, driven: _Driven, *, steps: Any, recorded: bool = False) -> None:
+        """Write all, each kind once; what was `recorded` as it went on is there already."""
+        import shutil
+
+        from magtwin.io.formats import write_run as write
+
+        if driven.scans is not None:
+            from magtwin.io.scans import write_scans
+
+            inside = [] if self.folder is None else [self.folder / "run.scans.parquet"]
+            for target in [*inside, *([] if self.scans is None else [self.scans])]:
+                write_scans(driven.scans, target, force=self.force)
+        steps("Writing the run")
+        for kind in _SUFFIXES:
+            options: dict[str, Any] = {}
+            if kind == "bag" and self.units is not None:
+                options["units"] = self.units
+            if kind == "usd" and self.usd_fps is not None:
+                options["fps"] = self.usd_fps or None
+            for number, target in enumerate(self.of(kind)):
+                if number:
+                    shutil.copyfile(self.of(kind)[0], target)
+                elif not recorded or kind not in _RECORDED:
+                    write(
+                        driven.run,
+                        target,
+                        driven.twin,
+                        planned=driven.planned,
+                        scans=driven.scans,
+                        force=self.force,
+                        **options,
+                    )
+        if self.folder:
+            from magtwin.io.plots import plot_run
+
+            planned = driven.planned
+            plot_run(
+                driven.run,
+                driven.twin.field,
+                self.folder / "run.png",
+                planned=planned.p_xy if planned else None,
+                force=self.force,
+            )
+
+
+@dataclass(frozen=True)
+class _Live:
+    """How a run is shown while it goes on."""
+
+    window: bool
+    """Whether in a window of its own."""
+    address: str | None
+    """Address of a viewer that is there already."""
+    pace: float
+    """Simulated seconds a second."""
+
+
+def _show(driven: _Driven, live: _Live, outputs: _Outputs, *, quiet: bool) -> _Driven:
+    """Let a run go on in step with the clock, seen and recorded; what came of it until its end, or Ctrl-C."""
+    from magtwin.io.live import LiveViewer
+    from magtwin.io.recorder import Recorder, in_step
+    from magtwin.io.viewer import live_viewer
+
+    run, address = driven.run, live.address
+    with ExitStack() as stack:
+        stop = stack.enter_context(_ctrl_c())
+        if live.window:
+            try:
+                address, _ = stack.enter_context(live_viewer())
+            except RefusedError as error:
+                print(f"  no view: {error}", file=sys.stderr)  # noqa: T201
+        viewers = []
+        if address is not None:
+            known: dict[str, Any] = {"expected": run, "planned": driven.planned, "scans": driven.scans}
+            viewers.append(LiveViewer(address, driven.twin, **known))
+        sinks = outputs.sinks(driven)
+        advance = stack.enter_context(progress("  Live [s]")) if not quiet and sys.stderr.isatty() else None
+        with Recorder(sinks, viewers) as recorder:
+            for block in in_step(run, live.pace, stop=stop):
+                recorder.append(block)
+                if advance is not None:
+                    advance(round(float(block["t"][-1])), round(float(run["t"][-1])), "Ctrl-C ends it")
+        if not recorder.rows:
+            raise RefusedError("ended before the first reading; nothing is written")
+    rows, scans = recorder.rows, driven.scans
+    if rows < run.rows:
+        run = type(run)({name: values[:rows] for name, values in run.items()}, run.facts)
+        if scans is not None:
+            seen = scans.t <= run["t"][-1]
+            scans = type(scans)(*(getattr(scans, f.name)[seen] for f in fields(scans)))
+    return replace(driven, run=run, scans=scans)
+
+
+@contextmanager
+def _ctrl_c() -> Iterator["Event"]:
+    """What Ctrl-C sets; the second one ends the process as ever."""
+    import signal
+    from threading import Event, current_thread, main_thread
+
+    stop = Event()
+    if current_thread() is not main_thread():
+        yield stop
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def end(*_: object) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, end)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _way(path: str | None, commands: Path | None, engine: str | None, replay: Path | None) -> str:

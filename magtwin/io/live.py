@@ -97,7 +97,7 @@ class RrdWriter:
 
 
 class LiveViewer:
-    """A viewer that shows a run while it goes on: a sink of a `Recorder`; when it is gone, the run goes on."""
+    """A viewer that shows a run as it goes on: a sink of a `Recorder`; when it is gone, the run goes on."""
 
     def __init__(
         self,

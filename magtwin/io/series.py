@@ -149,7 +149,7 @@ def send_facts(rec: rr.RecordingStream, run: Run, name: str) -> None:
     }
     texts = {FACTS: dict(run.facts), NAMES: told}
     as_json: dict[str, Any] = {key: [json.dumps(value, ensure_ascii=False)] for key, value in texts.items()}
-    rec.log(entity_of(COLUMNS_ENTITY, name), rr.AnyValues(**as_json, **{NAME: [name]}), static=True)
+    rec.log(entity_of(COLUMNS_ENTITY, name), rr.AnyValues(**as_json | {NAME: [name]}), static=True)
 
 
 def send_rows(rec: rr.RecordingStream, rows: int, name: str) -> None:

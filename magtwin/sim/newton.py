@@ -7,9 +7,11 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +50,9 @@ class Newton:
     robot: RobotSpec
     """The robot that is driven; it is found in the stage by its name."""
 
+    progress: Callable[[int, int, str], Any] | None = None
+    """Called ten times a simulated second: steps made, the most there can be, and the time in words."""
+
     name = "newton"
 
     def drive(
@@ -76,6 +81,8 @@ class Newton:
             rows = [world.seen()]
             yaw = rows[0][2]
             for k in range(course.steps):
+                if self.progress is not None and k % max(1, round(0.1 / dt)) == 0:
+                    self.progress(k, course.steps, f"{k * dt:.1f} s driven")
                 command = guide.command(k * dt, rows[-1][0], rows[-1][1], yaw, *wheels)
                 age = 0.0 if command is not None else age + dt
                 if command is not None:
