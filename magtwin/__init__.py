@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from magtwin.path import Path
     from magtwin.run import COLUMNS, Run
     from magtwin.spec import Scene
-    from magtwin.twin import Twin, open_twin, scene_from_toml, simulate, simulate_many
+    from magtwin.twin import Twin, open_twin, scene_from_toml, simulate, simulate_many, simulate_robots
 
 __version__ = "0.1.0"
 
@@ -29,6 +29,7 @@ _HOME = {
     "scene_from_toml": "magtwin.twin",
     "simulate": "magtwin.twin",
     "simulate_many": "magtwin.twin",
+    "simulate_robots": "magtwin.twin",
 }
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "scene_from_toml",
     "simulate",
     "simulate_many",
+    "simulate_robots",
 ]
 
 

@@ -1,7 +1,7 @@
 """simulate: a scene and a path go in, a Run with every column comes out."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -17,6 +17,7 @@ from magtwin.path import Path, check_on_floor
 from magtwin.run import COLUMNS, Run
 from magtwin.sim.battery import discharge, sense_battery
 from magtwin.sim.commands import Commands
+from magtwin.sim.companions import Companion, companions_field_nt, touching
 from magtwin.sim.controllers import Controller
 from magtwin.sim.drive import Moment, draw_wheel_errors
 from magtwin.sim.driver import Driver
@@ -113,7 +114,7 @@ def simulate(
         scene, path, rate_hz=rate_hz, duration_s=duration_s, lidar=lidar, network=disturbance_nt is not None
     )
     draws = streams(rng)
-    motion, facts = _travel(
+    motion, facts = travel(
         scene, path, draws, speed, duration_s, obstacles or Obstacles(), controller, engine or Kinematic()
     )
     sensed = sense(
@@ -131,7 +132,7 @@ def simulate(
     return sensed.read(None if disturbance_nt is None else disturbance_nt(sensed.run))
 
 
-def _travel(
+def travel(
     scene: Scene,
     path: Path | Commands | Run | str,
     draws: Mapping[str, np.random.Generator],
@@ -229,6 +230,9 @@ class Sensed:
     wanted: frozenset[str]
     """Columns of `COLUMNS` that the whole run is to have."""
 
+    beside_nt: Array | float = 0.0
+    """What other robots add to the field's magnitude at each reading [nT], shape (N,); 0 without others."""
+
     def read(self, disturbance_nt: NDArray[Any] | None = None) -> Run:
         """The whole run, of the columns that are wanted.
 
@@ -245,6 +249,7 @@ class Sensed:
             disturbance = np.asarray(disturbance_nt, float)
             if disturbance.shape != (rows,):
                 raise RefusedError(f"disturbance_nt must give shape {(rows,)}, got {disturbance.shape}")
+            disturbance = disturbance + self.beside_nt
         columns["b_disturbance_nt"] = disturbance
         columns["b_total_nt"] = columns["b_map_nt"] + disturbance
         if self.wanted & _READ:
@@ -273,6 +278,7 @@ def sense(
     network: bool,
     wanted: Iterable[str] = COLUMNS,
     inputs: Iterable[str] = COLUMNS,
+    companions: Sequence[Companion] = (),
 ) -> Sensed:
     """Read every sensor but the magnetometer in what a robot did.
 
@@ -292,6 +298,8 @@ def sense(
         network: Whether a network will predict the disturbance.
         wanted: Columns of `COLUMNS` that the whole run is to have.
         inputs: Columns that the network reads.
+        companions: Other robots in the lab, whose iron the magnetometer reads too where the Earth's field is
+            known: what a network predicts is without it.
     """
     robot, wanted = scene.robot, frozenset(wanted)
     needed = wanted | frozenset(inputs if network else ())
@@ -300,12 +308,13 @@ def sense(
         wanted & _EXACT
         or (not network and robot.magnetometer.kind == "physical")
         or (read and feels_direction(robot.magnetometer))
+        or (companions and scene.earth is not None)
     )
     end = motion.duration_s if duration_s is None else duration_s
     _check_readings(end, rate_hz)
     t = np.arange(max(1, math.ceil(end * rate_hz - 1e-9))) / rate_hz
     true = motion.at(t)
-    columns = _truth(true, t, robot.base_height_m)
+    columns, beside = _truth(true, t, robot.base_height_m), np.zeros(len(t))
     if needed & _ODOMETRY:
         columns |= sense_odometry(robot.drive, motion, t, draws["odometry"])
     if needed & _IMU:
@@ -320,7 +329,14 @@ def sense(
         if exact:
             supply_a = pack.current_a[pack.index(t)]
             columns |= _exact_field(scene, motion, t, true, columns["lidar_on"], supply_a)
+            if companions and scene.earth is not None:
+                added = companions_field_nt(scene, companions, motion, t, true)
+                alone = columns["b_truth_nt"]
+                columns |= _with(columns["b_vector_nt"], into_sensor(added, robot.q_base_magnetometer_xyzw))
+                beside = columns["b_truth_nt"] - alone
     columns |= _flags(scene, true)
+    if companions:
+        columns["flag_bump"] = columns["flag_bump"] | touching(t, motion, robot, companions)
     columns["b_sd_nt"] = np.full(len(t), np.nan)
     told: dict[str, str | int | float | bool] = {
         "scene": scene.name,
@@ -338,6 +354,7 @@ def sense(
         steep=_steep(scene, anomaly_map, motion, t) if read else np.zeros(len(t), bool),
         rng=draws["magnetometer"],
         wanted=wanted,
+        beside_nt=beside,
     )
 
 
@@ -406,6 +423,13 @@ def _exact_field(
         "b_vector_nt": into_sensor(vector, scene.robot.q_base_magnetometer_xyzw),
         "b_truth_nt": np.sqrt(x * x + y * y + z * z),
     }
+
+
+def _with(b_vector_nt: Array, added_nt: Array) -> dict[str, NDArray[Any]]:
+    """Field at the magnetometer with one that comes to it, both in its axes."""
+    vector = b_vector_nt + added_nt
+    x, y, z = vector.T
+    return {"b_vector_nt": vector, "b_truth_nt": np.sqrt(x * x + y * y + z * z)}
 
 
 def _steep(scene: Scene, anomaly_map: AnomalyMap, motion: Moving, t: Array) -> NDArray[np.bool_]:
