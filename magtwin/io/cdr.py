@@ -29,6 +29,9 @@ HEADER = 4
 MOST_TEXTS = 4096
 """Most strings of a sequence that are read."""
 
+MOST_PADDING = 64
+"""Bytes that sequences of unequal length may be filled up to, for each byte of the messages."""
+
 NS = 10**9
 """Nanoseconds in a second."""
 
@@ -160,8 +163,8 @@ def decode(form: Sequence[Leaf], messages: Messages, wanted: Iterable[str]) -> d
         wanted: Names of the leaves.
 
     Returns:
-        By name: numbers of shape (M,), (M, n) for n in a row; stamps as int64 [ns]; of a string a list of M,
-        of a sequence of strings a list of M tuples.
+        By name: numbers of shape (M,), (M, n) for n in a row, of sequences filled up with nan; stamps as
+        int64 [ns]; of a string a list of M, of a sequence of strings a list of M tuples.
 
     Raises:
         RefusedError: A message is too short for what it should hold, or is encoded otherwise.
@@ -222,13 +225,18 @@ def _leaf(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index, wanted
     begins = np.where(count > 0, _aligned(at, size), at)  # an empty sequence has no padding
     if np.any(begins + count * size > room):
         raise RefusedError(f"a message ends before the end of its {leaf.name}")
-    if not wanted or not len(count):
+    if not wanted or not np.any(count):
         return np.zeros((len(count), 0)), begins + count * size
-    if np.any(count != count[0]):
-        raise RefusedError(f"{leaf.name} is not equally long in all messages")
-    if not count[0]:
-        return np.zeros((len(count), 0), leaf.kind), at
-    return _numbers(leaf.kind, int(count[0]), buffer, body, room, at)
+    most = int(count.max())
+    if np.all(count == most):
+        return _numbers(leaf.kind, most, buffer, body, room, at)
+    if most * size * len(count) > MOST_PADDING * len(buffer):
+        raise RefusedError(f"{leaf.name} is too unequally long")
+    values = np.full((len(count), most), np.nan)
+    for n in np.unique(count):
+        rows = np.flatnonzero(count == n)
+        values[rows, :n], _ = _numbers(leaf.kind, int(n), buffer, body[rows], room[rows], at[rows])
+    return values, begins + count * size
 
 
 def _texts(
