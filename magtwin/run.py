@@ -455,6 +455,14 @@ class Run(Mapping[str, NDArray[Any]]):
         return f"the run goes from {t[0]:g} to {t[-1]:g} s" if len(t) else "the run has no rows"
 
 
+def check_clock(run: Run, what: str) -> None:
+    """Refuse a run without a clock, or with one that does not ascend; `what` says whose it is."""
+    if "t" not in run.columns:
+        known = ", ".join(list(run.columns)[:5]) or "none"
+        raise RefusedError(f"{what}: not a Run: column 't' is missing (columns: {known}, ...)")
+    check_instants(run["t"], what)
+
+
 def _resampled(run: Run, at: NDArray[Any], rules: Mapping[str, str]) -> dict[str, NDArray[Any]]:
     """Columns of a run at instants that it covers [s], shape (M,)."""
     before, share = bracket(run["t"], at)

@@ -16,8 +16,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from magtwin.names import RefusedError
-from magtwin.resample import RULES, check_instants
-from magtwin.run import COLUMNS, Column, Run
+from magtwin.resample import RULES
+from magtwin.run import COLUMNS, Column, Run, check_clock
 
 FACTS = b"magtwin_facts"
 
@@ -83,14 +83,6 @@ def spec_said(said: dict[str, str], parts: tuple[str, ...]) -> Column:
     rule: Any = said.get("interpolation", "linear")
     unit, frame, doc = (said.get(key, "") for key in ("unit", "frame", "doc"))
     return Column(unit, frame, doc, len(parts) or 1, parts, rule if rule in RULES else "linear")
-
-
-def check_clock(run: Run, what: str) -> None:
-    """Refuse a run without a clock, or with one that does not ascend."""
-    if "t" not in run.columns:
-        known = ", ".join(list(run.columns)[:5]) or "none"
-        raise RefusedError(f"{what}: not a Run: column 't' is missing (columns: {known}, ...)")
-    check_instants(run["t"], what)
 
 
 def facts_to_json(run: Run) -> str:

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from magtwin.files import existing
 from magtwin.names import RefusedError, hint
-from magtwin.resample import check_instants
-from magtwin.run import Run
+from magtwin.run import Run, check_clock
 
 if TYPE_CHECKING:
     from magtwin.path import Path as Planned
@@ -96,7 +95,7 @@ def read_run(path: str | os.PathLike[str]) -> Run:
     path = existing(path, "run")
     file, format_ = _found(path) if path.is_dir() else (path, format_of(path))
     run = format_.reader()(file)
-    check_instants(run["t"], str(path))
+    check_clock(run, str(path))
     return run
 
 
@@ -122,13 +121,14 @@ def write_run(
         options: Of single formats: `storage` and `units` of bags, `fps` of USD.
 
     Raises:
-        RefusedError: The name ends in no known way, the format has no such option, the file exists and
-            `force` was not given, or it cannot be written.
+        RefusedError: The name ends in no known way, the format has no such option, the run has no clock that
+            ascends, the file exists and `force` was not given, or it cannot be written.
     """
     path = Path(path)
     format_ = format_of(path)
     if unknown := sorted(options.keys() - format_.takes):
         raise RefusedError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
+    check_clock(run, "the run to write")
     scene_file = None if twin is None else twin.scene_file
     known = {"twin": twin, "planned": planned, "scans": scans, "scene_file": scene_file}
     given = {name: value for name, value in known.items() if name in format_.takes}

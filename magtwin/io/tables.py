@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from magtwin.files import check_free, existing, output
 from magtwin.io.arrow import (
     FACTS,
-    check_clock,
     facts_from_json,
     facts_to_json,
     run_of,
@@ -32,7 +31,7 @@ from magtwin.io.arrow import (
     table_of,
 )
 from magtwin.names import RefusedError
-from magtwin.run import COLUMNS, Run
+from magtwin.run import COLUMNS, Run, check_clock
 
 _MAGIC = b"PAR1"
 _ABOUT = "magtwin"
