@@ -425,8 +425,8 @@ def simulate_many(
     `simulate(twin, paths[i], seed=seeds[i])`, to the last bit, whatever the number, the order and the block.
 
     All are driven at once by the compiled loop, but for those that somebody drives ("random"), and their
-    readings go through the network in one stream of blocks. Checked at once, made when asked for: iterate over the result to have bounded memory, `list` it to
-    keep all.
+    readings go through the network in one stream of blocks. Checked at once, made when asked for: iterate
+    over the result to have bounded memory, `list` it to keep all.
 
     Args:
         twin: What `open_twin` gave, or the file of a scene.
@@ -463,8 +463,9 @@ def simulate_many(
         )
     count = len(numbers)
     given = _each("paths", paths, count)
-    named = {path for path in given if isinstance(path, str | FilePath) and path != "random"}
-    resolved = {path: resolve_path(path) for path in named}
+    resolved: dict[Any, Path] = {
+        path: resolve_path(path) for path in given if isinstance(path, str | FilePath) and path != "random"
+    }
     scenes: dict[int, Scene] = {}
     jobs = []
     for seed, path, speed, robot in zip(
@@ -478,7 +479,9 @@ def simulate_many(
             _check_magnetometer(twin, robot)
             scenes[id(robot)] = dataclasses.replace(twin.scene, robot=robot)
         scene = twin.scene if robot is None else scenes[id(robot)]
-        jobs.append(Job(scene, resolved[path] if path in named else path, seed, speed))
+        if isinstance(path, str | FilePath):
+            path = resolved.get(path, path)
+        jobs.append(Job(scene, path, seed, speed))
     network = twin.magnetometer
     configs = {id(scene): _config_sha256(scene) for scene in (twin.scene, *scenes.values())}
 

@@ -12,6 +12,7 @@ from magtwin.learn.model import FieldNet
 from magtwin.names import RefusedError
 from magtwin.run import COLUMNS, Run
 from magtwin.sim import many
+from magtwin.sim.commands import Commands
 from magtwin.sim.session import draw_session
 from magtwin.twin import Twin, open_twin
 
@@ -80,6 +81,47 @@ def test_a_run_asked_for_by_its_number_is_the_one_of_the_row(neural, alone):
         assert_same(run, alone[i])
     with pytest.raises(IndexError):
         runs[7]
+
+
+@pytest.fixture(scope="module")
+def others(neural) -> list[Commands | Run | str]:
+    """What can be driven beside paths."""
+    script = Commands("script", np.array([[0.0, 0.2, 0.3], [0.4, 0.1, -0.5], [0.8, 0.0, 0.0]]))
+    return [script, "random", simulate(neural, "sine", seed=8, **SHORT), "random"]
+
+
+@pytest.mark.parametrize("block", [1, 3, 8])
+def test_scripts_drivers_and_recorded_runs_are_those_of_simulate_too(neural, others, block):
+    ways = [*others[:2], "figure8", *others[2:]]
+    runs = simulate_many(neural, ways, range(5), block=block, **SHORT)
+    for k, run in enumerate(runs):
+        assert_same(run, simulate(neural, ways[k], seed=k, **SHORT))
+    assert len({run["p_world_base"].tobytes() for run in runs}) == 5
+
+
+def test_scripts_and_recorded_runs_end_where_they_end(neural, others):
+    script, _, recorded, _ = others
+    for run, way in zip(simulate_many(neural, [script, recorded], [1, 1]), (script, recorded), strict=True):
+        assert_same(run, simulate(neural, way, seed=1))
+
+
+def test_one_script_or_recorded_run_serves_all(neural, others):
+    for way in (others[0], others[2]):
+        runs = simulate_many(neural, way, [1, 2], **SHORT)
+        assert_same(runs[1], simulate(neural, way, seed=2, **SHORT))
+    assert len(simulate_many(neural, others[0], range(9), **SHORT)._planned) == 1
+
+
+def test_what_cannot_be_driven_is_refused_with_its_number_before_anything_is(neural, others):
+    broken = Commands("broken", np.array([[0.0, np.nan, 0.0]]))
+    with pytest.raises(RefusedError, match=r"^run 1 of 2, counted from 0: .*finite"):
+        simulate_many(neural, [others[0], broken], [0, 0], **SHORT)
+    walled = dataclasses.replace(neural, scene=dataclasses.replace(neural.scene, start=(2.95, 0.0, 0.0)))
+    for way in ("random", others[0]):
+        with pytest.raises(RefusedError, match=r"^run 1 of 2, counted from 0: the robot would begin in"):
+            simulate_many(walled, ["figure8", way], [0, 0], **SHORT)
+    with pytest.raises(RefusedError, match="randum"):
+        simulate_many(neural, "randum", [0], **SHORT)
 
 
 def test_whole_paths_end_when_each_robot_stands(physical, tmp_path):

@@ -173,6 +173,29 @@ def play(
         RefusedError: Commands are not finite or not in order of time, `duration_s` or `rate_hz` is out of
             range, or the start touches an obstacle.
     """
+    course = course_by(
+        commands,
+        drive,
+        start=start,
+        duration_s=duration_s,
+        rate_hz=rate_hz,
+        footprint_radius_m=footprint_radius_m,
+        wheel_errors=wheel_errors,
+    )
+    return (engine or Kinematic()).drive(course, controller, obstacles)
+
+
+def course_by(
+    commands: ArrayLike,
+    drive: DriveSpec,
+    *,
+    start: Pose = (0.0, 0.0, 0.0),
+    duration_s: float | None = None,
+    rate_hz: float = CONTROL_RATE_HZ,
+    footprint_radius_m: float = 0.0,
+    wheel_errors: tuple[float, float] = (0.0, 0.0),
+) -> Course:
+    """What plays a script, ready to run; arguments and refusals are those of `play`."""
     dt = _step(rate_hz, drive)
     guide = guide_by_commands(commands, drive)
     if duration_s is None:
@@ -181,7 +204,7 @@ def play(
     else:
         end = duration_s
     _check_duration(end)
-    course = Course(
+    return Course(
         drive=drive,
         guide=guide,
         dt=dt,
@@ -191,7 +214,6 @@ def play(
         footprint_radius_m=footprint_radius_m,
         wheel_errors=wheel_errors,
     )
-    return (engine or Kinematic()).drive(course, controller, obstacles)
 
 
 def _step(rate_hz: float, drive: DriveSpec) -> float:

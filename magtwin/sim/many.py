@@ -17,11 +17,13 @@ from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError, find
 from magtwin.obstacles import Obstacles
 from magtwin.path import Path
-from magtwin.run import COLUMNS, Run
+from magtwin.run import COLUMNS, Facts, Run
+from magtwin.sim.commands import Commands
 from magtwin.sim.course import PAYS, Course, run_courses, warm_up
-from magtwin.sim.drive import Motion, draw_wheel_errors
-from magtwin.sim.follow import check_arrived, course_along
-from magtwin.sim.simulate import Sensed, check_run, sense, streams
+from magtwin.sim.drive import Motion, Pose, draw_wheel_errors
+from magtwin.sim.engine import Kinematic, Travel
+from magtwin.sim.follow import check_arrived, course_along, course_by
+from magtwin.sim.simulate import Sensed, check_run, sense, streams, travel
 from magtwin.spec import DriveSpec, Scene
 
 BLOCK = 16
@@ -35,8 +37,8 @@ class Job:
     scene: Scene
     """Lab, robot and sensors."""
 
-    path: Path
-    """Where to drive."""
+    path: Path | Commands | Run | str
+    """Where to drive, as for `magtwin.sim.simulate.simulate`."""
 
     seed: int
     """Seed of all noise."""
@@ -106,7 +108,8 @@ class Runs(Sequence[Run]):
         self._columns = frozenset(COLUMNS if columns is None else {"t", *columns})
         for name in sorted(self._columns):
             find("column", name, COLUMNS)
-        self._planned: dict[tuple[Path, float, DriveSpec, float], Course] = {}
+        self._planned: dict[tuple[Path | Commands, float, DriveSpec, float, Pose], Course] = {}
+        self._courses: list[Course | None] = []
         checked = set()
         steps = 0
         for i in range(len(jobs)):
@@ -116,7 +119,9 @@ class Runs(Sequence[Run]):
                 if key not in checked:
                     self._rate(job)
                     checked.add(key)
-                steps += self._course(job).least_steps
+                course = self._course(job)
+                steps += course.least_steps if course else 0
+                self._courses.append(course)
         if steps >= PAYS:
             with suppress(ImportError):  # plain Python gives the same bits
                 warm_up()
@@ -154,29 +159,53 @@ class Runs(Sequence[Run]):
 
     def _sensed(self, numbers: Sequence[int]) -> list[Sensed]:
         """Drive and sense some runs."""
-        jobs = [self._jobs[i] for i in numbers]
-        draws = [streams(np.random.default_rng(job.seed)) for job in jobs]
-        courses = [
-            replace(
-                self._course(job),
-                drive=job.scene.robot.drive,
-                wheel_errors=draw_wheel_errors(job.scene.robot.drive, own["drive"]),
-            )
-            for job, own in zip(jobs, draws, strict=True)
-        ]
-        motions = run_courses(courses, self._conditions.obstacles)
+        draws = {i: streams(np.random.default_rng(self._jobs[i].seed)) for i in numbers}
+        courses: dict[int, Course] = {}
+        for i in numbers:
+            if (course := self._courses[i]) is not None:
+                drive = self._jobs[i].scene.robot.drive
+                errors = draw_wheel_errors(drive, draws[i]["drive"])
+                courses[i] = replace(course, drive=drive, wheel_errors=errors)
+        together = dict(
+            zip(courses, run_courses(list(courses.values()), self._conditions.obstacles), strict=True)
+        )
         done = []
-        for i, job, own, course, motion in zip(numbers, jobs, draws, courses, motions, strict=True):
+        for i in numbers:
             with self._numbered(i):
-                done.append(self._sense(job, own, course, motion))
+                if i in together:
+                    motion, facts = self._travelled(self._jobs[i], courses[i], together.pop(i))
+                else:
+                    motion, facts = self._travel(self._jobs[i], draws[i])
+                done.append(self._sense(self._jobs[i], draws[i], motion, facts))
         return done
 
-    def _sense(
-        self, job: Job, draws: dict[str, np.random.Generator], course: Course, motion: Motion
-    ) -> Sensed:
+    def _travelled(self, job: Job, course: Course, motion: Motion) -> tuple[Travel, Facts]:
+        """What a robot did that was driven among others."""
         common = self._conditions
+        if isinstance(job.path, Commands):
+            return motion, {"path": job.path.name, "controller": "commands"}
+        assert isinstance(job.path, Path)
         if common.duration_s is None:
             check_arrived(job.path, job.speed, course, motion)
+        name, speed = job.path.name, float(job.speed)
+        return motion, {"path": name, "controller": common.controller, "speed_m_s": speed}
+
+    def _travel(self, job: Job, draws: dict[str, np.random.Generator]) -> tuple[Travel, Facts]:
+        """What a robot does that somebody drives, or did when it was recorded."""
+        common = self._conditions
+        return travel(
+            job.scene,
+            job.path,
+            draws,
+            job.speed,
+            common.duration_s,
+            common.obstacles,
+            common.controller,
+            Kinematic(),
+        )
+
+    def _sense(self, job: Job, draws: dict[str, np.random.Generator], motion: Travel, facts: Facts) -> Sensed:
+        common = self._conditions
         rate = job.scene.robot.magnetometer.rate_hz if common.rate_hz is None else common.rate_hz
         return sense(
             job.scene,
@@ -187,11 +216,7 @@ class Runs(Sequence[Run]):
             duration_s=common.duration_s,
             outside=common.outside,
             lidar=common.lidar,
-            facts={
-                "path": job.path.name,
-                "controller": common.controller,
-                "speed_m_s": float(job.speed),
-            },
+            facts=facts,
             network=common.network,
             wanted=self._columns,
             inputs=common.inputs,
@@ -212,8 +237,13 @@ class Runs(Sequence[Run]):
             network=common.network,
         )
 
-    def _course(self, job: Job) -> Course:
-        """The course of a job, without its wheels' errors: planned once for all who drive alike."""
+    def _course(self, job: Job) -> Course | None:
+        """The course of a job, without its wheels' errors: planned once for all who drive alike.
+
+        None where it is not known beforehand: where somebody drives, or a run is driven once more.
+        """
+        if isinstance(job.path, Run):
+            return None
         common, radius = self._conditions, job.scene.robot.footprint_radius_m
         alike = replace(
             job.scene.robot.drive,
@@ -223,9 +253,15 @@ class Runs(Sequence[Run]):
             odometry_scale=(1.0, 1.0),
             odometry_noise_std=0.0,
         )
-        key = (job.path, job.speed, alike, radius)
-        if key not in self._planned:
-            self._planned[key] = course_along(
+        if isinstance(job.path, str):
+            still = course_by([[0.0, 0.0, 0.0]], alike, start=job.scene.start, footprint_radius_m=radius)
+            still.check(common.obstacles)
+            return None
+        key = (job.path, job.speed, alike, radius, job.scene.start)
+        if key in self._planned:
+            return self._planned[key]
+        if isinstance(job.path, Path):
+            course = course_along(
                 job.path,
                 alike,
                 speed=job.speed,
@@ -234,7 +270,17 @@ class Runs(Sequence[Run]):
                 obstacles=common.obstacles,
                 footprint_radius_m=radius,
             )
-        return self._planned[key]
+        else:
+            course = course_by(
+                job.path.rows,
+                alike,
+                start=job.scene.start,
+                duration_s=common.duration_s,
+                footprint_radius_m=radius,
+            )
+            course.check(common.obstacles)
+        self._planned[key] = course
+        return course
 
     @contextmanager
     def _numbered(self, index: int) -> Iterator[None]:
