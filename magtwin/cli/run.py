@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, Seed, announcer, check_suffix, print_report, progress, say
-from magtwin.names import RefusedError
+from magtwin.names import RefusedError, find
 
 if TYPE_CHECKING:
     from threading import Event
@@ -80,6 +80,8 @@ def run(
     *,
     path: str | None = None,
     commands: Path | None = None,
+    robot: str | None = None,
+    meet: Literal["refuse", "flag"] | None = None,
     engine: Literal["kinematic", "newton", "replay"] | None = None,
     replay: Path | None = None,
     controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
@@ -117,10 +119,16 @@ def run(
     path
         sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle,
         curvilinear, curvilinear_2; A to E, the cases of the paper's Table 1; random, a human-like driver
-        who goes where the seed takes them, for a minute or --duration; or a CSV file of x,y [m]. figure8
-        unless given.
+        who goes where the seed takes them, for a minute or --duration; or a CSV file of x,y [m]. Unless
+        given, what the scene says, or else figure8.
     commands
         CSV file of t,v,w [s, m/s, rad/s] to drive by in place of a path, as magtwin drive leaves it.
+    robot
+        Robot, in a scene of several, that --path, --commands or --replay are for, and whose run alone is
+        written; the others drive what the scene says. Unless given, every run is written, under names such
+        as run.NAME.rrd.
+    meet
+        What becomes of robots that run into each other: refuse, unless given, or flag it as a bump.
     engine
         What moves the robot: kinematic (default), newton for physics in the stage itself, or replay.
     replay
@@ -180,12 +188,17 @@ def run(
         Print the summary as JSON.
     """
     from magtwin.files import existing
+    from magtwin.usd.scene import robots_in
 
     existing(scene, "scene")
     given = {"rrd": rrd, "parquet": parquet, "bag": bag, "csv": csv, "usd": usd}
     files = {kind: file for kind, file in given.items() if file is not None}
     if out is None and not files:
         out = Path("run")
+    if viewer:
+        from magtwin.io.live import check_listens
+
+        check_listens(viewer)
     beside = parquet.with_suffix(".scans.parquet") if scans and parquet is not None else None
     targets = [target for target in (out, *files.values(), beside) if target is not None]
     if len({target.resolve() for target in targets}) < len(targets):
@@ -228,6 +241,20 @@ def run(
         "controller": controller,
     }
     wanted = _Outputs(out, files, beside, force=force, units=units, usd_fps=usd_fps)
+    robots = robots_in(scene)
+    if robot is not None:
+        find("robot", robot, robots)
+    if len(robots) > 1:
+        if live or viewer:
+            raise RefusedError(f"--live and --viewer show one robot, and {scene} has {', '.join(robots)}")
+        if robot is None and (path or commands or replay):
+            raise RefusedError(f"which of {', '.join(robots)} is to drive {way}? say it with --robot NAME")
+        _run_together(scene, wanted, robot=robot, path=path, meet=meet, scans=scans, quiet=json, **options)
+        return
+    if meet is not None:
+        raise RefusedError(f"--meet is for several robots, and {scene} has one; drop it")
+    if not (path or commands or replay):
+        way = str(robots[next(iter(robots))] or way)
     shown = _Live(window=live, address=viewer, pace=pace or 1.0) if live or viewer else None
     with ExitStack() as stack:
         written = wanted.begun() if shown else stack.enter_context(wanted.aside())
@@ -329,6 +356,63 @@ def _drive(
     return _Driven(result, twin, planned, seen)
 
 
+def _run_together(
+    scene_file: Path,
+    outputs: "_Outputs",
+    *,
+    robot: str | None,
+    path: str | None,
+    meet: Literal["refuse", "flag"] | None,
+    scans: bool,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Drive the robots of a scene of several, and write a run of each, or of the one that is named."""
+    from magtwin.io.formats import read_run
+    from magtwin.path import Path as Planned
+    from magtwin.path import resolve_path
+    from magtwin.report import Report
+    from magtwin.sim.commands import read_commands
+    from magtwin.twin import led_by, open_twin, scan, simulate_robots
+
+    steps = announcer(quiet=quiet)
+    if options.pop("engine") == "newton":
+        raise RefusedError(
+            f"--engine newton drives one robot by itself, and {scene_file} has several; drop it"
+        )
+    commands, replay = options.pop("commands"), options.pop("replay")
+    twin = open_twin(scene_file, net=options.pop("net"), magnetometer=options.pop("magnetometer"))
+    ways: dict[str, Any] = {one.robot.name: one.path or "figure8" for one in twin.scene.robots}
+    if robot is not None and (commands or replay or path):
+        ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path
+    ways = {n: resolve_path(w) if isinstance(w, str | Path) and w != "random" else w for n, w in ways.items()}
+    names = list(ways) if robot is None else [robot]
+    with ExitStack() as stack:
+        written = {}
+        folder = stack.enter_context(replace(outputs, files={}, scans=None).aside()).folder
+        for name in names:
+            own = outputs if robot else outputs.of_robot(name)
+            own = stack.enter_context(replace(own, folder=None).aside())
+            written[name] = replace(own, folder=folder)
+        steps(f"Driving {', '.join(ways)}")
+        runs = simulate_robots(twin, ways, robots=names, meet=meet or "refuse", **options)
+        for name, run in runs.items():
+            own_twin = led_by(twin, name)
+            seen = scan(own_twin, run, seed=options["seed"]) if scans else None
+            planned = ways[name] if isinstance(ways[name], Planned) else None
+            written[name].write(_Driven(run, own_twin, planned, seen), steps=steps)
+    reports = {name: run.report(name) for name, run in runs.items()}
+    figures = tuple(replace(f, name=f"{n}: {f.name}") for n, r in reports.items() for f in r.figures)
+    print_report(
+        Report(f"{', '.join(names)} in {scene_file}", figures, {n: r.facts for n, r in reports.items()}),
+        quiet,
+    )
+    if not quiet:
+        each = [outputs if robot else outputs.of_robot(name) for name in names]
+        files = [file for own in each for file in (*own.files.values(), own.scans) if file is not None]
+        say("Wrote " + ", ".join(map(str, [*([outputs.folder] if outputs.folder else []), *files])))
+
+
 @dataclass(frozen=True)
 class _Outputs:
     """What is to be written of a run, and where."""
@@ -342,6 +426,13 @@ class _Outputs:
     units: Literal["T", "nT"] | None = None
     usd_fps: float | None = None
     """Frames a second in USD; 0 for one at every reading, none for as many as it has unless told."""
+    robot: str = ""
+    """Name of one robot of several, that goes into the names of files."""
+
+    def of_robot(self, robot: str) -> "_Outputs":
+        """Those of one robot of several: run.NAME.rrd beside run.rrd."""
+        files = {kind: _with_name(file, robot) for kind, file in self.files.items()}
+        return replace(self, files=files, scans=self.scans and _with_name(self.scans, robot), robot=robot)
 
     @contextmanager
     def aside(self) -> Iterator["_Outputs"]:
@@ -389,7 +480,7 @@ class _Outputs:
     def of(self, kind: str) -> list[Path]:
         """Where a kind of file goes."""
         inside = self.folder is not None and kind in ("rrd", "parquet")
-        first = [self.folder / f"run.{kind}"] if inside and self.folder else []
+        first = [_with_name(self.folder / f"run.{kind}", self.robot)] if inside and self.folder else []
         return first + ([self.files[kind]] if kind in self.files else [])
 
     def sinks(self, driven: _Driven) -> list["Sink"]:
@@ -414,7 +505,9 @@ class _Outputs:
         if driven.scans is not None:
             from magtwin.io.scans import write_scans
 
-            inside = [] if self.folder is None else [self.folder / "run.scans.parquet"]
+            inside = (
+                [] if self.folder is None else [_with_name(self.folder / "run.scans.parquet", self.robot)]
+            )
             for target in [*inside, *([] if self.scans is None else [self.scans])]:
                 write_scans(driven.scans, target, force=self.force)
         steps("Writing the run")
@@ -444,10 +537,18 @@ class _Outputs:
             plot_run(
                 driven.run,
                 driven.twin.field,
-                self.folder / "run.png",
+                _with_name(self.folder / "run.png", self.robot),
                 planned=planned.p_xy if planned else None,
                 force=self.force,
             )
+
+
+def _with_name(file: Path, robot: str) -> Path:
+    """A file of one robot of several: run.NAME.scans.parquet for run.scans.parquet; as it is for ""."""
+    if not robot:
+        return file
+    ending = ".scans.parquet" if file.name.endswith(".scans.parquet") else file.suffix
+    return file.with_name(f"{file.name.removesuffix(ending)}.{robot}{ending}")
 
 
 @dataclass(frozen=True)

@@ -120,7 +120,7 @@ class LiveViewer:
         Raises:
             RefusedError: Nothing listens there.
         """
-        _check_listens(address)
+        check_listens(address)
         self._address = address
         self._growing: _Growing | None = _Growing(twin, expected, planned, scans, address=address)
 
@@ -217,8 +217,12 @@ class _Growing:
         return Recording(rec, robot=robot, scans=self._scans)
 
 
-def _check_listens(address: str) -> None:
-    """Refuse an address at which no viewer listens: Rerun itself would wait for it."""
+def check_listens(address: str) -> None:
+    """Refuse an address at which no viewer listens: Rerun itself would wait for one.
+
+    Raises:
+        RefusedError: It is no address of a viewer, or nothing is there.
+    """
     parts = urlsplit(address)
     try:
         if not parts.scheme.startswith("rerun") or not parts.hostname or not parts.port:
