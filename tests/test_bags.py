@@ -12,12 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from numpy.testing import assert_allclose, assert_array_equal
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 import magtwin
+from magtwin.io.bag import yaml_of
 from magtwin.io.cdr import encode, leaves
 from magtwin.io.messages import TOPICS
 from magtwin.io.recorder import partial_of
@@ -182,6 +185,22 @@ def test_metadata_is_laid_out_as_rosbags_lays_it_out(bags, tmp_path, name, stora
     about = ours["rosbag2_bagfile_information"]
     assert about["storage_identifier"] == storage
     assert about["relative_file_paths"] == [p.name for p in (bags / name).iterdir() if p.suffix != ".yaml"]
+
+
+@given(
+    st.recursive(
+        st.none()
+        | st.booleans()
+        | st.integers()
+        | st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"])),
+        lambda inner: st.lists(inner) | st.dictionaries(st.text("ab:- #'\"", min_size=1), inner),
+    )
+)
+def test_metadata_is_yaml_whatever_it_says(content):
+    assert yaml.safe_load(yaml_of({"all": content, "list": [content, {"deep": content, "b": 1}]})) == {
+        "all": content,
+        "list": [content, {"deep": content, "b": 1}],
+    }
 
 
 def test_qualities_of_service_are_read_by_rosbags_as_they_are_meant(bags):

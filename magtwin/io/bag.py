@@ -1,5 +1,7 @@
 """Bag: what the two storages of a rosbag2, MCAP and sqlite3, have in common."""
 
+import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -15,6 +17,9 @@ VERSION = 8
 
 ROOM = 31
 """Bytes before each message of a batch that are a storage's own: the head of a message record of MCAP."""
+
+_PLAIN = re.compile(r"(?!true$|null$|false$)[a-z_]\w{3,}")
+"""Keys that need no quotes in YAML."""
 
 INFINITE = {"sec": 9223372036, "nsec": 854775807}
 """What stands for no limit in a quality of service."""
@@ -142,6 +147,25 @@ def metadata(
         "custom_data": dict(custom) or None,
         "ros_distro": "humble",
     }
+
+
+def yaml_of(content: Mapping[str, Any] | Sequence[Any], indent: str = "") -> str:
+    """Metadata as YAML: a line an entry, every scalar as JSON has it, which YAML has too.
+
+    A hundred times as fast as a library for all of YAML, for it is written at every flush of a recording.
+    """
+    named = isinstance(content, Mapping)
+    lines = []
+    for key, value in content.items() if named else enumerate(content):  # type: ignore[union-attr]
+        word = str(key) if _PLAIN.fullmatch(str(key)) else json.dumps(key, ensure_ascii=False)
+        head = f"{indent}{word}:" if named else f"{indent}-"
+        if not isinstance(value, Mapping | list) or not value:
+            lines.append(f"{head} {json.dumps(value, ensure_ascii=False)}\n")
+        elif named:
+            lines.append(f"{head}\n{yaml_of(value, indent + '  ')}")
+        else:
+            lines.append(f"{head} {yaml_of(value, indent + '  ').lstrip(' ')}")
+    return "".join(lines)
 
 
 def in_time(batches: Sequence[Batch]) -> tuple[Index, NDArray[np.intp]]:

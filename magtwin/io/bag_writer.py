@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 import magtwin
 from magtwin.files import check_free, output
 from magtwin.io.arrow import check_clock, facts_to_json
-from magtwin.io.bag import ROOM, VERSION, Batch, Connection, Tally, metadata
+from magtwin.io.bag import ROOM, VERSION, Batch, Connection, Tally, metadata, yaml_of
 from magtwin.io.cdr import NS, Index, encode, leaves
 from magtwin.io.db3 import Db3Writer
 from magtwin.io.mcap import McapWriter
@@ -337,7 +336,7 @@ class _Sink:
         """Make it whole."""
         self._note()
         if isinstance(self._store, McapWriter):
-            self._store.note("rosbag2", {"serialized_metadata": _yaml(self._metadata())})
+            self._store.note("rosbag2", {"serialized_metadata": yaml_of(self._metadata())})
         self._store.close()
         self._write_metadata()
 
@@ -359,7 +358,7 @@ class _Sink:
     def _note(self) -> None:
         """Keep the metadata in a database itself, as rosbag2 does."""
         if isinstance(self._store, Db3Writer):
-            self._store.note(VERSION, _yaml(self._metadata()))
+            self._store.note(VERSION, yaml_of(self._metadata()))
 
     def _metadata(self) -> dict[str, Any]:
         custom = {FACTS + name: value for name, value in (self._facts or {}).items()}
@@ -369,12 +368,8 @@ class _Sink:
     def _write_metadata(self) -> None:
         if self._folder is not None:
             aside = self._folder / "metadata.yaml.new"
-            aside.write_text(_yaml({"rosbag2_bagfile_information": self._metadata()}), encoding="utf-8")
+            aside.write_text(yaml_of({"rosbag2_bagfile_information": self._metadata()}), encoding="utf-8")
             aside.replace(self._folder / "metadata.yaml")
-
-
-def _yaml(content: dict[str, Any]) -> str:
-    return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=10_000))
 
 
 @cache

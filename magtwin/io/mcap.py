@@ -240,6 +240,8 @@ class McapReader:
             if self._file.read(len(MAGIC)) != MAGIC:
                 raise RefusedError("it does not begin as MCAP does")
             self._scan()
+            if self._chunks and not self.whole:
+                self._chunks[-1][2].clear()  # its index may lack what was not written any more
             if self._chunks and not (self.whole and self._channels):
                 self._learn()
         except BaseException:
