@@ -365,7 +365,7 @@ def simulate_robots(
         way = (paths or {}).get(name, one.path or "figure8")
         ways[name] = resolve_path(way) if way != "random" and isinstance(way, str | FilePath) else way  # type: ignore[assignment]
     wanted = [name for name in placed if robots is None or name in set(robots)]
-    led = {name: _led_by(twin, name) for name in placed}
+    led = {name: led_by(twin, name) for name in placed}
     networks = {name: one.magnetometer for name, one in led.items()}
     runs = simulate_together(
         twin.scene,
@@ -392,8 +392,12 @@ def simulate_robots(
     return runs
 
 
-def _led_by(twin: Twin, name: str) -> Twin:
-    """The twin with another robot of its scene as the first."""
+def led_by(twin: Twin, name: str) -> Twin:
+    """A twin with the robot of that name as the first of its scene, and what runs its magnetometer.
+
+    Raises:
+        RefusedError: No robot is called so, or its weights cannot be used.
+    """
     scene = twin.scene.led_by(name)
     ours, its = twin.scene.robot.magnetometer, scene.robot.magnetometer
     if (its.kind, its.network, its.network_sha256) == (ours.kind, ours.network, ours.network_sha256):

@@ -1,13 +1,18 @@
 """Several robots in one lab: each by numbers of its own, felt by the others, kept from meeting."""
 
+import importlib.util
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from magtwin.cli import main
 from magtwin.field.map import AnomalyMap
 from magtwin.field.sources import dipole_field_nt
+from magtwin.files import shipped
+from magtwin.io.tables import read_parquet
 from magtwin.names import RefusedError
 from magtwin.path import Path
 from magtwin.run import Run
@@ -24,8 +29,9 @@ from magtwin.spec import (
     RobotSpec,
     Scene,
 )
-from magtwin.twin import Twin, simulate_robots
+from magtwin.twin import Twin, scene_from_toml, simulate_robots
 from magtwin.twin import simulate as simulate_one
+from magtwin.usd.scene import author_scene
 
 EARTH_NT = np.array([-2700.0, 24000.0, -38400.0])
 FLAT = AnomalyMap(
@@ -241,3 +247,63 @@ def test_a_scene_drives_all_of_its_robots_the_first_as_by_itself(tmp_path):
     assert not np.allclose(runs["ann"]["battery_v"][:rows], runs["bob"]["battery_v"][:rows])
     with pytest.raises(RefusedError, match="no robot 'an'; did you mean 'ann'"):
         simulate_robots(twin, robots=["an"])
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    """The default lab with two robots that pass each other, on disk."""
+    folder = tmp_path_factory.mktemp("two")
+    for name, text in (("ann", "-0.4,0\n0.4,0\n"), ("bob", "0.4,0.5\n-0.4,0.5\n")):
+        (folder / f"{name}.csv").write_text(text)
+    lab = scene_from_toml(shipped("scenes", "lab.toml"))
+    sensor = replace(lab.robot.magnetometer, kind="physical", network=None, network_sha256="", inputs=())
+    ann, bob = (replace(lab.robot, name=name, magnetometer=sensor) for name in ("ann", "bob"))
+    others = (PlacedRobot(robot=bob, path=folder / "bob.csv"),)
+    return author_scene(replace(lab, robot=ann, path=folder / "ann.csv", others=others), folder / "scene")
+
+
+def test_run_writes_a_file_for_each_robot_and_robot_the_one_to_the_same_bits(two, tmp_path, capsys):
+    main(["run", str(two), "--parquet", str(tmp_path / "r.parquet"), "--rate-hz", "20", "--json"])
+    report = json.loads(capsys.readouterr().out)
+    assert {"ann: duration", "bob: duration"} <= report["figures"].keys()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["r.ann.parquet", "r.bob.parquet"]
+    main(["run", str(two), "--robot", "bob", "--parquet", str(tmp_path / "one.parquet"), "--rate-hz", "20"])
+    whole, one = read_parquet(tmp_path / "r.bob.parquet"), read_parquet(tmp_path / "one.parquet")
+    for name, values in whole.items():
+        assert_array_equal(values, one[name], err_msg=name)
+    assert whole.facts["nearest_robot"] == report["facts"]["bob"]["nearest_robot"] == "ann"
+
+
+def test_meet_flag_lets_robots_drive_through_each_other(two, tmp_path, capsys):
+    (tmp_path / "through.csv").write_text("-0.4,0.5\n0.4,0.5\n")
+    options = ["run", str(two), "--robot", "ann", "--path", str(tmp_path / "through.csv"), "--rate-hz", "20"]
+    out = ["--parquet", str(tmp_path / "r.parquet")]
+    with pytest.raises(SystemExit):
+        main([*options, *out])
+    assert "'ann' and 'bob' would run into each other after" in capsys.readouterr().err
+    assert not (tmp_path / "r.parquet").exists()
+    main([*options, *out, "--meet", "flag"])
+    assert read_parquet(tmp_path / "r.parquet")["flag_bump"].any()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--path", "sine"], "which of ann, bob is to drive sine? say it with --robot NAME"),
+        (["--robot", "bo"], "no robot 'bo'; did you mean 'bob'"),
+        (["--engine", "newton"], "--engine newton drives one robot by itself"),
+        (["--live"], "--live and --viewer show one robot"),
+    ],
+)
+def test_run_refuses_what_goes_with_one_robot(two, options, said, capsys):
+    if "newton" in options and importlib.util.find_spec("newton") is None:
+        pytest.skip("newton is not installed, which is said first")
+    with pytest.raises(SystemExit):
+        main(["run", str(two), *options])
+    assert said in capsys.readouterr().err
+
+
+def test_run_refuses_several_robots_options_where_there_is_one(lab_scene, capsys):
+    with pytest.raises(SystemExit):
+        main(["run", str(lab_scene), "--meet", "flag"])
+    assert "--meet is for several robots" in capsys.readouterr().err

@@ -195,10 +195,6 @@ def run(
     files = {kind: file for kind, file in given.items() if file is not None}
     if out is None and not files:
         out = Path("run")
-    if viewer:
-        from magtwin.io.live import check_listens
-
-        check_listens(viewer)
     beside = parquet.with_suffix(".scans.parquet") if scans and parquet is not None else None
     targets = [target for target in (out, *files.values(), beside) if target is not None]
     if len({target.resolve() for target in targets}) < len(targets):
@@ -215,6 +211,10 @@ def run(
             raise RefusedError(f"--{option} is for {needs}, or drop it")
     if live and viewer:
         raise RefusedError("--live opens a viewer and --viewer names one that is there; give one of them")
+    if viewer:
+        from magtwin.io.live import check_listens
+
+        check_listens(viewer)
     if pace is not None and not pace > 0:
         raise RefusedError(f"--pace must be above 0 simulated seconds a second, got {pace:g}")
     way = _way(path, commands, engine, replay)

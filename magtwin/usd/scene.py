@@ -123,7 +123,7 @@ def read_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> S
     _check_axes(stage, path)
     world = stage.GetPseudoRoot()
     lab = read_lab(only_prim_with(world, "lab"))
-    prims = prims_with(world, "robot") or [only_prim_with(world, "robot")]  # refuses a scene of none
+    prims = prims_with(world, "robot") or [only_prim_with(world, "robot")]  # refuses a stage of none
     prim = prims[0]
     robots = [_placed(prim, check_network) for prim in prims]
     magnetometers = [only_prim_with(prim, "magnetometer") for prim in prims]
@@ -160,6 +160,18 @@ def read_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> S
     if scene.map_layer != Path(path).resolve():  # a flattened stage is its own map, and knows no checksum
         _check_map(scene, f"{place(magnetometers[0])}: ")
     return scene
+
+
+def robots_in(path: str | os.PathLike[str]) -> dict[str, str | Path]:
+    """The names of a stage's robots, in its order, and what each drives unless told otherwise.
+
+    Raises:
+        RefusedError: The file is missing or no stage, or has no robot.
+    """
+    stage = open_stage(path)  # held in a name: a prim does not keep its stage alive
+    root = stage.GetPseudoRoot()
+    prims = prims_with(root, "robot") or [only_prim_with(root, "robot")]  # refuses a stage of none
+    return {prim.GetName(): read_way(prim) for prim in prims}
 
 
 def _placed(prim: Usd.Prim, check_network: bool) -> PlacedRobot:
