@@ -255,9 +255,11 @@ def _own(bag: _Bag) -> Run:
     rows = told[READING.name]
     texts = decode(leaves(TYPES[NAMES.kind]), told[NAMES.name], ["data"])["data"]
     if not texts:
-        return Run({}, bag.facts())
+        raise RefusedError(f"{bag.path}: a recording of which nothing had been written yet")
     table = json.loads(texts[0])
     data = decode(leaves(TYPES[READING.kind]), rows, ["data"])["data"]
+    most = data.shape[1] if len(rows) else int(sum(int(c["width"] or 1) for c in table["columns"]))
+    data = data if len(rows) else np.zeros((0, most))
     unit = Sender(unit=table["unit"]).unit
     carriers = {
         str(c["topic"]): find("topic", str(c["topic"]), TOPICS) for c in table["columns"] if "topic" in c
@@ -275,10 +277,8 @@ def _own(bag: _Bag) -> Run:
         else:
             first = int(column["first"])
             last = first + (1 if width is None else int(width))
-            if not 0 <= first <= last <= data.shape[1]:
-                raise RefusedError(
-                    f"column {name!r} is not in the readings, which have {data.shape[1]} numbers"
-                )
+            if not 0 <= first <= last <= most:
+                raise RefusedError(f"column {name!r} is not in the readings, which have {most} numbers")
             values = data[:, first] if width is None else data[:, first:last]
         dtype = str(column["dtype"])
         if dtype not in _DTYPES:

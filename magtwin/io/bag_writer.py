@@ -429,12 +429,11 @@ class _Stream:
             raise RefusedError(f"rows of a bag must have the same columns, {', '.join(self._columns)}")
         t = self._checked(run)
         stamps = np.rint(t * NS).astype(np.int64)
-        if self._t == -np.inf and len(t):
-            for topic in self._once:
-                fields = topic.write({}, stamps[:1], self._who)
-                if topic is NAMES:
-                    fields = {"data": self._table}
-                yield topic, stamps[:1], _form(topic, fields), fields
+        once, self._once = self._once, []
+        for topic in once:
+            first = stamps[:1] if len(stamps) else np.zeros(1, np.int64)
+            fields = {"data": self._table} if topic is NAMES else topic.write({}, first, self._who)
+            yield topic, first, _form(topic, fields), fields
         for topic in self.topics:
             if topic.needs:
                 rows = self._rows(topic, run, t)
