@@ -207,5 +207,40 @@ def test_a_nodes_variance_is_what_headings_off_the_nominal_ones_leave_in_it(fit)
     mean, variance = model.predict(readings.p_xy, even.yaw)
     error = np.mean((mean - even.b_nt) ** 2)
     assert error > 100
-    assert_allclose(variance, model.noise_nt2)
-    assert error / 3 < model.noise_nt2 < error  # chords over 90 deg are flatter than the cosine, (2 / pi)^2
+    assert model.noise_nt2 == pytest.approx(error, rel=0.05)
+    assert_allclose(variance.mean(), model.noise_nt2, rtol=1e-6)
+    close = np.abs(mean - even.b_nt) <= 2 * np.sqrt(variance)
+    assert close.mean() > 0.95
+
+
+@pytest.mark.parametrize("fit", [fit_trilinear, fit_cubic])
+def test_the_intervals_hold_the_field_itself_at_nodes_and_between_them_whatever_the_noise(fit):
+    def rough(x, y, yaw):
+        return 42_000 + 500 * np.sin(4 * x + 1) * np.cos(3 * y) + 300 * np.cos(yaw)
+
+    rng = np.random.default_rng(3)
+    for noise in (5.0, 150.0):
+        even = grid_survey(rough, rows=15, columns=17)
+        model = fit(even.with_(b_nt=even.b_nt + noise * rng.standard_normal(len(even))))
+        assert np.sqrt(model.noise_nt2) == pytest.approx(noise, rel=0.2)
+        nodes, between = even.p_xy, rng.uniform((-1, -0.75), (3, 2.75), (4000, 2))
+        for p, least in ((nodes, 0.85), (between, 0.8)):
+            yaw = rng.choice(FOUR, len(p))
+            mean, variance = model.predict(p, yaw)
+            inside = np.mean(np.abs(mean - rough(*p.T, yaw)) <= 1.645 * np.sqrt(variance))
+            assert least <= inside <= 0.99, (noise, inside)
+
+
+@pytest.mark.parametrize("fit", [fit_trilinear, fit_cubic])
+def test_places_of_scattered_readings_err_as_the_readings_of_the_runs_through_them(fit):
+    rng = np.random.default_rng(4)
+    runs, count = 4, 600
+    p = rng.uniform((-1, -0.75), (1, 0.75), (count, 2))
+    p, run = np.tile(p, (runs, 1)), np.repeat(np.arange(runs), count)
+    b = linear(*p.T, 0.0) + 100 * rng.standard_normal(len(p))
+    model = fit(Readings(p_xy=p, yaw=np.zeros(len(p)), b_nt=b, run=run, runs=tuple("abcd"), name="made"))
+    assert np.sqrt(model.noise_nt2) == pytest.approx(100, rel=0.25)
+    mean, variance = model.predict(model.p_xy, 0.0)
+    assert variance.mean() == pytest.approx(model.noise_nt2 / runs / np.sum(model.b_nt > 0) * count, rel=0.25)
+    inside = np.abs(mean - linear(*model.p_xy.T, 0.0)) <= 1.645 * np.sqrt(variance)
+    assert 0.85 <= inside.mean() <= 0.99

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.bins import Bins, bin_readings, spacing_m
+from magtwin.field.errors import node_errors
 from magtwin.field.grid import TURN, Grid
 from magtwin.field.readings import Readings
 from magtwin.field.roughness import Roughness
@@ -50,7 +51,9 @@ def fit_trilinear(readings: Readings, *, fill: bool = False) -> "GridInterpolati
             that touch such a node are unknown.
 
     Returns:
-        The model; its variance is that of readings left out in turn (`Roughness`).
+        The model. Its variance is what places that were left out in turn show interpolation to miss
+        (`Roughness`), and at the nodes, and between them by the weights, that of a reading
+        (`magtwin.field.errors`); of a scattered survey, that of the readings of one place.
 
     Raises:
         RefusedError: There are fewer than four good readings, they lie on one line, or are all the same.
@@ -100,7 +103,7 @@ class GridInterpolation:
     """Figures of the fit."""
 
     noise_nt2: float
-    """Variance that headings off the nominal ones give a reading about the nodes' value [nT^2]."""
+    """Variance of a reading about the field of its node, mean over the survey [nT^2]."""
 
     grid: Grid
     """The nodes."""
@@ -111,8 +114,11 @@ class GridInterpolation:
     known: Flags
     """Nodes that were read, or filled, shape (H, Y, X)."""
 
+    node_nt2: Array
+    """Variance of the value of each node [nT^2], shape (H, Y, X)."""
+
     roughness: Roughness
-    """What the variance is made of."""
+    """How far interpolation is from the field between nodes."""
 
     turned_nt2: float
     """Mean square by which leaving out a heading misses it [nT^2]."""
@@ -132,9 +138,10 @@ class GridInterpolation:
         part, angle = u - low, np.where(inside, angle, 0.0)
         linear, between = _heading_weights(self.grid.headings_rad, angle)
         weights = _periodic_cubic(self.grid.headings_rad, angle) if self.method == "cubic" else linear
-        mean, unknown = np.zeros(len(p)), np.zeros(len(p))
+        mean, unknown, nodes = np.zeros(len(p)), np.zeros(len(p)), np.zeros(len(p))
         splines = self._splines() if self.method == "cubic" else None
         for h, (layer, known) in enumerate(zip(self.values_nt, self.known, strict=True)):
+            nodes += weights[:, h] ** 2 * _bilinear(self.node_nt2[h], low, part, squared=True)
             unknown += np.abs(weights[:, h]) * _bilinear((~known).astype(float), low, part)
             if splines is None:
                 mean += weights[:, h] * _bilinear(layer, low, part)
@@ -142,7 +149,9 @@ class GridInterpolation:
                 mean += weights[:, h] * splines[h].ev(u[:, 1], u[:, 0])
         at = np.where(inside[:, None], p, self.grid.origin_m)
         variance = self.roughness.variance_nt2(at) + (between * (1 - between)) ** 2 * self.turned_nt2
-        variance += self.noise_nt2  # a node's value is a reading, and errs as one
+        if splines is not None:
+            nodes *= np.prod(_cubic_share(part), axis=1)
+        variance += nodes  # a node's value is a reading, and errs as one
         hole = ~inside | (unknown > EDGE)
         mean[hole] = variance[hole] = np.nan
         return mean.reshape(shape), variance.reshape(shape)
@@ -174,11 +183,14 @@ class ScatterInterpolation:
     b_nt: Array
     """Its values there [nT], shape (M,)."""
 
+    place_nt2: Array
+    """Variance of these values [nT^2], shape (M,)."""
+
     wave_nt: Array
     """Coefficients of cos yaw, sin yaw, cos 2 yaw, sin 2 yaw [nT], shape (4,)."""
 
     roughness: Roughness
-    """What the variance is made of."""
+    """How far interpolation is from the field between these places."""
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field [nT] and its variance [nT^2] at poses; nan outside the convex hull of the readings.
@@ -190,7 +202,7 @@ class ScatterInterpolation:
         finite = np.all(np.isfinite(p), axis=1)
         at = np.where(finite[:, None], p, self.p_xy[0])
         mean = _triangles(order)(self.p_xy, self.b_nt, at) + _waves(angle) @ self.wave_nt
-        variance = self.roughness.variance_nt2(at)
+        variance = self.roughness.variance_nt2(at) + self.place_nt2[self.roughness.tree.query(at)[1]]
         mean[~finite] = np.nan
         variance[~np.isfinite(mean)] = np.nan
         return mean.reshape(shape), variance.reshape(shape)
@@ -237,27 +249,30 @@ def _fit_gridded(readings: Readings, grid: Grid, order: Order, fill: bool) -> Gr
         known[h] = np.isfinite(filled[h])
         if order == "cubic":  # the spline needs a whole grid: beyond the hull, the nearest value
             filled[h][~known[h]] = _nearest(places[known[h]], filled[h][known[h]], places[~known[h]])
+    errors = node_errors(readings, grid, np.where(known, filled, np.nan), read)
+    node_nt2 = np.where(read, errors.variance_nt2 / np.maximum(count, 1), errors.mean_nt2)
     known = known if fill else read
     filled = np.where(np.isfinite(filled), filled, 0.0)
     parts = [
-        Roughness.of(places[there], values[h][there], min(grid.cell_m), between)
+        Roughness.of(places[there], values[h][there], node_nt2[h][there], min(grid.cell_m), between)
         for h, there in enumerate(read)
     ]
-    noise, turned = _heading_errors(readings, grid, filled, read)
     return GridInterpolation(
         method="trilinear" if order == "linear" else "cubic",
         parameters={
             "nodes": count.size,
             "nodes_read": int(read.sum()),
             "nodes_filled": int((known & ~read).sum()),
-            "noise_nt": round(float(np.sqrt(noise)), 3),
+            "noise_nt": round(float(np.sqrt(errors.mean_nt2)), 3),
+            f"place_error_m_{'told' if errors.told else 'assumed'}": round(errors.place_m, 5),
         },
-        noise_nt2=noise,
+        noise_nt2=errors.mean_nt2,
         grid=grid,
         values_nt=filled,
         known=known,
+        node_nt2=node_nt2,
         roughness=Roughness.joined(parts),
-        turned_nt2=turned,
+        turned_nt2=_turned_nt2(grid, filled, read),
     )
 
 
@@ -270,24 +285,17 @@ def _check_layer(grid: Grid, h: int, places: Array) -> None:
     )
 
 
-def _heading_errors(readings: Readings, grid: Grid, values: Array, read: Flags) -> tuple[float, float]:
-    """Mean square [nT^2] of what turning off the nominal heading changes, and of leaving a heading out."""
+def _turned_nt2(grid: Grid, values: Array, read: Flags) -> float:
+    """Mean square by which the two headings beside one miss it [nT^2]."""
     headings = np.asarray(grid.headings_rad)
-    if len(headings) < 3:
-        return 0.0, 0.0
+    whole = read & np.roll(read, 1, axis=0) & np.roll(read, -1, axis=0)
+    if len(headings) < 3 or not whole.any():
+        return 0.0
     before, after = np.roll(values, 1, axis=0), np.roll(values, -1, axis=0)
     gap0 = np.mod(headings - np.roll(headings, 1), TURN)[:, None, None]
     gap1 = np.mod(np.roll(headings, -1) - headings, TURN)[:, None, None]
-    whole = read & np.roll(read, 1, axis=0) & np.roll(read, -1, axis=0)
-    if not whole.any():
-        return 0.0, 0.0
-    slope = (after - before) / (gap0 + gap1)
     chord = (before * gap1 + after * gap0) / (gap0 + gap1)
-    node = np.asarray(readings.node)
-    off = np.angle(np.exp(1j * (readings.yaw - headings[node[:, 0]])))
-    used = readings.good & whole[tuple(node.T)]
-    noise = float(np.mean((slope[tuple(node[used].T)] * off[used]) ** 2)) if used.any() else 0.0
-    return noise, float(np.mean((chord - values)[whole] ** 2))
+    return float(np.mean((chord - values)[whole] ** 2))
 
 
 def _heading_weights(headings_rad: tuple[float, ...], yaw: Array) -> tuple[Array, Array]:
@@ -320,12 +328,25 @@ def _periodic_cubic(headings_rad: tuple[float, ...], yaw: Array) -> Array:
     return np.where(np.abs(weights) < EDGE, 0.0, weights)
 
 
-def _bilinear(layer: Array, low: NDArray[np.intp], part: Array) -> Array:
-    """Bilinear sums; exact at nodes."""
+def _bilinear(layer: Array, low: NDArray[np.intp], part: Array, *, squared: bool = False) -> Array:
+    """Bilinear sums, exact at nodes; with the weights squared, as variances add up."""
     (i, j), (u, v) = low.T, part.T
-    lower = layer[j, i] * (1 - u) + layer[j, i + 1] * u
-    upper = layer[j + 1, i] * (1 - u) + layer[j + 1, i + 1] * u
-    return np.asarray(lower * (1 - v) + upper * v)
+    left, right, below, above = (w * w if squared else w for w in (1 - u, u, 1 - v, v))
+    lower = layer[j, i] * left + layer[j, i + 1] * right
+    upper = layer[j + 1, i] * left + layer[j + 1, i + 1] * right
+    return np.asarray(lower * below + upper * above)
+
+
+def _cubic_share(part: Array) -> Array:
+    """Sum of the squared weights of the cubic through four nodes in a row, over that of the line through two."""
+    t = part
+    weights = (
+        -t * (t - 1) * (t - 2) / 6,
+        (t + 1) * (t - 1) * (t - 2) / 2,
+        -(t + 1) * t * (t - 2) / 2,
+        (t + 1) * t * (t - 1) / 6,
+    )
+    return np.asarray(sum(w * w for w in weights) / ((1 - t) ** 2 + t**2))
 
 
 def _fit_scattered(readings: Readings, order: Order) -> ScatterInterpolation:
@@ -333,7 +354,7 @@ def _fit_scattered(readings: Readings, order: Order) -> ScatterInterpolation:
     cell = spacing / BINS_A_SPACING
     wave = _wave(readings, spacing)
     still = readings.b_nt - _waves(readings.yaw) @ wave
-    bins, within = _binned(readings, still, cell)
+    bins, noise, place_nt2 = _binned(readings, still, cell)
     between = _triangles(order)
     return ScatterInterpolation(
         method="trilinear" if order == "linear" else "cubic",
@@ -342,18 +363,23 @@ def _fit_scattered(readings: Readings, order: Order) -> ScatterInterpolation:
             "places": len(bins.p_xy),
             "bin_m": cell,
             "wave_nt": wave.tolist(),
-            "noise_nt": round(float(np.sqrt(within)), 3),
+            "noise_nt": round(float(np.sqrt(noise)), 3),
         },
-        noise_nt2=within,
+        noise_nt2=noise,
         p_xy=bins.p_xy,
         b_nt=bins.b_nt,
+        place_nt2=place_nt2,
         wave_nt=wave,
-        roughness=Roughness.of(bins.p_xy, bins.b_nt, spacing, between),
+        roughness=Roughness.of(bins.p_xy, bins.b_nt, place_nt2, spacing, between),
     )
 
 
-def _binned(readings: Readings, still: Array, cell_m: float) -> tuple[Bins, float]:
-    """Bins of what depends on the place; variance of readings of a run in a bin, and of runs [nT^2]."""
+def _binned(readings: Readings, still: Array, cell_m: float) -> tuple[Bins, float, Array]:
+    """Bins of what depends on the place; variance of a reading, and of the mean of each bin [nT^2].
+
+    A run's readings in a bin vary by w about their mean, and runs' means by r beside w over their number:
+    a reading's variance is w + r. Where no two runs met, r is unknown, and a bin is no surer than a reading.
+    """
     bins, index = bin_readings(readings, cell_m)
     rows = np.flatnonzero(readings.good)
     mean = np.bincount(index, still[rows]) / bins.count
@@ -363,11 +389,14 @@ def _binned(readings: Readings, still: Array, cell_m: float) -> tuple[Bins, floa
     within = float(np.sum((still[rows] - means[own]) ** 2) / freedom) if freedom else 0.0
     place = np.zeros(len(means), np.intp)
     place[own] = index
-    visits = np.bincount(place)
-    middle = np.bincount(place, means) / visits
-    freedom = len(means) - len(visits)
-    between = float(np.sum((means - middle[place]) ** 2) / freedom) if freedom else 0.0
-    return replace(bins, b_nt=mean), within + between
+    runs = np.bincount(place)
+    freedom = len(means) - len(runs)
+    if not freedom:
+        return replace(bins, b_nt=mean), within, np.full(len(runs), within)
+    middle, several = np.bincount(place, means) / runs, runs[place] > 1
+    found = float(np.sum((means - middle[place]) ** 2) / freedom)
+    between = max(found - within * float(np.mean(1 / apart.count[several])), 0.0)
+    return replace(bins, b_nt=mean), within + between, between / runs + within / bins.count
 
 
 def _wave(readings: Readings, cell_m: float) -> Array:

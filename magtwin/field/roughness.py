@@ -31,7 +31,7 @@ class Roughness:
     (de Boor 1978, chapter 3). So the variance at a point is the mean square of the residuals around it,
     times (d g)^2 there over (d g)^2 where they were left out, with d the distance to the nearest
     reading and g = max(cell - d, d) the way on to the next. Residuals have tails, so that the
-    whole is scaled until nine in ten of them lie in their own 90 % intervals.
+    whole is scaled until nine in ten of them lie in their own 90 % intervals, the readings' errors included.
     """
 
     tree: Any
@@ -41,20 +41,29 @@ class Roughness:
     """Places of the residuals, a scipy cKDTree."""
 
     scaled: Array
-    """Squared residual over (d g)^2 [nT^2 / m^4], shape (R,)."""
+    """Squared residual less the readings' own errors, over (d g)^2 [nT^2 / m^4], shape (R,)."""
 
     cell_m: float
     """Distance between readings, as a rule [m]."""
 
     @classmethod
     def of(
-        cls, p_xy: Array, b_nt: Array, cell_m: float, interpolate: Callable[[Array, Array, Array], Array]
+        cls,
+        p_xy: Array,
+        b_nt: Array,
+        noise_nt2: Array,
+        cell_m: float,
+        interpolate: Callable[[Array, Array, Array], Array],
     ) -> "Roughness":
         """Leave out each fifth of the places in turn, and see how well the rest tells it.
+
+        A residual has the errors of what was left out and of what tells it, which are no roughness: of a
+        place told by those on either side of it, half as much again as its own.
 
         Args:
             p_xy: Places of readings [m], shape (N, 2).
             b_nt: What was read there [nT], shape (N,).
+            noise_nt2: Variance of it [nT^2], shape (N,).
             cell_m: Side of the cells that are left out [m].
             interpolate: Gives values at places (third) from places (first) and values (second); nan outside.
         """
@@ -62,19 +71,20 @@ class Roughness:
 
         cell = np.floor((p_xy - p_xy.min(axis=0)) / cell_m + 0.5).astype(np.int64)
         part = (cell[:, 0] + 2 * cell[:, 1]) % FOLDS
-        scaled = np.full(len(p_xy), np.nan)
+        square, away = np.full(len(p_xy), np.nan), np.full(len(p_xy), np.nan)
         for k in range(FOLDS):
             out, kept = part == k, part != k
             if not out.any() or np.count_nonzero(kept) < 3:
                 continue
-            residual = b_nt[out] - interpolate(p_xy[kept], b_nt[kept], p_xy[out])
-            distance = np.maximum(cKDTree(p_xy[kept]).query(p_xy[out])[0], cell_m / 2)
-            scaled[out] = residual**2 / _between(distance, cell_m)
-        known = np.isfinite(scaled)
+            square[out] = (b_nt[out] - interpolate(p_xy[kept], b_nt[kept], p_xy[out])) ** 2
+            away[out] = _between(np.maximum(cKDTree(p_xy[kept]).query(p_xy[out])[0], cell_m / 2), cell_m)
+        known = np.isfinite(square)
         if not known.any():
-            return cls(cKDTree(p_xy), None, scaled[known], cell_m)
-        left_out, scaled = cKDTree(p_xy[known]), scaled[known]
-        return cls(cKDTree(p_xy), left_out, scaled * tail(left_out, scaled, scaled), cell_m)
+            return cls(cKDTree(p_xy), None, square[known], cell_m)
+        left_out, square, away, noise = cKDTree(p_xy[known]), square[known], away[known], noise_nt2[known]
+        scaled = (square - 1.5 * noise) / away
+        rough = np.maximum(local_mean(left_out, scaled, left_out.data, skip=1) * away, 0)
+        return cls(cKDTree(p_xy), left_out, scaled * _stretch(square, rough, 1.5 * noise), cell_m)
 
     @classmethod
     def joined(cls, parts: "Sequence[Roughness]") -> "Roughness":
@@ -92,7 +102,7 @@ class Roughness:
         if self.left_out is None:
             return np.full(p.shape[:-1], np.nan)
         away = _between(self.tree.query(p)[0], self.cell_m)
-        return np.asarray(local_mean(self.left_out, self.scaled, p) * away)
+        return np.asarray(np.maximum(local_mean(self.left_out, self.scaled, p), 0) * away)
 
 
 def _between(d: Array, cell_m: float) -> Array:
@@ -114,6 +124,17 @@ def local_mean(tree: Any, squares: Array, p_xy: Array, *, skip: int = 0) -> Arra
         return np.full(p_xy.shape[:-1], squares.mean())
     _, near = tree.query(p_xy, k=[*range(1 + skip, count + skip + 1)])
     return np.asarray((squares[near].sum(axis=-1) + PRIOR * squares.mean()) / (count + PRIOR))
+
+
+def _stretch(square: Array, rough: Array, noise: Array) -> float:
+    """Factor on `rough` with which nine in ten squares lie in the 90 % intervals of it and noise."""
+    known = rough > 0
+    if not known.any():
+        return 1.0
+    factor = (square[known] / NINETY**2 - noise[known]) / rough[known]
+    missed = np.count_nonzero(square[~known] > NINETY**2 * noise[~known])  # whatever the factor
+    inside = (0.9 * len(square) - (np.count_nonzero(~known) - missed)) / np.count_nonzero(known)
+    return max(float(np.quantile(factor, min(max(inside, 0.0), 1.0))), 0.0)
 
 
 def tail(tree: Any, squares: Array, each: Array, place: NDArray[np.intp] | None = None) -> float:
