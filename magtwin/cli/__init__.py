@@ -1,6 +1,20 @@
 """The command line: one typed function a subcommand, a module a noun, nothing else."""
 
-from magtwin.cli import compare, compensate, drive, file, map, net, report, rerun_of, robot, run, runs, scene  # noqa: A004, F401 - each registers its commands
+from magtwin.cli import (  # noqa: F401 - each registers its commands
+    compare,
+    compensate,
+    drive,
+    file,
+    map,  # noqa: A004
+    net,
+    picture,
+    report,
+    rerun_of,
+    robot,
+    run,
+    runs,
+    scene,
+)
 from magtwin.cli.app import main
 
 __all__ = ["main"]

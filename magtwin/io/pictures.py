@@ -34,6 +34,18 @@ BACKGROUND = "#e9edf1"
 INK = "#20262d"
 
 
+LIGHTS = (
+    ((0.6, 0.9, 1.4), 0.75),
+    ((0.9, -1.0, 0.5), 0.45),
+    ((-0.9, 0.2, 0.6), 0.4),
+    ((0.1, 0.0, -1.0), 0.3),
+)
+"""Direction that light comes from, in world, and its strength."""
+
+AMBIENT, DIFFUSE = 0.22, 0.8
+"""Shares of a thing's colour that it shows in no light, and in light that meets it upright."""
+
+
 @dataclass(frozen=True)
 class Camera:
     """Where a picture is taken from."""
@@ -93,11 +105,8 @@ def picture_of_stage(
         RefusedError: The stage is missing, is not USD or shows nothing; `out` is no PNG or is there
             already; or this machine has nothing to draw with (the packages are named).
     """
-    out = Path(out)
-    if out.suffix.lower() != ".png":
-        raise RefusedError(f"{out}: pictures are PNG; give it the suffix .png")
-    if not (min(size) >= 16 and max(size) <= 16384):
-        raise RefusedError(f"size must lie in 16..16384 pixels each way, got {size[0]} x {size[1]}")
+    out = check_png(out)
+    check_size(size)
     with output(out, force=force) as aside:
         plotter = plotter_of(size)
         try:
@@ -228,21 +237,69 @@ def _loads(*names: str) -> bool:
     return False
 
 
-def _add(plotter: Any, shape: Shape, vertices: NDArray) -> None:
-    """One shape in its colours, shaded smooth but for its creases."""
+def check_png(out: str | os.PathLike[str]) -> Path:
+    """`out` if it is named as a PNG."""
+    out = Path(out)
+    if out.suffix.lower() != ".png":
+        raise RefusedError(f"{out}: pictures are PNG; give it the suffix .png")
+    return out
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """Refuse a size that cannot be drawn."""
+    if not (min(size) >= 16 and max(size) <= 16384):
+        raise RefusedError(f"size must lie in 16..16384 pixels each way, got {size[0]} x {size[1]}")
+
+
+def write_png(image: NDArray[np.uint8], path: Path) -> None:
+    """Write an image, shape (height, width, 3)."""
+    from PIL import Image
+
+    Image.fromarray(image).save(path, format="png", optimize=True)
+
+
+def style_of(flat: bool) -> dict[str, Any]:
+    """How a mesh of `mesh_of` is shaded; a map's colours mean numbers, so light must not change them."""
+    lit = {
+        "ambient": AMBIENT,
+        "diffuse": DIFFUSE,
+        "specular": 0.25,
+        "specular_power": 25,
+        "smooth_shading": True,
+    }
+    return {"scalars": "rgb", "rgb": True, **({"lighting": False} if flat else lit)}
+
+
+def mesh_of(shape: Shape, vertices: NDArray) -> Any:
+    """A shape as a mesh with its colours at its points, and normals for shading unless a map's."""
     import pyvista
 
-    mesh = pyvista.PolyData.from_regular_faces(vertices.astype(np.float32), shape.faces)
-    style: dict[str, Any] = {"ambient": 0.22, "diffuse": 0.8, "specular": 0.25, "specular_power": 25}
-    if shape.vertex_colours is not None:  # a map's colours mean numbers: light must not change them
-        colours = (255 * srgb_from_linear(shape.vertex_colours)).round().astype(np.uint8)
-        style = {"scalars": colours, "rgb": True, "lighting": False}
-    else:
-        style["color"] = tuple(srgb_from_linear(shape.colour[:3]))
-        mesh = mesh.compute_normals(
-            cell_normals=False, split_vertices=True, feature_angle=35, consistent_normals=False
-        )
-    plotter.add_mesh(mesh, opacity=shape.colour[3], smooth_shading=shape.vertex_colours is None, **style)
+    mesh = pyvista.PolyData.from_regular_faces(np.asarray(vertices, np.float32), shape.faces)
+    if shape.vertex_colours is not None:
+        mesh["rgb"] = (255 * srgb_from_linear(shape.vertex_colours)).round().astype(np.uint8)
+        return mesh
+    mesh = mesh.compute_normals(
+        cell_normals=False, split_vertices=True, feature_angle=35, consistent_normals=False
+    )
+    colour = (255 * np.array(srgb_from_linear(shape.colour[:3]))).round().astype(np.uint8)
+    mesh["rgb"] = np.tile(colour, (mesh.n_points, 1))
+    return mesh
+
+
+def bake(mesh: Any) -> None:
+    """Put the light of `LIGHTS` into the colours of what does not move, which is then drawn without any."""
+    normals = np.asarray(mesh.point_data.active_normals, float)
+    shade = np.full(len(normals), AMBIENT)
+    for direction, strength in LIGHTS:
+        towards = np.array(direction) / np.linalg.norm(direction)
+        shade += DIFFUSE * strength * np.maximum(normals @ towards, 0.0)
+    mesh["rgb"] = np.minimum(mesh["rgb"] * shade[:, None], 255).round().astype(np.uint8)
+
+
+def _add(plotter: Any, shape: Shape, vertices: NDArray) -> None:
+    """One shape in its colours, shaded smooth but for its creases."""
+    flat = shape.vertex_colours is not None
+    plotter.add_mesh(mesh_of(shape, vertices), opacity=shape.colour[3], **style_of(flat))
 
 
 def _add_ground(plotter: Any, everything: NDArray) -> None:
@@ -256,24 +313,20 @@ def _add_ground(plotter: Any, everything: NDArray) -> None:
     plotter.add_mesh(floor, color=BACKGROUND, ambient=1.0, diffuse=0.0, specular=0.0)
 
 
-def light(plotter: Any, everything: NDArray) -> None:
-    """Light from four sides, the strongest from the upper left, and soft shadow in corners."""
+def light(plotter: Any, everything: NDArray, *, soft: bool = True) -> None:
+    """Light from four sides, the strongest from the upper left, and soft shadow in corners if wanted."""
     import pyvista
 
     middle = everything.mean(axis=0)
     reach = float(np.linalg.norm(np.ptp(everything, axis=0)))
-    for direction, strength in (
-        ((0.6, 0.9, 1.4), 0.75),
-        ((0.9, -1.0, 0.5), 0.45),
-        ((-0.9, 0.2, 0.6), 0.4),
-        ((0.1, 0.0, -1.0), 0.3),
-    ):
+    for direction, strength in LIGHTS:
         light = pyvista.Light(
             position=middle + 3 * reach * np.array(direction), focal_point=middle, intensity=strength
         )
         light.positional = False
         plotter.add_light(light)
-    plotter.enable_ssao(radius=0.08 * reach, bias=0.002 * reach, kernel_size=64, blur=True)
+    if soft:
+        plotter.enable_ssao(radius=0.08 * reach, bias=0.002 * reach, kernel_size=64, blur=True)
 
 
 def aim(plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int]) -> None:
@@ -314,4 +367,9 @@ def add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: 
         fmt="%.1f",
         color=INK,
     )
+    bar.DrawBackgroundOn()  # so that it can be read before anything
+    bar.GetBackgroundProperty().SetColor(pyvista.Color(BACKGROUND).float_rgb)
+    bar.GetBackgroundProperty().SetOpacity(0.7)
+    bar.GetTitleTextProperty().SetBackgroundColor(pyvista.Color(BACKGROUND).float_rgb)
+    bar.GetTitleTextProperty().SetBackgroundOpacity(0.7)
     bar.SetVerticalTitleSeparation(round(plotter.window_size[1] / 60))  # else it touches the top number

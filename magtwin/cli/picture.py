@@ -1,0 +1,151 @@
+"""`magtwin picture` and `magtwin film`: a run, or a stage, to look at."""
+
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, announcer, progress, say
+from magtwin.names import RefusedError
+
+if TYPE_CHECKING:
+    from magtwin.run import Run
+
+STAGES = (".usd", ".usda", ".usdc", ".usdz")
+
+
+@app.command
+def picture(
+    file: Path,
+    *,
+    out: Path,
+    camera: str | None = None,
+    at: Annotated[float | None, Parameter(name="--time")] = None,
+    size: str = "1600x1000",
+    scene: Path | None = None,
+    force: Force = False,
+) -> None:
+    """Draw a moment of a run in its lab, or a stage as it stands.
+
+    Parameters
+    ----------
+    file
+        A run, in any format that magtwin reads, or a stage.
+    out
+        PNG to write.
+    camera
+        orbit, from above at a slant; top, straight from above; chase, from behind the robot; or
+        x,y,z:x,y,z, from where to where in metres. orbit unless given.
+    at
+        Moment of a run [s]; its end unless given.
+    size
+        Width and height in pixels.
+    scene
+        Where the scene of a run lies; looked for where the run says unless given.
+    force
+        Replace what exists.
+    """
+    from magtwin.files import check_free, existing
+    from magtwin.io.pictures import check_png
+
+    existing(file, "run or stage")
+    check_free(check_png(out), force=force)
+    pixels, steps = _size(size), announcer(quiet=False)
+    if file.suffix in STAGES and at is None and scene is None:
+        from magtwin.io.pictures import picture_of_stage
+        from magtwin.io.scenery import View
+
+        if camera == "chase":
+            raise RefusedError(f"{file}: a stage as it stands has nothing to follow; take another camera")
+        steps("Drawing the stage")
+        seen = None if camera is None else View.of(camera).camera()
+        picture_of_stage(file, out, size=pixels, camera=seen, force=force)
+    else:
+        from magtwin.io.scenery import picture_of_run
+
+        run, stage = _run_and_scene(file, scene)
+        steps("Drawing the run")
+        picture_of_run(run, stage, out, time_s=at, camera=camera or "orbit", size=pixels, force=force)
+    say(f"Wrote {out}")
+
+
+@app.command
+def film(
+    file: Path,
+    *,
+    out: Path,
+    camera: str = "orbit",
+    fps: float = 25.0,
+    speed: float | None = None,
+    size: str | None = None,
+    scene: Path | None = None,
+    force: Force = False,
+) -> None:
+    """Draw a run in its lab as a film.
+
+    Parameters
+    ----------
+    file
+        A run, in any format that magtwin reads.
+    out
+        MP4 or GIF to write.
+    camera
+        orbit, going slowly round the lab; top, straight from above; chase, from behind the robot; or
+        x,y,z:x,y,z, from where to where in metres.
+    fps
+        Frames a second.
+    speed
+        How many times faster it is shown than it happened; as it happened unless given, and what lasts longer
+        than 30 s in 30 s.
+    size
+        Width and height in pixels; 1280x720, of a GIF 640x360, unless given.
+    scene
+        Where the scene of the run lies; looked for where the run says unless given.
+    force
+        Replace what exists.
+    """
+    from magtwin.files import check_free, existing
+    from magtwin.io.films import film_of_run
+
+    existing(file, "run")
+    check_free(out, force=force)
+    pixels = None if size is None else _size(size)
+    run, stage = _run_and_scene(file, scene)
+    start = time.monotonic()
+    with progress("Drawing frames") as advance:
+        film_of_run(
+            run,
+            stage,
+            out,
+            fps=fps,
+            speed=speed,
+            camera=camera,
+            size=pixels,
+            force=force,
+            advance=lambda k, n: advance(k, n, f"{k / (time.monotonic() - start):.3g} frames/s"),
+        )
+    say(f"Wrote {out}")
+
+
+def _run_and_scene(file: Path, scene: Path | None) -> "tuple[Run, Path]":
+    """A run and the stage that it happened in; says so where that has changed since."""
+    from magtwin.io.formats import read_run
+    from magtwin.twin import scene_of
+    from magtwin.usd.layers import stage_sha256
+
+    run = read_run(file)
+    stage = scene_of(run, scene, near=file)
+    if "scene_sha256" in run.facts and run.facts["scene_sha256"] != stage_sha256(stage):
+        print(f"  {stage} has changed since the run; it is drawn as it is now", file=sys.stderr)  # noqa: T201
+    return run, stage
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Width and height from WxH."""
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and len(text) < 20):
+        raise RefusedError(f"size is WIDTHxHEIGHT in pixels, such as 1280x720; got {text!r}")
+    return int(width), int(height)
