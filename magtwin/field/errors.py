@@ -55,11 +55,12 @@ def node_errors(readings: Readings, grid: Grid, values_nt: Array, read: Flags) -
     readings tell dB/dyaw.
 
     Two headings or more tell the rest: what is left of a node's readings beside what they have in common
-    (from four headings on beside a wave too, from six beside two) has the errors of single readings in full,
-    and of the field only its heading dependence, which is smooth over the floor. So its second differences along rows and columns, (c_- - 2 c + c_+) / sqrt(6), have
-    the variance s^2 + p^2 |grad B|^2 of a reading with noise s, taken p off its node; s and p are fitted to
-    their squares, none below 0. Of simulated surveys p comes out within a tenth. With one
-    heading nothing tells errors from the field's own bends, and p is taken to be a centimetre.
+    (from four headings on beside a wave too, from six beside two) has the errors of single readings in
+    full, and of the field only its heading dependence, which is smooth over the floor. So its second
+    differences along rows and columns, (c_- - 2 c + c_+) / sqrt(6), have the variance s^2 + p^2 |grad B|^2 of
+    a reading with noise s, taken p off its node; s and p are fitted to their squares, none below 0. Of
+    simulated surveys p comes out within a tenth. With one heading nothing tells errors from the
+    field's own bends, and p is taken to be a centimetre.
 
     Args:
         readings: A gridded survey.
@@ -119,7 +120,7 @@ def _deviation(readings: Readings, grid: Grid) -> Array:
 def _steepness(grid: Grid, values: Array) -> Array:
     """Squared gradient of the magnitude over the floor, median over headings [nT^2/m^2], shape (Y, X)."""
     along_y, along_x = np.gradient(values, grid.cell_m[1], grid.cell_m[0], axis=(1, 2))
-    square = along_x**2 + along_y**2
+    square: Array = np.asarray(along_x**2 + along_y**2, float)
     known = np.isfinite(square)
     mean = square[known].mean() if known.any() else 0.0
     square[:, ~known.any(axis=0)] = mean

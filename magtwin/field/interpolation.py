@@ -338,7 +338,7 @@ def _bilinear(layer: Array, low: NDArray[np.intp], part: Array, *, squared: bool
 
 
 def _cubic_share(part: Array) -> Array:
-    """Sum of the squared weights of the cubic through four nodes in a row, over that of the line through two."""
+    """Sum of squared weights of the cubic through four nodes in a row, over that of the line through two."""
     t = part
     weights = (
         -t * (t - 1) * (t - 2) / 6,
