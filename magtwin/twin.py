@@ -17,7 +17,7 @@ from magtwin.names import RefusedError, find
 from magtwin.obstacles import Obstacles
 from magtwin.path import Path, resolve_path
 from magtwin.run import Run
-from magtwin.spec import RobotSpec, Scene
+from magtwin.spec import MagnetometerSpec, RobotSpec, Scene
 
 Kind = Literal["physical", "neural", "map-only"]
 Facts = dict[str, str | int | float | bool]
@@ -490,7 +490,9 @@ def simulate_many(
     configs = {id(scene): _config_sha256(scene) for scene in (twin.scene, *scenes.values())}
 
     def finish(jobs: Sequence[Job], sensed: Sequence["Sensed"]) -> list[Run]:
-        read = network.read([one.run for one in sensed]) if network else [(None, None)] * len(sensed)
+        rows = [one.run for one in sensed]
+        flagged = "flag_out_of_distribution" in sensed[0].wanted
+        read = network.read(rows, outside=flagged) if network else [(None, None)] * len(rows)
         runs = []
         for job, one, (disturbance, outside_training) in zip(jobs, sensed, read, strict=True):
             run = one.read(disturbance)
@@ -556,12 +558,13 @@ def _known(
     scene: Scene, run: Run, network: "NeuralMagnetometer | None", outside_training: NDArray[np.bool_] | None
 ) -> dict[str, NDArray[Any]]:
     """Columns that only who knows the network can fill; none without one."""
-    if network is None or outside_training is None:
+    if network is None:
         return {}
     spec = scene.robot.magnetometer
     noise = spec.noise_density_nt * np.sqrt(float(run.facts["rate_hz"]) / 2)
     sd = np.full(run.rows, np.hypot(network.residual_sd_nt, noise))
-    return {"b_sd_nt": sd, "flag_out_of_distribution": outside_training}
+    known: dict[str, NDArray[Any]] = {"b_sd_nt": sd}
+    return known if outside_training is None else known | {"flag_out_of_distribution": outside_training}
 
 
 def _facts(
@@ -599,7 +602,12 @@ def _config_sha256(scene: Scene) -> str:
         sensor = dataclasses.replace(robot.magnetometer, network=None, network_sha256="", inputs=())
         return dataclasses.replace(robot, asset=FilePath(), magnetometer=sensor)
 
-    others = tuple(dataclasses.replace(other, robot=bare(other.robot), path="") for other in scene.others)
+    others = tuple(  # what they read is nothing to this run
+        dataclasses.replace(
+            other, robot=bare(dataclasses.replace(other.robot, magnetometer=MagnetometerSpec())), path=""
+        )
+        for other in scene.others
+    )
     scene = dataclasses.replace(
         scene, map_layer=FilePath(), map_sha256="", robot=bare(scene.robot), path="", others=others
     )

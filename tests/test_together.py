@@ -12,6 +12,7 @@ from magtwin.cli import main
 from magtwin.field.map import AnomalyMap
 from magtwin.field.sources import dipole_field_nt
 from magtwin.files import shipped
+from magtwin.io.provenance import repeat
 from magtwin.io.tables import read_parquet
 from magtwin.names import RefusedError
 from magtwin.path import Path
@@ -271,6 +272,9 @@ def test_run_writes_a_file_for_each_robot_and_robot_the_one_to_the_same_bits(two
     whole, one = read_parquet(tmp_path / "r.bob.parquet"), read_parquet(tmp_path / "one.parquet")
     for name, values in whole.items():
         assert_array_equal(values, one[name], err_msg=name)
+    again = repeat(whole)
+    assert again.equal
+    assert not again.causes
     assert whole.facts["nearest_robot"] == report["facts"]["bob"]["nearest_robot"] == "ann"
 
 

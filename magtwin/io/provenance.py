@@ -13,7 +13,7 @@ from magtwin.names import RefusedError
 from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
 from magtwin.report import Figure, Report
 from magtwin.run import COLUMNS, Run
-from magtwin.twin import Twin, locate, path_facts, scene_of, simulate, twin_of
+from magtwin.twin import Twin, locate, path_facts, scene_of, simulate, simulate_robots, twin_of
 
 CAUSES: Mapping[str, str] = {
     "magtwin": "another version of magtwin",
@@ -108,6 +108,20 @@ def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePat
         raise RefusedError(
             f"the run was moved by an engine of its maker's own, {engine!r}, which is not here"
         )
+    name = str(facts.get("robot", ""))
+    if name and twin.scene.others:  # beside others, which drive what the scene says
+        again = simulate_robots(
+            twin,
+            {name: what},
+            robots=[name],
+            meet="flag",
+            seed=seed,
+            speed=speed,
+            duration_s=asked,
+            rate_hz=rate,
+            **options,
+        )[name]
+        return _compared(run, again)
     again = simulate(
         twin,
         what,
@@ -118,6 +132,11 @@ def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePat
         engine="kinematic" if engine == "replay" else engine,
         **options,
     )
+    return _compared(run, again)
+
+
+def _compared(run: Run, again: Run) -> Repeat:
+    """A run, and what came out when it was made once more."""
     causes = [
         f"{why}: {fact} was {run.facts.get(fact, 'none')}, is {again.facts.get(fact, 'none')}"
         for fact, why in CAUSES.items()
