@@ -2,7 +2,9 @@
 
 import itertools
 import json
+import runpy
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -293,3 +295,12 @@ def test_a_users_own_column_keeps_what_it_was_said_to_hold():
         assert other.spec("head_k") == spec
     assert run.with_columns(est_q_xyzw=np.zeros((2, 4))).spec("est_q_xyzw").interpolation == "quaternion"
     assert run.with_columns(flag_x=np.zeros(2, bool)).spec("flag_x").interpolation == "hold"
+
+
+def test_the_documented_columns_are_those_of_the_code():
+    docs = Path(__file__).resolve().parents[1] / "docs"
+    page = runpy.run_path(str(docs / "columns.py"))["page"]()
+    written = (docs / "columns.md").read_text(encoding="utf-8")
+    assert written == page, "python docs/columns.py writes it anew"
+    for name, column in COLUMNS.items():
+        assert f"| `{name}` | {', '.join(column.parts)} | {column.unit} | {column.frame} |" in written
