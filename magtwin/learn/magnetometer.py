@@ -142,15 +142,22 @@ class NeuralMagnetometer:
         """
         return self.predict(features(run, self.features))
 
-    def read(self, runs: Sequence[Run]) -> list[tuple[Array, NDArray[np.bool_]]]:
+    def read(
+        self, runs: Sequence[Run], *, outside: bool = True
+    ) -> list[tuple[Array, NDArray[np.bool_] | None]]:
         """`disturbance_nt` and `outside_training` of each of many runs, all rows in one stream of blocks.
+
+        Args:
+            runs: At least one.
+            outside: Whether `outside_training` is wanted; none is given else.
 
         Raises:
             RefusedError: A run lacks a column that the network reads.
         """
         x = np.concatenate([features(run, self.features) for run in runs])
         ends = np.cumsum([run.rows for run in runs])[:-1]
-        return list(zip(np.split(self.predict(x), ends), np.split(self.outside(x), ends), strict=True))
+        left = np.split(self.outside(x), ends) if outside else [None] * len(runs)
+        return list(zip(np.split(self.predict(x), ends), left, strict=True))
 
     def outside_training(self, run: Run) -> NDArray[np.bool_]:
         """Whether an input of a reading left the range of the training rows, shape (N,).

@@ -42,6 +42,7 @@ def sense_magnetometer(
     *,
     rate_hz: float,
     steep: ArrayLike = False,
+    axes: bool = True,
 ) -> Columns:
     """Scalar and vector readings of a field.
 
@@ -53,9 +54,10 @@ def sense_magnetometer(
         rng: Source of noise.
         rate_hz: Readings a second [Hz].
         steep: Whether lock is lost to the gradient, shape (N,); see `lost_in`.
+        axes: Whether the vector's readings are wanted too.
 
     Returns:
-        b_measured_nt, b_noise_nt, b_vector_measured_nt, flag_lost_lock.
+        b_measured_nt, b_noise_nt, flag_lost_lock, and b_vector_measured_nt where it is wanted.
     """
     noise, vector_noise, latch, drop = rng.spawn(4)
     true, vector = np.asarray(b_total_nt, float), np.asarray(b_vector_nt, float)
@@ -72,16 +74,14 @@ def sense_magnetometer(
         read[lost] = latched_nt(spec, lost, latch)[lost]
     read = rounded(read, spec.resolution_nt)
     read[~known] = np.nan
-    axes = sense_vector(spec, vector, vector_noise, rate_hz=rate_hz, lost=lost)
+    columns: Columns = {}
+    if axes:
+        columns["b_vector_measured_nt"] = sense_vector(spec, vector, vector_noise, rate_hz=rate_hz, lost=lost)
     if spec.dropout_share:
         dropped = drop.random(len(read)) < spec.dropout_share
-        read[dropped], axes[dropped] = np.nan, np.nan
-    return {
-        "b_measured_nt": read,
-        "b_noise_nt": read - true,
-        "b_vector_measured_nt": axes,
-        "flag_lost_lock": lost,
-    }
+        for dropping in (read, *columns.values()):
+            dropping[dropped] = np.nan
+    return columns | {"b_measured_nt": read, "b_noise_nt": read - true, "flag_lost_lock": lost}
 
 
 def sense_vector(

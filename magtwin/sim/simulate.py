@@ -260,6 +260,7 @@ class Sensed:
                 self.rng,
                 rate_hz=self.rate_hz,
                 steep=self.steep,
+                axes="b_vector_measured_nt" in self.wanted,
             )
         return Run({name: columns[name] for name in COLUMNS if name in self.wanted}, self.run.facts)
 
