@@ -177,8 +177,8 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
     """Write a run as CSV: lines beginning with # that tell of it, a line of names, a line a row.
 
     Numbers are in the fewest digits that give the same bits back, flags are true and false. pandas reads
-    it with `read_csv(F, comment="#")`, to the bit with `float_precision="round_trip"` beside; DuckDB with
-    `read_csv('F', comment='#')`; polars with `read_csv(F, comment_prefix="#")`.
+    it with `read_csv(F, comment="#")` (before pandas 3, with `float_precision="round_trip"` beside), DuckDB
+    with `read_csv('F', comment='#')`, polars with `read_csv(F, comment_prefix="#")`.
 
     Args:
         run: The run; it must have a column `t`, which ascends.
