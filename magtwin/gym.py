@@ -23,6 +23,7 @@ from magtwin.names import RefusedError, find
 from magtwin.path import Path, check_clear, check_on_floor, resolve_path
 from magtwin.run import COLUMNS
 from magtwin.sim.fleet import Fleet
+from magtwin.sim.session import draw_session
 from magtwin.twin import Kind, Twin, open_twin
 
 Array = NDArray[np.float64]
@@ -120,6 +121,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         duration_s: float = 60.0,
         end_on_bump: bool = False,
         random_start: bool = False,
+        sessions: bool = True,
         render_mode: None = None,
     ) -> None:
         """Open a scene for robots.
@@ -136,6 +138,9 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             duration_s: Time after which an episode is truncated [s].
             end_on_bump: Whether touching an obstacle, or the floor's border, ends an episode.
             random_start: Whether robots begin anywhere on the path; otherwise at its first point.
+            sessions: Whether each episode is another day, as `magtwin.sim.session.draw_session` draws it:
+                charge, IMU zero, LiDAR's phase, wheels, odometry and the robot's own field; otherwise the robot
+                is as the scene has it, as `magtwin.simulate` takes it.
             render_mode: None: a Run is looked at in Rerun.
 
         Raises:
@@ -168,7 +173,8 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             disturbance_nt=twin.magnetometer.disturbance_nt if twin.magnetometer else None,
         )
         self.num_envs, self.reward, self.end_on_bump = num_envs, reward, end_on_bump
-        self.random_start, self._last_step = random_start, math.ceil(duration_s / step_s - 1e-9)
+        self.random_start, self.sessions = random_start, sessions
+        self._last_step = math.ceil(duration_s / step_s - 1e-9)
         low, high = np.repeat(np.array(bounds, np.float32).T, widths, axis=1)
         self.single_observation_space = spaces.Box(low, high, dtype=np.float32)
         top = np.array([robot.drive.v_max, robot.drive.w_max], np.float32)
@@ -245,7 +251,9 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             self._s[i] = rng.uniform(0.0, self.path.length) if self.random_start else 0.0
         xy, heading = self.path.at(self._s[which]), self.path.heading(self._s[which])
         poses = [(float(x), float(y), float(yaw)) for (x, y), yaw in zip(xy, heading, strict=True)]
-        self.fleet.begin(which.tolist(), poses, rngs)
+        robot = self.fleet.scene.robot
+        days = [draw_session(robot, rng) for rng in rngs] if self.sessions else None
+        self.fleet.begin(which.tolist(), poses, rngs, days)
         self._made[which], self._over[which] = 0, False
 
     def _observations(self) -> NDArray[np.float32]:

@@ -13,6 +13,8 @@ from gymnasium.vector import SyncVectorEnv  # noqa: E402
 import magtwin.gym  # noqa: E402
 from magtwin.names import RefusedError  # noqa: E402
 from magtwin.run import COLUMNS  # noqa: E402
+from magtwin.sim.fleet import Fleet  # noqa: E402
+from magtwin.sim.session import draw_session  # noqa: E402
 from magtwin.twin import Twin, open_twin  # noqa: E402
 
 NAME = "magtwin/MagNav-v0"
@@ -53,8 +55,48 @@ def column(env, observations, name):
 
 
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space")  # ours is in m/s and rad/s
-def test_gymnasiums_checker_passes(twin):
-    check_env(gymnasium.make(NAME, scene=twin).unwrapped)
+@pytest.mark.parametrize("sessions", [True, False])
+def test_gymnasiums_checker_passes(twin, sessions):
+    check_env(gymnasium.make(NAME, scene=twin, sessions=sessions).unwrapped)
+
+
+def test_each_episode_is_another_day_and_none_without_sessions(twin):
+    names = ("battery_fraction", "imu_q_xyzw", "b_total_nt")
+    for sessions in (True, False):
+        env = vector(twin, 2, signals=names, sessions=sessions)
+        first, _ = env.reset(seed=4)
+        again, _ = env.reset()
+        charges = np.concatenate([column(env, o, "battery_fraction").ravel() for o in (first, again)])
+        assert len(set(charges.tolist())) == (4 if sessions else 1)
+        yaw = np.concatenate([column(env, o, "imu_q_xyzw")[:, 2:] for o in (first, again)])
+        apart = np.abs(yaw - yaw[0]).max()
+        assert apart > 0.02 if sessions else apart < 0.01
+        field = np.concatenate([column(env, o, "b_total_nt").ravel() for o in (first, again)])
+        assert np.ptp(field) > 50 if sessions else np.ptp(field) < 1
+
+
+def test_robots_of_many_days_do_together_what_each_does_in_a_scene_of_its_day(twin):
+    days = [draw_session(twin.scene.robot, np.random.default_rng(day)) for day in range(6)]
+    poses = [(-2.0 + 0.5 * i, -1.2, 0.3 * i) for i in range(6)]
+    common = {"anomaly_map": twin.field, "obstacles": twin.obstacles, "step_s": 0.1}
+
+    def driven(fleet, which):
+        fleet.begin(
+            list(range(len(which))),
+            [poses[i] for i in which],
+            [np.random.default_rng(i) for i in which],
+            None if len(which) == 1 else days,
+        )
+        for k in range(12):
+            fleet.step(np.tile([0.2, 0.05 * k], (len(which), 1)))
+        return fleet.columns
+
+    together = driven(Fleet(twin.scene, 6, **common), range(6))
+    assert 0 < together["lidar_on"].sum() < 6
+    for i, day in enumerate(days):
+        alone = driven(Fleet(replace(twin.scene, robot=day), 1, **common), [i])
+        for name, values in alone.items():
+            assert_allclose(together[name][i], values[0], rtol=1e-9, atol=1e-9, err_msg=name)
 
 
 def test_one_seed_is_one_episode_and_another_seed_another(twin):
@@ -130,7 +172,7 @@ def test_the_field_is_the_exact_one_of_a_run_at_the_same_pose(twin, line):
     still = replace(robot.platform, left_motor_nt_nm=(0.0, 0.0, 0.0), right_motor_nt_nm=(0.0, 0.0, 0.0))
     twin = replace(twin, scene=replace(twin.scene, robot=replace(robot, platform=still)))
     run = magtwin.simulate(twin, line, seed=0, duration_s=0.1, rate_hz=135.0)  # its motors start at once
-    env = gymnasium.make(NAME, scene=twin, path=line, signals=("b_total_nt", "b_map_nt"))
+    env = gymnasium.make(NAME, scene=twin, path=line, signals=("b_total_nt", "b_map_nt"), sessions=False)
     observation, _ = env.reset(seed=0)
     assert_allclose(observation[1], run["b_map_nt"][0], rtol=1e-6)
     assert_allclose(observation[0], run["b_total_nt"][0], atol=5.0)  # electronics

@@ -9,7 +9,7 @@ generator, whatever robots are beside it.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,11 +33,11 @@ from magtwin.sim.controllers import guide_by_commands
 from magtwin.sim.course import Course, fence_of
 from magtwin.sim.drive import Moment, Pose, draw_wheel_errors, wheel_rates
 from magtwin.sim.follow import CONTROL_RATE_HZ
-from magtwin.sim.interference import TORQUE_S, field_at_sensor_nt
+from magtwin.sim.interference import TORQUE_S, field_at_sensor_nt, platforms_of_rows
 from magtwin.sim.lidar import lidar_on
 from magtwin.sim.magnetometer import rounded
 from magtwin.sim.sensors import into_sensor
-from magtwin.spec import Scene
+from magtwin.spec import RobotSpec, Scene
 
 Array = NDArray[np.float64]
 
@@ -103,6 +103,8 @@ class Fleet:
         self._odom, self._twist = np.zeros((count, 3)), np.zeros((count, 2))
         self._bias, self._ran_away, self._tilt = np.zeros((count, 3)), np.zeros(count), np.zeros((count, 2))
         self._charge, self._supply_a = np.ones(count), np.zeros(count)
+        self._days = [scene.robot] * count
+        self._yaw_zero, self._lidar_s = np.zeros(count), np.zeros(count)
         self._columns: dict[str, NDArray[Any]] = {}
 
     @property
@@ -110,20 +112,28 @@ class Fleet:
         """The table after the last step: columns of a Run, a robot a row."""
         return self._columns
 
-    def begin(self, which: Sequence[int], poses: Sequence[Pose], rngs: Sequence[np.random.Generator]) -> None:
+    def begin(
+        self,
+        which: Sequence[int],
+        poses: Sequence[Pose],
+        rngs: Sequence[np.random.Generator],
+        robots: Sequence[RobotSpec] | None = None,
+    ) -> None:
         """Put robots somewhere, at rest, with a new run's draws; the others stay as they are.
 
         Args:
             which: Numbers of the robots.
             poses: x [m], y [m], yaw [rad] in world of each.
             rngs: Source of all noise of each until it begins anew.
+            robots: The scene's robot as it is on a day of each, as `magtwin.sim.session.draw_session` gives
+                it; None takes it as the scene has it.
 
         Raises:
             RefusedError: One would begin in an obstacle.
         """
-        robot = self.scene.robot
-        drive, imu = robot.drive, robot.imu
-        for i, pose, rng in zip(which, poses, rngs, strict=True):
+        days = [self.scene.robot] * len(which) if robots is None else robots
+        for i, pose, rng, robot in zip(which, poses, rngs, days, strict=True):
+            drive, imu = robot.drive, robot.imu
             course = Course(
                 drive=drive,
                 guide=guide_by_commands([[0.0, 0.0, 0.0]], drive),
@@ -141,7 +151,9 @@ class Fleet:
             self._factors[i] = np.array(drive.odometry_scale) * (1 + drive.odometry_noise_std * draw[:2])
             self._bias[i], self._ran_away[i], self._tilt[i] = imu.gyro_bias, 0.0, draw[2:]
             self._t[i], self._angle[i], self._odom[i], self._twist[i] = 0.0, 0.0, 0.0, 0.0
-            self._charge[i] = robot.battery.initial_fraction
+            self._charge[i], self._days[i] = robot.battery.initial_fraction, robot
+            self._yaw_zero[i] = imu.yaw_zero
+            self._lidar_s[i] = robot.lidar.phase_s - self.scene.robot.lidar.phase_s
             self._record[i] = 0.0
             self._record[i, :3] = np.array(pose)[:, None]
         self._sense(np.asarray(which), moved=False)
@@ -190,7 +202,7 @@ class Fleet:
         half = np.array(self.scene.lab.floor_m) / 2
         beyond = np.any(np.abs(now.pose[:, :2]) + robot.footprint_radius_m > half + 1e-9, axis=1)
         yaw, zero = wrap_angle(now.pose[:, 2]), np.zeros(len(which))
-        on = lidar_on(robot.lidar, self._t[which], "schedule")
+        on = lidar_on(robot.lidar, self._t[which] + self._lidar_s[which], "schedule")
         table: dict[str, NDArray[Any]] = {
             "t": self._t[which],
             "p_world_base": np.column_stack([now.pose[:, :2], zero + robot.base_height_m]),
@@ -264,7 +276,7 @@ class Fleet:
         acceleration += (
             np.hypot(spec.accel_noise_std, shaking * np.array(spec.accel_vibration)) * white[:, 6:9]
         )
-        heading = now.pose[:, 2] - spec.yaw_zero + self._ran_away[which]
+        heading = now.pose[:, 2] - self._yaw_zero[which] + self._ran_away[which]
         tilt = spec.tilt + spec.tilt_std * self._tilt[which]
         q = quat_multiply(quat_from_rpy(np.column_stack([tilt, heading])), q_base_imu)
         q = quat_multiply(quat_from_rpy([*spec.level_error, 0.0]), q)
@@ -319,7 +331,7 @@ class Fleet:
         elif spec.kind == "physical":
             early = max(self._steps - 1 - round(TORQUE_S * CONTROL_RATE_HZ), 0)
             field = field_at_sensor_nt(
-                scene,
+                self._scene_of(which),
                 _Before(self._moment(which, early)),
                 np.maximum(self._t[which], TORQUE_S),  # rows are robots, whose times come in no order
                 true=now,
@@ -336,6 +348,16 @@ class Fleet:
             "b_total_nt": b_map + disturbance,
             "b_measured_nt": rounded(b_map + disturbance + noise, spec.resolution_nt),
         }
+
+    def _scene_of(self, which: NDArray[np.intp]) -> Scene:
+        """The scene with the platforms of some robots' days, a row each."""
+        robot = self.scene.robot
+        days = [self._days[i] for i in which]
+        if all(day is robot for day in days):
+            return self.scene
+        return replace(
+            self.scene, robot=replace(robot, platform=platforms_of_rows([day.platform for day in days]))
+        )
 
 
 def _compiled_or_plain() -> Callable[..., None]:

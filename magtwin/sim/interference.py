@@ -1,6 +1,7 @@
 """Fields at the magnetometer: the lab's, and what the robot adds to it."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -37,6 +38,21 @@ CREEP = 0.05
 MANY = 20_000
 """Points at one height from which on their field is looked up, as `level_field_nt` does: so many take as long
 as the floor of a lab."""
+
+DRAWN = (
+    "hard_iron_nt",
+    "left_motor_nt_nm",
+    "right_motor_nt_nm",
+    "lidar_nt",
+    "lidar_cos_nt",
+    "lidar_sin_nt",
+    "battery_nt",
+    "left_wheel_phase",
+    "right_wheel_phase",
+    "caster_phase",
+    "lidar_phase",
+)
+"""Figures of a platform by which one day differs from another."""
 
 NEAREST_M = 1e-3
 """Distance from the middle of a wheel within which no magnetometer can be [m]."""
@@ -191,22 +207,23 @@ def platform_field_nt(
     field += platform.hard_iron_nt
     if any(platform.eddy_s):
         field += _times(np.broadcast_to(b_rate, b.shape), np.reshape(platform.eddy_s, (3, 3)).T)
-    motors = np.array([platform.left_motor_nt_nm, platform.right_motor_nt_nm])
+    motors = np.stack([platform.left_motor_nt_nm, platform.right_motor_nt_nm], axis=-2)
     if motors.any():
         field += _times(np.asarray(motor_nm, float), motors)
-    if any(platform.battery_nt):
-        field += np.asarray(battery_a, float)[..., None] * platform.battery_nt
+    if np.any(platform.battery_nt):
+        field += np.asarray(battery_a, float)[..., None] * np.asarray(platform.battery_nt)
     on = np.broadcast_to(np.asarray(lidar_on, bool), b.shape[:-1])
     if on.any():
         angle = np.broadcast_to(lidar_angle, on.shape)[on]
-        parts = np.array([platform.lidar_nt, platform.lidar_cos_nt, platform.lidar_sin_nt])
+        parts = np.stack([platform.lidar_nt, platform.lidar_cos_nt, platform.lidar_sin_nt], axis=-2)
+        parts = parts if parts.ndim == 2 else parts[on]
         field[on] += _times(np.column_stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)]), parts)
     return field
 
 
 def _times(rows: Array, matrix: Array) -> Array:
-    """Rows (..., K) times a matrix (K, 3): so few columns are no work for the threads that `@` wakes."""
-    return np.einsum("...k,kj->...j", rows, matrix)
+    """Rows (..., K) times a matrix (K, 3), or one each: no work for the threads that `@` wakes."""
+    return np.einsum("...k,kj->...j" if matrix.ndim == 2 else "nk,nkj->nj", rows, matrix)
 
 
 def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
@@ -387,9 +404,22 @@ def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> Plat
     )
 
 
+def platforms_of_rows(platforms: Sequence[PlatformFieldSpec]) -> PlatformFieldSpec:
+    """Robots' platforms as one, for readings of which each is another robot's.
+
+    Args:
+        platforms: As `draw_platform` gives them for one robot on several days, one for each reading.
+
+    Returns:
+        The first, with arrays of one row or number a robot where they differ by what is drawn.
+    """
+    rows = {name: np.array([getattr(one, name) for one in platforms]) for name in DRAWN}
+    return replace(platforms[0], **rows)  # type: ignore[arg-type]
+
+
 def _torques(robot: RobotSpec, motion: Moving, t: Array, true: Moment) -> Array:
     """Torques of the wheels at times, their accelerations over `TORQUE_S` before [N m], shape (N, 2)."""
-    if not (any(robot.platform.left_motor_nt_nm) or any(robot.platform.right_motor_nt_nm)):
+    if not (np.any(robot.platform.left_motor_nt_nm) or np.any(robot.platform.right_motor_nt_nm)):
         return np.zeros((len(t), 2))
     before = moment_at(motion, t - TORQUE_S)
     rate = wheel_rates(true.v, true.w, robot.drive)
