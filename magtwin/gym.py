@@ -139,7 +139,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             end_on_bump: Whether touching an obstacle, or the floor's border, ends an episode.
             random_start: Whether robots begin anywhere on the path; otherwise at its first point.
             sessions: Whether each episode is another day, as `magtwin.sim.session.draw_session` draws it:
-                charge, IMU zero, LiDAR's phase, wheels, odometry and the robot's own field; otherwise the robot
+                charge, IMU zero, LiDAR's phase, wheels, odometry and its own field; otherwise the robot
                 is as the scene has it, as `magtwin.simulate` takes it.
             render_mode: None: a Run is looked at in Rerun.
 
