@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +14,11 @@ from validators import assert_valid
 from magtwin.frames import rotate
 from magtwin.names import RefusedError
 from magtwin.run import COLUMNS, Column, Run
+from magtwin.spec import PlacedRobot
 from magtwin.twin import open_twin, simulate
 from magtwin.usd.animation import is_animation, read_animation, write_animation
 from magtwin.usd.geometry import read_links
+from magtwin.usd.scene import author_scene
 
 MAGNETOMETER = "/World/turtlebot4/magnetometer_link/magnetometer"
 
@@ -257,3 +260,20 @@ def test_runs_that_contradict_themselves_are_refused(body, message, tmp_path):
     (tmp_path / "run.usda").write_text(text)
     with pytest.raises(RefusedError, match=message):
         read_animation(tmp_path / "run.usda")
+
+
+def test_two_robots_play_in_one_stage_a_layer_each(lab_scene, run, tmp_path):
+    """The second layer is over the first one's, which goes on playing below it."""
+    scene = open_twin(lab_scene, magnetometer="physical").scene
+    second = PlacedRobot(robot=replace(scene.robot, name="second"), start=(1.0, -0.5, 0.0))
+    both = author_scene(replace(scene, others=(second,)), tmp_path / "two")
+    shifted = run.with_columns(p_world_base=run["p_world_base"] + (0.3, 0.2, 0)).with_facts(robot="second")
+    write_animation(run, tmp_path / "one.usdc", both)
+    write_animation(shifted, tmp_path / "two.usdc", tmp_path / "one.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "two.usdc"))
+    for name, ran in (("turtlebot4", run), ("second", shifted)):
+        p, _ = world_pose(stage, f"/World/{name}/base_link", 90)
+        assert_allclose(p, ran.resample([3.0])["p_world_base"][0], atol=1e-12)
+    assert_same(read_animation(tmp_path / "two.usdc"), shifted)
+    with pytest.raises(RefusedError, match="no robot 'secnd'; did you mean 'second'"):
+        write_animation(run.with_facts(robot="secnd"), tmp_path / "no.usdc", both)

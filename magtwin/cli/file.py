@@ -193,10 +193,12 @@ def _info_of_net(file: Path) -> Any:
 
 def _twin(run: "Run", file: Path, scene: Path | None) -> "Twin | None":
     """The scene to show a run in; where it is not there and was not asked for, says so and goes on."""
-    from magtwin.twin import open_twin, scene_of
+    from magtwin.twin import led_by, open_twin, scene_of
 
     try:
         twin = open_twin(scene_of(run, scene, near=file), magnetometer="map-only")  # needs no network
+        if "robot" in run.facts:
+            twin = led_by(twin, str(run.facts["robot"]))
     except RefusedError as error:
         if scene is not None:
             raise

@@ -24,7 +24,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from magtwin.files import existing, output
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
-from magtwin.names import RefusedError
+from magtwin.names import RefusedError, find
 from magtwin.resample import check_instants, grid
 from magtwin.run import COLUMNS, Column, Run
 from magtwin.spec import Quat, Vec3
@@ -117,10 +117,12 @@ def write_animation(
     Bodies are moved by their transforms: to look at, not for a physics engine to simulate.
 
     Args:
-        run: What happened; the robot is where `p_world_base` has it, or else motion capture or odometry.
+        run: What happened; the robot is where `p_world_base` has it, or else motion capture or odometry. In a
+            scene of several, it is the one that its fact `robot` names, or the first.
         path: The .usd, .usda or .usdc file to make; the first and last are small, text is not.
-        scene_file: The stage that it happened in, which becomes a sublayer, named relative to `path`.
-            Without it, bare Xforms called robot and magnetometer stand for them.
+        scene_file: The stage that it happened in, which becomes a sublayer, named relative to `path`. One
+            that plays another robot's run goes on playing it. Without a stage, bare Xforms called robot
+            and magnetometer stand for them.
         fps: Frames a second; none samples at every row.
         force: Whether a file that exists is replaced.
 
@@ -143,7 +145,7 @@ def write_animation(
     if scene_file is not None:
         stage = open_stage(scene_file)
         _check_apart(path, stage)
-        stand = _stand(stage)
+        stand = _stand(stage, str(run.facts.get("robot", "")))
     with output(path, force=force) as aside:
         layer = Sdf.Layer.CreateNew(str(aside))
         if layer is None:
@@ -241,9 +243,13 @@ def _pose_columns(run: Run) -> tuple[str, str]:
     raise RefusedError(f"the run says nowhere where the robot is; it needs {known}")
 
 
-def _stand(stage: Usd.Stage) -> _Stand:
-    """Where a scene's robot is, and how it is made."""
-    prim = only_prim_with(stage.GetPseudoRoot(), "robot")
+def _stand(stage: Usd.Stage, name: str) -> _Stand:
+    """Where a scene's robot is, and how it is made; the first of them where `name` is ""."""
+    root = stage.GetPseudoRoot()
+    robots = {prim.GetName(): prim for prim in prims_with(root, "robot")}
+    prim = find("robot", name, robots) if name else next(iter(robots.values()), None)
+    if prim is None:
+        prim = only_prim_with(root, "robot")  # refuses
     default = stage.GetDefaultPrim()
     if not default or prim.GetParent() != default:
         raise RefusedError(
