@@ -38,7 +38,7 @@ AS_MANY = 25
 """Poses in numpy that take as long as one in plain Python does beyond one in compiled code."""
 
 SHARE = 65_536
-"""Poses from which on a thread of compiled code is worth its start."""
+"""Poses that a thread of compiled code takes at a time; fewer are not worth its start."""
 
 MOST_THREADS = 8
 """Beyond, memory is what one waits for."""
@@ -230,22 +230,27 @@ class Lookup:
     def _in_threads(
         self, compiled: ModuleType, p: Array, yaw: Array, clamp: bool, out: Array, slopes: Array
     ) -> None:
-        """Compiled code on equal shares of the poses; who works on a pose changes no byte."""
-        q, yaw = (np.require(array, float, ["C", "A"]) for array in (p.reshape(-1), yaw))
+        """Compiled code on shares of the poses; who works on a pose changes no byte."""
+        q, yaw = _plain(p.reshape(-1)), _plain(yaw)
         flat = slopes.reshape(-1)
         shares = len(yaw) // SHARE
-        if shares < 2:
+        threads = 1 if shares < 2 else min(shares, MOST_THREADS, os.cpu_count() or 1)
+        if threads < 2:
             compiled.lookup(self.table, q, yaw, clamp, out, flat)
             return
-        shares = min(shares, MOST_THREADS, os.cpu_count() or 1)
-        ends = [len(yaw) * n // shares for n in range(shares + 1)]
+        starts = iter(range(0, len(yaw), SHARE))  # whoever is free takes the next share
 
-        def work(start: int, stop: int) -> None:
-            at, some, g = q[2 * start : 2 * stop], yaw[start:stop], flat[3 * start : 3 * stop]
-            compiled.lookup(self.table, at, some, clamp, out[start:stop], g)
+        def work() -> None:
+            for start in starts:
+                stop = start + SHARE
+                at, some, g = q[2 * start : 2 * stop], yaw[start:stop], flat[3 * start : 3 * stop]
+                compiled.lookup(self.table, at, some, clamp, out[start:stop], g)
 
-        with ThreadPoolExecutor(shares) as pool:
-            list(pool.map(work, ends[:-1], ends[1:]))
+        with ThreadPoolExecutor(threads - 1) as pool:
+            others = [pool.submit(work) for _ in range(threads - 1)]
+            work()
+            for other in others:
+                other.result()
 
     def _by_numpy(self, p: Array, yaw: Array, clamp: bool, out: Array, slopes: Array) -> None:
         """Numpy on a block of poses; `slopes` is empty where the gradient is not wanted."""
@@ -289,6 +294,12 @@ class Lookup:
             for axis, hole in enumerate(sides_of(holes, wx, wy, wh, 1.0)):
                 slopes[(rates[axis] != 0) & (hole > EDGE), axis] = np.nan
         slopes[unknown] = np.nan
+
+
+def _plain(array: Array) -> Array:
+    """The array, or a copy that lies as compiled code wants it."""
+    flags = array.flags
+    return array if flags.c_contiguous and flags.aligned else np.require(array, float, ["C", "A"])
 
 
 class _Cells(dict[int, tuple[Corners, Corners | None]]):

@@ -301,7 +301,8 @@ class AnomalyMap:
             shape = np.broadcast_shapes(p.shape[:-1], shape)
             p, yaw = np.broadcast_to(p, (*shape, 2)), np.broadcast_to(yaw, shape)
         p, yaw = p.reshape(-1, 2), yaw.reshape(-1)
-        self._check_outside(p, outside)
+        if outside != "nan":
+            self._check_outside(p, outside)
         b, slopes = self._lookup.lookup(p, yaw, clamp=outside == "clamp", gradient=gradient)
         return b.reshape(shape), slopes.reshape(*shape, 3) if gradient else slopes
 
