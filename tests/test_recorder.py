@@ -190,17 +190,20 @@ def deaf_address() -> str:
 
 def test_ctrl_c_ends_a_live_run_and_keeps_what_was_driven(lab_scene, tmp_path, capsys):
     def interrupt() -> None:
-        deadline = time.monotonic() + 60
-        while not list(tmp_path.glob("out/run.parquet.parts/*")) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        os.kill(os.getpid(), signal.SIGINT)
+        while not over.wait(0.05):
+            if len(list(tmp_path.glob("out/run.parquet.parts/*"))) > 1:
+                os.kill(os.getpid(), signal.SIGINT)
+                return
 
-    hand = threading.Thread(target=interrupt)
+    over, hand = threading.Event(), threading.Thread(target=interrupt)
     hand.start()
     arguments = ["run", str(lab_scene), "--net", "none", "--duration", "300", "--rate-hz", "50", "--json"]
     outputs = ["--out", str(tmp_path / "out"), "--csv", str(tmp_path / "run.csv")]
-    main([*arguments, *outputs, "--viewer", deaf_address()])
-    hand.join()
+    try:
+        main([*arguments, *outputs, "--viewer", deaf_address()])
+    finally:
+        over.set()
+        hand.join()
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["run.parquet", "run.png", "run.rrd"]
     table = read_run(tmp_path / "out" / "run.parquet")
     assert 0 < table["t"][-1] < 60

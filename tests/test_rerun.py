@@ -1,4 +1,5 @@
 import dataclasses
+import os
 import shutil
 import subprocess
 import sys
@@ -12,8 +13,9 @@ from rerun.chunk import RrdReader
 
 from magtwin.field.map import AnomalyMap
 from magtwin.frames import quat_from_rpy, quat_from_yaw, rotate
-from magtwin.io.rerun import read_run, view, write_rrd
-from magtwin.io.series import STATES
+from magtwin.io.live import RrdWriter
+from magtwin.io.rerun import read_run, read_runs, view, write_comparison, write_rrd
+from magtwin.io.series import DERIVED, STATES
 from magtwin.io.tables import write_parquet
 from magtwin.io.viewer import headless_viewer, screenshot
 from magtwin.names import RefusedError
@@ -395,6 +397,225 @@ def test_a_stage_that_is_missing_is_refused_and_nothing_is_left(parts, tmp_path)
         )
     assert not list(tmp_path.iterdir())
     assert rr.strict_mode() == strict
+
+
+def test_columns_of_other_kinds_come_back_too(tmp_path):
+    run = Run(
+        {
+            "t": np.arange(5.0),
+            "est_p": np.arange(10.0).reshape(5, 2) / 3,
+            "a count, of /odd:name": np.arange(5, dtype=np.int16),
+            "est_sd": np.linspace(0, 1, 5, dtype=np.float32),
+            "flag_bump": np.array([1, 0, 1, 1, 0], bool),
+        },
+        {"seed": 2**80, "note": 'a | "b"\nc', "share": 0.1, "on": True},
+    )
+    write_rrd(run, tmp_path / "run.rrd")
+    back = read_run(tmp_path / "run.rrd")
+    assert list(back) == list(run)
+    assert dict(back.facts) == dict(run.facts)
+    assert {type(fact) for fact in back.facts.values()} == {int, str, float, bool}
+    for name in run:
+        assert back[name].dtype == run[name].dtype
+        assert np.array_equal(back[name], run[name])
+    with pytest.raises(RefusedError, match="column 'word' cannot be recorded"):
+        write_rrd(Run({"t": np.arange(2.0), "word": np.array(["a", "b"])}), tmp_path / "b.rrd")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.rrd"]
+
+
+def test_reruns_dataframe_api_gives_the_table_of_the_run(parts, written):
+    pytest.importorskip("datafusion")
+    run, _ = parts
+    table = RrdReader(written).stream().collect().reader(index="sim_time", contents="/run").to_pandas()
+    table = table[table["/run:t"].notna()]
+    assert len(table) == run.rows
+    assert np.array_equal(np.concatenate(table["/run:b_total_nt"]), run["b_total_nt"], equal_nan=True)
+
+
+def test_plots_of_error_and_interval_follow_from_the_columns(parts, tmp_path):
+    run, rest = parts
+    rng = np.random.default_rng(3)
+    run = run.with_columns(
+        b_truth_nt=run["b_total_nt"] - rng.normal(0, 40, run.rows), b_sd_nt=np.full(run.rows, 41.0)
+    )
+    write_rrd(run, tmp_path / "run.rrd", **rest)
+    _, values = columns_of(tmp_path / "run.rrd", "derived")
+    assert set(values) == set(DERIVED)
+    shown = {name: np.ravel(values[name]) for name in DERIVED}
+    total, truth = run["b_total_nt"], run["b_truth_nt"]
+    single = {"rtol": 1e-6, "atol": 0.01, "equal_nan": True}  # they are drawn in single precision
+    np.testing.assert_allclose(shown["error_nt"], total - truth, **single)
+    np.testing.assert_allclose(shown["measured_error_nt"], run["b_measured_nt"] - truth, **single)
+    np.testing.assert_allclose(shown["interval_high_nt"] - shown["interval_low_nt"], 3.29 * 41, atol=0.02)
+    known = np.isfinite(total)
+    inside = np.abs(shown["error_nt"][known]) < shown["error_high_nt"][known]
+    assert inside.mean() == pytest.approx(0.9, abs=0.03)
+    assert set(read_run(tmp_path / "run.rrd")) == set(run)
+
+
+def events_of(rrd):
+    times, values = columns_of(rrd, "events")
+    texts = [text[0] for text in values.get("TextLog:text", [])]
+    return sorted(zip((times / 1e9).tolist(), texts, strict=True))
+
+
+def test_events_tell_when_and_where_each_flag_began_and_ended(tmp_path):
+    t = np.arange(0, 10, 0.01)
+    flag = np.zeros(len(t), bool)
+    flag[100:151], flag[160:201], flag[500:], lock = True, True, True, np.zeros(len(t), bool)
+    p = np.column_stack([t, -t, 0 * t])
+    lock[0] = True
+    run = Run({"t": t, "p_world_base": p, "flag_bump": flag, "flag_lost_lock": lock})
+    write_rrd(run, tmp_path / "run.rrd")
+    assert events_of(tmp_path / "run.rrd") == [
+        (0.0, "magnetometer has lock again at x, y = +0.00, -0.00 m, after 0.00 s"),
+        (0.0, "magnetometer loses lock at x, y = +0.00, -0.00 m"),
+        (1.0, "bump: touches an obstacle at x, y = +1.00, -1.00 m"),
+        (
+            2.0,
+            "clear of the obstacle at x, y = +2.00, -2.00 m, after 1.00 s",
+        ),  # 0.1 s apart are not two bumps
+        (5.0, "bump: touches an obstacle at x, y = +5.00, -5.00 m"),  # and the last one does not end
+    ]
+
+
+@pytest.mark.parametrize("block", [1, 7, 100, 333])
+def test_events_and_states_are_the_same_however_the_run_is_cut_into_blocks(block, tmp_path):
+    rng = np.random.default_rng(block)
+    t = np.arange(600) / 20
+    flags = {
+        name: np.repeat(rng.random(60) < 0.4, 10) for name in ("flag_bump", "flag_pose_lost", "lidar_on")
+    }
+    run = Run({"t": t, "p_world_base": np.column_stack([t, t, t]), **flags})
+    write_rrd(run, tmp_path / "whole.rrd")
+    writer = RrdWriter(tmp_path / "blocks.rrd")
+    for start in range(0, run.rows, block):
+        writer.append(Run({name: values[start : start + block] for name, values in run.items()}))
+    writer.close()
+    assert events_of(tmp_path / "blocks.rrd") == events_of(tmp_path / "whole.rrd")
+    for state in ("bump", "mocap", "LiDAR"):
+        a, b = (columns_of(tmp_path / f"{name}.rrd", f"states/{state}") for name in ("blocks", "whole"))
+        assert np.array_equal(a[0], b[0])
+        assert a[1]["StateChange:state"] == b[1]["StateChange:state"]
+
+
+def test_runs_that_are_compared_stand_on_one_timeline_with_their_offsets_and_come_back(parts, tmp_path):
+    run, rest = parts
+    other = Run({name: values[:500] for name, values in run.items()}, {"seed": 2})
+    runs = {"the first": run, "b/2": other}
+    write_comparison(runs, tmp_path / "two.rrd", rest["twin"], offsets_s={"b/2": 2.5})
+    back = read_runs(tmp_path / "two.rrd")
+    assert list(back) == list(runs)
+    for name, one in runs.items():
+        assert dict(back[name].facts) == dict(one.facts)
+        assert all(back[name][key].tobytes() == np.ascontiguousarray(one[key]).tobytes() for key in one)
+    for entity in ("run/b_2", "world/robot/b_2"):
+        times, _ = columns_of(tmp_path / "two.rrd", entity)
+        assert times[0] == 2.5e9
+    assert rerun("rrd", "verify", tmp_path / "two.rrd").returncode == 0
+    with pytest.raises(RefusedError, match=r"compares 2 runs \(the first, b/2\)"):
+        read_run(tmp_path / "two.rrd")
+
+
+def test_runs_that_cannot_be_told_apart_and_offsets_of_none_are_refused(parts, tmp_path):
+    run, _ = parts
+    path = tmp_path / "two.rrd"
+    for runs, offsets, said in (
+        ({}, {}, "no runs to compare"),
+        ({"a b": run, "a_b": run}, {}, "need names that differ"),
+        ({"": run}, {}, "need names that differ"),
+        ({"a": run}, {"b": 1.0}, "offset 1.0 s of 'b'"),
+        ({"a": run}, {"a": np.inf}, "offset inf s of 'a'"),
+    ):
+        with pytest.raises(RefusedError, match=said):
+            write_comparison(runs, path, offsets_s=offsets)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_recording_that_was_cut_short_or_is_none_is_refused_in_a_line(written, tmp_path):
+    whole = written.read_bytes()
+    changed = bytearray(whole)
+    changed[len(whole) // 2 : len(whole) // 2 + 400] = bytes(400)
+    rec = rr.RecordingStream("another", send_properties=False)
+    rec.save(tmp_path / "foreign.rrd")
+    rec.log("points", rr.Points3D([[0, 0, 0]]))
+    rec.log("run", rr.TextDocument("not a table"), static=True)
+    rec.flush()
+    rec.disconnect()
+    for name, content, said in (
+        ("half.rrd", whole[: len(whole) // 2], "can be read|cut short"),
+        ("no_end.rrd", whole[:-5000], "can be read|cut short"),
+        ("changed.rrd", bytes(changed), "can be read"),
+        ("text.rrd", b"t,b_total_nt\n0,1\n" * 99, "not a Rerun recording that can be read"),
+        ("empty.rrd", b"", "not a Rerun recording that can be read"),
+        ("foreign.rrd", None, "not one of a run"),
+    ):
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        with pytest.raises(RefusedError, match=said) as refused:
+            read_run(tmp_path / name)
+        assert str(refused.value).startswith(str(tmp_path / name))
+        assert "\n" not in str(refused.value)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="a limit on file sizes is of POSIX")
+def test_a_full_disk_is_said_in_a_line_and_earlier_files_stay(parts, tmp_path):
+    from magtwin.io.tables import write_parquet
+
+    run, _ = parts
+    write_parquet(run, tmp_path / "run.parquet")
+    (tmp_path / "run.rrd").write_text("mine")
+    script = """
+import resource, signal, sys
+from magtwin.io.rerun import write_rrd
+from magtwin.io.live import RrdWriter
+from magtwin.io.tables import read_parquet
+from magtwin.names import RefusedError
+
+run = read_parquet("run.parquet")
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+for limit in (1000, 100_000, int(sys.argv[1])):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+    try:
+        write_rrd(run, "run.rrd", force=True)
+    except RefusedError as error:
+        print(error)
+writer = RrdWriter("live.rrd")
+try:
+    for _ in range(3):
+        writer.append(run)
+except RefusedError as error:
+    print(error)
+"""
+    write_rrd(run, tmp_path / "size.rrd")
+    just = (tmp_path / "size.rrd").stat().st_size - 1000  # so that only its end does not fit
+    command = [sys.executable, "-c", script, str(just)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True)
+    lines = done.stdout.splitlines()
+    assert len(lines) == 4
+    assert all(
+        line.startswith(("run.rrd: cannot be written", "live.rrd: cannot be written")) for line in lines
+    )
+    assert (tmp_path / "run.rrd").read_text() == "mine"
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "run.parquet",
+        "run.rrd",
+        "size.rrd",
+        "live.partial.rrd",
+    }
+
+
+def test_a_folder_that_cannot_be_written_is_refused(parts, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(RefusedError, match="cannot be written"):
+        write_rrd(parts[0], tmp_path / "file" / "run.rrd")
+    with pytest.raises(RefusedError, match="cannot be written"):
+        RrdWriter(tmp_path / "file" / "run.rrd")
+
+
+def test_a_clock_that_is_not_finite_is_refused(tmp_path):
+    with pytest.raises(RefusedError, match=r"t of row 3 is not finite"):
+        write_rrd(Run({"t": [0.0, 1.0, np.nan]}), tmp_path / "run.rrd")
 
 
 def test_a_run_of_no_rows_is_refused(parts, tmp_path):

@@ -14,7 +14,17 @@ import rerun.blueprint as rrb
 from magtwin.files import check_free
 from magtwin.io.layout import lab_eye, layout
 from magtwin.io.recorder import partial_of
-from magtwin.io.recording import APPLICATION, Recording, facts_page, send_properties, stream, title_of
+from magtwin.io.recording import (
+    APPLICATION,
+    ROOM,
+    Recording,
+    check_room,
+    facts_page,
+    send_properties,
+    size_of,
+    stream,
+    title_of,
+)
 from magtwin.io.series import STATES, TIMELINE
 from magtwin.io.viewer import live_viewer
 from magtwin.io.world import Room, heading_of, mesh_of
@@ -174,6 +184,8 @@ class _Growing:
     def append(self, run: Run) -> None:
         if self._recording is None:
             self._recording = self._begun(run)
+        if self._file is not None:
+            check_room(self._file, self._file.stat().st_size + size_of(run) + ROOM, self._said)
         try:
             self._recording.append(run)
             self._recording.rec.flush(timeout_sec=10.0)

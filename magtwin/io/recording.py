@@ -1,7 +1,11 @@
 """Recording: a Run on its way into a Rerun stream, whole or block by block, to a file, a viewer, or both."""
 
+import errno
 import hashlib
 import json
+import os
+import shutil
+import tempfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -21,11 +25,50 @@ from magtwin.sim.lidar import Scans
 
 APPLICATION = "magtwin"
 
+PATIENCE_S = 60.0
+"""How long Rerun may take to write what it was given [s]."""
+
 END = b"RRF2FOOT"
 """What stands at the end of a file that Rerun finished."""
 
+ROOM = 1 << 23
+"""Bytes that a lab, a robot and a layout take, or more."""
+
 POSED = frozenset(("p_world_base", "q_world_base_xyzw"))
 """Columns that place a robot."""
+
+
+def check_room(file: FilePath, size: int, said: FilePath | None = None) -> None:
+    """Refuse to begin what the disk has no room for.
+
+    It is asked beforehand, as Rerun writes from a thread of its own, and waits for that thread for ever where
+    a full disk has ended it.
+
+    Args:
+        file: The file that grows; nothing is done to it.
+        size: Bytes that it will have, or more.
+        said: The file that a refusal names, where that is another.
+
+    Raises:
+        RefusedError: There is no room, or its folder cannot be written.
+    """
+    try:
+        with tempfile.TemporaryFile(dir=file.parent) as probe:
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(probe.fileno(), 0, size)
+            elif shutil.disk_usage(file.parent).free < size:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    except OSError as error:
+        raise RefusedError(
+            f"{said or file}: cannot be written ({error.strerror}): it needs up to "
+            f"{size / 1e6:.1f} MB; make room"
+        ) from error
+
+
+def size_of(run: Run) -> int:
+    """Bytes that the rows of a run take in a recording, or more."""
+    own = sum(values.nbytes + 4 * run.rows for values in run.values())
+    return own + 24 * run.rows + 2 * (24 + 4 * 8) * run.rows
 
 
 @contextmanager
@@ -37,6 +80,7 @@ def stream(
     file: FilePath | None = None,
     address: str | None = None,
     said: FilePath | None = None,
+    room: int = ROOM,
 ) -> Iterator[rr.RecordingStream]:
     """A stream to a file, to the viewer at an address, or to both; complete and closed at the end.
 
@@ -47,11 +91,14 @@ def stream(
         file: The file to make; it can be read at any time up to the last flush.
         address: Where a viewer listens.
         said: The file that a refusal names, where that is another.
+        room: Bytes that the disk must have for it.
 
     Raises:
         RefusedError: Rerun is switched off, or the file cannot be written.
     """
     said = said or file
+    if file is not None:
+        check_room(file, room, said)
     strict = rr.strict_mode()
     rec = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
     if not rr.is_enabled(rec):
@@ -63,7 +110,7 @@ def stream(
         rec.set_sinks(*sinks, default_blueprint=views)
         rec.send_recording_name(name)
         yield rec
-        rec.flush()
+        rec.flush(timeout_sec=PATIENCE_S)
     except RuntimeError as error:
         raise RefusedError(_unwritten(said, error)) from error
     finally:

@@ -15,10 +15,12 @@ from magtwin.files import existing, output
 from magtwin.io.layout import RUN_COLOURS, Shown, comparison_layout, layout, plotted
 from magtwin.io.recorder import PARTIAL
 from magtwin.io.recording import (
+    ROOM,
     Recording,
     content_id,
     facts_page,
     send_properties,
+    size_of,
     stream,
     title_of,
 )
@@ -66,7 +68,9 @@ def write_rrd(
     name = title_of(run) or FilePath(path).stem
     with (
         output(path, force=force) as aside,
-        stream(content_id(run), name, views, file=aside, said=FilePath(path)) as rec,
+        stream(
+            content_id(run), name, views, file=aside, said=FilePath(path), room=ROOM + size_of(run)
+        ) as rec,
     ):
         send_properties(rec, run.facts)
         rec.log("facts", facts_page(run.facts, run.rows), static=True)
@@ -136,6 +140,7 @@ def write_comparison(
             comparison_layout(shown, lab, heading=heading),
             file=aside,
             said=FilePath(path),
+            room=ROOM + sum(map(size_of, runs.values())),
         ) as rec,
     ):
         room = None if twin is None else Room.enter(rec, twin, first, planned=planned)
@@ -277,3 +282,6 @@ def view(path: str | os.PathLike[str]) -> None:
 def _check_rows(run: Run, path: str | os.PathLike[str]) -> None:
     if not run.rows or "t" not in run.columns:
         raise RefusedError(f"{path}: the run has no rows, there is nothing to record")
+    if not np.isfinite(run["t"]).all():
+        row = int(np.argmin(np.isfinite(run["t"]))) + 1
+        raise RefusedError(f"{path}: t of row {row} is not finite; a recording needs the time of each row")
