@@ -356,6 +356,7 @@ def add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: 
     points = pyvista.PolyData(np.zeros((2, 3)))
     points["field"] = np.array([least, greatest]) * factor
     actor = plotter.add_mesh(points, scalars="field", cmap=table, opacity=0, show_scalar_bar=False)
+    letters = max(8, round(min(plotter.window_size[1], plotter.window_size[0] / 1.6) / 42))
     bar = plotter.add_scalar_bar(
         title=f"total field [{unit}]",
         mapper=actor.mapper,
@@ -366,6 +367,8 @@ def add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: 
         width=0.05,
         fmt="%.1f",
         color=INK,
+        title_font_size=letters,
+        label_font_size=letters,
     )
     bar.DrawBackgroundOn()  # so that it can be read before anything
     bar.GetBackgroundProperty().SetColor(pyvista.Color(BACKGROUND).float_rgb)

@@ -213,13 +213,8 @@ class Scenery:
         """What is seen at the k-th time, shape (height, width, 3); it is overwritten by the next."""
         from vtkmodules.util.numpy_support import vtk_to_numpy
 
-        base = _matrix(self._p[k], self._q[k])
-        for actor, rest, axis, side in self._bodies:
-            turned = rest
-            if side is not None and axis is not None:
-                half = self._wheels[k, side] / 2
-                turned = rest @ _matrix((0, 0, 0), [*(np.sin(half) * np.asarray(axis)), np.cos(half)])
-            actor.user_matrix = base @ turned
+        for name, T_world_link in self.poses(k).items():
+            self._actors[name].user_matrix = T_world_link
         quads = max(0, int(np.searchsorted(self._trail_t, self._times[k], side="right")) - 1)
         for mesh, actor, faces in self._ribbons:
             actor.visibility = quads > 0
@@ -233,6 +228,21 @@ class Scenery:
         seen = self._grab.GetOutput().GetPointData().GetScalars()
         image: NDArray[np.uint8] = vtk_to_numpy(seen).reshape(self._size[1], self._size[0], 3)[::-1]
         return image
+
+    def poses(self, k: int) -> dict[str, Array]:
+        """Where the robot's visible bodies are at the k-th time: T_world_link (4, 4) by the link's name."""
+        base = _matrix(self._p[k], self._q[k])
+        poses = {}
+        for name, link in self._links.items():
+            T_base_link = _matrix(link.p_base_link, link.q_base_link_xyzw)
+            side = self._sides.get(link.joint)
+            if side is not None and link.axis_link is not None:
+                half = self._wheels[k, side] / 2
+                T_base_link = T_base_link @ _matrix(
+                    (0, 0, 0), (*np.multiply(link.axis_link, np.sin(half)), np.cos(half))
+                )
+            poses[name] = base @ T_base_link
+        return poses
 
     def _pose(self, run: Run) -> None:
         """Where the robot is at each time, how far its wheels have turned, and what is said of it."""
@@ -281,15 +291,15 @@ class Scenery:
         for (flat, opacity), meshes in bodies.items():
             whole = meshes[0] if len(meshes) == 1 else meshes[0].append_polydata(*meshes[1:])
             self.plotter.add_mesh(whole, opacity=opacity, **style_of(flat))
-        self._bodies: list[tuple[Any, Array, Vec3 | None, int | None]] = []
+        self._actors: dict[str, Any] = {}
+        self._links: dict[str, Link] = {}
         for name, link in moving.items():
             meshes = [mesh_of(s, s.vertices) for s in carried if s.link == name and s.vertex_colours is None]
             if not meshes:
                 continue
             whole = meshes[0] if len(meshes) == 1 else meshes[0].append_polydata(*meshes[1:])
-            actor = self.plotter.add_mesh(whole, **style_of(False))
-            rest = _matrix(link.p_base_link, link.q_base_link_xyzw)
-            self._bodies.append((actor, rest, link.axis_link, self._sides.get(link.joint)))
+            self._actors[name] = self.plotter.add_mesh(whole, **style_of(False))
+            self._links[name] = link
         self._everything = np.vstack([*placed, self._p]).astype(float)
 
     def _put_up_trail(self, run: Run, limits: tuple[float, float] | None) -> None:
