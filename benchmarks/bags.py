@@ -1,8 +1,9 @@
 """A run of 600 s as a bag and back, against rosbags on the same messages, in one process.
 
-81,000 readings of the shipped lab's robot with all of its topics, some 500,000 messages, in both storages. The
-peer writes the same messages with rosbags' Writer, given as bytes already, and reads and decodes them again. For
-scale: numpy's savez of the same columns. Seconds by the clock and of all processors, medians over repetitions.
+81,000 readings of the shipped lab's robot with all of its topics, some 500,000 messages, in both storages.
+The peer writes the same messages with rosbags' Writer, given as bytes already, and reads and decodes them
+again. For scale: numpy's savez of the same columns. Seconds by the clock and of all processors, medians over
+repetitions of ours, one of the peer.
 
     python benchmarks/bags.py [--seconds 600] [--repetitions 3]
 """
@@ -70,23 +71,25 @@ def main() -> None:
             def write(bag: Path = bag, storage: str = storage) -> None:
                 write_bag(run, bag, twin, storage=storage, scans=scans, force=True)  # type: ignore[arg-type]
 
-            ours = (
-                seconds(write, options.repetitions),
-                seconds(lambda bag=bag: read_bag(bag), options.repetitions),
-            )
+            def read(bag: Path = bag) -> None:
+                read_bag(bag)
+
+            ours = seconds(write, options.repetitions), seconds(read, options.repetitions)
             with Reader(bag) as reader:
                 messages = [(c.topic, c.msgtype, t, bytes(data)) for c, t, data in reader.messages()]
-            peer = (
-                seconds(
-                    lambda storage=storage, m=messages: rosbags_write(folder / f"peer_{storage}", storage, m),
-                    1,
-                ),
-                seconds(lambda bag=bag: rosbags_read(bag), 1),
-            )
+
+            def peer_writes(bag: Path = bag, storage: str = storage, messages: list = messages) -> None:
+                rosbags_write(bag.with_name(f"peer_{storage}"), storage, messages)
+
+            def peer_reads(bag: Path = bag) -> None:
+                rosbags_read(bag)
+
+            peer = seconds(peer_writes, 1), seconds(peer_reads, 1)
             for what, mine, theirs in zip(("write", "read"), ours, peer, strict=True):
+                ratio = theirs[1] / mine[1]
                 print(
-                    f"{storage:8} {what:5} {len(messages)} messages: ours {mine[0]:.2f} s ({mine[1]:.2f} s of all "
-                    f"processors), rosbags {theirs[0]:.2f} s ({theirs[1]:.2f} s), {theirs[1] / mine[1]:.0f} times as much"
+                    f"{storage:8} {what:5} {len(messages)} messages: ours {mine[0]:.2f} s ({mine[1]:.2f} s of"
+                    f" all processors), rosbags {theirs[0]:.2f} s ({theirs[1]:.2f} s), {ratio:.1f} times as much"
                 )
 
 

@@ -400,9 +400,9 @@ def blocks(run, rows):
 @pytest.mark.parametrize("name", KINDS)
 def test_a_run_in_blocks_says_what_the_whole_run_says(made, twin, heard, tmp_path, name):
     storage = "sqlite3" if name == "bag3" else None
-    with BagWriter(tmp_path / name, twin, storage=storage) as writer:
-        for k, block in enumerate(blocks(made[0], 101)):
-            writer.append(block, made[1] if k == 0 else None)
+    with BagWriter(tmp_path / name, twin, storage=storage, scans=made[1]) as writer:
+        for block in blocks(made[0], 101):
+            writer.append(block)
             assert writer.partial.exists()
             assert not (tmp_path / name).exists()
     assert [p.name for p in tmp_path.iterdir()] == [name]

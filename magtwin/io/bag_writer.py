@@ -5,7 +5,7 @@ import dataclasses
 import json
 import os
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -97,15 +97,10 @@ def write_bag(
     check_free(path, force=force)
     who = _sender(twin, units, run)
     with output(path, force=force) as aside, _refused(path):
-        sink = _Sink(aside, storage, who, live=False)
+        sink = _Sink(aside, storage, who, scans, live=False)
         try:
             for first in range(0, max(run.rows, 1), BLOCK):
-                block = run.take(slice(first, first + BLOCK))
-                arrived = None
-                if scans is not None:
-                    last = run["t"][first + BLOCK] if first + BLOCK < run.rows else np.inf
-                    arrived, scans = _arrived(scans, last)
-                sink.append(block, arrived)
+                sink.append(run.take(slice(first, first + BLOCK)))
             sink.close()
         except BaseException:
             sink.abort()
@@ -113,8 +108,8 @@ def write_bag(
 
 
 def _arrived(scans: "Scans", t: float) -> "tuple[Scans, Scans]":
-    """Scans that arrived before a time [s], and those that did later."""
-    k = int(np.searchsorted(scans.arrival, t))
+    """Scans that arrived by a time [s], and those that did later."""
+    k = int(np.searchsorted(scans.arrival, t, side="right"))
     parts = [
         {f.name: getattr(scans, f.name)[rows] for f in dataclasses.fields(scans)}
         for rows in (slice(k), slice(k, None))
@@ -133,6 +128,7 @@ class BagWriter:
         twin: What the run happens in.
         storage: "mcap" or "sqlite3".
         units: Unit of fields.
+        scans: What the LiDAR will have seen; each is written when it has arrived.
         force: Whether what exists is replaced.
 
     Raises:
@@ -146,9 +142,11 @@ class BagWriter:
         *,
         storage: Storage | None = None,
         units: Unit = "T",
+        scans: "Scans | None" = None,
         force: bool = False,
     ) -> None:
         self._path, self._twin, self._units, self._force = Path(path), twin, units, force
+        self._scans = scans
         self._storage = _storage(self._path, storage)
         _check_units(units)
         check_free(self._path, force=force)
@@ -160,12 +158,11 @@ class BagWriter:
                 f"{self.partial}: left by a recording that did not end; read and remove it, or give --force"
             )
 
-    def append(self, run: Run, scans: "Scans | None" = None) -> None:
+    def append(self, run: Run) -> None:
         """Add rows of a run, later than those before and of the same columns; they outlive this process.
 
         Args:
             run: The rows; facts that are new or other than before replace them.
-            scans: Scans that arrived meanwhile.
 
         Raises:
             RefusedError: As `write_bag`.
@@ -173,7 +170,7 @@ class BagWriter:
         with _refused(self._path):
             if self._sink is None:
                 self._sink = self._open(run)
-            self._sink.append(run, scans)
+            self._sink.append(run)
             self._sink.flush()
 
     def close(self) -> None:
@@ -209,7 +206,7 @@ class BagWriter:
         else:
             self.partial.unlink(missing_ok=True)
         self.partial.parent.mkdir(parents=True, exist_ok=True)
-        return _Sink(self.partial, self._storage, who, live=True)
+        return _Sink(self.partial, self._storage, who, self._scans, live=True)
 
 
 def _storage(path: Path, storage: str | None) -> Storage:
@@ -285,8 +282,10 @@ class _Store(Protocol):
 class _Sink:
     """A bag at the very path that is given: its storage file, and metadata.yaml where it is a folder."""
 
-    def __init__(self, path: Path, storage: Storage, who: Sender, *, live: bool) -> None:
-        self._who, self._storage = who, storage
+    def __init__(
+        self, path: Path, storage: Storage, who: Sender, scans: "Scans | None", *, live: bool
+    ) -> None:
+        self._who, self._storage, self._scans = who, storage, scans
         self._folder = None if path.suffix in STORAGES.values() else path
         if self._folder is not None:
             path.mkdir()
@@ -301,30 +300,17 @@ class _Sink:
         self._tally = Tally({})
         self._stream: _Stream | None = None
 
-    def append(self, run: Run, scans: "Scans | None") -> None:
-        """Write rows, and scans."""
+    def append(self, run: Run) -> None:
+        """Write rows, and the scans that arrived by the last of them."""
         if self._stream is None:
-            self._stream = _Stream(run, self._who, scans is not None)
+            self._stream = _Stream(run, self._who, self._scans)
             self._connect(self._stream.topics)
-        if scans is not None and SCAN.name not in self._connections:
-            raise RefusedError(
-                "scans came after rows without any; give them, or none, from the first rows on"
-            )
         facts = {name: json.dumps(value) for name, value in json.loads(facts_to_json(run)).items()}
         if facts != self._facts:
             self._facts = facts
             if isinstance(self._store, McapWriter):
                 self._store.note(NOTE, facts)
-        batches = [
-            Batch(
-                self._connections[topic.name],
-                received,
-                encode(leaves(form), fields, len(received), room=ROOM),
-            )
-            for topic, received, form, fields in self._stream.messages(run, scans)
-        ]
-        self._store.write(batches)
-        self._tally.add(batches)
+        self._write(self._stream.messages(run))
 
     def flush(self) -> None:
         """Have it outlive this process."""
@@ -334,6 +320,8 @@ class _Sink:
 
     def close(self) -> None:
         """Make it whole."""
+        if self._stream is not None:
+            self._write(self._stream.last())
         self._note()
         if isinstance(self._store, McapWriter):
             self._store.note("rosbag2", {"serialized_metadata": yaml_of(self._metadata())})
@@ -344,6 +332,14 @@ class _Sink:
         """Leave it as it is."""
         with contextlib.suppress(OSError, sqlite3.Error):
             self._store.abort()
+
+    def _write(self, said: Iterable["_Said"]) -> None:
+        batches = [
+            Batch(self._connections[topic.name], t, encode(leaves(form), fields, len(t), room=ROOM))
+            for topic, t, form, fields in said
+        ]
+        self._store.write(batches)
+        self._tally.add(batches)
 
     def _connect(self, topics: Sequence[Topic]) -> None:
         for topic in topics:
@@ -395,11 +391,15 @@ class _Last:
     """How often they have been sent again since."""
 
 
+_Said = tuple[Topic, Index, str, dict[str, Any]]
+"""A topic with the times of some messages [ns], the leaves of their type, and their fields."""
+
+
 class _Stream:
     """What a robot says as a run goes on; it remembers what it said last."""
 
-    def __init__(self, run: Run, who: Sender, with_scans: bool) -> None:
-        self._who = who
+    def __init__(self, run: Run, who: Sender, scans: "Scans | None") -> None:
+        self._who, self._scans = who, scans
         self._t = -np.inf
         self._last: dict[str, _Last] = {}
         columns = set(run)
@@ -420,11 +420,11 @@ class _Stream:
         if who.description:
             once.append(DESCRIPTION)
         self._once = once
-        self.topics = [*once, *sent, *([SCAN] if with_scans else []), READING]
+        self.topics = [*once, *sent, *([] if scans is None else [SCAN]), READING]
         """Topics that there are."""
 
-    def messages(self, run: Run, scans: "Scans | None") -> Iterator[tuple[Topic, Index, str, dict[str, Any]]]:
-        """Topics with the times of their messages [ns], the leaves of their type, and their fields."""
+    def messages(self, run: Run) -> Iterator["_Said"]:
+        """What is said in the time of some rows."""
         if {name: (values.dtype, values.shape[1:]) for name, values in run.items()} != self._columns:
             raise RefusedError(f"rows of a bag must have the same columns, {', '.join(self._columns)}")
         t = self._checked(run)
@@ -444,15 +444,24 @@ class _Stream:
                 )
                 fields = topic.write(chosen, stamps[rows], self._who)
                 yield topic, stamps[rows], _form(topic, fields), fields
-        if scans is not None:
-            arrived = np.rint(scans.arrival * NS).astype(np.int64)
-            moments = np.rint(scans.t * NS).astype(np.int64)
-            fields = SCAN.write({"ranges_m": scans.ranges_m}, moments, self._who)
-            yield SCAN, arrived, TYPES[SCAN.kind], fields
         data = np.column_stack([np.asarray(run[name], float) for name in self._rest])
         yield READING, stamps, TYPES[READING.kind], {"data": data}
         if len(t):
             self._t = float(t[-1])
+            yield from self._scanned(self._t)
+
+    def last(self) -> Iterator["_Said"]:
+        """What is said after the last row: scans that were on their way."""
+        yield from self._scanned(np.inf)
+
+    def _scanned(self, until_s: float) -> Iterator["_Said"]:
+        """The scans that arrived by a time and have not been told yet."""
+        if self._scans is None:
+            return
+        arrived, self._scans = _arrived(self._scans, until_s)
+        moments, came = (np.rint(t * NS).astype(np.int64) for t in (arrived.t, arrived.arrival))
+        fields = SCAN.write({"ranges_m": arrived.ranges_m}, moments, self._who)
+        yield SCAN, came, TYPES[SCAN.kind], fields
 
     def _checked(self, run: Run) -> Array:
         """Times of rows, which rise."""
