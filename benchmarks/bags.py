@@ -88,8 +88,9 @@ def main() -> None:
             for what, mine, theirs in zip(("write", "read"), ours, peer, strict=True):
                 ratio = theirs[1] / mine[1]
                 print(
-                    f"{storage:8} {what:5} {len(messages)} messages: ours {mine[0]:.2f} s ({mine[1]:.2f} s of"
-                    f" all processors), rosbags {theirs[0]:.2f} s ({theirs[1]:.2f} s), {ratio:.1f} times as much"
+                    f"{storage:8} {what:5} {len(messages)} messages: ours {mine[0]:.2f} s "
+                    f"({mine[1]:.2f} s of all processors), rosbags {theirs[0]:.2f} s ({theirs[1]:.2f} s), "
+                    f"{ratio:.1f} times as much"
                 )
 
 

@@ -492,8 +492,8 @@ class _Outputs:
         known: dict[str, Any] = {"expected": driven.run, "planned": driven.planned, "scans": driven.scans}
         recordings = [RrdWriter(path, driven.twin, **known, force=self.force) for path in self.of("rrd")[:1]]
         tables = [ParquetParts(path, force=self.force) for path in self.of("parquet")[:1]]
-        units = self.units or "T"
-        bags = [BagWriter(path, driven.twin, units=units, force=self.force) for path in self.of("bag")]
+        options: dict[str, Any] = {"units": self.units or "T", "scans": driven.scans, "force": self.force}
+        bags = [BagWriter(path, driven.twin, **options) for path in self.of("bag")]
         return [*recordings, *tables, *bags]
 
     def write(self, driven: _Driven, *, steps: Any, recorded: bool = False) -> None:
