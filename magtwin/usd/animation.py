@@ -350,11 +350,11 @@ def _move(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], p: Any, q: NDArr
     if isinstance(p, Gf.Vec3d):
         translate.default = p
     else:
-        _sample(layer, translate.path, codes, p)
-    _sample(layer, orient.path, codes, Vt.QuatdArray.FromNumpy(np.ascontiguousarray(q)))
+        sample(layer, translate.path, codes, p)
+    sample(layer, orient.path, codes, Vt.QuatdArray.FromNumpy(np.ascontiguousarray(q)))
 
 
-def _sample(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], values: Iterable[Any]) -> None:
+def sample(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], values: Iterable[Any]) -> None:
     """Samples of an attribute, as fast as Python calls a function."""
     deque(map(layer.SetTimeSample, repeat(path), codes, values), maxlen=0)
 
@@ -376,12 +376,12 @@ def _sample_readings(
             if spec.interpolation == "hold":
                 values = run[name]
                 rows = np.flatnonzero(np.append(True, values[1:] != values[:-1]))
-                _sample(layer, attribute.path, ((t[rows] - t[0]) * rate).tolist(), values[rows].tolist())
+                sample(layer, attribute.path, ((t[rows] - t[0]) * rate).tolist(), values[rows].tolist())
             elif spec.width == 3:
                 vectors = Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(frames[name]))
-                _sample(layer, attribute.path, codes, vectors)
+                sample(layer, attribute.path, codes, vectors)
             else:
-                _sample(layer, attribute.path, codes, frames[name].tolist())
+                sample(layer, attribute.path, codes, frames[name].tolist())
 
 
 def _store(layer: Sdf.Layer, path: Sdf.Path, run: Run) -> None:
