@@ -10,7 +10,7 @@ from pxr import Sdf, Usd
 
 from magtwin.cli import main
 from magtwin.files import git_revision, sha256
-from magtwin.io.provenance import differences, repeat
+from magtwin.io.provenance import differences, repeat, repeat_of
 from magtwin.io.tables import read_parquet, write_parquet
 from magtwin.names import RefusedError
 from magtwin.path import Path
@@ -164,6 +164,22 @@ def test_a_run_of_a_data_set_comes_out_again_with_its_robot_of_the_day(lab_scene
     assert figures["equal columns"]["value"] == 4
     a, b = (read_parquet(out / f"run_0000{k}.parquet").facts["config_sha256"] for k in (0, 1))
     assert a != b
+
+
+@pytest.mark.parametrize("name", ["run.csv", "run.npz", "run.rrd", "run.usdc", "run.mcap", "bag"])
+def test_a_run_comes_out_again_from_a_file_of_any_format(run, twin, tmp_path, name):
+    from magtwin.io.formats import write_run
+
+    write_run(run, tmp_path / name, twin)
+    found = repeat_of(tmp_path / name)
+    assert found.causes == ()
+    assert found.equal, found.report(name)
+
+
+def test_a_run_that_was_resampled_says_so(run):
+    found = repeat(run.resample(rate_hz=10.0))
+    assert found.causes[0].startswith("the run was made from another: resample")
+    assert not found.equal
 
 
 def test_what_changed_is_named_first_and_the_columns_that_differ(lab_scene, tmp_path, run, capsys):

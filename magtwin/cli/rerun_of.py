@@ -37,16 +37,14 @@ def rerun_of(
         Print the verdict as JSON.
     """
     from magtwin.files import check_free
-    from magtwin.io.formats import read_run, write_run
-    from magtwin.io.provenance import repeat
+    from magtwin.io.formats import write_run
+    from magtwin.io.provenance import repeat_of
 
     if out is not None:
         check_free(out, force=force)
     steps = announcer(quiet=json)
-    steps("Reading the run")
-    run = read_run(file)
     steps("Making it once more")
-    found = repeat(run, scene, near=file)
+    found = repeat_of(file, scene)
     if out is not None:
         write_run(found.again, out, force=force)
     report = found.report(f"{file}, made once more")

@@ -1,7 +1,7 @@
 """Provenance: a run made once more from what its facts say, and whether it is the same."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -71,6 +71,22 @@ class Repeat:
         return Report(title, tuple(figures), {"changed": list(self.causes)} if self.causes else {})
 
 
+def repeat_of(file: str | FilePath, scene: str | FilePath | None = None) -> Repeat:
+    """Make the run of a file once more, and compare it with what such a file would keep of it.
+
+    Raises:
+        RefusedError: The file holds no run; or as for `repeat`.
+    """
+    from magtwin.io.formats import read_run
+
+    file = FilePath(file)
+    run = read_run(file)
+    found = repeat(run, scene, near=file)
+    if found.equal:
+        return found
+    return replace(found, differences=differences(run, as_kept(found.again, file)))
+
+
 def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None) -> Repeat:
     """Make a run once more, from what its facts say, and compare.
 
@@ -137,12 +153,25 @@ def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePat
 
 def _compared(run: Run, again: Run) -> Repeat:
     """A run, and what came out when it was made once more."""
-    causes = [
+    causes = [f"the run was made from another: {run.facts['derived']}"] if "derived" in run.facts else []
+    causes += [
         f"{why}: {fact} was {run.facts.get(fact, 'none')}, is {again.facts.get(fact, 'none')}"
         for fact, why in CAUSES.items()
         if run.facts.get(fact) != again.facts.get(fact)
     ]
     return Repeat(run, again, tuple(causes), differences(run, again))
+
+
+def as_kept(run: Run, file: FilePath) -> Run:
+    """What a file of the same format keeps of a run; a bag, say, keeps a battery in single precision."""
+    import tempfile
+
+    from magtwin.io.formats import read_run, write_run
+
+    with tempfile.TemporaryDirectory() as folder:
+        beside = FilePath(folder) / (f"run{file.suffix}" if file.suffix and not file.is_dir() else "run")
+        write_run(run, beside)
+        return read_run(beside)
 
 
 def map_of(
@@ -237,8 +266,6 @@ def _read_run(file: FilePath) -> Run:
 
 def _on_its_day(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> Twin:
     """The twin with its robot as it was on the run's day, where `magtwin runs` dealt it to one."""
-    from dataclasses import replace
-
     from magtwin.sim.session import session_of
 
     if "session_seed" not in facts:
