@@ -120,9 +120,8 @@ class Room:
         rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         _send_map(rec, twin.field, scale, heading_of(twin.field, known))
         _send_scale(rec, twin.field, scale)
-        for shape in shapes:
-            if not shape.link and shape.prim != str(HEAT_MAP):  # the map is drawn finer, see _send_map
-                rec.log(f"world/lab/{_entity(shape.prim)}", mesh_of([shape]), static=True)
+        for prim, things in _things(shapes).items():
+            rec.log(f"world/lab/{_entity(prim)}", mesh_of(things), static=True)
         if planned is not None:
             _send_planned(rec, planned)
         return cls(rec, twin.scene.robot, shapes, links, scale)
@@ -441,6 +440,17 @@ def _colours(shape: Shape) -> NDArray[np.uint8]:
     own = shape.colour[:3] if shape.vertex_colours is None else shape.vertex_colours[shape.faces.ravel()]
     rgba[:, :3], rgba[:, 3] = srgb_from_linear(own), shape.colour[3]
     return (rgba * 255).round().astype(np.uint8)
+
+
+def _things(shapes: Sequence[Shape]) -> dict[str, list[Shape]]:
+    """Shapes that stand still by the prim of the thing that they are part of: a desk, not its legs."""
+    things: dict[str, list[Shape]] = {}
+    for shape in shapes:
+        if not shape.link and shape.prim != str(HEAT_MAP):  # the map is drawn finer, see _send_map
+            parent, _, _ = shape.prim.rpartition("/")
+            whole = parent if parent.count("/") > 1 else shape.prim  # a prim below the root is a thing itself
+            things.setdefault(whole, []).append(shape)
+    return things
 
 
 def _entity(name: str) -> str:
