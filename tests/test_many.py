@@ -156,8 +156,19 @@ def test_robots_that_differ_in_their_session_alone_share_a_plan(neural):
     assert len(runs._planned) == 1
 
 
-def test_columns_that_are_kept_are_those_named_and_t_in_the_tables_order(neural, alone):
-    wanted = ["b_total_nt", "yaw", "odom_v"]
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        ["b_total_nt", "yaw", "odom_v"],
+        ["b_measured_nt"],
+        ["b_vector_measured_nt", "flag_bump"],
+        ["b_sd_nt", "battery_a"],
+        ["flag_out_of_distribution", "mocap_p"],
+        [],
+    ],
+    ids=lambda wanted: "+".join(wanted) or "t",
+)
+def test_columns_that_are_kept_are_those_named_and_t_in_the_tables_order(neural, alone, wanted):
     runs = simulate_many(neural, PATHS, SEEDS, speeds=SPEEDS, columns=wanted, **SHORT)
     for run, own in zip(runs, alone, strict=True):
         assert list(run) == [name for name in COLUMNS if name in {"t", *wanted}]
