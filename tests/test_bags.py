@@ -452,7 +452,9 @@ def test_of_an_mcap_that_was_cut_anywhere_what_is_whole_is_read(made, tmp_path, 
     write_bag(made[0], cut)
     content = cut.read_bytes()
     cut.write_bytes(content[: int(keep * len(content))])
-    with pytest.raises(RefusedError, match=r"run\.mcap: cut short: its end is missing; .* recover=True"):
+    with pytest.raises(
+        RefusedError, match=r"cut short: its end is missing; .* name such as run\.partial\.mcap"
+    ):
         read_bag(cut)
     back = read_bag(cut, recover=True)
     rows = back.rows
@@ -526,6 +528,32 @@ def test_a_table_of_columns_that_lies_is_refused(bags, made, tmp_path):
         with pytest.raises(RefusedError, match=text) as refusal:
             read_bag(path)
         assert "\n" not in str(refusal.value)
+
+
+def test_a_database_that_computes_what_is_read_is_refused(bags, tmp_path):
+    path = tmp_path / "run.db3"
+    for statement in (
+        "CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id, 0 AS timestamp, zeroblob(1000000) AS data",
+        "CREATE TABLE messages(id, topic_id, timestamp, data AS (zeroblob(1000000000)))",
+        "CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)",
+    ):
+        path.write_bytes((bags / "run.db3").read_bytes())
+        database = sqlite3.connect(path)
+        database.execute("DROP TABLE messages")
+        database.execute(statement)
+        database.commit()
+        database.close()
+        with pytest.raises(RefusedError, match=r"without the tables of a bag|not one of plain columns"):
+            read_bag(path)
+
+
+def test_a_chunk_that_says_it_is_a_thousand_times_its_size_is_refused_unread(bags, tmp_path):
+    content = bytearray((bags / "run.mcap").read_bytes())
+    chunk = content.index(b"zstd") - 4 - 4 - 8  # its size stands before checksum and codec
+    content[chunk : chunk + 8] = (1 << 29).to_bytes(8, "little")
+    (tmp_path / "run.mcap").write_bytes(content)
+    with pytest.raises(RefusedError, match=r"a chunk of 536870912 bytes, zstd compressed to .* cannot be"):
+        read_bag(tmp_path / "run.mcap")
 
 
 def test_readings_for_a_map_are_read_from_our_own_bags(bags, made):

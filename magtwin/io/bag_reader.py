@@ -41,6 +41,7 @@ from magtwin.io.messages import (
     Sender,
     Topic,
 )
+from magtwin.io.recorder import PARTIAL, partial_of
 from magtwin.names import RefusedError, find, hint
 from magtwin.run import COLUMNS, Column, Run
 
@@ -99,9 +100,10 @@ def read_bag(
     """
     path = existing(path, "bag")
     with _refusing(path), _Bag(path) as bag:
-        if not bag.whole and not recover and ".partial" not in path.name:
+        if not bag.whole and not recover and PARTIAL not in path.name:
             raise RefusedError(
-                f"{path}: cut short: its end is missing; copy it again, or read what there is: recover=True"
+                f"{path}: cut short: its end is missing; copy it again, or give it a name such as "
+                f"{partial_of(path).name}, under which what is whole is read"
             )
         if READING.name in bag.kinds and NAMES.name in bag.kinds and not topics:
             return _own(bag)
@@ -260,7 +262,7 @@ def _own(bag: _Bag) -> Run:
     data = decode(leaves(TYPES[READING.kind]), rows, ["data"])["data"]
     most = data.shape[1] if len(rows) else int(sum(int(c["width"] or 1) for c in table["columns"]))
     data = data if len(rows) else np.zeros((0, most))
-    unit = Sender(unit=table["unit"]).unit
+    unit = str(table["unit"])
     carriers = {
         str(c["topic"]): find("topic", str(c["topic"]), TOPICS) for c in table["columns"] if "topic" in c
     }

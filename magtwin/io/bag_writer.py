@@ -204,7 +204,8 @@ class BagWriter:
                 file.unlink()
             self.partial.rmdir()
         else:
-            self.partial.unlink(missing_ok=True)
+            for log in ("", "-wal", "-shm"):
+                self.partial.with_name(self.partial.name + log).unlink(missing_ok=True)
         self.partial.parent.mkdir(parents=True, exist_ok=True)
         return _Sink(self.partial, self._storage, who, self._scans, live=True)
 

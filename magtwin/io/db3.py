@@ -133,10 +133,15 @@ class Db3Reader:
     def _learn(self) -> None:
         for pragma in ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0"):
             self._database.execute(f"PRAGMA {pragma}").close()
-        self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_BYTES)
-        tables = {name for (name,) in self._all("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_BYTES)  # of a message
+        made = dict(self._all("SELECT name, sql FROM sqlite_master WHERE type = 'table'"))
+        tables = {name for name in ("topics", "messages", "metadata") if name in made}
         if not {"topics", "messages"} <= tables:
             raise RefusedError("a database without the tables of a bag")
+        for name in tables:  # what is computed when it is read could be of any size
+            columns = self._all(f"SELECT hidden FROM pragma_table_xinfo('{name}')")
+            if any(hidden for (hidden,) in columns) or not str(made[name]).upper().startswith("CREATE TABLE"):
+                raise RefusedError(f"its table {name} is not one of plain columns")
         self.topics = [
             Heard(int(number), str(name), str(kind), str(encoding))
             for number, name, kind, encoding in self._all(

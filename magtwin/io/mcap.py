@@ -28,6 +28,9 @@ CHUNK = 1 << 20
 LARGEST_CHUNK = 1 << 30
 """Bytes of the largest chunk that is read."""
 
+MOST_RATIO = 1000
+"""Most bytes that a chunk may hold for each one that it has in the file, beside a first `CHUNK`."""
+
 LEVEL = 1
 """Of zstd's compression."""
 
@@ -347,7 +350,8 @@ class McapReader:
         words.number("<QQ")
         size, crc, codec, stored = words.number("<Q"), words.number("<I"), words.text(), words.number("<Q")
         raw = words.rest()
-        if stored != len(raw) or size > LARGEST_CHUNK or codec not in ("", "zstd", "lz4"):
+        most = min(LARGEST_CHUNK, CHUNK + MOST_RATIO * len(raw))
+        if stored != len(raw) or size > most or codec not in ("", "zstd", "lz4"):
             raise RefusedError(f"a chunk of {size} bytes, {codec or 'not'} compressed to {stored}, cannot be")
         try:
             content = pa.Codec(codec).decompress(raw, size) if codec else raw
