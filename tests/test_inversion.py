@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.field.grid import Grid
 from magtwin.field.harmonic import HarmonicField
 from magtwin.field.interpolation import fit_trilinear
-from magtwin.field.inversion import fit_harmonic
+from magtwin.field.inversion import _headings, fit_harmonic
 from magtwin.field.readings import Readings
 from magtwin.names import RefusedError
 
@@ -255,6 +255,36 @@ def test_too_few_readings_and_a_second_set_of_layers_are_refused(lab):
         fit_harmonic(readings, like=lab[1], depth_m=0.5)
     with pytest.raises(RefusedError, match=r"p_xy must have shape \(\.\.\., 2\)"):
         lab[1].predict(np.zeros(3), 0.0)
+
+
+def test_the_earths_field_of_the_readings_counts_where_none_is_given(lab):
+    _, model = lab
+    readings = survey(truth()).with_(earth_nt=EARTH)
+    want = fit_harmonic(readings.with_(earth_nt=None), earth_nt=EARTH, like=model).unknowns
+    assert_array_equal(fit_harmonic(readings, like=model).unknowns, want)
+
+
+def test_headings_that_a_platform_does_not_explain_widen_what_lies_between_them(lab):
+    field, model = lab
+    p, _ = off_grid(50)
+    readings = survey(field)
+    odd = np.array([200.0, -150.0, 0.0, -250.0])[readings.node[:, 0]]  # neither hard nor soft iron
+    odd += 150.0 * np.array([1.0, -1.0, 1.0, -1.0])[readings.node[:, 0]]
+    other = fit_harmonic(readings.with_(b_nt=readings.b_nt + odd), earth_nt=EARTH, like=model)
+    assert_allclose(other.headings_rad, QUARTERS)
+    at, between = (other.predict(p, yaw)[1].mean() for yaw in (0.0, np.pi / 4))
+    assert between > at + 900
+    assert model.predict(p, np.pi / 4)[1].mean() < at + 900
+
+
+def test_a_drive_with_headings_all_around_has_no_gaps_between_them():
+    heading, group = _headings(np.linspace(0, 2 * np.pi, 200))
+    assert not len(heading)
+    assert (group == -1).all()
+    stray = np.concatenate([np.repeat(QUARTERS, 30), [0.8]])
+    heading, group = _headings(stray)
+    assert_allclose(heading, QUARTERS, atol=1e-12)
+    assert_array_equal(group, [*np.repeat([0, 1, 2, 3], 30), -1])
 
 
 @pytest.mark.slow

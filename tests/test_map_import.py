@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_cli import refused
+from test_gp import survey
 from test_latch import gridded
 from test_rosbag import at_middle, drive, write_bag
 
 from magtwin.cli import main
+from magtwin.cli.map import _earth_nt
+from magtwin.field.earth import earth_field_nt
 from magtwin.field.survey import import_survey
 from magtwin.io.readings import load_readings, save_readings
 from magtwin.usd.maps import load_map
+from magtwin.usd.scene import read_scene
 
 
 def run(*arguments):
@@ -205,3 +209,52 @@ def test_runs_under_several_licences_keep_all_of_them(tmp_path, capsys):
     run("map", "import", tmp_path / "a.parquet", tmp_path / "b.parquet", "--out", tmp_path / "c.parquet")
     capsys.readouterr()
     assert load_readings(tmp_path / "c.parquet").licence == "MIT; CC-BY-4.0"
+
+
+def test_the_earths_field_is_taken_from_a_place_and_day_as_numbers_or_from_a_scene(lab_scene):
+    place = _earth_nt("29.64, -82.35, 50, 2024-06-01")
+    assert place == earth_field_nt(29.64, -82.35, 50.0, "2024-06-01")
+    assert _earth_nt("-2700,24000,-38400") == (-2700.0, 24000.0, -38400.0)
+    assert _earth_nt(str(lab_scene)) == read_scene(lab_scene, check_network=False).earth.b_world_nt
+
+
+def test_a_survey_of_a_twin_knows_the_earths_field_and_keeps_it(tmp_path, capsys, lab_scene):
+    out = tmp_path / "a.parquet"
+    run("map", "survey", lab_scene, "--out", out, "--spacing", "1", "--readings", "1")
+    assert load_readings(out).earth_nt == read_scene(lab_scene, check_network=False).earth.b_world_nt
+
+
+def test_a_check_takes_the_kernel_of_the_gaussian_process_and_leaves_headings_out(tmp_path, capsys):
+    save_readings(survey(rows=5, columns=5), tmp_path / "a.parquet")
+
+    def told(*more):
+        run("map", "check", tmp_path / "a.parquet", "--json", *more)
+        report = json.loads(capsys.readouterr().out)
+        return report["facts"]["split"], report["figures"]
+
+    matern = told("--method", "gp", "--kernel", "matern")[1]["gp RMSE"]["value"]
+    poisson = told("--method", "gp", "--kernel", "poisson")[1]["gp RMSE"]["value"]
+    assert told("--method", "gp")[1]["gp RMSE"]["value"] == poisson != matern
+    split, figures = told("--method", "trilinear", "--split", "heading")
+    assert split == "one heading at a time"
+    assert figures["turns"]["value"] == 4
+    assert figures["trilinear predicted"]["value"] == 100
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        (("--method", "cubic", "--kernel", "matern"), "--kernel is for --method gp alone"),
+        (("--method", "gp", "--earth", "1,2,3"), "--earth is for --method harmonic alone"),
+        (("--earth", "1,2,south"), "--earth is a scene; latitude,longitude,height,date; or x,y,z in nT"),
+        (("--earth", "0,0,0"), "earth_nt must be three numbers"),
+        (("--earth", "29,-82,50,2050-01-01"), "lies beyond the IGRF-14"),
+        (("--earth", "lab.usda"), "there is no file 'lab.usda'"),
+    ],
+)
+def test_an_option_of_another_method_and_a_field_that_is_none_are_refused(
+    tmp_path, monkeypatch, capsys, arguments, what
+):
+    monkeypatch.chdir(tmp_path)
+    assert what in refused(capsys, "map", "fit", "a.csv", "--out", "a.usdc", *arguments)
+    assert not list(tmp_path.iterdir())

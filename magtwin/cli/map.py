@@ -15,6 +15,7 @@ map_app = App(name="map", help="Make and look at anomaly maps.")
 app.command(map_app)
 
 KeepLatched = Annotated[bool, Parameter(name="--keep-latched", negative="")]
+Kernel = Literal["matern", "poisson"]
 TableColumns = Annotated[Columns, Parameter(name="*")]
 NO_COLUMNS = Columns()
 
@@ -127,6 +128,8 @@ def map_fit(
     *sources: Path,
     out: Path,
     method: Literal["trilinear", "cubic", "gp", "harmonic"] = "harmonic",
+    kernel: Kernel | None = None,
+    earth: str | None = None,
     spacing: float | None = None,
     headings: str | None = None,
     about: AboutSurvey = NOTHING_SAID,
@@ -148,6 +151,13 @@ def map_fit(
     method
         trilinear between nodes, cubic, a Gaussian process, or the harmonic field of equivalent dipoles
         with the platform that the survey was made with.
+    kernel
+        Covariance of the Gaussian process: Matern's of order 5/2, or Poisson's, that of a field above uncorrelated
+        sources; poisson unless given.
+    earth
+        The Earth's field for the harmonic fit: a scene or stage that knows it; latitude,longitude,height,date
+        [deg, deg, m, YYYY-MM-DD], where the world's y is true north; or its x,y,z in the world [nT]. That
+        of a survey of a twin is known unless given.
     spacing
         Distance between the map's nodes [m]; the survey's own for trilinear, else a fifth of it.
     headings
@@ -170,11 +180,12 @@ def map_fit(
     check_free(out, force=force)
     angles = None if headings is None else _headings_rad(headings)
     given = about.given(out)
+    options = _options([method], kernel, earth).get(method, {})
     readings, found = _read(sources, columns, given, keep_latched, pose_topic, field_topic)
     from magtwin.field.fit import fit, raster
 
     with progress(f"Fitting {method}") as advance:
-        model = fit(readings, method, progress=advance)
+        model = fit(readings, method, progress=advance, **options)
         named = readings.with_(name=given["name"])
         field = raster(model, named, spacing_m=spacing, headings_rad=angles, progress=advance)
     save_map(field, out, force=force)
@@ -187,7 +198,9 @@ def map_fit(
 def map_check(
     *sources: Path,
     method: list[Literal["trilinear", "cubic", "gp", "harmonic"]] | None = None,
-    split: Literal["checkerboard", "run", "block"] | None = None,
+    split: Literal["checkerboard", "heading", "run", "block"] | None = None,
+    kernel: Kernel | None = None,
+    earth: str | None = None,
     within: float | None = None,
     keep_latched: KeepLatched = False,
     pose_topic: str | None = None,
@@ -204,8 +217,15 @@ def map_check(
     method
         Method to check; may be given several times; all of them unless given.
     split
-        What is left out: every other node at all its headings, one run at a time, or blocks of the floor;
-        nodes of a gridded survey, runs where there are several, else blocks, unless given.
+        What is left out: every other node at all its headings, one heading at a time, one run at a time, or
+        blocks of the floor; nodes of a gridded survey, runs where there are several, else blocks, unless given.
+    kernel
+        Covariance of the Gaussian process: Matern's of order 5/2, or Poisson's, that of a field above uncorrelated
+        sources; poisson unless given.
+    earth
+        The Earth's field for the harmonic fit: a scene or stage that knows it; latitude,longitude,height,date
+        [deg, deg, m, YYYY-MM-DD], where the world's y is true north; or its x,y,z in the world [nT]. That
+        of a survey of a twin is known unless given.
     within
         Only readings this near to one that was shown count [m].
     keep_latched
@@ -217,14 +237,16 @@ def map_check(
     json
         Print the summary as JSON.
     """
-    readings, _ = _read(sources, columns, {}, keep_latched, pose_topic, field_topic)
-    from magtwin.field.check import check
+    from magtwin.field.check import FILLED, check
     from magtwin.field.fit import METHODS
 
+    methods = list(method or METHODS)
+    options = {**FILLED, **_options(methods, kernel, earth)}
+    readings, _ = _read(sources, columns, {}, keep_latched, pose_topic, field_topic)
     if split is None:
         split = "checkerboard" if readings.grid is not None else "run" if len(readings.runs) > 1 else "block"
     with progress("Checking") as advance:
-        report = check(readings, list(method or METHODS), split=split, within_m=within, progress=advance)
+        report = check(readings, methods, split=split, within_m=within, options=options, progress=advance)
     print_report(report, json)
 
 
@@ -524,6 +546,42 @@ def _read(
             "survey again, or give --keep-latched to take them as they are"
         )
     return (readings if keep_latched else masked), found
+
+
+def _options(methods: list[str], kernel: str | None, earth: str | None) -> dict[str, dict[str, Any]]:
+    """Options of methods, by name; refused where none of them takes what was given."""
+    options: dict[str, dict[str, Any]] = {}
+    for flag, value, method in (("--kernel", kernel, "gp"), ("--earth", earth, "harmonic")):
+        if value is not None and method not in methods:
+            raise RefusedError(f"{flag} is for --method {method} alone; leave it out of a {methods[0]} fit")
+    if kernel is not None:
+        options["gp"] = {"kernel": kernel}
+    if earth is not None:
+        options["harmonic"] = {"earth_nt": _earth_nt(earth)}
+    return options
+
+
+def _earth_nt(text: str) -> tuple[float, float, float]:
+    """The Earth's field in world axes [nT], of a scene, of a place and a day, or as it stands."""
+    words = [word.strip() for word in text.split(",")]
+    forms = "a scene; latitude,longitude,height,date; or x,y,z in nT"
+    if len(words) in (3, 4) and not Path(text).exists():
+        from magtwin.field.earth import earth_field_nt
+        from magtwin.field.readings import checked_earth_nt
+
+        try:
+            x, y, z = (float(word) for word in words[:3])
+        except ValueError as error:
+            raise RefusedError(f"--earth is {forms}; got {text!r}") from error
+        return checked_earth_nt((x, y, z)) if len(words) == 3 else earth_field_nt(x, y, z, words[3])
+    from magtwin.usd.scene import read_scene
+
+    if not Path(text).is_file():
+        raise RefusedError(f"--earth is {forms}; there is no file {text!r}")
+    known = read_scene(text, check_network=False).earth
+    if known is None:
+        raise RefusedError(f"--earth {text}: this scene does not know the Earth's field; give it as {forms}")
+    return known.b_world_nt
 
 
 def _headings_rad(text: str) -> list[float]:

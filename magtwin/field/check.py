@@ -1,6 +1,7 @@
 """Check: how well methods tell readings that they were not shown."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -46,9 +47,10 @@ def check(
         readings: A survey.
         methods: Names of `METHODS`.
         split: "checkerboard": every other node of a gridded survey is left out, at all its headings,
-            then the others. "run": one run at a time. "block": every fifth block of three spacings, in five
+            then the others. "heading": one nominal heading of a gridded survey at a time. "run": one run at
+            a time. "block": every fifth block of three spacings, in five
             turns. Or the rows to fit and the rows to predict of each turn. Unless given, the first
-            of these three that the survey allows.
+            that the survey allows of checkerboard, run and block.
         within_m: Only readings this near to one that was fitted are predicted [m].
         options: Options of the methods, by name of the method.
         progress: Called as progress(done, total, what).
@@ -90,7 +92,7 @@ def check(
                 if progress is not None:
                     progress(step, steps, method)
                 step += 1
-                m, v = _predict(readings.take(train), readings.take(test), method, options.get(method, {}))
+                m, v = _predict(_shown(readings, train), readings.take(test), method, options.get(method, {}))
             mean.append(m)
             variance.append(v)
         figures += _figures(method, readings, tested, np.concatenate(mean), np.concatenate(variance), heading)
@@ -100,6 +102,18 @@ def check(
     if within_m is not None:
         facts["within"] = f"{within_m:g} m of a reading that was fitted"
     return Report(f"check of {readings.name or 'survey'}", tuple(figures), facts)
+
+
+def _shown(readings: Readings, rows: Rows) -> Readings:
+    """Some readings, on a grid of the headings that they have."""
+    shown = readings.take(rows)
+    if shown.grid is None or shown.node is None:
+        return shown
+    left, heading = np.unique(shown.node[:, 0], return_inverse=True)
+    if len(left) == len(shown.grid.headings_rad):
+        return shown
+    grid = replace(shown.grid, headings_rad=tuple(shown.grid.headings_rad[h] for h in left))
+    return shown.with_(grid=grid, node=np.column_stack([heading.ravel(), shown.node[:, 1:]]))
 
 
 def _predict(train: Readings, test: Readings, method: str, options: Mapping[str, Any]) -> tuple[Array, Array]:
@@ -135,12 +149,22 @@ def _turns(
 
 
 def _checkerboard(readings: Readings) -> tuple[Rows, str]:
+    return _nodes(readings, "checkerboard")[:, 1:].sum(
+        axis=1
+    ) % 2, "every other node at all its headings, then the others"
+
+
+def _heading(readings: Readings) -> tuple[Rows, str]:
+    return _nodes(readings, "heading")[:, 0], "one heading at a time"
+
+
+def _nodes(readings: Readings, split: str) -> Rows:
     if readings.node is None:
         raise RefusedError(
-            f"split 'checkerboard' needs the nodes of a gridded survey, {readings.name!r} has none; "
+            f"split {split!r} needs the nodes of a gridded survey, {readings.name!r} has none; "
             "take 'run' or 'block'"
         )
-    return readings.node[:, 1:].sum(axis=1) % 2, "every other node at all its headings, then the others"
+    return readings.node
 
 
 def _run(readings: Readings) -> tuple[Rows, str]:
@@ -156,6 +180,7 @@ def _block(readings: Readings) -> tuple[Rows, str]:
 
 SPLITS: dict[str, Callable[[Readings], tuple[Rows, str]]] = {
     "checkerboard": _checkerboard,
+    "heading": _heading,
     "run": _run,
     "block": _block,
 }

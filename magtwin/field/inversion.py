@@ -12,7 +12,8 @@ moments have normal priors, which is a Gaussian process with curl- and divergenc
   around it in its layer, drawn a little towards the layer's.
 - All these figures follow from the readings: strengths by MacKay's (1992) fixed point of the evidence
   (Rasmussen & Williams 2006, section 5.4, with Laplace's approximation), noises and tail by
-  expectation-maximization. How wide the intervals are is learnt from places left out in turn.
+  expectation-maximization. How wide the intervals are is learnt from places left out in turn, and
+  between headings that are far apart from headings left out in turn: iron is not all that a robot changes.
 
 The magnitude is not linear in the field; Gauss-Newton steps, halved until the posterior grows, solve it. Each
 costs one factorisation, of a matrix as large as the readings where they are few, so that layers may be
@@ -28,9 +29,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.bins import spacing_m as survey_spacing_m
 from magtwin.field.forward import SOFT, Forward, Reading
+from magtwin.field.grid import TURN
 from magtwin.field.harmonic import HarmonicField
 from magtwin.field.posterior import Posterior
-from magtwin.field.readings import Readings
+from magtwin.field.readings import Readings, checked_earth_nt
+from magtwin.field.roughness import NINETY
 from magtwin.frames import wrap_angle
 from magtwin.names import RefusedError
 
@@ -121,6 +124,15 @@ WIDTHS = np.linspace(-np.log(16), np.log(16), 161)
 WIDTH_SD = np.log(2)
 """How far the width is thought to lie from 1, as a logarithm, before places are left out."""
 
+FAR_TURN = np.radians(60.0)
+"""Gap between headings from which what lies in it counts as not surveyed."""
+
+TURN_SECTORS = 24
+"""Sectors into which headings are parted to see where a scattered survey has none."""
+
+STRAY = 0.05
+"""Part of the readings up to which a heading of its own is none that was surveyed."""
+
 BLOCK = 512
 """Poses predicted at a time."""
 
@@ -197,6 +209,13 @@ class HarmonicModel:
     width: float
     """Factor of the magnitude's posterior variance where that is large beside the noise, see `_widened`."""
 
+    headings_rad: Array
+    """Headings that were surveyed, ascending, where they are few and far apart; else none, shape (H,)."""
+
+    turned: float
+    """Variance that headings between them add, over (d g)^2 with d and g the angles to the two beside,
+    as headings left out in turn show it [nT^2/rad^4]: a platform is more than iron."""
+
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field magnitude as the survey's robot reads it, and its variance.
 
@@ -219,6 +238,7 @@ class HarmonicModel:
             read = self.forward.read(self.unknowns, p[part], yaw[part], vectors=False)
             value[part] = read.values_nt[:, 0]
             variance[part] = _widened(self._variance(read.jacobian[:, 0]), self.noise_nt2, self.width)
+            variance[part] += self.turned * _between(self.headings_rad, yaw[part])
         return value.reshape(shape), variance.reshape(shape)
 
     def predict_vector(self, p_world: ArrayLike) -> tuple[Array, Array]:
@@ -257,6 +277,15 @@ def _widened(variance_nt2: Array, noise_nt2: Array | float, width: Array | float
     return np.asarray(variance_nt2 * (noise_nt2 + width * variance_nt2) / (noise_nt2 + variance_nt2))
 
 
+def _between(headings_rad: Array, yaw: Array) -> Array:
+    """(d g)^2, d and g the angles from headings to the nearest of some on either side [rad^4]."""
+    if not len(headings_rad):
+        return np.zeros(len(yaw))
+    up = np.mod(headings_rad[:, None] - yaw, TURN).min(axis=0)
+    down = np.mod(yaw - headings_rad[:, None], TURN).min(axis=0)
+    return np.asarray((up * down) ** 2)
+
+
 def fit_harmonic(
     readings: Readings,
     *,
@@ -275,8 +304,8 @@ def fit_harmonic(
     other within a short way count as one, their mean.
 
     Magnitudes alone leave the field's sign open: B and -B read the same, with the hard iron turned too.
-    Without `earth_nt` the uniform part is thought to point down with the readings' median magnitude, give
-    or take half of it each way, as nowhere but in the northern hemisphere: name the Earth's field where
+    Where the Earth's field is unknown the uniform part is thought to point down with the readings' median
+    magnitude, give or take half of it each way, as nowhere but in the northern hemisphere: name it where
     it is known (`magtwin.field.earth`), above all where vectors are wanted. Where vectors are read it is
     thought to be their mean, as loosely.
 
@@ -287,7 +316,7 @@ def fit_harmonic(
             twice and four times that, and, if the evidence is for it, a layer above at twice that.
         spacing_m: Distance between the dipoles of the first layer [m]; 0.6 of a layer's depth unless
             given, and in every layer in proportion to its depth.
-        earth_nt: The Earth's field in world axes [nT].
+        earth_nt: The Earth's field in world axes [nT]; that of the readings unless given.
         earth_sd_nt: How far the uniform part of the lab's may lie from it, each way [nT].
         height_m: Height of the sensor above the floor [m]; that of the readings unless given, and 0
             where unknown: heights then count from the sensor.
@@ -308,6 +337,7 @@ def fit_harmonic(
             f"a harmonic fit needs {LEAST_READINGS} at least"
         )
     height = height_m if height_m is not None else (readings.height_m or 0.0)
+    earth_nt = earth_nt if earth_nt is not None else readings.earth_nt
     _check(earth_nt, earth_sd_nt, height, spacing_m)
     if like is not None:
         if depth_m is not None or spacing_m is not None:
@@ -334,9 +364,7 @@ def _check(
     earth_nt: Sequence[float] | None, earth_sd_nt: float, height: float, spacing_m: float | None
 ) -> None:
     if earth_nt is not None:
-        earth = np.asarray(earth_nt, float)
-        if earth.shape != (3,) or not np.all(np.isfinite(earth)):
-            raise RefusedError(f"earth_nt must be three numbers [nT], east, north, up, got {earth_nt!r}")
+        checked_earth_nt(earth_nt)
     for name, value in (("earth_sd_nt", earth_sd_nt), ("spacing_m", spacing_m)):
         if value is not None and not (np.isfinite(value) and value > 0):
             raise RefusedError(f"{name} must be above 0, got {value!r}")
@@ -525,6 +553,31 @@ def _cells(good: Readings, way_m: float, most: int) -> NDArray[np.intp]:
     return cell
 
 
+def _headings(yaw: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Means of headings that lie together, ascending, and which of them each belongs to, -1 for a stray one.
+
+    None where the headings are all around, or fewer than three.
+    """
+    angle = np.mod(yaw, TURN)
+    sorted_angles = np.sort(angle)
+    gap = np.diff(np.append(sorted_angles, sorted_angles[0] + TURN))
+    wide = gap > TURN / TURN_SECTORS
+    none = np.empty(0), np.full(len(yaw), -1)
+    if gap.max() < FAR_TURN:
+        return none
+    edges = np.sort(np.mod(sorted_angles[wide] + gap[wide] / 2, TURN))
+    group = np.searchsorted(edges, angle) % len(edges)
+    count = np.bincount(group, minlength=len(edges))
+    whole = np.flatnonzero(count > STRAY * len(yaw))
+    if len(whole) < 3:
+        return none
+    mean = np.array([np.angle(np.exp(1j * angle[group == k]).sum()) for k in whole]) % TURN
+    order = np.argsort(mean)
+    rank = np.full(len(edges), -1)
+    rank[whole[order]] = np.arange(len(whole))
+    return mean[order], rank[group]
+
+
 def _shares(layers: _Layers) -> list[Array]:
     """How much dipoles of each layer tell of each other's strength, one matrix a layer."""
     shares = []
@@ -680,6 +733,7 @@ class _State:
         precision = self.weights(variance)[:, None] / variance
         posterior = self.posterior(precision)
         learnt, width = posterior.directions(), self._width(posterior, precision)
+        headings, turned = self._turned(posterior, precision)
         field = problem.forward.field(self.unknowns)
         slopes = problem.forward.read(self.unknowns, problem.p_xy, problem.yaw, vectors=False)
         wide = figures.freedom / (figures.freedom - 2)
@@ -689,7 +743,8 @@ class _State:
         noise += float(np.mean(within**2))
         return HarmonicModel(
             field=field,
-            parameters=self._parameters(learnt, width, len(good)),
+            parameters=self._parameters(learnt, width, len(good))
+            | {"added between headings [nT/rad^2]": round(float(np.sqrt(turned)), 2)},
             noise_nt2=noise,
             figures=figures,
             forward=problem.forward,
@@ -697,6 +752,8 @@ class _State:
             prior_sd=self.prior_sd,
             learnt=learnt,
             width=width,
+            headings_rad=headings,
+            turned=turned,
         )
 
     def _width(self, posterior: Posterior, precision: Array) -> float:
@@ -715,6 +772,25 @@ class _State:
         scale = _widened(field, noise, np.exp(WIDTHS)[:, None]) + noise
         surprise = (freedom + 1) / 2 * np.log1p(square / (freedom * scale)) + np.log(scale) / 2
         return float(np.exp(WIDTHS[np.argmin(surprise @ share + (WIDTHS / WIDTH_SD) ** 2 / 2)]))
+
+    def _turned(self, posterior: Posterior, precision: Array) -> tuple[Array, float]:
+        """See `HarmonicModel.headings_rad` and `HarmonicModel.turned`."""
+        from scipy.special import stdtrit
+
+        heading, group = _headings(self.problem.yaw)
+        if not len(heading) or not np.any(self.problem.rest_sd[3:]):
+            return np.empty(0), 0.0
+        root = np.sqrt(precision).ravel()
+        target = root * self.off.ravel() + posterior.rows @ self._scaled()
+        rows = np.arange(len(root)).reshape(precision.shape)
+        groups = [rows[group == h].ravel() for h in range(len(heading))]
+        off, field = posterior.left_out(target, groups)
+        beyond, away = 0.0, 0.0
+        for h, part in enumerate(groups):
+            beyond += float(np.sum((off[part] ** 2 - field[part] - 1) / root[part] ** 2))
+            away += len(part) * float(_between(np.delete(heading, h), heading[h : h + 1])[0])
+        few = float(stdtrit(len(heading), 0.95)) / NINETY  # so many headings tell it: Student's t
+        return heading, max(beyond / away, 0.0) * few**2
 
     def _parameters(self, learnt: Array, width: float, count: int) -> dict[str, Any]:
         figures, problem = self.figures, self.problem

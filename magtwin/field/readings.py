@@ -73,6 +73,9 @@ class Readings:
     datum: str = ""
     """Where that frame lies: its origin in the room or on Earth; "" where unknown."""
 
+    earth_nt: tuple[float, float, float] | None = None
+    """The Earth's field in that frame [nT]; none where unknown."""
+
     def __post_init__(self) -> None:
         p = np.asarray(self.p_xy, float)
         if p.ndim != 2 or p.shape[1] != 2 or not len(p):
@@ -109,6 +112,8 @@ class Readings:
             raise RefusedError(
                 f"height_m of Readings is a height above the floor, 0 m or more, got {self.height_m!r}"
             )
+        if self.earth_nt is not None:
+            object.__setattr__(self, "earth_nt", checked_earth_nt(self.earth_nt))
         if not (self.run.min() >= 0 and self.run.max() < len(self.runs)):
             raise RefusedError(
                 f"run of Readings must index runs ({len(self.runs)}), got {self.run.min()}..{self.run.max()}"
@@ -161,6 +166,18 @@ class Readings:
 
 TEXTS = ("name", "source", "licence", "created", "frame", "datum")
 """What readings say of themselves in words."""
+
+
+def checked_earth_nt(earth_nt: ArrayLike) -> tuple[float, float, float]:
+    """The Earth's field in world axes [nT], refused where it is not three numbers that are not all 0."""
+    field = np.asarray(earth_nt, float)
+    if field.shape != (3,) or not np.all(np.isfinite(field)) or not np.any(field):
+        raise RefusedError(
+            f"earth_nt must be three numbers [nT], those of the world's x, y and z, got {earth_nt!r}"
+        )
+    x, y, z = field.tolist()
+    return x, y, z
+
 
 SHAPES: dict[str, tuple[int, type]] = {
     "p_xy": (2, float),

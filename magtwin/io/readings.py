@@ -169,7 +169,7 @@ def save_readings(readings: Readings, path: Source, *, force: bool = False) -> N
             fields.append(pa.field(label, array.type, nullable=False, metadata=said))
             arrays.append(array)
     about: dict[str, Any] = {key: getattr(readings, key) for key in (*_TEXTS, *_PLACES)}
-    about |= {"runs": readings.runs, "height_m": readings.height_m}
+    about |= {"runs": readings.runs, "height_m": readings.height_m, "earth_nt": readings.earth_nt}
     about["grid"] = None if readings.grid is None else asdict(readings.grid)
     schema = pa.schema(fields, metadata={_SURVEY: json.dumps(about, ensure_ascii=False)})
     split = {f.name: "BYTE_STREAM_SPLIT" for f in fields if pa.types.is_floating(f.type)}
@@ -199,7 +199,7 @@ def load_readings(path: Source) -> Readings:
             **{**about["grid"], "headings_rad": tuple(about["grid"]["headings_rad"])}
         )
         given = {key: about[key] for key in (*_TEXTS, "height_m")} | {"runs": tuple(about["runs"])}
-        given |= {key: about.get(key, "") for key in _PLACES}
+        given |= {key: about.get(key, "") for key in _PLACES} | {"earth_nt": about.get("earth_nt")}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         if isinstance(error, RefusedError):
             raise RefusedError(f"{path}: {error}") from error
@@ -398,7 +398,13 @@ def _together(parts: Sequence[Readings]) -> Readings:
         values = [getattr(part, key) for part in parts]
         arrays[key] = None if any(v is None for v in values) else np.concatenate(values)
     same: dict[str, Any] = {}
-    for key, unknown in (("created", ""), ("frame", ""), ("datum", ""), ("height_m", None)):
+    for key, unknown in (
+        ("created", ""),
+        ("frame", ""),
+        ("datum", ""),
+        ("height_m", None),
+        ("earth_nt", None),
+    ):
         found = {getattr(part, key) for part in parts}
         same[key] = found.pop() if len(found) == 1 else unknown
     same["licence"] = "; ".join(dict.fromkeys(part.licence for part in parts if part.licence))

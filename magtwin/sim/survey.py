@@ -173,6 +173,7 @@ def _visit(
         created=created,
         frame=_frame(scene),
         datum=_datum(scene),
+        earth_nt=None if scene.earth is None else scene.earth.b_world_nt,
     )
     return read, lost
 
