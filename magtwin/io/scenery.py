@@ -32,7 +32,7 @@ from magtwin.io.pictures import (
 from magtwin.names import RefusedError
 from magtwin.run import Run
 from magtwin.spec import Vec3
-from magtwin.usd.geometry import BASE_LINK, Link, Shape, read_colour_scale, read_links, read_shapes
+from magtwin.usd.geometry import Link, Shape, read_colour_scale, read_links, read_shapes
 from magtwin.usd.layers import open_stage
 from magtwin.usd.scene import read_scene
 
@@ -167,12 +167,9 @@ class Scenery:
         self._pose(run)
         stage, scene = open_stage(scene_file), read_scene(scene_file, check_network=False)
         shapes, links = read_shapes(stage), read_links(stage)
-        drive = scene.robot.drive
+        moving = _links_of(links, [placed.robot.name for placed in scene.robots], run)
+        drive = scene.led_by(str(run.facts["robot"])).robot.drive if scene.others else scene.robot.drive
         self._sides = {drive.left_wheel_joint: 0, drive.right_wheel_joint: 1}
-        base = BASE_LINK if BASE_LINK in links else next((n for n, x in links.items() if not x.joint), "")
-        if not base:
-            raise RefusedError(f"{scene_file}: has no robot that could move")
-        moving = {name: link for name, link in links.items() if link.joint or name == base}
         still = [shape for shape in shapes if shape.link not in moving]
         if not shapes:
             raise RefusedError(f"{scene_file}: shows nothing")
@@ -418,6 +415,22 @@ def _position(run: Run) -> str:
         if name in run and np.isfinite(run[name]).all(axis=1).any():
             return name
     raise RefusedError(f"the run does not say where the robot was: it has none of {', '.join(POSITIONS)}")
+
+
+def _links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dict[str, Link]:
+    """The links of the robot that a run is of; other robots of a scene stand where it has them.
+
+    Raises:
+        RefusedError: There is none, or the run does not say which of several it is of.
+    """
+    bases = list(dict.fromkeys(link.base for link in links.values() if link.joint))
+    if not bases:
+        raise RefusedError("the scene has no robot that could move")
+    name = str(run.facts.get("robot", robots[0] if len(robots) == 1 else ""))
+    if len(robots) > 1 and name not in robots:
+        raise RefusedError(f"the run does not say of which robot it is; the scene has {', '.join(robots)}")
+    base = bases[robots.index(name)] if len(robots) == len(bases) and name in robots else bases[0]
+    return {name: link for name, link in links.items() if link.base == base}
 
 
 def _steps(p_xy: Array) -> NDArray[np.intp]:

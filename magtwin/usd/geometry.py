@@ -74,6 +74,9 @@ class Link:
     q_world_link_xyzw: Quat = IDENTITY_XYZW
     """Axes in world, as the stage stands."""
 
+    base: str = ""
+    """Name of the base of its robot; its own where no joint holds it."""
+
 
 @dataclass(frozen=True)
 class ColourScale:
@@ -184,6 +187,7 @@ def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
             joint="" if joint is None else joint.GetPrim().GetName(),
             p_world_link=p_world,
             q_world_link_xyzw=q_world,
+            base=bodies[base],
         )
     return links
 
