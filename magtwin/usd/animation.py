@@ -355,8 +355,9 @@ def _move(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], p: Any, q: NDArr
 
 
 def sample(layer: Sdf.Layer, path: Sdf.Path, codes: list[float], values: Iterable[Any]) -> None:
-    """Samples of an attribute, as fast as Python calls a function."""
-    deque(map(layer.SetTimeSample, repeat(path), codes, values), maxlen=0)
+    """Author samples of an attribute, as fast as Python calls a function, and tell nobody until the last."""
+    with Sdf.ChangeBlock():
+        deque(map(layer.SetTimeSample, repeat(path), codes, values), maxlen=0)
 
 
 def _sample_readings(
