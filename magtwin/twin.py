@@ -98,6 +98,8 @@ def _with_magnetometer(robot: RobotSpec, net: str | FilePath | None, kind: Kind 
     """A robot whose magnetometer is of another network or kind; arguments as for `open_twin`."""
     spec = robot.magnetometer
     if net is not None:
+        if FilePath(net).is_dir():
+            raise RefusedError(f"{net}: a folder; name the weights file in it")
         of, weights = ("physical", None) if str(net) == "none" else ("neural", FilePath(net).resolve())
         spec = dataclasses.replace(spec, kind=of, network=weights, network_sha256="", inputs=())  # type: ignore[arg-type]
     if kind is not None:

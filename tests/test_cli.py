@@ -259,7 +259,17 @@ def test_a_seed_that_is_no_whole_number_from_0_up_is_refused(lab_scene, tmp_path
     with pytest.raises(SystemExit) as stop:
         main(["run", str(lab_scene), "--seed", seed, "--parquet", str(tmp_path / "a.parquet")])
     assert stop.value.code in (1, 2)
-    assert "seed" in capsys.readouterr().err.lower()
+    assert "a whole number" in capsys.readouterr().err.replace("seed must be ", "")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("net", "said"), [(".", "a folder; name the weights file in it"), ("gone.pth", "no such")]
+)
+def test_weights_that_are_no_file_are_refused(lab_scene, tmp_path, capsys, net, said):
+    with pytest.raises(SystemExit):
+        main(["run", str(lab_scene), "--net", str(tmp_path / net), "--parquet", str(tmp_path / "a.parquet")])
+    assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

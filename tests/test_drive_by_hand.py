@@ -130,6 +130,13 @@ def test_a_gamepad_that_is_not_there_is_refused(tmp_path, lab_scene, capsys):
     assert not (tmp_path / "d").exists()
 
 
+def test_a_folder_is_no_gamepad(tmp_path, lab_scene, capsys):
+    with pytest.raises(SystemExit):
+        main(["drive", str(lab_scene), "--gamepad", str(tmp_path), "--out", str(tmp_path / "d"), "--no-view"])
+    assert f"{tmp_path}: a folder; name a gamepad in it" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_viewer_that_listens_shows_the_drive_while_it_goes_on(lab_scene):
     scene = open_twin(lab_scene, net="none").scene
     try:

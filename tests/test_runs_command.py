@@ -50,6 +50,16 @@ def test_each_file_is_the_run_of_its_seed_and_path_to_the_last_bit(lab_scene, tm
         assert (int(row["seed"]), int(row["readings"]), row["session"]) == (7 + k, own.rows, "")
 
 
+def test_a_random_driver_is_dealt_like_a_path(lab_scene, tmp_path):
+    out = tmp_path / "set"
+    options = ["--out", str(out), "--count", "3", "--path", "random", "figure8", "--json", *SHORT]
+    main(["runs", str(lab_scene), *options])
+    assert [row["path"] for row in listed(out)] == ["random", "figure8", "random"]
+    own = simulate(open_twin(lab_scene, magnetometer="physical"), "random", seed=2, duration_s=1.0)
+    run = read_parquet(out / "run_00002.parquet")
+    assert all(run[name].tobytes() == own[name].tobytes() for name in own)
+
+
 def test_sessions_differ_and_their_runs_share_what_a_day_has(lab_scene, tmp_path):
     options = ["--count", "4", "--sessions", "2", "--columns", "battery_fraction", "b_measured_nt", *SHORT]
     for name in ("a", "b"):

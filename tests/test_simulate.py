@@ -460,6 +460,7 @@ def test_a_single_reading_is_a_run_too():
         ({"rate_hz": 0.0}, "rate_hz of the magnetometer must be above 0 Hz"),
         ({"rate_hz": float("inf")}, "rate_hz of the magnetometer must be above 0 Hz and finite"),
         ({"duration_s": -1.0}, "duration_s must be above 0 s"),
+        ({"duration_s": float("inf")}, "duration_s must be above 0 s and finite, got inf"),
         (
             {"rate_hz": 1e9},
             r"at 1e\+09 Hz make .*e\+\d+ readings, more than 20,000,000; lower rate_hz to .* Hz",

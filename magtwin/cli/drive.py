@@ -70,8 +70,8 @@ def drive(
     from magtwin.twin import open_twin
 
     existing(scene, "scene")
-    if gamepad is not None:
-        existing(gamepad, "gamepad")
+    if gamepad is not None and existing(gamepad, "gamepad").is_dir():
+        raise RefusedError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
     with output(out, force=force) as folder:
         twin = open_twin(scene, net=net)
         robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ

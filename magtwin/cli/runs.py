@@ -37,7 +37,7 @@ def runs(
 
     Run k, in run_00000.parquet and so on, has the seed SEED + k and drives the next path in turn; without
     sessions it is what `magtwin run` writes with these, to the last bit. runs.csv lists file, path, seed,
-    session, speed and readings.
+    session, speed and readings. Of a scene of several robots the first drives, alone.
 
     Parameters
     ----------
@@ -48,7 +48,8 @@ def runs(
     count
         How many runs.
     path
-        Paths to drive in turn, as for `magtwin run`: names, cases A to E, CSV files; figure8 unless given.
+        Paths to drive in turn, as for `magtwin run`: names, cases A to E, random, CSV files; figure8 unless
+        given.
     seed
         Seed of the first run; each next one's is one more.
     sessions
@@ -93,7 +94,7 @@ def runs(
     with output(out, force=force) as folder:
         steps("Opening the scene")
         twin = open_twin(scene, net=net, magnetometer=magnetometer)
-        paths = [resolve_path(name) for name in path or ["figure8"]]
+        paths = [name if name == "random" else resolve_path(name) for name in path or ["figure8"]]
         robot = twin.scene.robot
         days = [robot]
         if sessions:
@@ -142,7 +143,7 @@ def runs(
             Figure("took", round(took, 3), "s"),
             Figure("rate", count / took, "runs/s"),
         ),
-        {"paths": ", ".join(one.name for one in paths), "sessions": sessions},
+        {"paths": ", ".join(getattr(one, "name", "random") for one in paths), "sessions": sessions},
     )
     print_report(report, json)
     if not json:

@@ -13,7 +13,10 @@ from magtwin.names import RefusedError
 
 def _whole(kind: type, tokens: Any) -> int:
     """A whole number; cyclopts itself would round 1.5 to 2."""
-    return int(tokens[0].value)
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"a whole number is wanted, got {tokens[0].value!r}") from None
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]

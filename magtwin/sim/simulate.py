@@ -377,6 +377,8 @@ def _check_kind(scene: Scene) -> None:
 
 def _check_readings(duration_s: float, rate_hz: float) -> None:
     """Refuse a run of which no memory could hold the columns."""
+    if not math.isfinite(duration_s):
+        raise RefusedError(f"duration_s must be above 0 s and finite, got {duration_s!r}")
     if duration_s * rate_hz > MOST_READINGS:
         raise RefusedError(
             f"{duration_s:g} s at {rate_hz:g} Hz make {duration_s * rate_hz:.3g} readings, more than "
