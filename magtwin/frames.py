@@ -26,8 +26,8 @@ def quat_from_yaw(yaw: ArrayLike) -> Array:
 
 def quat_from_rpy(rpy: ArrayLike) -> Array:
     """Quaternions xyzw of fixed-axis roll, pitch, yaw [rad] (URDF's rpy), shape (..., 3) -> (..., 4)."""
-    half = np.asarray(rpy, float) / 2
-    (sr, sp, sy), (cr, cp, cy) = np.moveaxis(np.sin(half), -1, 0), np.moveaxis(np.cos(half), -1, 0)
+    half = np.ascontiguousarray(np.moveaxis(np.asarray(rpy, float), -1, 0)) / 2
+    (sr, sp, sy), (cr, cp, cy) = np.sin(half), np.cos(half)
     return np.stack(
         [
             sr * cp * cy - cr * sp * sy,
