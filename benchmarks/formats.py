@@ -1,9 +1,9 @@
 """One run of ten minutes in every format; playback's time samples against USD's own way of setting them.
 
-81,000 readings of every column are written in each format and read back. Time samples, a position and a turn
-a step, are authored by magtwin's way, on the layer, and by `UsdGeom.XformOp.Set` on a stage, as USD's
-tutorials do, in seconds of the processor; what saving takes is the same for both. All in turn in one process after one
-warm-up; figures are medians, ratios are taken repetition by repetition.
+81,000 readings of every column are written in each format and read back. Time samples, a position and a
+turn a step, are authored by magtwin's way, on the layer, and by `UsdGeom.XformOp.Set` on a stage, as USD's
+tutorials do, in seconds of the processor; what saving takes is the same for both. All in turn in one
+process after one warm-up; figures are medians, ratios are taken repetition by repetition.
 
     python benchmarks/formats.py [repetitions]
 """

@@ -367,7 +367,7 @@ def _sample_readings(
     t, kinds = run["t"], Sdf.ValueTypeNames
     for noun, names in READINGS.items():
         for name in names:
-            if name not in run or noun not in stand.sensors:
+            if name not in run or noun not in stand.sensors or np.isnan(run[name]).all():
                 continue
             prim, spec = Sdf.CreatePrimInLayer(layer, stand.sensors[noun]), COLUMNS[name]
             kind = {"bool": kinds.Bool}.get(spec.unit, kinds.Double3 if spec.width == 3 else kinds.Double)
