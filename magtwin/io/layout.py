@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 _ROOM = 0.08
 """Room beyond the values and the ticks of an axis, as a share of the values' range."""
 
-_LEGEND_ROW, _LEGEND_MOST = 0.1, 0.6
+_LEGEND_ROW, _LEGEND_MOST = 0.1, 0.65
 """Height of a legend's row, as a share of the tall first plot, and the most that a legend may take."""
 
 _LEGEND_WIDTH, _LEGEND_LETTER = 0.07, 0.01
@@ -233,7 +233,7 @@ def layout(
     if lab is None:
         root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
     else:
-        below = rrb.Horizontal(_robot_view(), _floor_view(lab, [""]), about, column_shares=[1.0, 1.3, 1.3])
+        below = rrb.Horizontal(_robot_view(), _floor_view(lab, [""]), about, column_shares=[0.9, 1.1, 1.6])
         left = rrb.Vertical(_lab_view(lab, heading, [""]), below, row_shares=[2.0, 1.0])
         root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
     return _blueprint(root)
@@ -317,7 +317,7 @@ def _plot(
     ends = value_range(np.array([(np.nanmin(values), np.nanmax(values)) for _, _, values in lines]))
     if legend and ends:
         height = min(
-            _LEGEND_MOST, len({series.name for _, series, _ in lines}) * _LEGEND_ROW * (1.0 if tall else 1.6)
+            _LEGEND_MOST, len({series.name for _, series, _ in lines}) * _LEGEND_ROW * (1.0 if tall else 2.0)
         )
         width = _LEGEND_WIDTH + _LEGEND_LETTER * max(len(series.name) for _, series, _ in lines)
         t, values = [], []
@@ -448,7 +448,7 @@ def _robot_view() -> rrb.Spatial3DView:
     """The robot from behind its left shoulder; the view's axes are the robot's, so that it stays in sight."""
     return _view_3d(
         "world/robot",
-        "Robot and its sensors",
+        "Robot",
         [""],
         without="world/scale",
         position=(-0.62, 0.42, 0.55),
