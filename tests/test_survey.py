@@ -290,3 +290,10 @@ def test_a_survey_is_refused_in_one_line_that_says_where(tmp_path, case):
 def test_a_heading_that_was_not_asked_for_is_refused(tmp_path):
     with pytest.raises(RefusedError, match="heading 90, 270 deg is not among the expected 0, 180"):
         import_survey(write_survey(tmp_path), headings_deg=(0, 180))
+
+
+def test_the_real_survey_is_known_to_its_headings_places_and_noise(real_data):
+    field = import_survey(real_data / "aprilab" / "maps")
+    sd = np.sqrt(field.variance_nt2[field.valid])
+    assert 40 < np.median(sd) < 100
+    assert np.sqrt(np.mean(sd**2)) == pytest.approx(85, abs=10)

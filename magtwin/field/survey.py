@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.field.errors import node_errors
 from magtwin.field.grid import Grid
 from magtwin.field.map import AnomalyMap
 from magtwin.field.readings import Readings
@@ -88,7 +89,8 @@ def node_map(readings: Readings) -> AnomalyMap:
 
     Returns:
         The map on the survey's grid; nodes with no good reading are not valid, and keep the mean of
-        the others, or nan, as their value. Nothing is known of the variance.
+        the others, or nan, as their value. The variance is what the survey tells of its errors
+        (`magtwin.field.errors`); a survey of one heading tells nothing.
 
     Raises:
         RefusedError: The readings are not gridded.
@@ -101,15 +103,18 @@ def node_map(readings: Readings) -> AnomalyMap:
     grid = readings.grid
     flat = np.ravel_multi_index(tuple(readings.node.T), grid.shape)
     size = int(np.prod(grid.shape))
-    means = []
+    means, counts = [], []
     for rows in (readings.good, ~readings.good):
         count = np.bincount(flat[rows], minlength=size)
         total = np.bincount(flat[rows], weights=readings.b_nt[rows], minlength=size)
+        counts.append(np.maximum(count, 1).reshape(grid.shape))
         means.append(np.divide(total, count, out=np.full(size, np.nan), where=count > 0))
     valid = np.isfinite(means[0])
+    errors = node_errors(readings, grid, means[0].reshape(grid.shape), valid.reshape(grid.shape))
     return AnomalyMap(
         values_nt=np.where(valid, *means).reshape(grid.shape),
         valid=valid.reshape(grid.shape),
+        variance_nt2=errors.variance_nt2 / counts[0] if errors.told else None,
         origin_m=grid.origin_m,
         cell_m=grid.cell_m,
         headings_rad=np.asarray(grid.headings_rad),
