@@ -93,9 +93,10 @@ def level_field_nt(scene: Scene, p_xy: ArrayLike, height_m: float) -> tuple[Arra
     Raises:
         RefusedError: As for `ambient_field_nt`.
     """
-    earth, _ = _known(scene)
-    field, slopes = _plane(scene.magnets, scene.earth, float(height_m)).field_and_slopes_nt(p_xy)
-    return field + earth, slopes
+    earth = _known_earth(scene)
+    plane = _plane(scene.magnets, earth, float(height_m))
+    field, slopes = plane.field_and_slopes_nt(p_xy)
+    return field + earth.b_world_nt, slopes
 
 
 def level_gradient_nt_m(scene: Scene, p_xy: ArrayLike, height_m: float) -> Array:
@@ -149,12 +150,18 @@ def ambient_gradient_nt_m(scene: Scene, p_world: ArrayLike) -> Array:
 
 def _known(scene: Scene) -> tuple[Array, Bodies]:
     """The Earth's field [nT] (3,), and everything that is magnetised."""
+    earth = _known_earth(scene)
+    return np.array(earth.b_world_nt), _bodies(scene.magnets, earth)
+
+
+def _known_earth(scene: Scene) -> EarthFieldSpec:
+    """The Earth's field, where it is known."""
     if scene.earth is None:
         raise RefusedError(
             f"scene {scene.name!r} has no Earth's field, so its exact field is not known; "
             "give it an [earth] table, or read the field from its map"
         )
-    return np.array(scene.earth.b_world_nt), _bodies(scene.magnets, scene.earth)
+    return scene.earth
 
 
 @lru_cache(maxsize=8)
