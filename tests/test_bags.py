@@ -165,6 +165,30 @@ def test_mcap_read_without_its_summary_as_a_stream_gives_the_same_in_order_of_ti
     assert times == sorted(times)
 
 
+@pytest.mark.parametrize("way", ["NONE", "LZ4", "ZSTD", "unchunked"])
+def test_a_bag_that_mcaps_own_writer_wrote_anew_is_read(bags, made, tmp_path, way):
+    from mcap.writer import CompressionType, Writer
+
+    compression = CompressionType.NONE if way == "unchunked" else CompressionType[way]
+    with open(bags / "run.mcap", "rb") as old, open(tmp_path / "run.mcap", "wb") as new:
+        reader, writer = (
+            make_reader(old),
+            Writer(new, compression=compression, use_chunking=way != "unchunked"),
+        )
+        writer.start("ros2")
+        schemas, channels = {}, {}
+        for schema, channel, message in reader.iter_messages():
+            if schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", schemas[schema.id])
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        for note in reader.iter_metadata():
+            writer.add_metadata(note.name, note.metadata)
+        writer.finish()
+    assert_same(read_bag(tmp_path / "run.mcap"), made[0])
+
+
 def shape_of(content):
     """The keys of metadata, and the types of what they hold."""
     if isinstance(content, dict):

@@ -315,6 +315,24 @@ def test_what_cannot_be_a_run_is_refused_with_what_is_there(tmp_path):
         assert "\n" not in str(refusal.value)
 
 
+def test_convert_makes_a_table_of_a_robots_own_bag(tmp_path, capsys):
+    from magtwin.cli import main
+    from magtwin.io.formats import read_run
+
+    bag, out = record(tmp_path / "bag", {MAG: readings(), "/vrpn/pose": poses()}), tmp_path / "run.parquet"
+    main(["convert", str(bag), str(out), "--topic", f"{POSE}=/vrpn/pose", "--field-unit", "nT"])
+    assert "p_world_base" in read_run(out)
+    for topic, text in {
+        "/vrpn/pose": "--topic takes NAME=THEIRS, such as /robot/enu/pose=/vrpn/pose, got '/vrpn/pose'",
+        f"{POSE}=/vrnp/pose": "no topic /vrnp/pose; did you mean '/vrpn/pose'",
+    }.items():
+        with pytest.raises(SystemExit, match="1"):
+            main(["convert", str(bag), str(out), "--force", "--topic", topic])
+        assert text in capsys.readouterr().err
+    with pytest.raises(RefusedError, match="Parquet is read without unit; drop it"):
+        read_run(out, unit="T")
+
+
 def test_a_bag_in_two_files_is_one(tmp_path):
     """As `ros2 bag record --max-bag-duration` makes them."""
     import yaml

@@ -79,9 +79,11 @@ def convert(
     storage: Literal["mcap", "sqlite3"] | None = None,
     units: Literal["T", "nT"] | None = None,
     usd_fps: Annotated[float | None, Parameter(name="--usd-fps")] = None,
+    topic: list[str] | None = None,
+    field_unit: Literal["nT", "uT", "T", "mG", "G"] | None = None,
     force: Force = False,
 ) -> None:
-    """Write a run in another format.
+    """Write a run in another format; a robot's own bag becomes a run so.
 
     Parameters
     ----------
@@ -98,6 +100,10 @@ def convert(
         Unit of the field in a bag: T, as ROS has it, unless given; nT, as the released package publishes it.
     usd_fps
         Frames a second in USD [Hz]; 30 unless given, 0 for one at every reading.
+    topic
+        What a topic is called in a robot's own bag, as NAME=THEIRS: /robot/enu/pose=/vrpn/pose. Repeatable.
+    field_unit
+        Unit of the field in a robot's own bag; told by its size unless given.
     force
         Replace what exists.
     """
@@ -114,7 +120,8 @@ def convert(
         raise RefusedError(f"{out}: a table shows no scene; drop --scene")
     if out.resolve() == run.resolve():
         raise RefusedError(f"{out}: is the run itself; name another file")
-    result = read_run(run)
+    named: dict[str, Any] = {"topics": _named(topic) if topic else None, "unit": field_unit}
+    result = read_run(run, **{name: value for name, value in named.items() if value is not None})
     twin = _twin(result, run, scene) if takes & {"twin", "scene_file"} else None
     write_run(result, out, twin, force=force, **options)
     say(f"Wrote {out}: {result.rows:,} rows, {len(result)} columns, {result.duration_s:g} s")
@@ -148,6 +155,15 @@ def fetch(
     with progress(f"Fetching {what}") as advance:
         files = fetch_files(what, dest, base_url=base_url, force=force, progress=advance)
     say(f"Wrote {len(files)} files to {dest}")
+
+
+def _named(topics: list[str]) -> dict[str, str]:
+    """Names of topics, by those that magtwin gives them."""
+    pairs = [topic.partition("=") for topic in topics]
+    wrong = [topic for topic, (name, _, theirs) in zip(topics, pairs, strict=True) if not (name and theirs)]
+    if wrong:
+        raise RefusedError(f"--topic takes NAME=THEIRS, such as /robot/enu/pose=/vrpn/pose, got {wrong[0]!r}")
+    return {name: theirs for name, _, theirs in pairs}
 
 
 def _info_of_usd(file: Path) -> Any:

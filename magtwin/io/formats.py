@@ -34,6 +34,9 @@ class Format:
     write: str
     """Name of the writer, `write(run, path, *, force, ...)`."""
 
+    reads: frozenset[str] = frozenset()
+    """Options that the reader takes."""
+
     takes: frozenset[str] = frozenset()
     """What else the writer takes: of `twin`, `planned`, `scans`, which a format that cannot hold them is not
     given, and of the options, which it refuses."""
@@ -54,14 +57,15 @@ _BAG = Format(
     "magtwin.io.rosbag",
     "read_bag",
     "write_bag",
-    frozenset(("twin", "scans", "storage", "units")),
+    reads=frozenset(("topics", "unit")),
+    takes=frozenset(("twin", "scans", "storage", "units")),
 )
 _USD = Format(
     "USD",
     "magtwin.usd.animation",
     "read_animation",
     "write_animation",
-    frozenset(("scene_file", "fps")),
+    takes=frozenset(("scene_file", "fps")),
 )
 
 FORMATS: Mapping[str, Format] = MappingProxyType(
@@ -70,7 +74,11 @@ FORMATS: Mapping[str, Format] = MappingProxyType(
         ".csv": Format("CSV", _TABLES, "read_csv", "write_csv"),
         ".npz": Format("npz", _TABLES, "read_npz", "write_npz"),
         ".rrd": Format(
-            "Rerun", "magtwin.io.rerun", "read_run", "write_rrd", frozenset(("twin", "planned", "scans"))
+            "Rerun",
+            "magtwin.io.rerun",
+            "read_run",
+            "write_rrd",
+            takes=frozenset(("twin", "planned", "scans")),
         ),
         ".mcap": _BAG,
         ".db3": _BAG,
@@ -82,19 +90,23 @@ FORMATS: Mapping[str, Format] = MappingProxyType(
 """Formats by the end of a file's name. A name without one is that of a rosbag2 folder."""
 
 
-def read_run(path: str | os.PathLike[str]) -> Run:
+def read_run(path: str | os.PathLike[str], **options: Any) -> Run:
     """The run that a file holds, whatever its format.
 
     Args:
         path: A file whose name ends as one of `FORMATS`; or a folder: a bag's, the part files of a Parquet
             file that was never finished, or the one that `magtwin run --out` makes.
+        options: Of single formats: `topics` and `unit` of a robot's own bag.
 
     Raises:
-        RefusedError: The file is missing, of no known kind, damaged, or holds no run.
+        RefusedError: The file is missing, of no known kind, damaged, holds no run, or its format has no such
+            option.
     """
     path = existing(path, "run")
     file, format_ = _found(path) if path.is_dir() else (path, format_of(path))
-    run = format_.reader()(file)
+    if unknown := sorted(options.keys() - format_.reads):
+        raise RefusedError(f"{path}: {format_.name} is read without {unknown[0]}; drop it")
+    run = format_.reader()(file, **options)
     check_clock(run, str(path))
     return run
 

@@ -34,7 +34,6 @@ _TRANSFORM = (
 
 TYPES: Mapping[str, str] = MappingProxyType(
     {
-        "builtin_interfaces/msg/Time": "i4 sec, u4 nanosec",
         "geometry_msgs/msg/PoseStamped": _STAMPED + "f8[3] pose.position, f8[4] pose.orientation",
         "geometry_msgs/msg/PoseWithCovarianceStamped": _STAMPED
         + "f8[3] pose.pose.position, f8[4] pose.pose.orientation, f8[36] pose.covariance",
@@ -219,9 +218,6 @@ class Topic:
 
     lost: str = ""
     """Column of flags while which it is not sent again."""
-
-    exact: bool = True
-    """Whether it gives back a Run's numbers to the last bit."""
 
     write: Callable[[Columns, NDArray[np.int64], Sender], Fields]
     """Fields of the messages of some rows, from their columns and stamps [ns]."""
@@ -477,7 +473,6 @@ BATTERY = Topic(
     needs=("battery_v", "battery_a", "battery_fraction"),
     carries=("battery_v", "battery_a", "battery_fraction"),
     every_s=4.0,
-    exact=False,
     write=_battery,
     read={"sensor_msgs/msg/BatteryState": _read_battery},
     leaves={"sensor_msgs/msg/BatteryState": ("voltage", "current", "percentage")},
@@ -488,7 +483,6 @@ MAGNITUDE = Topic(
     needs=("b_measured_nt",),
     carries=("b_measured_nt",),
     sent="each",
-    exact=False,
     write=_magnitude,
     read={
         _FIELD: lambda f: {"magnetic_field": f["magnetic_field"]},
@@ -507,7 +501,6 @@ VECTOR = Topic(
     needs=("b_vector_measured_nt",),
     carries=("b_vector_measured_nt",),
     sent="each",
-    exact=False,
     write=_field,
     read={_FIELD: lambda f: {"magnetic_field": f["magnetic_field"]}},
     leaves={_FIELD: ("magnetic_field",)},
