@@ -39,7 +39,11 @@ def info_of_stage(path: Path) -> Report:
     applied = [
         (schema, prim) for prim in prims for schema in prim.GetAppliedSchemas() if schema.startswith(_PREFIX)
     ]
-    figures += [Figure(schema, str(prim.GetPath())) for schema, prim in applied if schema not in _MANY]
+    places: dict[str, list[str]] = {}
+    for schema, prim in applied:
+        if schema not in _MANY:
+            places.setdefault(schema, []).append(str(prim.GetPath()))
+    figures += [Figure(schema, ", ".join(paths)) for schema, paths in places.items()]
     for many in _MANY:
         if count := sum(schema == many for schema, _ in applied):
             figures.append(Figure(many, count, "prims"))
