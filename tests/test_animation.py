@@ -235,6 +235,21 @@ def test_files_that_play_nothing_or_are_damaged_are_refused(played, lab_scene, t
         read_animation(tmp_path / "none.usd")
 
 
+def test_damage_inside_a_playback_is_a_refusal_or_another_run_never_a_fault(played, tmp_path):
+    whole, rng = played.read_bytes(), np.random.default_rng(0)
+    refusals = 0
+    for _ in range(60):
+        content = bytearray(whole)
+        at = rng.integers(88, len(content) - 8)  # behind the mark that it is USD
+        content[at : at + 8] = rng.bytes(8)
+        (tmp_path / "run.usdc").write_bytes(content)
+        try:
+            assert read_animation(tmp_path / "run.usdc").rows
+        except RefusedError:
+            refusals += 1
+    assert refusals < 60
+
+
 @pytest.mark.parametrize(
     ("body", "message"),
     [
@@ -242,7 +257,7 @@ def test_files_that_play_nothing_or_are_damaged_are_refused(played, lab_scene, t
             'double[] magtwin:run:t = [0, 1]\nstring magtwin:run:yaw = "x"',
             "must be an array of numbers, got string",
         ),
-        ("double[] magtwin:run:yaw = [0, 1]", "has no column 't'"),
+        ("double[] magtwin:run:yaw = [0, 1]", "not a Run: column 't' is missing"),
         ("double[] magtwin:run:t = [1, 0]", "row 1 has 0 s after 1 s"),
         (
             "double[] magtwin:run:t = [0, 1]\ndouble[] magtwin:run:yaw = [0]",

@@ -72,8 +72,13 @@ def read_parquet(path: str | os.PathLike[str]) -> Run:
         RefusedError: The file is missing, is not Parquet, was cut short, or holds no run.
     """
     path = existing(path, "Parquet file")
-    if not path.is_dir():
-        return run_of(_table(path), path)
+    try:
+        return _read_parts(path) if path.is_dir() else run_of(_table(path), path)
+    except UnicodeDecodeError as error:
+        raise RefusedError(f"{path}: damaged Parquet (a name is no text); write it again") from error
+
+
+def _read_parts(path: Path) -> Run:
     parts = sorted(path.glob("part-*.parquet"))
     if not parts:
         raise RefusedError(f"{path}: a folder without Parquet parts; name the file in it")

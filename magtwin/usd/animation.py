@@ -25,8 +25,8 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 from magtwin.files import existing, output
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
 from magtwin.names import RefusedError, find
-from magtwin.resample import check_instants, grid
-from magtwin.run import COLUMNS, Column, Run
+from magtwin.resample import grid
+from magtwin.run import COLUMNS, Column, Run, check_clock
 from magtwin.spec import Quat, Vec3
 from magtwin.usd.figures import read_pose, target
 from magtwin.usd.geometry import BASE_LINK, read_links
@@ -135,7 +135,8 @@ def write_animation(
         raise RefusedError(f"{path}: a USD file ends in {', '.join(SUFFIXES)}")
     if fps is not None and not 0 < fps <= MOST_FPS:
         raise RefusedError(f"fps must be above 0 and at most {MOST_FPS:g}, got {fps!r}")
-    t = check_instants(run["t"], "the run to write")
+    check_clock(run, "the run to write")
+    t = run["t"]
     if not len(t):
         raise RefusedError("the run has no rows, there is nothing to play")
     rate = fps or (round(1 / float(np.median(np.diff(t))), 6) if len(t) > 1 else 1.0)
@@ -171,25 +172,13 @@ def read_animation(path: str | os.PathLike[str]) -> Run:
         RefusedError: The file is missing, is not USD, is cut short, or plays no run of magtwin's.
     """
     layer = _open_layer(path)
-    prim = layer.GetPrimAtPath(_run_path(layer))
-    if not prim:
-        raise RefusedError(f"{path}: plays no run: it has no prim {_run_path(layer)} that holds one")
-    columns, specs = {}, {}
-    for attribute in sorted(prim.properties, key=_number):
-        name = attribute.name.removeprefix("magtwin:run:")
-        if name == attribute.name:
-            continue
-        columns[name] = _array(attribute, path)
-        if name not in COLUMNS:
-            specs[name] = _spec_said(attribute)
     try:
-        facts = json.loads(layer.customLayerData.get(_FACTS, "{}"))
-        run = Run(columns, {key: value for key, value in facts.items() if _is_fact(value)}, specs)
-    except (ValueError, AttributeError, TypeError) as error:
-        raise RefusedError(f"{path}: holds a damaged run: {error}") from error
-    if "t" not in run:
-        raise RefusedError(f"{path}: plays no run: <{prim.path}> has no column 't'")
-    check_instants(run["t"], str(path))
+        run = _read(layer, path)
+    except RefusedError:
+        raise
+    except (Tf.ErrorException, ValueError, AttributeError, TypeError) as error:
+        raise RefusedError(f"{path}: holds a damaged run; write it again") from error
+    check_clock(run, str(path))
     return run
 
 
@@ -217,6 +206,26 @@ def _open_layer(path: str | os.PathLike[str]) -> Sdf.Layer:
     if layer is None:
         raise RefusedError(f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD")
     return layer
+
+
+def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
+    """The run of a layer, with whatever faults its file has."""
+    prim = layer.GetPrimAtPath(_run_path(layer))
+    if not prim:
+        raise RefusedError(f"{path}: plays no run: it has no prim {_run_path(layer)} that holds one")
+    columns, specs = {}, {}
+    for attribute in sorted(prim.properties, key=_number):
+        name = attribute.name.removeprefix("magtwin:run:")
+        if name == attribute.name:
+            continue
+        columns[name] = _array(attribute, path)
+        if name not in COLUMNS:
+            specs[name] = _spec_said(attribute)
+    facts = json.loads(layer.customLayerData.get(_FACTS, "{}"))
+    try:
+        return Run(columns, {key: value for key, value in facts.items() if _is_fact(value)}, specs)
+    except RefusedError as error:
+        raise RefusedError(f"{path}: holds a damaged run: {error}") from error
 
 
 def _run_path(layer: Sdf.Layer) -> Sdf.Path:
