@@ -1,6 +1,7 @@
 """Pictures and films of runs in their lab."""
 
 import stat
+from dataclasses import replace
 
 import imageio_ffmpeg
 import numpy as np
@@ -8,12 +9,15 @@ import pytest
 from PIL import Image
 
 from magtwin.cli import main
+from magtwin.files import shipped
 from magtwin.io.films import LONGEST_S, film_of_run, frame_times
 from magtwin.io.scenery import Scenery, View, picture_of_run
 from magtwin.io.tables import write_parquet
 from magtwin.names import RefusedError
 from magtwin.run import Run
-from magtwin.twin import open_twin, simulate
+from magtwin.spec import PlacedRobot
+from magtwin.twin import open_twin, scene_from_toml, simulate
+from magtwin.usd.scene import author_scene
 
 SIZE = (160, 90)
 
@@ -190,3 +194,20 @@ def test_an_encoder_that_ends_early_is_a_refusal_with_its_reason(run, lab_scene,
     with pytest.raises(RefusedError, match=r"a\.mp4: cannot be written: .*No space left on device"):
         film_of_run(run, lab_scene, tmp_path / "a.mp4", fps=5, speed=2, size=(320, 180))
     assert [p.name for p in tmp_path.iterdir()] == ["ffmpeg"]
+
+
+def test_of_two_robots_the_runs_own_moves(run, tmp_path):
+    lab = scene_from_toml(shipped("scenes", "lab.toml"))
+    ann, bob = (replace(lab.robot, name=name) for name in ("ann", "bob"))
+    placed = PlacedRobot(robot=bob, start=(1.0, 1.0, 0.0))
+    scene = author_scene(replace(lab, robot=ann, others=(placed,)), tmp_path / "scene")
+    view, there = View.of("top"), {}
+    for name in ("ann", "bob"):
+        with Scenery(run.with_facts(robot=name), scene, [0.0, 5.0], view=view, size=SIZE) as scenery:
+            there[name] = scenery.poses(1)
+    assert there["ann"].keys().isdisjoint(there["bob"])
+    for poses in there.values():
+        places = np.array([T[:2, 3] for T in poses.values()])
+        np.testing.assert_allclose(places, run["p_world_base"][[100] * len(places), :2], atol=0.3)
+    with pytest.raises(RefusedError, match="does not say of which robot it is; the scene has ann, bob"):
+        Scenery(run.with_facts(robot="cleo"), scene, [0.0], view=view, size=SIZE)

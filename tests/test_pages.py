@@ -193,6 +193,15 @@ def test_commands_write_reports_and_comparisons(runs, lab_scene, tmp_path, capsy
     assert json.loads(capsys.readouterr().out)["agreements"]["b_map_nt"]["unit"] == "nT"
 
 
+def test_a_data_sets_folder_is_reported_run_by_run(runs, tmp_path):
+    for k, run in enumerate(runs):
+        write_parquet(run, tmp_path / "set" / f"run_{k:05d}.parquet")
+    (tmp_path / "set" / "runs.csv").write_text("file\n")
+    main(["report", str(tmp_path / "set"), "--out", str(tmp_path / "set.json")])
+    names = [one["name"] for one in json.loads((tmp_path / "set.json").read_text())["runs"]]
+    assert names == ["run_00000.parquet", "run_00001.parquet"]
+
+
 def test_a_map_that_is_no_longer_what_the_run_read_is_not_shown(runs, tmp_path, capsys):
     file = tmp_path / "a.parquet"
     write_parquet(runs[0].with_facts(map_sha256="0" * 64), file)

@@ -1,6 +1,7 @@
 """`magtwin report`: a run, or a set of runs, as one page."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -8,6 +9,9 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, check_suffix, progress, say
+
+MOST_PICTURED = 60
+"""Runs of a page with pictures: 0.4 MB and a second each."""
 
 
 @app.command
@@ -25,7 +29,7 @@ def report(
     Parameters
     ----------
     runs
-        Runs, in any format that magtwin reads.
+        Runs, in any format that magtwin reads; or the folder of a data set, for all of its runs.
     out
         Page to write: .html, which needs nothing else to be shown; .md; or .json.
     scene
@@ -42,8 +46,9 @@ def report(
     check_suffix(out, tuple(WRITERS), "a report")
     check_free(out, force=force)
     told = []
-    names = [file.name for file in runs]
-    for file in runs:
+    files = [file for given in runs for file in _files(given)]
+    names = [file.name for file in files]
+    for file in files:
         run = read_run(file)
         note, field = "", None
         try:
@@ -56,8 +61,17 @@ def report(
     with progress("Drawing") as advance:
         page = page_of_runs(
             told,
-            pictures=out.suffix == ".html",
+            pictures=out.suffix == ".html" and len(told) <= MOST_PICTURED,
             advance=lambda done: advance(done, len(told), f"{done / (time.monotonic() - start):.2g} runs/s"),
         )
+    if out.suffix == ".html" and len(told) > MOST_PICTURED:
+        page = replace(page, lead=f"{page.lead} Pictures are left out of more than {MOST_PICTURED} runs.")
     write_page(page, out, force=force)
     say(f"Wrote {out}")
+
+
+def _files(given: Path) -> list[Path]:
+    """The runs of a data set that `magtwin runs` made, or the one run that a name is of."""
+    if not (given / "runs.csv").is_file():
+        return [given]
+    return sorted(given.glob("run_*.parquet"))
