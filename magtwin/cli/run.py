@@ -590,6 +590,8 @@ def _show(driven: _Driven, live: _Live, outputs: _Outputs, *, quiet: bool) -> _D
                     advance(round(float(block["t"][-1])), round(float(run["t"][-1])), "Ctrl-C ends it")
         if not recorder.rows:
             raise RefusedError("ended before the first reading; nothing is written")
+        if live.window and address is not None and sys.stdin.isatty():
+            _wait(address, stop)
     rows, scans = recorder.rows, driven.scans
     if rows < run.rows:
         run = type(run)({name: values[:rows] for name, values in run.items()}, run.facts)
@@ -597,6 +599,19 @@ def _show(driven: _Driven, live: _Live, outputs: _Outputs, *, quiet: bool) -> _D
             seen = scans.t <= run["t"][-1]
             scans = type(scans)(*(getattr(scans, f.name)[seen] for f in fields(scans)))
     return replace(driven, run=run, scans=scans)
+
+
+def _wait(address: str, stop: "Event") -> None:
+    """Leave a viewer on the screen until it is closed, or Ctrl-C."""
+    from magtwin.io.live import check_listens
+
+    if not stop.is_set():
+        print("  The run has ended; close the viewer, or press Ctrl-C", file=sys.stderr)  # noqa: T201
+    while not stop.wait(0.5):
+        try:
+            check_listens(address)
+        except RefusedError:
+            return
 
 
 @contextmanager

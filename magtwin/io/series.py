@@ -223,12 +223,21 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
             name: np.concatenate([_values(tables[k].column(name)) for k in order])
             for name in (names if tables else ())
         }
-    except (KeyError, ValueError, TypeError, AttributeError, IndexError, pa.ArrowException) as error:
+        run = Run(columns, facts)
+    except (
+        KeyError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        IndexError,
+        pa.ArrowException,
+        RefusedError,
+    ) as error:
         raise RefusedError(
             f"{what}: a Rerun recording, but not one of a run that magtwin can read "
             f"({type(error).__name__}: {error}); read the run's Parquet, or record it again"
         ) from error
-    return str(told.get(NAME) or COLUMNS_ENTITY), Run(columns, facts), rows
+    return str(told.get(NAME) or COLUMNS_ENTITY), run, rows
 
 
 def _values(column: pa.Array) -> NDArray[Any]:
