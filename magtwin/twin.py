@@ -289,6 +289,14 @@ def simulate(
     network = twin.magnetometer
     if path != "random" and isinstance(path, str | FilePath):
         path = resolve_path(path)
+    outside_training: NDArray[np.bool_] | None = None
+
+    def disturbance_nt(run: Run) -> NDArray[Any]:
+        nonlocal outside_training
+        assert network is not None
+        ((disturbance, outside_training),) = network.read([run])
+        return disturbance
+
     run = run_scene(
         twin.scene,
         path,
@@ -297,14 +305,13 @@ def simulate(
         speed=speed,
         duration_s=duration_s,
         rate_hz=rate_hz,
-        disturbance_nt=network.disturbance_nt if network else None,
+        disturbance_nt=disturbance_nt if network else None,
         outside=outside,
         lidar=lidar,
         obstacles=twin.obstacles,
         controller=controller,
         engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
     )
-    outside_training = network.outside_training(run) if network else None
     return run.with_columns(**_known(twin.scene, run, network, outside_training)).with_facts(
         **_facts(twin, seed, path, duration_s, _config_sha256(twin.scene))
     )

@@ -154,7 +154,8 @@ class NeuralMagnetometer:
         Raises:
             RefusedError: A run lacks a column that the network reads.
         """
-        x = np.concatenate([features(run, self.features) for run in runs])
+        parts = [features(run, self.features) for run in runs]
+        x = parts[0] if len(parts) == 1 else np.concatenate(parts)
         ends = np.cumsum([run.rows for run in runs])[:-1]
         left = np.split(self.outside(x), ends) if outside else [None] * len(runs)
         return list(zip(np.split(self.predict(x), ends), left, strict=True))
