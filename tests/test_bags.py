@@ -1,6 +1,5 @@
 """Runs as bags and back; rosbags and MCAP's own reader are the judges."""
 
-import dataclasses
 import json
 import signal
 import sqlite3
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from numpy.testing import assert_allclose, assert_array_equal
@@ -106,31 +105,23 @@ def messages(path):
     return found
 
 
+def raw(path):
+    """By topic the times and bytes of the messages that rosbags finds."""
+    found = {}
+    with Reader(path) as reader:
+        for connection, t, data in reader.messages():
+            found.setdefault(connection.topic, []).append((t, bytes(data)))
+    return found
+
+
 @pytest.fixture(scope="module")
 def heard(bags):
     return messages(bags / "bag")
 
 
-def numbers(message):
-    """All that a message says, flat."""
-    if isinstance(message, np.ndarray):
-        return message.tolist()
-    if isinstance(message, list):
-        return [numbers(m) for m in message]
-    if dataclasses.is_dataclass(message):
-        return [numbers(getattr(message, f.name)) for f in dataclasses.fields(message)]
-    return message
-
-
 @pytest.mark.parametrize("name", KINDS[1:])
-def test_rosbags_reads_the_same_messages_in_both_storages(bags, heard, name):
-    other = messages(bags / name)
-    assert other.keys() == heard.keys()
-    for topic, said in heard.items():
-        assert [t for t, _ in said] == [t for t, _ in other[topic]]
-        assert repr([numbers(m) for _, m in said]) == repr(
-            [numbers(m) for _, m in other[topic]]
-        )  # nan as nan
+def test_rosbags_finds_the_same_messages_in_both_storages(bags, name):
+    assert raw(bags / name) == raw(bags / "bag")
 
 
 def test_mcaps_own_reader_reads_every_message_and_checks_every_checksum(bags, heard):
@@ -211,6 +202,7 @@ def test_metadata_is_laid_out_as_rosbags_lays_it_out(bags, tmp_path, name, stora
     assert about["relative_file_paths"] == [p.name for p in (bags / name).iterdir() if p.suffix != ".yaml"]
 
 
+@settings(max_examples=40)
 @given(
     st.recursive(
         st.none()
@@ -422,7 +414,7 @@ def blocks(run, rows):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_run_in_blocks_says_what_the_whole_run_says(made, twin, heard, tmp_path, name):
+def test_a_run_in_blocks_says_what_the_whole_run_says(made, twin, bags, tmp_path, name):
     storage = "sqlite3" if name == "bag3" else None
     with BagWriter(tmp_path / name, twin, storage=storage, scans=made[1]) as writer:
         for block in blocks(made[0], 101):
@@ -431,10 +423,7 @@ def test_a_run_in_blocks_says_what_the_whole_run_says(made, twin, heard, tmp_pat
             assert not (tmp_path / name).exists()
     assert [p.name for p in tmp_path.iterdir()] == [name]
     assert_same(read_bag(tmp_path / name), made[0])
-    other = messages(tmp_path / name)
-    for topic, said in heard.items():
-        assert [t for t, _ in said] == [t for t, _ in other[topic]], topic
-        assert repr([numbers(m) for _, m in said]) == repr([numbers(m) for _, m in other[topic]]), topic
+    assert raw(tmp_path / name) == raw(bags / name)
 
 
 KILLED = """
@@ -466,7 +455,10 @@ def test_a_recording_that_is_killed_leaves_every_block_that_was_appended(made, t
     with pytest.raises(RefusedError, match="left by a recording that did not end"):
         BagWriter(target)
     if name == "bag3":  # and what it wrote is in the database itself, not in a log that others pass over
-        assert len(messages(partial_of(target))["/magtwin/reading"]) == run.rows
+        found = raw(partial_of(target))
+        assert len(found["/magtwin/reading"]) == run.rows
+        told = yaml.safe_load((partial_of(target) / "metadata.yaml").read_text())
+        assert told["rosbag2_bagfile_information"]["message_count"] == sum(map(len, found.values()))
 
 
 @pytest.mark.parametrize("keep", [0.3, 0.5, 0.97])
