@@ -107,9 +107,19 @@ def test_the_command_line_gives_the_same_bytes_for_one_seed_and_others_for_anoth
     tmp_path, lab_scene, capsys
 ):
     for name, seed in (("a", 3), ("b", 3), ("c", 4)):
-        main(["run", str(lab_scene), "--seed", str(seed), "--parquet", str(tmp_path / name), "--json"])
+        main(
+            [
+                "run",
+                str(lab_scene),
+                "--seed",
+                str(seed),
+                "--parquet",
+                str(tmp_path / f"{name}.parquet"),
+                "--json",
+            ]
+        )
         facts = json.loads(capsys.readouterr().out)["facts"]
         assert facts["seed"] == seed
-    a, b, c = ((tmp_path / name).read_bytes() for name in "abc")
+    a, b, c = ((tmp_path / f"{name}.parquet").read_bytes() for name in "abc")
     assert a == b
     assert a != c
