@@ -38,7 +38,7 @@ from magtwin.usd.figures import write_pose
 from magtwin.usd.lab import LAB, define_lab, read_lab
 from magtwin.usd.layers import new_stage
 from magtwin.usd.maps import MAP, save_map
-from magtwin.usd.scene import author_scene, read_scene, scene_from_toml
+from magtwin.usd.scene import author_scene, open_alone, read_scene, robots_in, scene_from_toml
 
 EARTH = EarthFieldSpec(
     b_world_nt=(-2_000.5, 23_000.25, -39_000.125),
@@ -867,3 +867,17 @@ def test_a_map_that_was_changed_is_refused(parts, tmp_path):
         RefusedError, match=r"</World/AnomalyMap>: .*not those that its checksum was taken of"
     ):
         read_scene(root)
+
+
+def test_a_stage_can_be_opened_with_one_of_its_robots_alone(own_parts, tmp_path):
+    root = author_scene(two_robots(own_parts), tmp_path / "s")
+    before = root.read_bytes()
+    stage = open_alone(root, "bob")
+    active = [name for name in ("ann", "bob", "cleo") if stage.GetPrimAtPath(f"/World/{name}").IsActive()]
+    assert active == ["bob"]
+    assert robots_in(root) == {
+        "ann": "figure8",
+        "bob": tmp_path / "s" / "paths" / "there.csv",
+        "cleo": "random",
+    }
+    assert root.read_bytes() == before

@@ -34,8 +34,9 @@ from magtwin.run import Run
 from magtwin.sim.lidar import Scans
 from magtwin.spec import Scene
 from magtwin.twin import Twin
-from magtwin.usd.geometry import open_stage, read_links, read_shapes
+from magtwin.usd.geometry import read_links, read_shapes
 from magtwin.usd.maps import HEAT_MAP
+from magtwin.usd.scene import open_alone
 
 Show = Callable[[float, tuple[float, float, float]], None]
 """Takes the time [s] and x [m], y [m], yaw [rad] of base_link."""
@@ -268,7 +269,7 @@ def streamed(scene: Scene, scene_file: Path, address: str) -> Iterator[Show]:
     )
     rec.connect_grpc(address, default_blueprint=rrb.Blueprint(lab, collapse_panels=True))
     rec.send_recording_name("manual drive")
-    stage = open_stage(scene_file)
+    stage = open_alone(scene_file, scene.robot.name)
     shapes, links = read_shapes(stage), read_links(stage)
     rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     still = [shape for shape in shapes if not shape.link and shape.prim != str(HEAT_MAP)]

@@ -19,8 +19,9 @@ from magtwin.run import Run
 from magtwin.sim.lidar import Scans
 from magtwin.spec import RobotSpec
 from magtwin.twin import Twin
-from magtwin.usd.geometry import BASE_LINK, Link, Shape, open_stage, read_links, read_shapes, srgb_from_linear
+from magtwin.usd.geometry import BASE_LINK, Link, Shape, read_links, read_shapes, srgb_from_linear
 from magtwin.usd.maps import HEAT_MAP, HEAT_MAP_HEIGHT_M
+from magtwin.usd.scene import open_alone
 
 Array = NDArray[np.float64]
 
@@ -114,7 +115,7 @@ class Room:
         Raises:
             RefusedError: The stage cannot be read.
         """
-        stage = open_stage(twin.scene_file)
+        stage = open_alone(twin.scene_file, twin.scene.robot.name)  # of the others nothing is known here
         shapes, links = list(read_shapes(stage)), read_links(stage)
         scale = Scale.over(twin.field, known.get("b_total_nt", np.empty(0)))
         rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)

@@ -174,6 +174,25 @@ def robots_in(path: str | os.PathLike[str]) -> dict[str, str | Path]:
     return {prim.GetName(): read_way(prim) for prim in prims}
 
 
+def open_alone(path: str | os.PathLike[str], robot: str) -> Usd.Stage:
+    """A stage opened as if a robot were alone in it: others are inactive, in its session layer.
+
+    Args:
+        path: Root layer of a scene.
+        robot: Name of the robot that stays; of a stage without one of that name, all stay.
+
+    Raises:
+        RefusedError: The file is missing or no stage.
+    """
+    stage = open_stage(path)
+    prims = prims_with(stage.GetPseudoRoot(), "robot")
+    if any(prim.GetName() == robot for prim in prims):
+        with Usd.EditContext(stage, stage.GetSessionLayer()):
+            for prim in prims:
+                prim.SetActive(prim.GetName() == robot)
+    return stage
+
+
 def _placed(prim: Usd.Prim, check_network: bool) -> PlacedRobot:
     """The robot at a prim, where it begins, and what it drives."""
     robot = robot_of(prim)
