@@ -146,6 +146,12 @@ class Run(Mapping[str, NDArray[Any]]):
         object.__setattr__(self, "columns", MappingProxyType(arrays))
         object.__setattr__(self, "facts", MappingProxyType(dict(self.facts)))
         own = {name: spec for name, spec in self.specs.items() if name in arrays and name not in COLUMNS}
+        for name, spec in own.items():
+            parts = arrays[name].shape[1] if arrays[name].ndim == 2 else 0
+            if len(spec.parts) != parts:
+                raise RefusedError(
+                    f"column {name!r} has rows of {parts or 'no'} parts, and its spec names {len(spec.parts)}"
+                )
         object.__setattr__(self, "specs", MappingProxyType(own))
 
     def __getitem__(self, name: str) -> NDArray[Any]:

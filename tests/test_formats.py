@@ -251,10 +251,8 @@ def shown(monkeypatch):
     return seen
 
 
-@pytest.mark.parametrize(
-    "name", ["run.parquet", "run.csv", "run.npz", "run.usdc", "run.mcap", "sqlite3", "run.rrd"]
-)
-def test_view_shows_a_run_of_every_format(name, run, written, shown):
+@pytest.mark.parametrize("name", ["run.csv", "run.usdc", "sqlite3", "run.rrd"])
+def test_view_shows_a_run_of_any_format(name, run, written, shown):
     main(["view", str(written / name)])
     assert np.array_equal(shown[0]["run"]["b_total_nt"], run["b_total_nt"])
 

@@ -297,6 +297,14 @@ def test_a_users_own_column_keeps_what_it_was_said_to_hold():
     assert run.with_columns(flag_x=np.zeros(2, bool)).spec("flag_x").interpolation == "hold"
 
 
+def test_a_spec_that_does_not_fit_its_column_is_refused():
+    run = Run({"t": [0.0, 1.0], "head": np.zeros((2, 3))})
+    with pytest.raises(RefusedError, match="'head' has rows of 3 parts, and its spec names 2"):
+        run.with_specs(head=Column("K", "", "", 2, ("in", "out")))
+    with pytest.raises(RefusedError, match="'est_x' has rows of no parts, and its spec names 1"):
+        Run({"t": [0.0], "est_x": [1.0]}, {}, {"est_x": Column("", "", "", 1, ("a",))})
+
+
 def test_the_documented_columns_are_those_of_the_code():
     docs = Path(__file__).resolve().parents[1] / "docs"
     page = runpy.run_path(str(docs / "columns.py"))["page"]()
