@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magtwin.field.survey import NT_PER, check_unit
 from magtwin.files import existing, sha256
-from magtwin.frames import quat_conjugate, rotate, yaw_from_quat
+from magtwin.frames import canonical, quat_conjugate, rotate, yaw_from_quat
 from magtwin.io.arrow import spec_said
 from magtwin.io.bag import Heard
 from magtwin.io.bag_readings import poses_at, unit_of
@@ -462,6 +462,8 @@ def _columns(
     values = signal.read(signal.fields)
     if signal.topic is VECTOR:
         values = {"b_vector_measured_nt": values["magnetic_field"] * NT_PER[unit]}
+    for name in values.keys() & {"mocap_q_xyzw", "imu_q_xyzw"}:
+        values[name] = canonical(values[name])
     if signal.topic is IMU:
         a = values["imu_a"]
         known_a = a[np.isfinite(a).all(axis=1)]

@@ -494,7 +494,7 @@ class _Stream:
             steps = np.floor(t / topic.every_s + 1e-6).astype(np.int64)
             sent = np.diff(steps, prepend=last.times if last.values else steps[0] - 1) > 0
             last.times, last.values = int(steps[-1]), {"t": t[-1]}
-            return np.flatnonzero(sent)
+            return np.flatnonzero(sent & _finite(run, topic.needs))
         changed = np.zeros(len(t), bool)
         changed[0] = not last.values
         for name in topic.needs:
@@ -512,7 +512,7 @@ class _Stream:
         last.changed_s, last.times = float(since[-1]), int(times[-1])
         sent = changed | again
         if not topic.carries:
-            sent &= np.all([np.isfinite(run[name]) for name in topic.needs], axis=0)
+            sent &= _finite(run, topic.needs)
         return np.flatnonzero(sent)
 
     def _told(self, run: Run) -> str:
@@ -537,7 +537,14 @@ def _form(topic: Topic, fields: Mapping[str, Any]) -> str:
     return transforms(fields["count"]) if topic.kind.startswith("tf2_msgs") else TYPES[topic.kind]
 
 
+def _finite(run: Columns, names: Iterable[str]) -> NDArray[np.bool_]:
+    """Which rows of some columns are numbers."""
+    return np.asarray(
+        np.logical_and.reduce([np.isfinite(run[n]).reshape(len(run[n]), -1).all(1) for n in names])
+    )
+
+
 def _differ(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which rows are not the same; nan is as nan."""
-    other = (a != b) & ~((a != a) & (b != b))
+    """Which rows of float64 are not the same to the last bit."""
+    other = a.view(np.int64) != b.view(np.int64)
     return other if other.ndim == 1 else other.any(axis=1)

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.frames import canonical, quat_conjugate, quat_multiply, rotate
+from magtwin.frames import quat_conjugate, quat_multiply, rotate
 from magtwin.spec import IDENTITY_XYZW, ZERO3, Quat, RobotSpec, Vec3
 
 Array = NDArray[np.float64]
@@ -264,6 +264,7 @@ def _odometry(c: Columns, stamp: NDArray[np.int64], who: Sender) -> Fields:
 
 def _imu(c: Columns, stamp: NDArray[np.int64], who: Sender) -> Fields:
     speed = np.abs(c["odom_v"][:, :1]) if "odom_v" in c else np.zeros((len(stamp), 1))
+    speed = np.where(np.isfinite(speed), speed, 0.0)
     rates = who.gyro_std**2 + (speed * np.array(who.gyro_vibration)) ** 2
     accelerations = who.accel_std**2 + (speed * np.array(who.accel_vibration)) ** 2
     return {
@@ -297,7 +298,7 @@ def _magnitude(c: Columns, stamp: NDArray[np.int64], who: Sender) -> Fields:
     """The magnitude in x, as APRILab's robot publishes it, with the variance that is predicted for it."""
     zero = np.zeros(len(stamp))
     variance = c["b_sd_nt"] / _nt_per(who.unit) if "b_sd_nt" in c else zero
-    variance = np.nan_to_num(variance * variance)
+    variance = np.where(np.isfinite(variance), variance, 0.0) ** 2
     return {
         **_header(stamp, who.magnetometer_frame),
         "magnetic_field": np.column_stack([c["b_measured_nt"] / _nt_per(who.unit), zero, zero]),
@@ -390,7 +391,7 @@ def _nt_per(unit: Unit) -> float:
 
 
 def _read_pose(position: str, orientation: str) -> Callable[[Fields], dict[str, NDArray[Any]]]:
-    return lambda f: {"mocap_p": f[position], "mocap_q_xyzw": canonical(f[orientation])}
+    return lambda f: {"mocap_p": f[position], "mocap_q_xyzw": f[orientation]}
 
 
 def _read_odometry(f: Fields) -> dict[str, NDArray[Any]]:
@@ -404,7 +405,7 @@ def _read_odometry(f: Fields) -> dict[str, NDArray[Any]]:
 
 def _read_imu(f: Fields) -> dict[str, NDArray[Any]]:
     return {
-        "imu_q_xyzw": canonical(f["orientation"]),
+        "imu_q_xyzw": f["orientation"],
         "imu_w": f["angular_velocity"],
         "imu_a": f["linear_acceleration"],
     }
