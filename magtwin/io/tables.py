@@ -270,6 +270,9 @@ def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str]
         if text.startswith("#"):
             about.append(text)
         elif text.strip():
+            other = next((sign for sign in (";", "\t") if sign in text and "," not in text), None)
+            if other is not None:
+                raise RefusedError(f"{path}: its columns are separated by {other!r}; save it with commas")
             return about, [name.strip().strip('"') for name in text.split(",")], count
     raise RefusedError(f"{path}: has no line of column names; it is empty, or cut short")
 
