@@ -188,10 +188,10 @@ def test_runs_that_cannot_be_shown_are_refused(run, lab_scene, tmp_path):
 
 def test_an_encoder_that_ends_early_is_a_refusal_with_its_reason(run, lab_scene, tmp_path, monkeypatch):
     broken = tmp_path / "ffmpeg"
-    broken.write_text("#!/bin/sh\necho 'a.mp4: No space left on device' >&2\nexit 1\n")
+    broken.write_text("#!/bin/sh\necho '[out#0/mp4 @ 0x5] Error: No space left on device' >&2\nexit 1\n")
     broken.chmod(broken.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(broken))
-    with pytest.raises(RefusedError, match=r"a\.mp4: cannot be written: .*No space left on device"):
+    with pytest.raises(RefusedError, match=r"a\.mp4: cannot be written: Error: No space left on device$"):
         film_of_run(run, lab_scene, tmp_path / "a.mp4", fps=5, speed=2, size=(320, 180))
     assert [p.name for p in tmp_path.iterdir()] == ["ffmpeg"]
 

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
@@ -179,7 +180,7 @@ def _ffmpeg(
 def _last_line(said: IO[bytes]) -> str:
     said.seek(0)
     lines = [line.strip() for line in said.read().decode(errors="replace").splitlines() if line.strip()]
-    return lines[-1] if lines else ""
+    return re.sub(r"^\[[^]]*] ", "", lines[-1]) if lines else ""  # the part of ffmpeg that speaks
 
 
 def _write_gif(frames: Iterator[Image], aside: Path, fps: float, out: Path) -> None:
