@@ -558,6 +558,24 @@ def test_a_recording_that_was_cut_short_or_is_none_is_refused_in_a_line(written,
         assert "\n" not in str(refused.value)
 
 
+def test_bytes_that_were_changed_never_end_the_process(tmp_path):
+    run = Run({"t": np.arange(50.0), "b_total_nt": np.arange(50.0)})
+    write_rrd(run, tmp_path / "run.rrd")
+    whole, rng = (tmp_path / "run.rrd").read_bytes(), np.random.default_rng(0)
+    refused = 0
+    for _ in range(12):
+        changed = bytearray(whole)
+        for at in rng.integers(0, len(whole), 4):
+            changed[at] = rng.integers(0, 256)
+        (tmp_path / "changed.rrd").write_bytes(changed)
+        try:
+            read_run(tmp_path / "changed.rrd")
+        except RefusedError as error:
+            refused += 1
+            assert "\n" not in str(error)
+    assert refused >= 6
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a limit on file sizes is of POSIX")
 def test_a_full_disk_is_said_in_a_line_and_earlier_files_stay(parts, tmp_path):
     from magtwin.io.tables import write_parquet

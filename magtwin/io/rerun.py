@@ -25,7 +25,7 @@ from magtwin.io.recording import (
     title_of,
 )
 from magtwin.io.series import COLUMNS_ENTITY, entity_of, table_of
-from magtwin.io.viewer import show
+from magtwin.io.viewer import check_decodes, show
 from magtwin.io.world import Room, heading_of
 from magtwin.names import RefusedError
 from magtwin.path import Path
@@ -189,6 +189,7 @@ def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
     chunks: dict[str, list] = {}
     with _readable(path, partial=partial) as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a file without an end has none
+        check_decodes(file, path)
         try:
             found = RrdReader(file).stream().filter(content=f"/{COLUMNS_ENTITY}/**").to_chunks()
             for chunk in found:

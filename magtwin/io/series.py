@@ -224,15 +224,7 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
             for name in (names if tables else ())
         }
         run = Run(columns, facts)
-    except (
-        KeyError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        IndexError,
-        pa.ArrowException,
-        RefusedError,
-    ) as error:
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, pa.ArrowException) as error:
         raise RefusedError(
             f"{what}: a Rerun recording, but not one of a run that magtwin can read "
             f"({type(error).__name__}: {error}); read the run's Parquet, or record it again"

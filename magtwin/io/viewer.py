@@ -166,6 +166,25 @@ def _connected(process: "subprocess.Popen[bytes]", port: int, log: IO[str]) -> V
     return clients[-1]
 
 
+def check_decodes(rrd: Path, said: str | os.PathLike[str]) -> None:
+    """Refuse a recording that Rerun's own verifier cannot decode.
+
+    It is a process of its own: where bytes were changed, Rerun's decoder may end the process that it is in.
+
+    Args:
+        rrd: The recording.
+        said: The file that a refusal names.
+
+    Raises:
+        RefusedError: It is no recording, was cut short, or its bytes were changed.
+    """
+    done = subprocess.run([_binary(), "rrd", "verify", str(rrd)], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RefusedError(
+            f"{said}: not a Rerun recording that can be read ({_reason(done.stderr)}); write it again"
+        )
+
+
 def _crop(png: Path) -> None:
     """Take the empty title bar off a picture."""
     from matplotlib.image import imread, imsave
