@@ -412,6 +412,13 @@ def test_a_toml_gives_room_start_earth_and_sources(own_parts):
     assert (other.earth, other.sources) == (None, ()), "what made one map does not make another"
 
 
+def test_a_toml_of_one_robot_can_say_its_start_and_path_beside_it(own_parts, tmp_path):
+    (own_parts / "scene.toml").write_text(TOML + "start = [1, 0, 0.5]\npath = 'sine'\n")
+    scene = scene_from_toml(own_parts / "scene.toml")
+    assert (scene.start, scene.path, scene.others) == ((1.0, 0.0, 0.5), "sine", ())
+    assert read_scene(author_scene(scene, tmp_path / "s")).path == "sine"
+
+
 def test_a_network_brings_its_inputs_and_its_checksum(own_parts):
     from magtwin.learn.model import load_net
 
