@@ -12,7 +12,8 @@ from magtwin.field.readings import Readings
 from magtwin.field.roughness import local_mean
 from magtwin.names import RefusedError
 
-KERNELS = ("matern52", "poisson")
+KERNELS = ("matern", "poisson")
+PATCHES, APART = np.array([[-0.5, 0.0], [0.6, 0.4], [0.3, -0.8]]), 0.9
 
 
 def some(count=14, seed=0):
@@ -37,6 +38,13 @@ def plainly(covariance, figures, p, yaw, q, turn):
     h = covariance.harmonics
     s, reach, u = np.exp(figures[:h]), np.exp(figures[h : 2 * h]), np.exp(figures[2 * h : 3 * h])
     arm = figures[-2:] / 30 if h > 1 else np.zeros(2)
+    own = figures[covariance.of_patches]
+
+    def strength(at):
+        if not len(own):
+            return 1.0
+        weight = [np.exp(-(np.linalg.norm(at - q) ** 2) / (2 * (0.7 * APART) ** 2)) for q in PATCHES]
+        return np.exp(np.dot(weight, own) / np.sum(weight))
 
     def sensor(at, angle):
         c, d = np.cos(angle), np.sin(angle)
@@ -53,7 +61,9 @@ def plainly(covariance, figures, p, yaw, q, turn):
         for j in range(len(q)):
             d = np.linalg.norm(sensor(p[i], yaw[i]) - sensor(q[j], turn[j]))
             for k in range(h):
-                out[i, j] += np.cos(k * (yaw[i] - turn[j])) * (s[k] ** 2 * value(d, reach[k]) + u[k] ** 2)
+                both = strength(p[i]) * strength(q[j]) if k == 0 else 1.0
+                part = s[k] ** 2 * both * value(d, reach[k]) + u[k] ** 2
+                out[i, j] += np.cos(k * (yaw[i] - turn[j])) * part
     return out
 
 
@@ -89,20 +99,21 @@ def truth(p, yaw, arm=(0.0, 0.0)):
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("harmonics", [1, 3])
-def test_the_covariance_is_its_equation_by_loops(kernel, harmonics):
-    covariance = Covariance(kernel, harmonics, False)
+@pytest.mark.parametrize("patches", [(), (PATCHES, APART)])
+def test_the_covariance_is_its_equation_by_loops(kernel, harmonics, patches):
+    covariance = Covariance(kernel, harmonics, False, *patches)
     figures = figures_of(covariance)
     (p, yaw, _), (q, turn, _) = some(), some(9, seed=4)
     expected = plainly(covariance, figures, p, yaw, q, turn)
     assert_allclose(covariance.between(figures, (p, yaw), (q, turn)), expected, rtol=1e-12)
     variance = np.diag(covariance.between(figures, (p, yaw), (p, yaw)))
-    assert_allclose(variance, covariance.variance_nt2(figures), rtol=1e-12)
+    assert_allclose(variance, covariance.variance_nt2(figures, p), rtol=1e-12)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize(("harmonics", "runs"), [(1, False), (3, False), (1, True), (3, True)])
 def test_the_likelihoods_gradient_is_that_of_finite_differences(kernel, harmonics, runs):
-    covariance = Covariance(kernel, harmonics, runs)
+    covariance = Covariance(kernel, harmonics, runs, PATCHES, APART)
     figures, guess = figures_of(covariance), np.zeros(covariance.size)
     p, yaw, run = some()
     b = np.random.default_rng(3).normal(0, 1000, len(p))
@@ -115,7 +126,7 @@ def test_the_likelihoods_gradient_is_that_of_finite_differences(kernel, harmonic
 def test_the_likelihood_is_the_normal_densitys():
     from scipy.stats import multivariate_normal
 
-    covariance = Covariance("matern52", 3, False)
+    covariance = Covariance("matern", 3, False, PATCHES, APART)
     figures = figures_of(covariance)
     p, yaw, run = some()
     b = np.random.default_rng(3).normal(0, 1000, len(p))
@@ -126,8 +137,9 @@ def test_the_likelihood_is_the_normal_densitys():
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_mean_and_variance_are_the_textbooks_on_a_few_points(kernel):
+def test_mean_and_variance_are_the_textbooks_on_a_few_points(kernel, monkeypatch):
     readings = survey(rows=4, columns=4)
+    monkeypatch.setattr("magtwin.field.gp._patches", lambda p_xy: (PATCHES, APART))
     model = fit_gp(readings, kernel=kernel)
     covariance, figures = model.covariance, model.figures
     p, yaw = model.poses
@@ -154,6 +166,15 @@ def test_a_smooth_field_is_told_between_its_nodes_to_its_noise(kernel):
     assert 0.8 <= np.mean(np.abs(error) <= 1.645 * np.sqrt(variance)) <= 1
     sd = np.sqrt(variance + model.noise_nt2)
     assert 0.85 <= np.mean(np.abs(error + rng.normal(0, 20, 500)) <= 1.645 * sd) <= 0.97  # fresh readings
+
+
+def test_a_field_that_is_rough_in_one_corner_is_told_to_be_so():
+    whole = survey(noise=5.0)
+    x, y = whole.p_xy.T
+    rough = 3000 * np.sin(7 * x) * np.sin(6 * y) / (1 + np.exp(-12 * (x - 0.2)))
+    model = fit_gp(whole.with_(b_nt=whole.b_nt + rough))
+    west, east = model.covariance.variance_nt2(model.figures, np.array([[-0.8, 0.0], [0.8, 0.0]]))
+    assert east > 2 * west
 
 
 def test_the_sensors_place_beside_base_link_is_found():
@@ -207,7 +228,7 @@ def test_a_drive_of_many_readings_is_averaged_to_a_bound():
 
 
 def test_an_unknown_kernel_and_readings_without_an_area_are_refused():
-    with pytest.raises(RefusedError, match='kernel must be "matern52" or "poisson", got \'rbf\''):
+    with pytest.raises(RefusedError, match='kernel must be "matern" or "poisson", got \'rbf\''):
         fit_gp(survey(), kernel="rbf")
     with pytest.raises(RefusedError, match="3 good readings"):
         fit_gp(survey().take(np.arange(3)))

@@ -1,13 +1,13 @@
 """Covariance of a field over place and heading, and how likely readings are under it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Kernel = Literal["matern52", "poisson"]
+Kernel = Literal["matern", "poisson"]
 
 ROOT5 = np.sqrt(5.0)
 
@@ -20,17 +20,26 @@ UNLIKELY = 1e25
 DOUBT = 3.0
 """Standard deviation of the prior of every logarithm about its first guess: a factor of 20 either way."""
 
+UNEVEN = 0.25
+"""Standard deviation of the prior of the logarithm of how strong the field is at a place, about 0."""
 
-@dataclass(frozen=True)
+OVERLAP = 0.7
+"""Width of a patch, one standard deviation, in the distance between patches."""
+
+
+@dataclass(frozen=True, eq=False)
 class Covariance:
     """What two readings have in common, by where they were taken, how the robot was turned, and in which run.
 
-        k = sum over h of cos(h (yaw - yaw')) (s_h^2 k_h(|x - x'|) + u_h^2) + r^2 k_r(|x - x'|) [same run],
+        k = sum over h of cos(h (yaw - yaw')) (s_h^2 a_h a_h' k_h(|x - x'|) + u_h^2)
+            + r^2 k_r(|x - x'|) [same run],
         x = p + R(yaw) l,
 
     with h = 0, 1, 2 (0 alone where no heading differs): the field; what a hard iron adds to its
     magnitude; what a soft iron does. Each has a part that changes over the floor and one that does not.
-    x is where the sensor is, l beside base_link; r is how far runs disagree about one place. k_h is Matern's
+    x is where the sensor is, l beside base_link; r is how far runs disagree about one place. Iron lies in
+    some places and not in others: log a_0 is a mean over patches of the floor, with the weights of normal
+    distributions about them (a_h is 1 for other h). k_h is Matern's
     function of order 5/2 (Rasmussen & Williams 2006, eq. 4.17), or the Poisson kernel
     (1 + (d / reach)^2)^(-3/2): the covariance that a harmonic field has above uncorrelated sources at a
     depth of half its reach (as the upward continuation of white noise; Blakely 1995, eq. 12.6).
@@ -45,10 +54,32 @@ class Covariance:
     runs: bool
     """Whether runs may disagree."""
 
+    patches: Array = field(default_factory=lambda: np.empty((0, 2)))
+    """Middles of patches of the floor [m], shape (B, 2); none where the field is as strong everywhere."""
+
+    apart_m: float = 1.0
+    """Distance between patches [m]."""
+
     @property
     def size(self) -> int:
-        """Number of figures: log s_h, reach_h, u_h, noise; if any, log r and its reach, the arm's x and y."""
-        return 3 * self.harmonics + 1 + 2 * self.runs + 2 * (self.harmonics > 1)
+        """Number of figures: log s_h, reach_h, u_h, noise; if any, log r and its reach, those of log a_0 of
+        the patches, the arm's x and y.
+        """
+        return self._even + len(self.patches) + 2 * (self.harmonics > 1)
+
+    @property
+    def _even(self) -> int:
+        return 3 * self.harmonics + 1 + 2 * self.runs
+
+    @property
+    def of_patches(self) -> slice:
+        """Which figures are those of the patches."""
+        return slice(self._even, self._even + len(self.patches))
+
+    def prior_sd(self) -> Array:
+        """Standard deviations of the figures' priors about their first guesses, shape (size,)."""
+        arm = [np.inf] * (2 * (self.harmonics > 1))
+        return np.array([DOUBT] * self._even + [UNEVEN] * len(self.patches) + arm)
 
     def noise_nt2(self, figures: Array) -> float:
         """Variance of a reading beside the field and its run [nT^2]."""
@@ -62,10 +93,23 @@ class Covariance:
         """The sensor's place beside base_link, forward and left [m], shape (2,)."""
         return np.asarray(ARM_M * figures[-2:] if self.harmonics > 1 else np.zeros(2))
 
-    def variance_nt2(self, figures: Array) -> float:
-        """Variance of the field anywhere [nT^2]."""
+    def variance_nt2(self, figures: Array, p_xy: Array) -> Array:
+        """Variance of the field at places of base_link [nT^2], shape (N,)."""
         h = self.harmonics
-        return float(np.exp(2 * figures[:h]).sum() + np.exp(2 * figures[2 * h : 3 * h]).sum())
+        even = np.exp(2 * figures[1:h]).sum() + np.exp(2 * figures[2 * h : 3 * h]).sum()
+        return np.asarray(np.exp(2 * figures[0]) * self._strength(figures, p_xy) ** 2 + even)
+
+    def _strength(self, figures: Array, p_xy: Array) -> Array:
+        """a_0 at places of base_link, shape (N,)."""
+        return np.asarray(np.exp(self._shares(p_xy) @ figures[self.of_patches]))
+
+    def _shares(self, p_xy: Array) -> Array:
+        """Weights of the patches at places, shape (N, B)."""
+        if not len(self.patches):
+            return np.empty((len(p_xy), 0))
+        near = -((_distance(p_xy, self.patches) / (OVERLAP * self.apart_m)) ** 2) / 2
+        weight = np.exp(near - near.max(axis=1, keepdims=True))
+        return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
     def places(self, figures: Array, p_xy: Array, yaw: Array) -> Array:
         """Where the sensor is [m], shape (N, 2)."""
@@ -88,6 +132,9 @@ class Covariance:
         for k, wave in enumerate(self._waves(a[1], b[1])):
             part = _value(self.kernel, r, float(np.exp(figures[h + k])))
             part *= np.exp(2 * figures[k])
+            if k == 0 and len(self.patches):
+                part *= self._strength(figures, a[0])[:, None]
+                part *= self._strength(figures, b[0])
             part += np.exp(2 * figures[2 * h + k])
             out += part if k == 0 else np.multiply(part, wave, out=part)
         return out
@@ -101,12 +148,18 @@ class Covariance:
         return [one, turned, 2 * turned * turned - 1]
 
     def loss(
-        self, figures: Array, guess: Array, p_xy: Array, yaw: Array, run: NDArray[np.intp], b_nt: Array
+        self,
+        figures: Array,
+        guess: Array,
+        p_xy: Array,
+        yaw: Array,
+        run: NDArray[np.intp],
+        b_nt: Array,
     ) -> tuple[float, Array]:
         """Minus the logarithm of marginal likelihood and prior, and its gradient.
 
         b K^-1 b / 2 + log |K| / 2 (Rasmussen & Williams 2006, eq. 5.8, 5.9, a constant left out), and
-        (figure - guess)^2 / (2 DOUBT^2) for every logarithm.
+        (figure - guess)^2 / (2 sd^2) for every figure that has a prior.
 
         Args:
             figures: Where to evaluate, shape (size,).
@@ -125,11 +178,14 @@ class Covariance:
         h = self.harmonics
         place = self.places(figures, p_xy, yaw)
         r = _distance(place, place)
-        waves = self._waves(yaw, yaw)
+        waves, strength = self._waves(yaw, yaw), self._strength(figures, p_xy)
         total, slope, parts = np.zeros_like(r), np.zeros_like(r), []
         for k in range(h):
             value, by_reach, by_r = _with_slopes(self.kernel, r, float(np.exp(figures[h + k])))
             scale = np.exp(2 * figures[k]) * waves[k]
+            if k == 0 and len(self.patches):
+                scale *= strength[:, None]
+                scale *= strength
             for array in (value, by_reach, by_r):
                 array *= scale
             total += value + np.exp(2 * figures[2 * h + k]) * waves[k]
@@ -157,6 +213,8 @@ class Covariance:
         gradient.append(self.noise_nt2(figures) * np.trace(weight))
         if apart:
             gradient += [np.vdot(weight, apart[0]), np.vdot(weight, apart[1]) / 2]
+        if len(self.patches):
+            gradient += list(np.sum(weight * parts[0][0], axis=1) @ self._shares(p_xy))
         if h > 1:
             weight *= slope
             c, s = np.cos(yaw), np.sin(yaw)
@@ -166,11 +224,8 @@ class Covariance:
                 moved -= 2 * np.vdot(weight @ column, place)
                 gradient.append(ARM_M * moved / 2)
         value = b_nt @ alpha / 2 + np.log(np.diag(lower)).sum()
-        slopes = np.array(gradient, float)
-        logs = self.size - 2 * (h > 1)
-        off = figures[:logs] - guess[:logs]
-        slopes[:logs] += off / DOUBT**2
-        return float(value + off @ off / (2 * DOUBT**2)), slopes
+        off = (figures - guess) / self.prior_sd()
+        return float(value + off @ off / 2), np.array(gradient, float) + off / self.prior_sd()
 
 
 def _distance(a: Array, b: Array) -> Array:
@@ -179,7 +234,7 @@ def _distance(a: Array, b: Array) -> Array:
 
 
 def _value(kernel: Kernel, r: Array, reach: float) -> Array:
-    if kernel == "matern52":
+    if kernel == "matern":
         a = ROOT5 / reach * r
         return np.asarray((1 + a + a * a / 3) * np.exp(-a))
     q = 1 + (r / reach) ** 2
@@ -188,7 +243,7 @@ def _value(kernel: Kernel, r: Array, reach: float) -> Array:
 
 def _with_slopes(kernel: Kernel, r: Array, reach: float) -> tuple[Array, Array, Array]:
     """The function of distance, its derivative by log reach, and that by r over r."""
-    if kernel == "matern52":
+    if kernel == "matern":
         a = ROOT5 / reach * r
         fall = np.exp(-a)
         slope = (1 + a) * fall / 3

@@ -32,6 +32,9 @@ STARTS = (1.0, 0.4, 2.5)
 STEPS = 60
 """Steps of L-BFGS, once the best start is known."""
 
+PATCHES = 8
+"""Patches along the longer side of the floor, each with its own strength of field."""
+
 WIDEST = 6.0
 """How far a figure may go from its first guess: a logarithm by a factor of 400, the arm by 0.2 m."""
 
@@ -91,12 +94,12 @@ class GpModel:
         p, angle, shape = flat_poses(p_xy, yaw)
         mean, variance = np.full(len(p), np.nan), np.full(len(p), np.nan)
         finite = np.flatnonzero(np.isfinite(p).all(axis=1) & np.isfinite(angle))
-        prior = self.covariance.variance_nt2(self.figures)
         for start in range(0, len(finite), BLOCK):
             rows = finite[start : start + BLOCK]
             across = self.covariance.between(self.figures, self.poses, (p[rows], angle[rows]))
             mean[rows] = self.mean_nt + across.T @ self.alpha
             half = solve_triangular(self.lower, across, lower=True, overwrite_b=True, check_finite=False)
+            prior = self.covariance.variance_nt2(self.figures, p[rows])
             own = np.maximum(prior - np.einsum("ij,ij->j", half, half), 0.0)
             variance[rows] = own * self._scale(p[rows])
         return mean.reshape(shape), variance.reshape(shape)
@@ -110,8 +113,9 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
     """Condition a Gaussian process on the good readings, its figures the likeliest.
 
     Recorded headings count. Where there are more than `MOST` readings, or a drive's crowd, those of one
-    run, cell and sector of heading are averaged; their scatter joins the noise. The figures maximise
-    the marginal likelihood by L-BFGS with its gradient, from several starts.
+    run, cell and sector of heading are averaged; their scatter joins the noise. The figures, among them
+    how strong the field is in each part of the floor, maximise the marginal likelihood by L-BFGS with its
+    gradient, from several starts.
 
     Args:
         readings: A survey.
@@ -125,8 +129,8 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
         RefusedError: There are fewer than four good readings, they lie on one line or are all the same;
             or the kernel is unknown.
     """
-    if kernel not in ("matern52", "poisson"):
-        raise RefusedError(f'kernel must be "matern52" or "poisson", got {kernel!r}')
+    if kernel not in ("matern", "poisson"):
+        raise RefusedError(f'kernel must be "matern" or "poisson", got {kernel!r}')
     check_readings(readings)
     say = progress or (lambda done, total, what: None)
     total = len(STARTS) + 3
@@ -136,7 +140,7 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
     poses, b = (bins.p_xy, bins.yaw), bins.b_nt - mean
     several = readings.grid is None and len(np.unique(bins.run)) > 1
     turned = np.ptp(np.abs(np.angle(np.exp(1j * (bins.yaw - bins.yaw[0]))))) > 1e-6
-    covariance = Covariance(kernel, 3 if turned else 1, several)
+    covariance = Covariance(kernel, 3 if turned else 1, several, *_patches(bins.p_xy))
     order = np.random.default_rng(0).permutation(len(b))  # a fixed draw: which rows are learnt from
     spacing = spacing_m(readings)
     figures = _learn(covariance, bins, b, order, spacing, lambda done, what: say(done, total, what))
@@ -176,6 +180,14 @@ def _data(readings: Readings) -> tuple[Bins, float]:
     return bins, float(away @ away / freedom) if freedom else 0.0
 
 
+def _patches(p_xy: Array) -> tuple[Array, float]:
+    """Middles of even patches over the readings, and how far they are apart [m]."""
+    low, high = p_xy.min(axis=0), p_xy.max(axis=0)
+    apart = float((high - low).max()) / PATCHES
+    axes = [np.linspace(a, b, round((b - a) / apart) + 1) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2), apart
+
+
 def _learn(
     covariance: Covariance,
     bins: Bins,
@@ -186,7 +198,8 @@ def _learn(
 ) -> Array:
     """The likeliest figures: the best of several starts on few readings, then on more.
 
-    No reach is shorter than the readings' spacing: such a part could not be told from noise.
+    The starts have one strength everywhere. No reach is shorter than
+    the readings' spacing: such a part could not be told from noise.
     """
     from scipy.optimize import minimize
 
@@ -196,7 +209,10 @@ def _learn(
     least[reaches] = np.minimum(np.log(least_m), guess[reaches])
     bounds = list(zip(least, guess + WIDEST, strict=True))
 
-    def descend(start: Array, rows: NDArray[np.intp], steps: int) -> tuple[float, Array]:
+    even = bounds.copy()
+    even[covariance.of_patches] = [(0.0, 0.0)] * len(covariance.patches)
+
+    def descend(start: Array, rows: NDArray[np.intp], steps: int, bounds: Any) -> tuple[float, Array]:
         data = (bins.p_xy[rows], bins.yaw[rows], bins.run[rows], b[rows])
         found = minimize(
             covariance.loss,
@@ -215,10 +231,10 @@ def _learn(
         say(k, "starts")
         start = guess.copy()
         start[h : 2 * h] += np.log(factor)
-        starts.append(descend(start, tried, STEPS // 2))
+        starts.append(descend(start, tried, STEPS // 2, even))
     best = min(starts, key=lambda found: found[0])[1]
     say(len(STARTS), "figures")
-    return descend(best, np.sort(order[:MOST_LEARNT]), STEPS)[1]
+    return descend(best, np.sort(order[:MOST_LEARNT]), STEPS, bounds)[1]
 
 
 def _guess(covariance: Covariance, bins: Bins, b: Array) -> Array:
@@ -228,7 +244,8 @@ def _guess(covariance: Covariance, bins: Bins, b: Array) -> Array:
     waves = [np.log(spread)] + [np.log(spread / 20)] * (h - 1)
     even = [np.log(spread)] + [np.log(spread / 10)] * (h - 1)
     guess = [*waves, *[np.log(extent / 8)] * h, *even, np.log(spread / 50)]
-    guess += [np.log(spread / 20), np.log(extent / 16)] * covariance.runs + [0.0, 0.0] * (h > 1)
+    guess += [np.log(spread / 20), np.log(extent / 16)] * covariance.runs
+    guess += [0.0] * (len(covariance.patches) + 2 * (h > 1))
     return np.array(guess)
 
 
@@ -295,7 +312,7 @@ def _parameters(
     covariance: Covariance, figures: Array, readings: Readings, count: int, noise: float
 ) -> dict[str, Any]:
     h = covariance.harmonics
-    size = np.exp(figures[: 3 * h])
+    size, uneven = np.exp(figures[: 3 * h]), np.exp(figures[covariance.of_patches])
     told: dict[str, Any] = {
         "kernel": covariance.kernel,
         "readings": int(readings.good.sum()),
@@ -303,6 +320,7 @@ def _parameters(
         "sd_nt": [round(float(v), 3) for v in size[:h]],
         "reach_m": [round(float(v), 5) for v in size[h : 2 * h]],
         "uniform_sd_nt": [round(float(v), 3) for v in size[2 * h :]],
+        "strength_of_patches": [round(float(uneven.min()), 3), round(float(uneven.max()), 3)],
         "noise_nt": round(float(np.sqrt(noise)), 3),
     }
     if covariance.runs:
