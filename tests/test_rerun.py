@@ -11,6 +11,7 @@ import rerun as rr
 import rerun_cli
 from rerun.chunk import RrdReader
 
+from magtwin.cli import main
 from magtwin.field.map import AnomalyMap
 from magtwin.frames import quat_from_rpy, quat_from_yaw, rotate
 from magtwin.io.live import RrdWriter
@@ -515,6 +516,21 @@ def test_runs_that_are_compared_stand_on_one_timeline_with_their_offsets_and_com
     assert rerun("rrd", "verify", tmp_path / "two.rrd").returncode == 0
     with pytest.raises(RefusedError, match=r"compares 2 runs \(the first, b/2\)"):
         read_run(tmp_path / "two.rrd")
+
+
+def test_view_shows_several_runs_with_the_offsets_that_are_given(parts, tmp_path, monkeypatch, capsys):
+    run, _ = parts
+    for name in ("a.parquet", "b.parquet"):
+        write_parquet(run, tmp_path / name)
+    seen = tmp_path / "seen.rrd"
+    monkeypatch.setattr("magtwin.io.viewer.show", lambda rrd, **_: shutil.copy(rrd, seen))
+    files = [str(tmp_path / "a.parquet"), str(tmp_path / "b.parquet")]
+    main(["view", *files, "--offset", "0", "--offset", "1.5"])
+    assert [columns_of(seen, f"run/{name}")[0][0] for name in "ab"] == [0, 1.5e9]
+    for arguments in ([*files, "--offset", "1"], [files[0], "--offset", "1"]):
+        with pytest.raises(SystemExit):
+            main(["view", *arguments])
+        assert "--offset is given once for each of several runs" in capsys.readouterr().err
 
 
 def test_runs_that_cannot_be_told_apart_and_offsets_of_none_are_refused(parts, tmp_path):

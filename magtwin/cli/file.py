@@ -47,7 +47,7 @@ def info(file: Path, *, json: Json = False) -> None:
 
 
 @app.command
-def view(*files: Path, scene: Path | None = None) -> None:
+def view(*files: Path, scene: Path | None = None, offset: list[float] | None = None) -> None:
     """Show a run, several of them together, or a stage.
 
     Runs are shown in the Rerun viewer: in their lab where their scene is found, else as series; several on
@@ -59,11 +59,17 @@ def view(*files: Path, scene: Path | None = None) -> None:
         Runs in any format that magtwin writes, or a stage.
     scene
         Stage to show runs in, in place of the one that they name.
+    offset
+        Seconds to add to the times of a run among several, once a run, in their order.
     """
+    if offset and (len(offset) != len(files) or len(files) < 2):
+        raise RefusedError(
+            f"--offset is given once for each of several runs, got {len(offset)} of {len(files)}"
+        )
     if not files:
         raise RefusedError("view needs a file; name a run or a stage")
     if len(files) > 1:
-        _view_together(files, scene)
+        _view_together(files, scene, offset or [0.0] * len(files))
     elif files[0].suffix in _STAGES and not files[0].is_dir():
         _view_stage(files[0])
     else:
@@ -254,7 +260,7 @@ def _view_run(file: Path, scene: Path | None) -> None:
         show(rrd, shown=file)
 
 
-def _view_together(files: tuple[Path, ...], scene: Path | None) -> None:
+def _view_together(files: tuple[Path, ...], scene: Path | None, offsets: list[float]) -> None:
     import tempfile
 
     from magtwin.io.formats import read_run
@@ -268,7 +274,7 @@ def _view_together(files: tuple[Path, ...], scene: Path | None) -> None:
     twin = _twin(next(iter(runs.values())), files[0], scene)
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder) / "runs.rrd"
-        write_comparison(runs, rrd, twin)
+        write_comparison(runs, rrd, twin, offsets_s=dict(zip(runs, offsets, strict=True)))
         show(rrd, shown=files[0])
 
 
