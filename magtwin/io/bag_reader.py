@@ -52,6 +52,9 @@ FieldUnit = Literal["nT", "uT", "T", "mG", "G"]
 LARGEST_METADATA = 1 << 24
 """Bytes of the largest metadata.yaml that is read."""
 
+LONGEST_LINE = 2000
+"""Most characters that are said of a bag."""
+
 SCAN_S = 0.5
 """How long a LiDAR counts as on after a scan [s]."""
 
@@ -99,7 +102,7 @@ def read_bag(
             stamps run backwards; the unit cannot be.
     """
     path = existing(path, "bag")
-    with _refusing(path), _Bag(path) as bag:
+    with _refusing(path), _Bag(path) as bag, np.errstate(over="ignore", invalid="ignore"):
         if not bag.whole and not recover and PARTIAL not in path.name:
             raise RefusedError(
                 f"{path}: cut short: its end is missing; copy it again, or give it a name such as "
@@ -116,15 +119,21 @@ def _refusing(path: Path) -> Iterator[None]:
     try:
         yield
     except RefusedError as error:
-        if str(error).startswith(str(path)):
-            raise
-        raise RefusedError(f"{path}: damaged bag, or none ({error})") from error
+        said = str(error).removeprefix(f"{path}: ")
+        text = _line(said) if said != str(error) else f"damaged bag, or none ({_line(said)})"
+        raise RefusedError(f"{path}: {text}") from error
     except (
         *(OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError),
         *(struct.error, sqlite3.Error, pa.ArrowException, yaml.YAMLError, RecursionError),
     ) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise RefusedError(f"{path}: damaged bag, or none ({reason[:200]})") from error
+        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error) or type(error).__name__
+        raise RefusedError(f"{path}: damaged bag, or none ({_line(reason)[:200]})") from error
+
+
+def _line(text: str) -> str:
+    """What is said of a bag in a line, as names in it may be of any bytes and any length."""
+    text = "".join(c if c.isprintable() else " " for c in text)
+    return text if len(text) <= LONGEST_LINE else f"{text[:LONGEST_LINE]} ..."
 
 
 class _Bag:

@@ -352,7 +352,9 @@ class McapReader:
         raw = words.rest()
         most = min(LARGEST_CHUNK, CHUNK + MOST_RATIO * len(raw))
         if stored != len(raw) or size > most or codec not in ("", "zstd", "lz4"):
-            raise RefusedError(f"a chunk of {size} bytes, {codec or 'not'} compressed to {stored}, cannot be")
+            raise RefusedError(
+                f"a chunk of {size} bytes, {codec[:8] or 'not'} compressed to {stored}, cannot be"
+            )
         try:
             content = pa.Codec(codec).decompress(raw, size) if codec else raw
         except (pa.ArrowException, OSError, ValueError) as error:
