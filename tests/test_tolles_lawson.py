@@ -8,7 +8,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from magtwin.cli import main
 from magtwin.field.map import AnomalyMap
+from magtwin.io.tables import write_parquet
 from magtwin.learn.tolles_lawson import (
     TollesLawson,
     compensate_run,
@@ -377,3 +379,27 @@ def test_what_cannot_be_fitted_is_refused(change, says):
     given = {"b_nt": np.linalg.norm(b, axis=1), "b_vector_nt": b, "rate_hz": RATE_HZ, **change}
     with pytest.raises(RefusedError, match=says):
         fit_tolles_lawson(**given)
+
+
+def test_compensate_says_which_vectors_it_took(calibration, tmp_path, capsys):
+    write_parquet(calibration("figure8", 1), tmp_path / "run.parquet")
+    told = {}
+    for name, options in (("measured", []), ("exact", ["--exact"])):
+        model = str(tmp_path / f"{name}.json")
+        main(
+            [
+                "compensate",
+                "fit",
+                str(tmp_path / "run.parquet"),
+                "--out",
+                model,
+                "--no-band",
+                "--json",
+                *options,
+            ]
+        )
+        fitted = json.loads(capsys.readouterr().out)["facts"]["vector"]
+        out = ["--out", str(tmp_path / f"{name}.parquet"), "--json"]
+        main(["compensate", "apply", str(tmp_path / "run.parquet"), model, *out])
+        told[name] = fitted, json.loads(capsys.readouterr().out)["facts"]["vector"]
+    assert told == {"measured": ("b_vector_measured_nt",) * 2, "exact": ("b_vector_nt",) * 2}
