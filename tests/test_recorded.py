@@ -249,6 +249,14 @@ def test_a_vector_field_gives_its_magnitude_and_itself(tmp_path):
     assert_allclose(run["b_measured_nt"], np.linalg.norm(b))
 
 
+def test_a_vector_beside_the_magnitude_has_a_unit_of_its_own(tmp_path):
+    b = np.array([12_000.0, 20_000.0, -38_000.0])
+    field = [(r, magnetic(s, *(b * 1e-9))) for s, r in at(50)]
+    run = read_bag(record(tmp_path / "bag", {MAG: readings(), "/robot/qtfm/field": field}))
+    assert_allclose(run["b_vector_measured_nt"], np.tile(b, (200, 1)))
+    assert (run.facts["field_unit"], run.facts["vector_unit"]) == ("nT", "T")
+
+
 def test_plain_numbers_are_taken_as_received(tmp_path):
     said = [(r, make("std_msgs/msg/Float64", data=41_000.0)) for _, r in at(50)]
     run = read_bag(record(tmp_path / "bag", {"/mag": said, POSE: poses()}), topics={MAG: "/mag"})

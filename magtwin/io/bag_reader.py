@@ -405,7 +405,7 @@ def _recorded(bag: _Bag, names: Mapping[str, str], unit: FieldUnit | None) -> Ru
                 f"{path}: {signal.name} spans {when[0]:.3f}..{when[-1]:.3f} s since the first reading of "
                 f"{clock.name}, which ends at {t[-1]:.3f} s; are they of one clock?"
             )
-        columns |= _columns(signal, when, t, facts, clock.fields["unit"], path)
+        columns |= _columns(signal, when, t, facts, path)
     facts["topics"] = " ".join(sorted(signal.name for signal in signals.values()))
     return Run({name: columns[name] for name in COLUMNS if name in columns}, facts)
 
@@ -457,9 +457,7 @@ def _field(signal: _Signal, path: Path, unit: FieldUnit | None) -> tuple[Array, 
     return NT_PER[unit] * size, None if vector is None else NT_PER[unit] * vector
 
 
-def _columns(
-    signal: _Signal, when: Array, t: Array, facts: Facts, unit: str, path: Path
-) -> dict[str, NDArray[Any]]:
+def _columns(signal: _Signal, when: Array, t: Array, facts: Facts, path: Path) -> dict[str, NDArray[Any]]:
     """The columns that a slower signal gives, held causally at the times of readings [s]."""
     at = np.searchsorted(when, t, side="right") - 1
     known = at >= 0
@@ -470,6 +468,11 @@ def _columns(
         return _wheels(signal, when, t)
     values = signal.read(signal.fields)
     if signal.topic is VECTOR:
+        size = np.linalg.norm(values["magnetic_field"], axis=1)
+        if not np.isfinite(size).any():
+            return {}
+        unit = unit_of(float(size[np.isfinite(size)].mean()), path, signal.name)  # perhaps not the clock's
+        facts["vector_unit"] = unit
         values = {"b_vector_measured_nt": values["magnetic_field"] * NT_PER[unit]}
     for name in values.keys() & {"mocap_q_xyzw", "imu_q_xyzw"}:
         values[name] = canonical(values[name])
