@@ -183,7 +183,7 @@ def test_heights_that_a_grid_cannot_give_are_refused(change, height, said):
 
 def test_a_height_below_the_floor_or_among_the_dipoles_is_refused():
     sheet = a_sheet(1.0)
-    with pytest.raises(RefusedError, match="too low for map 'sheet': below 0 m is the floor"):
+    with pytest.raises(RefusedError, match="height_m is a height above the floor, 0 m or more"):
         at_height(a_map(sheet, harmonic=sheet), -0.1)
     x, y = np.meshgrid(np.arange(-3, 3.1, 0.25), np.arange(-3, 3.1, 0.25))
     layer = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -0.05)])
@@ -195,3 +195,19 @@ def test_a_height_below_the_floor_or_among_the_dipoles_is_refused():
     assert (
         at_height(a_map(low, harmonic=low, height_m=0.1), 0.15).height_m == 0.15
     )  # up from where it was fitted
+
+
+@pytest.mark.parametrize(
+    ("height", "said"),
+    [
+        (-0.1, "height_m is a height above the floor, 0 m or more, got -0.1"),
+        (1e9, "farther above than it is long, what lies beside it makes the field"),
+    ],
+)
+def test_heights_below_the_floor_and_far_above_the_map_are_refused(height, said):
+    values = 41_000 + np.random.default_rng(0).normal(0, 100, (1, 6, 8))
+    field = AnomalyMap(
+        values_nt=values, origin_m=(0, 0), cell_m=(0.25, 0.25), headings_rad=[0.0], height_m=0.4
+    )
+    with pytest.raises(RefusedError, match=said):
+        at_height(field, height)

@@ -375,3 +375,18 @@ def test_what_a_survey_says_of_itself_has_its_form(changes, said):
     given = {"p_xy": [[0.0, 0.0]], "yaw": [0.0], "b_nt": [4e4]}
     with pytest.raises(RefusedError, match=said):
         Readings(**{**given, **changes})
+
+
+def test_rows_of_two_units_are_refused_by_the_first_line_that_is_off(tmp_path):
+    rows = [f"{k},0,0,{41_000 + k if k % 3 else 41 + k / 1e3}\n" for k in range(1, 40)]
+    path = file(tmp_path, "x,y,yaw,field\n" + "".join(rows))
+    said = (
+        r"a\.csv:4: field is 41\.003 nT, where most readings are about 41,0.* it and 12 more would fit in uT"
+    )
+    with pytest.raises(RefusedError, match=said):
+        read_readings(path)
+
+
+def test_an_outlier_is_no_row_of_another_unit(tmp_path):
+    rows = [f"{k},0,0,{41_000 + k if k != 7 else 410}\n" for k in range(1, 300)]
+    assert len(read_readings(file(tmp_path, "x,y,yaw,field\n" + "".join(rows)))) == 299

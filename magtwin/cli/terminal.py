@@ -37,7 +37,7 @@ def announcer(*, quiet: bool) -> Any:
 
 @contextmanager
 def progress(title: str) -> Iterator[Any]:
-    """A progress bar with rate and time left; gives `advance(done, total, what)`."""
+    """A progress bar with rate and time left, on a terminal; gives `advance(done, total, what)`."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -48,7 +48,8 @@ def progress(title: str) -> Iterator[Any]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[what]}"),
     )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task(title, total=None, what="")
         yield lambda done, total, what: progress.update(task, completed=done, total=total, what=what)
 

@@ -58,6 +58,8 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
     """
     if not np.isfinite(height_m):
         raise RefusedError(f"height_m must be a length [m], got {height_m!r}")
+    if height_m < 0:
+        raise RefusedError(f"height_m is a height above the floor, 0 m or more, got {height_m!r}")
     height_m = float(height_m)
     if field.height_m is None:
         raise RefusedError(
@@ -120,6 +122,12 @@ def _of_the_grid(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap
             f"height_m {height_m:g} lies {-step:g} m below the map {field.name!r}; a grid of {cell:g} m goes "
             f"down by {LARGEST_STEP_DOWN * cell:g} m at most, below that its noise would be field; fit the "
             "readings with --method harmonic, which knows the field down to the floor"
+        )
+    x0, x1, y0, y1 = field.extent
+    if step > max(x1 - x0, y1 - y0):
+        raise RefusedError(
+            f"height_m {height_m:g} lies {step:g} m above the map {field.name!r} of {x1 - x0:g} x "
+            f"{y1 - y0:g} m; farther above than it is long, what lies beside it makes the field"
         )
     if not field.valid.any(axis=(1, 2)).all():
         raise RefusedError(f"map {field.name!r} has a heading without a valid node; nothing can be continued")

@@ -26,6 +26,10 @@ def day_of(field: AnomalyMap) -> datetime.date:
     Raises:
         RefusedError: It has none.
     """
+    if field.created == "":
+        raise RefusedError(
+            f"map {field.name!r} does not say its day; say it when the map is made (--created YYYY-MM-DD)"
+        )
     return parse_day(field.created, f"created of map {field.name!r}")
 
 

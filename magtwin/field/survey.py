@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,9 @@ LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
 
 NT_PER = {"nT": 1.0, "uT": 1e3, "T": 1e9, "mG": 1e2, "G": 1e5}
 """Units that a field may be in, and the nT that each is."""
+
+MIXED = 0.01
+"""Share of readings that are a unit's factor off the others, above which they are no outliers."""
 
 WIDEST_DEG = 90.0
 """Headings farther apart than this are taken for an incomplete survey unless the caller names them."""
@@ -274,7 +278,7 @@ def _read_layer(path: Path, heading_deg: float, unit: str) -> _Layer:
     x, y, theta, field = table.T
     field = NT_PER[unit] * field
     layer = _Layer(path, heading_deg, np.array([n for n, _ in lines]), x, y, theta, field, sha256(path))
-    check_unit(field, str(path), "scalar_mag", unit)
+    check_unit(field, str(path), "scalar_mag", unit, lambda k: f"{path}:{layer.lines[k]}")
     return layer
 
 
@@ -302,18 +306,33 @@ def _row(path: Path, number: int, line: str) -> list[float]:
     return values
 
 
-def check_unit(b_nt: Array, where: str, column: str, unit: str = "nT") -> None:
-    """Refuse readings whose mean cannot be the Earth's field in nT.
+def check_unit(
+    b_nt: Array, where: str, column: str, unit: str = "nT", row: Callable[[int], str] | None = None
+) -> None:
+    """Refuse readings whose mean cannot be the Earth's field in nT, and those of two units.
 
     Args:
         b_nt: Magnitudes of the field as taken for nT, shape (N,).
         where: File, for the refusal.
         column: Its column.
         unit: Unit that the file was said to be in.
+        row: Says where a reading stands, by its index; the file itself unless given.
 
     Raises:
-        RefusedError: The mean lies outside 10,000..100,000 nT; the text names the unit that would fit.
+        RefusedError: The mean lies outside 10,000..100,000 nT; the text names the unit that would fit. Or
+            more readings than outliers would be are another unit's factor off the others.
     """
+    usual = float(np.sort(b_nt)[len(b_nt) // 2])
+    for other, factor in NT_PER.items():
+        ratio = b_nt / usual * factor / NT_PER[unit]
+        odd = np.flatnonzero((np.abs(np.log10(np.maximum(ratio, 1e-12))) < 0.3) & (other != unit))
+        if LEAST_MEAN_NT <= usual <= GREATEST_MEAN_NT and len(odd) > max(1, MIXED * len(b_nt)):
+            first = int(odd[0])
+            raise RefusedError(
+                f"{row(first) if row else where}: {column} is {b_nt[first]:.6g} nT, where most readings are "
+                f"about {usual:,.0f} nT; it and {len(odd) - 1} more would fit in {other}: give all rows in "
+                "one unit"
+            )
     mean = float(b_nt.mean())
     if LEAST_MEAN_NT <= mean <= GREATEST_MEAN_NT:
         return

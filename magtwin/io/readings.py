@@ -235,6 +235,11 @@ def _only_unit(path: Path, columns: Columns) -> None:
 
 
 def _of_file(source: str, path: Path, columns: Columns) -> Readings:
+    if path.suffix in (".usd", ".usda", ".usdc"):
+        raise RefusedError(
+            f"{path}: a stage or a map, not readings; give the survey that it was made from, or survey a "
+            "scene (magtwin map survey)"
+        )
     if path.suffix in PARQUET and path == Path(source):
         metadata = _metadata(path)
         if _SURVEY in metadata or b"magtwin_facts" in metadata:
@@ -299,6 +304,7 @@ def _of_sheet(sheet: Sheet, paths: list[Path], columns: Columns) -> Readings:
         str(sheet.path),
         _magnitude(sheet, columns).name or columns.field or columns.vector,
         columns.unit or "nT",
+        lambda k: _magnitude(sheet, columns).where(int(np.flatnonzero(known)[k])),
     )
     run, runs = _runs(sheet, columns, paths[0].stem, known)
     return Readings(

@@ -134,6 +134,13 @@ def _visit(
     for name, sd in {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}.items():
         if not 0 <= sd < np.inf:
             raise RefusedError(f"{name} must not be below 0, got {sd!r}")
+    if position_error_m > spacing_m > 0:
+        raise RefusedError(
+            f"position_error_m {position_error_m!r} is beyond the spacing of {spacing_m!r} m; such a robot "
+            "does not find its nodes"
+        )
+    if heading_error_rad > np.pi / 2:
+        raise RefusedError(f"heading_error_rad must not be above pi/2, got {heading_error_rad!r}")
     height = sensor_height_m(scene) if height_m is None else height_m
     if not 0 <= height < np.inf:
         raise RefusedError(f"height_m is a height above the floor, 0 m or more, got {height!r}")
