@@ -24,6 +24,20 @@ def quat_from_yaw(yaw: ArrayLike) -> Array:
     return np.stack([zero, zero, np.sin(half), np.cos(half)], axis=-1)
 
 
+def into_base(v_xy: ArrayLike, yaw: ArrayLike) -> Array:
+    """World vectors along the floor in the axes of a base that heads for `yaw` [rad], forward and left.
+
+    Args:
+        v_xy: Vectors along world x and y, shape (N, 2).
+        yaw: Headings [rad], shape (N,).
+
+    Returns:
+        The same vectors forward and to the left, shape (N, 2).
+    """
+    (x, y), c, s = np.asarray(v_xy, float).T, np.cos(yaw), np.sin(yaw)
+    return np.column_stack([c * x + s * y, c * y - s * x])
+
+
 def quat_from_rpy(rpy: ArrayLike) -> Array:
     """Quaternions xyzw of fixed-axis roll, pitch, yaw [rad] (URDF's rpy), shape (..., 3) -> (..., 4)."""
     half = np.ascontiguousarray(np.moveaxis(np.asarray(rpy, float), -1, 0)) / 2

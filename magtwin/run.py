@@ -46,7 +46,8 @@ class Column:
     """How it is read between two rows; "hold" where only what was known by then counts."""
 
 
-_XYZ, _XYZW, _SIDES = ("x", "y", "z"), ("x", "y", "z", "w"), ("left", "right")
+_XYZ, _XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
+_SIDES, _PLANE = ("left", "right"), ("forward", "left")
 
 COLUMNS: Mapping[str, Column] = MappingProxyType(
     {
@@ -79,6 +80,9 @@ COLUMNS: Mapping[str, Column] = MappingProxyType(
         "battery_fraction": Column("", "", "charge left, 0 to 1", interpolation="hold"),
         "lidar_on": Column("bool", "", "whether the LiDAR spins", interpolation="hold"),
         "b_map_nt": Column("nT", "", "anomaly map at the true pose"),
+        "b_map_gradient_nt_m": Column(
+            "nT/m", "base_link", "what the anomaly map changes by along base_link's axes", 2, _PLANE
+        ),
         "b_disturbance_nt": Column("nT", "", "disturbance by the network, by physics, or none"),
         "b_total_nt": Column("nT", "", "b_map_nt + b_disturbance_nt"),
         "b_noise_nt": Column("nT", "", "the sensor's own error; nan where it gave no reading"),

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from magtwin.learn.features import FEATURES, FULL, SETS, features
+from magtwin.learn.features import EDDY, FEATURES, FULL, INDUCED, SETS, columns_of, features
+from magtwin.learn.tolles_lawson import design_matrix
 from magtwin.names import RefusedError
 from magtwin.run import COLUMNS, Run
 
@@ -66,7 +67,7 @@ def test_features_come_in_the_order_they_are_named_in():
 def test_every_feature_of_a_set_is_known_and_comes_from_a_column_of_a_run():
     for names in SETS.values():
         assert set(names) <= set(FEATURES)
-    assert {f.column for f in FEATURES.values()} <= set(COLUMNS)
+    assert {column for f in FEATURES.values() for column in f.columns} <= set(COLUMNS)
 
 
 @pytest.mark.parametrize(
@@ -86,3 +87,64 @@ def test_an_unknown_name_is_refused_with_the_near_one(names, text):
 def test_a_run_without_a_column_is_refused():
     with pytest.raises(RefusedError, match="no column 'yaw'"):
         features(Run({"t": np.zeros(3)}))
+
+
+def test_the_heading_comes_as_sin_and_cos_of_itself_and_of_twice_itself():
+    run = a_run()
+    yaw = run["yaw"]
+    x = features(run, ["yaw_sin", "yaw_cos", "yaw_sin_2", "yaw_cos_2"])
+    assert_allclose(x, np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2 * yaw), np.cos(2 * yaw)]))
+    turned = features(run.with_columns(yaw=yaw + 2 * np.pi), "circular")
+    assert_allclose(turned, features(run, "circular"), atol=1e-12)
+
+
+def test_nothing_in_circular_tells_one_session_from_another():
+    """Charge, voltage and an IMU zero that were drawn anew leave it as it was."""
+    run = a_run()
+    other = run.with_columns(
+        battery_v=run["battery_v"] - 3,
+        battery_fraction=run["battery_fraction"] / 2,
+        imu_q_xyzw=-run["mocap_q_xyzw"],
+    )
+    for name in ("circular", "gradient", "vector"):
+        assert_array_equal(features(other, name), features(run, name))
+
+
+def test_gradient_features_are_those_of_a_lever_arm_and_of_a_latency():
+    run = a_run()
+    x = features(run, ["map_gradient_left", "speed_map_gradient_forward"])
+    assert_array_equal(x[:, 0], run["b_map_gradient_nt_m"][:, 1])
+    assert_array_equal(x[:, 1], run["b_map_gradient_nt_m"][:, 0] * run["odom_v"][:, 0])
+
+
+def test_the_size_of_the_measured_vector_is_in_no_feature():
+    """It is what is to be predicted."""
+    run = a_run()
+    louder = run.with_columns(b_vector_measured_nt=run["b_vector_measured_nt"] * 1.07)
+    assert_allclose(features(louder, "vector"), features(run, "vector"), rtol=1e-12)
+
+
+def test_induced_and_eddy_products_are_those_of_tolles_and_lawson_in_a_field_that_stands_still():
+    rate, t = 400.0, np.arange(400) / 400.0
+    yaw = 0.8 * np.sin(3 * t)
+    b = np.column_stack([20e3 * np.cos(yaw), -20e3 * np.sin(yaw), np.full(len(t), -40e3)])
+    w = np.column_stack([np.zeros((len(t), 2)), 2.4 * np.cos(3 * t)])
+    run = Run({"t": t, "b_vector_measured_nt": b, "imu_w": w})
+    matrix, names = design_matrix(b, rate, ("induced6", "eddy9"))
+    matrix = matrix / np.linalg.norm(b, axis=1)[:, None]
+    ours = {name: f"induced {name[8:]}" for name in INDUCED}
+    ours |= {name: f"eddy {name[5]}d{name[7]}" for name in EDDY}
+    for name, theirs in ours.items():
+        x = features(run, [name])[5:-5, 0]
+        assert_allclose(x, matrix[5:-5, names.index(theirs)], atol=2e-4)
+
+
+def test_a_field_of_nothing_has_no_direction():
+    run = a_run(3).with_columns(b_vector_measured_nt=np.zeros((3, 3)))
+    assert np.isnan(features(run, ["cosine_x", "induced_xx"])).all()
+
+
+def test_columns_of_a_set_are_all_that_it_needs():
+    for name in SETS:
+        run = a_run().select(*columns_of(name))
+        assert features(run, name).shape == (50, len(SETS[name]))

@@ -295,6 +295,17 @@ def test_a_network_gives_the_disturbance_from_columns_that_are_filled():
     assert np.isnan(run["b_vector_nt"]).all()
 
 
+def test_the_maps_gradient_is_what_a_step_forward_or_to_the_left_changes_it_by():
+    run, h = drive(), 1e-5
+    p, yaw = run["p_world_base"][:, :2], run["yaw"]
+    forward = h * np.column_stack([np.cos(yaw), np.sin(yaw)])
+    left = h * np.column_stack([-np.sin(yaw), np.cos(yaw)])
+    for i, step in enumerate((forward, left)):
+        change = (MAP.lookup(p + step, yaw) - MAP.lookup(p, yaw)) / h
+        inside = np.isfinite(change) & (np.abs(change - run["b_map_gradient_nt_m"][:, i]) < 1)
+        assert inside.mean() > 0.99  # but where a step leads into the next cell
+
+
 def test_with_a_network_the_exact_field_is_still_given_where_it_is_known():
     run = drive(KNOWN, disturbance_nt=lambda run: np.full(run.rows, 7.0))
     assert_array_equal(run["b_total_nt"], run["b_map_nt"] + 7.0)

@@ -14,21 +14,25 @@ from magtwin.run import COLUMNS, Run
 Array = NDArray[np.float64]
 
 
+Convert = Callable[..., NDArray[Any]]
+
+
 @dataclass(frozen=True)
 class Feature:
-    """One input of a network: a number of a column of a Run, and how its unit is changed."""
+    """One input of a network: a number made of columns of a Run, in the unit in which it is read."""
 
-    column: str
-    """Column of the Run it is taken from."""
+    columns: tuple[str, ...]
+    """Columns of the Run it is made of."""
 
     index: int | None
-    """Which number of each row of that column; None where the column holds one."""
+    """Which number of each row of what they give; None where that holds one."""
 
     unit: str
     """Unit in which the network reads it, "" for numbers without one."""
 
-    convert: Callable[[NDArray[Any]], NDArray[Any]] | None = None
-    """From the column, (N,) or (N, width), to what the network reads, same shape; None changes nothing."""
+    convert: Convert | None = None
+    """From the columns, each (N,) or (N, width), to what the network reads, (N,) or (N, width'), row by row:
+    no row of it depends on another. None takes the one column as it is."""
 
 
 def degrees_0_360(yaw: NDArray[Any]) -> Array:
@@ -37,33 +41,97 @@ def degrees_0_360(yaw: NDArray[Any]) -> Array:
     return np.where(deg >= 360.0, 0.0, deg)  # -1e-17 % 360 is 360
 
 
+def circle(yaw: NDArray[Any]) -> Array:
+    """Headings [rad], shape (N,), as sin, cos and those of twice the heading, shape (N, 4).
+
+    The field of hard iron goes once about with the heading, that of soft iron twice.
+    """
+    return np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2 * yaw), np.cos(2 * yaw)])
+
+
+def carried(gradient_nt_m: NDArray[Any], odom_v: NDArray[Any]) -> Array:
+    """Gradients forward and to the left [nT/m], (N, 2), times the forward speed [m/s] of (N, 3): [nT/s].
+
+    A reading that is late by tau errs by tau of the first, as a lever arm l does by l of the gradient.
+    """
+    return gradient_nt_m * odom_v[:, :1]
+
+
+def direction_cosines(b_vector_nt: NDArray[Any]) -> Array:
+    """Unit vectors along fields, shape (N, 3); nan for a field of 0.
+
+    Their size is left out on purpose: it is the very field that is to be predicted.
+    """
+    size = np.linalg.norm(b_vector_nt, axis=1, keepdims=True)
+    return np.divide(b_vector_nt, size, out=np.full(b_vector_nt.shape, np.nan), where=size > 0)
+
+
+def induced_products(b_vector_nt: NDArray[Any]) -> Array:
+    """Products of direction cosines xx, xy, xz, yy, yz, shape (N, 5); zz is 1 less xx and yy.
+
+    Tolles and Lawson's induced terms (Leliak 1961), without the field's size.
+    """
+    x, y, z = direction_cosines(b_vector_nt).T
+    return np.column_stack([x * x, x * y, x * z, y * y, y * z])
+
+
+def eddy_products(b_vector_nt: NDArray[Any], imu_w: NDArray[Any]) -> Array:
+    """Products u_i du_j/dt of direction cosines and their rates [1/s], j = x, y of i = x, y, z: (N, 6).
+
+    Tolles and Lawson's eddy terms (Leliak 1961). In a field that stands still a turning body sees
+    du/dt = -w x u, so the gyroscope gives the rates of a row without its neighbours; on a floor that of z
+    is about 0.
+    """
+    u = direction_cosines(b_vector_nt)
+    rate = -np.cross(imu_w, u)
+    return np.column_stack([u[:, i] * rate[:, j] for i in range(3) for j in range(2)])
+
+
 def _canonical(q: NDArray[Any]) -> Array:
     """Quaternions (N, 4) with w >= 0; a factor of +-1, three times as fast as choosing whole rows."""
     return q * np.where(q[:, 3:] < 0, -1.0, 1.0)
 
 
-def _vector(
-    prefix: str, column: str, convert: Callable[[NDArray[Any]], NDArray[Any]] | None = None
-) -> dict[str, Feature]:
+def _vector(prefix: str, column: str, convert: Convert | None = None) -> dict[str, Feature]:
     """A feature for each number of a vector column: `prefix` and the name of its part."""
     spec = COLUMNS[column]
-    return {f"{prefix}_{part}": Feature(column, i, spec.unit, convert) for i, part in enumerate(spec.parts)}
+    return _named({f"{prefix}_{part}": spec.unit for part in spec.parts}, convert, column)
 
+
+def _named(units: Mapping[str, str], convert: Convert | None, *columns: str) -> dict[str, Feature]:
+    """A feature for each number that `convert` makes of the columns."""
+    return {name: Feature(columns, i, unit, convert) for i, (name, unit) in enumerate(units.items())}
+
+
+_B = "b_vector_measured_nt"
+CIRCLE = ("yaw_sin", "yaw_cos", "yaw_sin_2", "yaw_cos_2")
+GRADIENT = ("map_gradient_forward", "map_gradient_left")
+CARRIED = ("speed_map_gradient_forward", "speed_map_gradient_left")
+COSINES = ("cosine_x", "cosine_y", "cosine_z")
+INDUCED = ("induced_xx", "induced_xy", "induced_xz", "induced_yy", "induced_yz")
+EDDY = ("eddy_xdx", "eddy_xdy", "eddy_ydx", "eddy_ydy", "eddy_zdx", "eddy_zdy")
 
 FEATURES: Mapping[str, Feature] = MappingProxyType(
     {
-        "yaw_deg": Feature("yaw", None, "deg", degrees_0_360),
+        "yaw_deg": Feature(("yaw",), None, "deg", degrees_0_360),
         **_vector("odom_v", "odom_v"),
         **_vector("odom_w", "odom_w"),
         **_vector("imu_q", "imu_q_xyzw", _canonical),
         **_vector("imu_w", "imu_w"),
         **_vector("imu_a", "imu_a"),
-        "battery_v": Feature("battery_v", None, "V"),
-        "battery_fraction": Feature("battery_fraction", None, ""),
-        "lidar_on": Feature("lidar_on", None, "0 or 1"),
+        "battery_v": Feature(("battery_v",), None, "V"),
+        "battery_fraction": Feature(("battery_fraction",), None, ""),
+        "lidar_on": Feature(("lidar_on",), None, "0 or 1"),
+        **_named(dict.fromkeys(CIRCLE, ""), circle, "yaw"),
+        "battery_a": Feature(("battery_a",), None, "A"),
+        **_named(dict.fromkeys(GRADIENT, "nT/m"), None, "b_map_gradient_nt_m"),
+        **_named(dict.fromkeys(CARRIED, "nT/s"), carried, "b_map_gradient_nt_m", "odom_v"),
+        **_named(dict.fromkeys(COSINES, ""), direction_cosines, _B),
+        **_named(dict.fromkeys(INDUCED, ""), induced_products, _B),
+        **_named(dict.fromkeys(EDDY, "1/s"), eddy_products, _B, "imu_w"),
     }
 )
-"""Every feature by name."""
+"""Every feature by name. Names are kept in weights: they are added to, and never change what they mean."""
 
 FULL: tuple[str, ...] = (
     "yaw_deg",
@@ -77,14 +145,28 @@ FULL: tuple[str, ...] = (
 """The 20 inputs of the paper's network, in its order: true heading, odometry's linear and angular
 velocity, IMU's orientation, rates and acceleration, battery voltage and charge, LiDAR on or off."""
 
+CIRCULAR: tuple[str, ...] = (
+    *CIRCLE,
+    *("odom_v_x", "odom_w_z"),
+    *("imu_w_x", "imu_w_y", "imu_w_z"),
+    *("imu_a_x", "imu_a_y", "imu_a_z"),
+    *("battery_a", "lidar_on"),
+)
+"""What a robot's field depends on, and nothing that tells one session from another: no level of charge or
+voltage, no orientation from a zero of the IMU's own."""
+
 SETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "full": FULL,
         "correlated": ("yaw_deg", "odom_v_x", "imu_q_x", "imu_q_y", "imu_q_z", "imu_q_w"),
+        "circular": CIRCULAR,
+        "gradient": (*CIRCULAR, *GRADIENT, *CARRIED),
+        "vector": (*CIRCULAR, *GRADIENT, *CARRIED, *COSINES, *INDUCED, *EDDY),
     }
 )
 """Features by the name of a set. "correlated" holds those whose Spearman correlation with the
-disturbance exceeds 0.04 in the paper's Figure 2."""
+disturbance exceeds 0.04 in the paper's Figure 2; "gradient" adds to "circular" what a lever arm and a
+latency make of the map; "vector" what the vector axes tell of the platform's attitude in the field."""
 
 
 def feature_names(names: str | Sequence[str]) -> tuple[str, ...]:
@@ -108,7 +190,7 @@ def features(run: Run, names: str | Sequence[str] = "full") -> Array:
 
     Args:
         run: Needs the columns that the features are taken from.
-        names: A set ("full", "correlated") or names of features, in the order of the network's inputs.
+        names: A set of `SETS` or names of features, in the order of the network's inputs.
 
     Returns:
         Features in the units of `FEATURES`, shape (N, F), rows contiguous.
@@ -118,12 +200,22 @@ def features(run: Run, names: str | Sequence[str] = "full") -> Array:
     """
     names = feature_names(names)
     x = np.empty((run.rows, len(names)))
-    converted: dict[str, NDArray[Any]] = {}  # a quaternion is made canonical once, not four times
+    made: dict[tuple[Any, ...], NDArray[Any]] = {}  # a quaternion is made canonical once, not four times
     for i, name in enumerate(names):
         feature = FEATURES[name]
-        if feature.column not in converted:
-            column = run[feature.column]
-            converted[feature.column] = feature.convert(column) if feature.convert else column
-        values = converted[feature.column]
+        key = (feature.convert, feature.columns)
+        if key not in made:
+            columns = [run[column] for column in feature.columns]
+            made[key] = feature.convert(*columns) if feature.convert else columns[0]
+        values = made[key]
         x[:, i] = values if feature.index is None else values[:, feature.index]
     return x
+
+
+def columns_of(names: str | Sequence[str]) -> tuple[str, ...]:
+    """Columns of a Run that features are made of, each once; `names` as for `features`.
+
+    Raises:
+        RefusedError: An unknown feature or set.
+    """
+    return tuple(dict.fromkeys(c for name in feature_names(names) for c in FEATURES[name].columns))

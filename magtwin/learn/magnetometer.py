@@ -116,7 +116,7 @@ class NeuralMagnetometer:
     @property
     def columns(self) -> frozenset[str]:
         """Columns of a Run that the inputs are taken from."""
-        return frozenset(FEATURES[name].column for name in self.features)
+        return frozenset(column for name in self.features for column in FEATURES[name].columns)
 
     @property
     def residual_sd_nt(self) -> float:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.field.map import AnomalyMap
 from magtwin.frames import (
     canonical,
+    into_base,
     matrix_from_quat,
     quat_from_rpy,
     quat_from_yaw,
@@ -327,7 +328,10 @@ class Fleet:
         b_map = self._map.lookup(now.pose[:, :2], table["yaw"], outside="clamp")
         b_map = np.where(np.isnan(b_map), np.nanmean(self._map.values_nt), b_map)  # beside masked nodes
         if self._disturbance_nt is not None:
-            disturbance = self._disturbance_nt(Run(table | {"b_map_nt": b_map}))
+            slopes = self._map.gradient(now.pose[:, :2], table["yaw"], outside="clamp")[:, :2]
+            sloped = into_base(np.nan_to_num(slopes), table["yaw"])
+            known = {"b_map_nt": b_map, "b_map_gradient_nt_m": sloped}
+            disturbance = self._disturbance_nt(Run(table | known))
         elif spec.kind == "physical":
             early = max(self._steps - 1 - round(TORQUE_S * CONTROL_RATE_HZ), 0)
             field = field_at_sensor_nt(

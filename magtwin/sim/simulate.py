@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.field.map import AnomalyMap
-from magtwin.frames import quat_from_yaw, wrap_angle
+from magtwin.frames import into_base, quat_from_yaw, wrap_angle
 from magtwin.names import RefusedError
 from magtwin.obstacles import Obstacles
 from magtwin.path import Path, check_on_floor
@@ -323,7 +323,8 @@ def sense(
     if needed & _MOCAP:
         columns |= sense_mocap(robot.mocap, robot.base_height_m, motion, t, draws["mocap"])
     columns["lidar_on"] = lidar_on(robot.lidar, t, lidar)
-    columns |= _map(anomaly_map, true.pose[:, :2], columns["yaw"], outside)
+    sloped = "b_map_gradient_nt_m" in needed
+    columns |= _map(anomaly_map, true.pose[:, :2], columns["yaw"], outside, gradient=sloped)
     if exact or needed & _BATTERY:
         pack = discharge(robot.battery, robot.drive, motion, partial(lidar_on, robot.lidar, mode=lidar), end)
         columns |= sense_battery(robot.battery, pack, t, draws["battery"])
@@ -404,14 +405,24 @@ def _truth(true: Moment, t: Array, height_m: float) -> dict[str, NDArray[Any]]:
 
 
 def _map(
-    anomaly_map: AnomalyMap, xy: Array, yaw: Array, outside: Literal["nan", "clamp", "raise"]
+    anomaly_map: AnomalyMap,
+    xy: Array,
+    yaw: Array,
+    outside: Literal["nan", "clamp", "raise"],
+    *,
+    gradient: bool,
 ) -> dict[str, NDArray[Any]]:
-    """Map at base_link's poses, and where there is none."""
-    b = anomaly_map.lookup(xy, yaw, outside=outside)
+    """Map at base_link's poses, its gradient in base_link's axes if wanted, and where there is none."""
+    columns = {}
+    if gradient:
+        b, slopes = anomaly_map.lookup_with_gradient(xy, yaw, outside=outside)
+        columns["b_map_gradient_nt_m"] = into_base(slopes[:, :2], yaw)
+    else:
+        b = anomaly_map.lookup(xy, yaw, outside=outside)
     off = np.isnan(b)
     if outside == "clamp":
         off = off | ~anomaly_map.contains(xy)
-    return {"b_map_nt": b, "flag_outside_map": off}
+    return {"b_map_nt": b, **columns, "flag_outside_map": off}
 
 
 def _exact_field(
