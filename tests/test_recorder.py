@@ -96,6 +96,9 @@ def test_a_recording_that_broke_off_in_a_message_is_read_up_to_it(run, tmp_path)
         assert equal(left, rows(run, slice(left.rows)))
         sizes.append(left.rows)
     assert set(sizes) <= {100, 200, 300, 400}
+    (tmp_path / "cut.rrd").write_bytes(bytes_)
+    with pytest.raises(RefusedError, match="was cut short: it holds 400 rows of a run that did not end"):
+        read_rrd(tmp_path / "cut.rrd")
     assert max(sizes) == 400
 
 
@@ -232,6 +235,20 @@ def test_a_viewer_that_is_not_there_is_refused_before_anything_is_written(lab_sc
             main([*arguments, *options])
         assert said in capsys.readouterr().err.splitlines()[-1]
     assert not list(tmp_path.iterdir())
+
+
+def test_a_live_run_that_is_refused_leaves_nothing(lab_scene, tmp_path, capsys):
+    far = tmp_path / "far.csv"
+    far.write_text("x,y\n0,0\n50,0\n")
+    live = ["--viewer", deaf_address(), "--out", str(tmp_path / "out"), "--bag", str(tmp_path / "a.mcap")]
+    with pytest.raises(SystemExit):
+        main(["run", str(lab_scene), "--net", "none", "--path", str(far), *live])
+    assert "far.csv" in capsys.readouterr().err
+    (tmp_path / "a.partial.mcap").touch()
+    with pytest.raises(SystemExit):
+        main(["run", str(lab_scene), "--net", "none", "--duration", "1", *live])
+    assert "a.partial.mcap: exists already" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.partial.mcap", "far.csv"]
 
 
 @pytest.fixture

@@ -466,15 +466,12 @@ class _Outputs:
     def begun(self) -> "_Outputs":
         """The same, in place: files grow there, under names that tell so."""
         from magtwin.files import check_free
+        from magtwin.io.recorder import partial_of
 
-        for target in (self.folder, *self.files.values(), self.scans):
+        unfinished = [partial_of(path) for path in (*self.of("rrd"), *self.of("bag"))]
+        for target in (self.folder, *self.files.values(), self.scans, *unfinished):
             if target is not None:
                 check_free(target, force=self.force)
-        if self.folder is not None:
-            try:
-                self.folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise RefusedError(f"{self.folder}: cannot be written ({error.strerror})") from error
         return self
 
     def of(self, kind: str) -> list[Path]:
@@ -490,8 +487,8 @@ class _Outputs:
         from magtwin.io.tables import ParquetParts
 
         known: dict[str, Any] = {"expected": driven.run, "planned": driven.planned, "scans": driven.scans}
-        recordings = [RrdWriter(path, driven.twin, **known, force=self.force) for path in self.of("rrd")[:1]]
         tables = [ParquetParts(path, force=self.force) for path in self.of("parquet")[:1]]
+        recordings = [RrdWriter(path, driven.twin, **known, force=self.force) for path in self.of("rrd")[:1]]
         options: dict[str, Any] = {"units": self.units or "T", "scans": driven.scans, "force": self.force}
         bags = [BagWriter(path, driven.twin, **options) for path in self.of("bag")]
         return [*recordings, *tables, *bags]
