@@ -14,10 +14,10 @@ import pyarrow as pa
 import yaml
 from numpy.typing import NDArray
 
+from magtwin.arrow import spec_said
 from magtwin.field.survey import NT_PER, check_unit
 from magtwin.files import existing, sha256
 from magtwin.frames import canonical, quat_conjugate, rotate, yaw_from_quat
-from magtwin.io.arrow import spec_said
 from magtwin.io.bag import Heard
 from magtwin.io.bag_readings import poses_at, unit_of
 from magtwin.io.bag_writer import FACTS, NOTE

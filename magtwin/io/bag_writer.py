@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import magtwin
+from magtwin.arrow import check_clock, facts_to_json
 from magtwin.files import check_free, output
-from magtwin.io.arrow import check_clock, facts_to_json
 from magtwin.io.bag import ROOM, VERSION, Batch, Connection, Tally, metadata, yaml_of
 from magtwin.io.cdr import NS, Index, encode, leaves
 from magtwin.io.db3 import Db3Writer

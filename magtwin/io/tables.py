@@ -20,8 +20,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from magtwin.files import check_free, existing, output
-from magtwin.io.arrow import (
+from magtwin.arrow import (
     FACTS,
     facts_from_json,
     facts_to_json,
@@ -30,6 +29,7 @@ from magtwin.io.arrow import (
     spec_said,
     table_of,
 )
+from magtwin.files import check_free, existing, output
 from magtwin.names import RefusedError
 from magtwin.run import COLUMNS, Run, check_clock
 
