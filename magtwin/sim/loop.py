@@ -495,7 +495,10 @@ def drive_on(
         w = w_told + left_at_end * (w - w_told)
         if v_told == 0.0 and w_told == 0.0 and abs(v) < REST_M_S and abs(w) < rest_w:
             v = w = 0.0
-        v_body = v_mean * (1.0 - slip * (v_mean - was)) * scale_v
+        slipped = slip * (v_mean - was)
+        if v_mean < 0.0:  # backwards, what speeds up is a change below 0
+            slipped = -slipped
+        v_body = v_mean * (1.0 - slipped) * scale_v
         w_body = w_mean * scale_w
         if (first + k) % ANEW == 0:
             cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
