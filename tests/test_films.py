@@ -78,8 +78,8 @@ def test_frames_come_again_the_same_and_in_any_order(scenery):
     np.testing.assert_array_equal(scenery.frame(1), early)
 
 
-@pytest.mark.parametrize("camera", ["orbit", "chase", "2,-3,1.5:0,0,0"])
-def test_every_camera_sees_the_robot(run, lab_scene, camera):
+@pytest.mark.parametrize("camera", ["chase", "2,-3,1.5:0,0,0"])
+def test_cameras_that_follow_or_stand_see_the_robot(run, lab_scene, camera):
     with Scenery(run, lab_scene, [1.0, 4.0], view=View.of(camera), size=SIZE) as scenery:
         frames = [scenery.frame(k).astype(int) for k in (0, 1)]
     assert (np.abs(frames[0] - frames[1]) > 40).any(axis=-1).sum() > 50
