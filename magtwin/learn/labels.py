@@ -1,17 +1,19 @@
 """Labels: what a magnetometer read beyond the map, and how well that is known."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.field.map import AnomalyMap
-from magtwin.frames import wrap_angle, yaw_from_quat
+from magtwin.frames import into_base, wrap_angle, yaw_from_quat
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
-from magtwin.run import Run
+from magtwin.run import Column, Run
 
 Array = NDArray[np.float64]
 
@@ -26,6 +28,26 @@ LATENCIES_S = np.arange(-0.4, 0.41, 0.02)
 
 LEAST_ROWS = 200
 """Fewer readings with a label do not tell an alignment."""
+
+LEVER_ARM_PRIOR_M = 0.05
+"""How far a sensor is off its place before any run tells, as a standard deviation of each axis [m]."""
+
+LATENCY_PRIOR_S = 0.1
+"""How late a reading is before any run tells, as a standard deviation [s]."""
+
+FIT_RATE_HZ = 20.0
+"""Readings a second that an alignment is fitted to; more are too alike to tell more."""
+
+STARTS = 3
+"""Latencies, of those that leave least, that are refined."""
+
+LABEL_COLUMNS: Mapping[str, Column] = MappingProxyType(
+    {
+        "label_nt": Column("nT", "", "measured field less the map at the sensor; nan where there is none"),
+        "label_sd_nt": Column("nT", "", "how well the map is known there, as a standard deviation"),
+    }
+)
+"""Columns that `labelled` adds to a run beside those that `magtwin.run.COLUMNS` has."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +94,9 @@ class Labels:
     map_nt: Array
     """Map at the sensor's place [nT], shape (N,)."""
 
+    gradient_nt_m: Array
+    """What the map changes by there, forward and to the left of base_link [nT/m], shape (N, 2)."""
+
     @property
     def known(self) -> NDArray[np.bool_]:
         """Readings that have a label, shape (N,)."""
@@ -110,11 +135,53 @@ def labels(run: Run, field: AnomalyMap, alignment: Alignment | None = None) -> L
         if flag in run:
             usable &= ~run[flag]
     measured = np.where(usable, run["b_measured_nt"], np.nan)
-    return Labels(measured - value, np.sqrt(variance), value)
+    return Labels(measured - value, np.sqrt(variance), value, into_base(gradient[:, :2], yaw))
+
+
+def labelled(run: Run, field: AnomalyMap, alignment: Alignment | None = None) -> Run:
+    """A run with its labels as columns, and the map that they were made on: one table to learn from.
+
+    label_nt and label_sd_nt are added; b_map_nt, b_map_gradient_nt_m and flag_outside_map become those of
+    this map at the sensor's place, so that b_measured_nt = b_map_nt + label_nt. Where motion capture alone
+    tells the pose, yaw is taken from it. The arguments are those of `labels`.
+
+    Raises:
+        RefusedError: The run lacks a column, or no reading of it has a label.
+    """
+    found = labels(run, field, alignment)
+    if not found.known.any():
+        low_x, high_x, low_y, high_y = field.extent
+        p = run["mocap_p"] if "mocap_p" in run else run["p_world_base"]
+        lost = np.zeros(run.rows, bool)
+        for flag in UNUSABLE:
+            lost |= run.get(flag, False)
+        seen = [f"{np.nanmin(v):.2f} to {np.nanmax(v):.2f}" for v in p[:, :2].T if np.isfinite(v).any()]
+        raise RefusedError(
+            f"none of {run.rows} readings has a label on the map {field.name!r} (x {low_x:g} to {high_x:g}, "
+            f"y {low_y:g} to {high_y:g} m): the robot was at x, y {', '.join(seen) or 'unknown'} m, "
+            f"{int(np.isfinite(run['b_measured_nt']).sum())} readings hold a field, {int(lost.sum())} had no "
+            "lock or no pose; name the map of its lab, in its frame"
+        )
+    columns: dict[str, NDArray[Any]] = {
+        "b_map_nt": found.map_nt,
+        "b_map_gradient_nt_m": found.gradient_nt_m,
+        "flag_outside_map": np.isnan(found.map_nt),
+        "label_nt": found.value_nt,
+        "label_sd_nt": np.where(found.known, found.sd_nt, np.nan),
+    }
+    if "yaw" not in run:
+        columns["yaw"] = wrap_angle(yaw_from_quat(run["mocap_q_xyzw"]))
+    return run.with_columns(**columns).with_specs(**LABEL_COLUMNS)
 
 
 def fit_alignment(
-    runs: Sequence[Run], field: AnomalyMap, *, lever_arm: bool = True, latency: bool = True, rounds: int = 20
+    runs: Sequence[Run],
+    field: AnomalyMap,
+    *,
+    lever_arm: bool = True,
+    latency: bool = True,
+    rounds: int = 20,
+    prior_sd: tuple[float, float] = (LEVER_ARM_PRIOR_M, LATENCY_PRIOR_S),
 ) -> Alignment:
     """Lever arm and latency that make readings agree best with a map.
 
@@ -123,49 +190,163 @@ def fit_alignment(
 
         map(p(t - tau) + R l) = map(p) + (R^T grad B) . l - tau dB/dt,
 
-    relinearised until they stay, from the latency of `LATENCIES_S` that leaves least. The other terms
-    (cos and sin of the heading and of twice it) stand for the platform, so that its hard iron is not taken
-    for a place. Spreads are those of blocks of `BLOCK_S`.
+    relinearised until they stay, from each of the `STARTS` latencies of `LATENCIES_S` that leave least; of
+    what they lead to the likeliest is kept. The other terms (cos and sin of the heading and of twice it)
+    stand for the platform, so that its hard iron is not taken for a place. Its covariance V is that of
+    blocks of `BLOCK_S`, whose readings err alike. Along a straight line at one speed a lever arm forward
+    and a latency are the same, so each has a weak prior about 0 of covariance P: what is found is
+    P (P + V)^-1 of the least squares', which is theirs where the runs tell the two apart, and is shared
+    between them, with spreads that say so, where they do not.
 
     Args:
-        runs: Runs of one robot, as for `labels`; they should turn, and drive at more than one speed: along a
-            straight line at one speed a lever arm forward and a latency are the same.
+        runs: Runs of one robot, as for `labels`; they should turn, and drive at more than one speed.
         field: The map.
         lever_arm: Whether the lever arm is fitted; otherwise it is 0.
         latency: Whether the latency is fitted; otherwise it is 0.
         rounds: Relinearisations at most.
+        prior_sd: Standard deviations of the prior, of a lever arm [m] and of a latency [s].
 
     Raises:
-        RefusedError: Fewer than `LEAST_ROWS` readings have a label, the runs do not tell the one from the
-            other, or nothing is to be fitted.
+        RefusedError: Fewer than `LEAST_ROWS` readings have a label, or nothing is to be fitted.
     """
     if not (lever_arm or latency):
         raise RefusedError("neither the lever arm nor the latency is to be fitted; name one")
-    free = np.array([lever_arm, lever_arm, latency])
+    if not all(0 < sd < np.inf for sd in prior_sd):
+        raise RefusedError(f"prior_sd must be above 0 and finite, got {prior_sd}")
     known = sum(int(labels(run, field).known.sum()) for run in runs)
     if known < LEAST_ROWS:
         raise RefusedError(
             f"{known} readings have a label on the map {field.name!r}, too few to fit lever arm and latency: "
             f"it takes {LEAST_ROWS}; do the runs lie on the map?"
         )
-    start = np.zeros(3)
+    free = np.array([lever_arm, lever_arm, latency])
+    prior = np.array([prior_sd[0], prior_sd[0], prior_sd[1]])[free] ** 2
+    fit = _Fit(runs, field, free, prior)
+    starts = [np.zeros(3)]
     if latency:
-        left = [_round(runs, field, np.array([0.0, 0.0, tau]), free)[2] for tau in LATENCIES_S]
-        start[2] = LATENCIES_S[int(np.argmin(left))]
-    found, best = start, np.inf
+        tried = np.zeros((len(LATENCIES_S), 3))
+        tried[:, 2] = LATENCIES_S
+        left = [fit.at(one).promised for one in tried]
+        starts = [tried[i] for i in np.argsort(left)[:STARTS]]
+    fit.alike = fit.at(starts[0]).alike
+    best = min((_descend(fit, start, rounds) for start in starts), key=lambda one: one.cost)
+    sd = np.zeros(3)
+    sd[free] = np.sqrt(np.diag(best.covariance))
+    forward, left_of, late = best.place.tolist()
+    return Alignment((forward, left_of), late, (float(sd[0]), float(sd[1])), float(sd[2]))
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """The least squares of an alignment about a place (forward, left, latency)."""
+
+    place: Array
+    wanted: Array
+    """Where they and the prior lead to, shape (3,)."""
+    covariance: Array
+    """Of the free ones, the prior's part included, from how alike the readings of a block err."""
+    cost: float
+    """Twice the negative logarithm of the posterior of the place, but for a constant."""
+    promised: float
+    """Mean square that would be left where the least squares lead to [nT^2]."""
+    alike: float
+    """How many readings err as one."""
+
+
+def _descend(fit: "_Fit", start: Array, rounds: int) -> _Linearised:
+    """The alignment that is reached from another, step by step; a step that leads up is halved."""
+    here = fit.at(start)
     for _ in range(rounds):
-        step, sd, left_over = _round(runs, field, found, free)
-        if not np.all(np.isfinite(step)):
-            raise RefusedError(
-                "the runs do not tell lever arm and latency apart: they do not turn, or keep one speed; "
-                "add a run that does, or fit one of the two"
-            )
-        if np.abs(step / np.where(sd > 0, sd, 1.0)).max() < 1e-3 or left_over > best * (1 + 1e-9):
+        step = here.wanted - here.place
+        sd = np.sqrt(np.diag(here.covariance))
+        if np.all(np.abs(step[fit.free]) < 1e-3 * sd):
             break
-        best, found = left_over, found + step
-    return Alignment(
-        (float(found[0]), float(found[1])), float(found[2]), (float(sd[0]), float(sd[1])), float(sd[2])
-    )
+        for share in (1.0, 0.5, 0.25, 0.125):
+            there = fit.at(here.place + share * step)
+            if there.cost < here.cost:
+                break
+        else:
+            break
+        here = there
+    return here
+
+
+class _Fit:
+    """Readings, thinned to what tells, against a map."""
+
+    def __init__(self, runs: Sequence[Run], field: AnomalyMap, free: NDArray[np.bool_], prior: Array) -> None:
+        self.field, self.free, self.prior = field, free, prior
+        self.alike = 1.0
+        self.runs = []
+        for run in runs:
+            step = float(np.median(np.diff(run["t"]))) if run.rows > 1 else 1.0
+            every = max(1, round(1 / (step * FIT_RATE_HZ)))
+            self.runs.append((run, np.arange(0, run.rows, every)))
+
+    def at(self, place: Array) -> _Linearised:
+        """The least squares about a place."""
+        alignment = Alignment((float(place[0]), float(place[1])), float(place[2]))
+        parts_x, parts_y, parts_block, blocks = [], [], [], 0
+        for run, rows in self.runs:
+            p, yaw, rates = (values[rows] for values in _placed(run, alignment))
+            value, gradient = self.field.lookup_with_gradient(p, yaw)
+            usable = np.isfinite(value) & np.isfinite(gradient).all(axis=1)
+            for flag in UNUSABLE:
+                usable &= ~run[flag][rows] if flag in run else True
+            label = run["b_measured_nt"][rows] - value
+            kept = usable & np.isfinite(label)
+            slopes = _slopes(gradient, yaw, rates)[:, self.free]
+            terms = [np.ones(len(rows)), np.cos(yaw), np.sin(yaw), np.cos(2 * yaw), np.sin(2 * yaw)]
+            terms += [run["odom_v"][rows, 0]] if "odom_v" in run else []
+            terms += [run["lidar_on"][rows].astype(float)] if "lidar_on" in run else []
+            matrix = np.column_stack([slopes, *terms])
+            kept &= np.isfinite(matrix).all(axis=1)
+            if not kept.any():
+                continue
+            parts_x.append(matrix[kept])
+            parts_y.append(label[kept])
+            block = ((run["t"][rows][kept] - run["t"][0]) // BLOCK_S).astype(int)
+            parts_block.append(blocks + np.unique(block, return_inverse=True)[1])
+            blocks = int(parts_block[-1][-1]) + 1
+        if not parts_x:
+            return _Linearised(place, place, np.diag(self.prior), np.inf, np.inf, 1.0)
+        x, y, block = np.vstack(parts_x), np.concatenate(parts_y), np.concatenate(parts_block)
+        return self._solved(place, x, y, block)
+
+    def _solved(self, place: Array, x: Array, y: Array, block: NDArray[np.intp]) -> _Linearised:
+        rows, count, at = len(y), len(self.prior), place[self.free]
+        scale = np.sqrt(np.mean(x**2, axis=0))
+        scale[scale == 0] = 1.0  # on a level map no place differs from another
+        x = x / scale
+        normal = x.T @ x
+        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+        solved = inverse @ (x.T @ y)
+        error = y - x @ solved
+        promised = max(float(np.mean(error**2)), 1e-12)
+        platform = x[:, count:]
+        here = y - platform @ np.linalg.lstsq(platform, y, rcond=None)[0]
+        score = np.zeros((int(block.max()) + 1, x.shape[1]))
+        np.add.at(score, block, x * error[:, None])
+        # Few blocks make their own scatter small.
+        few = len(score) / max(len(score) - x.shape[1], 1)
+        blocked = few * (inverse @ (score.T @ score) @ inverse)
+        alike = np.trace(blocked[:count, :count]) / max(promised * np.trace(inverse[:count, :count]), 1e-300)
+        # Along what the runs do not tell, the pseudo-inverse claims a variance of 0: there the prior stands.
+        values, vectors = np.linalg.eigh(normal)
+        blind = vectors[:, values < 1e-10 * values[-1]]
+        unknown = 1e12 * blind @ blind.T
+        prior = np.diag(self.prior)
+
+        def shrunk(spread: Array) -> Array:
+            spread = (spread + unknown)[:count, :count] / np.outer(scale[:count], scale[:count])
+            return prior @ np.linalg.inv(prior + spread)
+
+        wanted = place.copy()
+        wanted[self.free] = shrunk(self.alike * promised * inverse) @ (at + solved[:count] / scale[:count])
+        covariance = prior - shrunk(blocked) @ prior
+        left = max(float(np.mean(here**2)), 1e-12)
+        cost = rows / self.alike * np.log(left) + float(np.sum(at**2 / self.prior))
+        return _Linearised(place, wanted, (covariance + covariance.T) / 2, cost, promised, max(alike, 1.0))
 
 
 def _placed(run: Run, alignment: Alignment) -> tuple[Array, Array, Array]:
@@ -197,47 +378,5 @@ def _unbroken(yaw: Array) -> Array:
 
 def _slopes(gradient: Array, yaw: Array, rates: Array) -> Array:
     """What the map changes by for a metre forward, a metre left, and a second of latency, shape (N, 3)."""
-    gx, gy, gyaw = gradient.T
-    c, s = np.cos(yaw), np.sin(yaw)
-    late = -(gx * rates[:, 0] + gy * rates[:, 1] + gyaw * rates[:, 2])
-    return np.column_stack([c * gx + s * gy, c * gy - s * gx, late])
-
-
-def _round(
-    runs: Sequence[Run], field: AnomalyMap, at: Array, free: NDArray[np.bool_]
-) -> tuple[Array, Array, float]:
-    """A Gauss-Newton step from lever arm and latency, its standard deviations, and the mean square left."""
-    alignment = Alignment((float(at[0]), float(at[1])), float(at[2]))
-    blocks, parts_x, parts_y = [], [], []
-    for run in runs:
-        p, yaw, rates = _placed(run, alignment)
-        gradient = field.gradient(p, yaw)
-        label = labels(run, field, alignment).value_nt
-        kept = np.isfinite(label) & np.isfinite(gradient).all(axis=1)
-        slopes = _slopes(gradient, yaw, rates)[:, free]
-        terms = [np.ones(run.rows), np.cos(yaw), np.sin(yaw), np.cos(2 * yaw), np.sin(2 * yaw)]
-        terms += [run["odom_v"][:, 0]] if "odom_v" in run else []
-        terms += [run["lidar_on"].astype(float)] if "lidar_on" in run else []
-        parts_x.append(np.column_stack([slopes, *terms])[kept])
-        parts_y.append(label[kept])
-        start = (blocks[-1][-1] + 1) if blocks and len(blocks[-1]) else 0
-        blocks.append(start + ((run["t"][kept] - run["t"][0]) // BLOCK_S).astype(int))
-    x, y, block = np.vstack(parts_x), np.concatenate(parts_y), np.concatenate(blocks)
-    scale = np.sqrt(np.mean(x**2, axis=0))
-    x = x[:, scale > 0] / scale[scale > 0]
-    step, sd = np.zeros(3), np.zeros(3)
-    count = int(free.sum())
-    if not np.all(scale[:count] > 0):
-        return np.full(3, np.nan), sd, np.inf
-    normal = x.T @ x
-    if np.linalg.cond(normal[:count, :count]) > 1e10:
-        return np.full(3, np.nan), sd, np.inf
-    inverse = np.linalg.pinv(normal, hermitian=True)
-    solved = inverse @ (x.T @ y)
-    error = y - x @ solved
-    score = np.zeros((int(block.max()) + 1, x.shape[1]))
-    np.add.at(score, block, x * error[:, None])
-    spread = inverse @ (score.T @ score) @ inverse
-    step[free] = solved[:count] / scale[:count]
-    sd[free] = np.sqrt(np.diag(spread)[:count]) / scale[:count]
-    return step, sd, float(np.mean(error**2))
+    late = -np.sum(gradient * rates, axis=1)
+    return np.column_stack([into_base(gradient[:, :2], yaw), late])
