@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q install -c constraint
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow simready lint bench wheel-test schema assets clean help
+.PHONY: demo test test-slow simready physics lint bench wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -56,6 +56,13 @@ assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
 	$(BIN)/python maps/lab/build.py
 	$(BIN)/python weights/train_lab.py
 	$(BIN)/python scenes/build.py
+
+pictures: $(VENV)/.installed  ## Take the README's pictures anew, but for the viewer's
+	$(BIN)/magtwin picture scenes/lab/lab.usda --out docs/lab.png --force
+	$(BIN)/magtwin picture robots/turtlebot4/turtlebot4.usda --size 1100x900 --out docs/robot.png --force
+	$(BIN)/magtwin map plot maps/lab/lab.usdc --out docs/map.png --force
+	$(BIN)/magtwin run scenes/lab/lab.usda --seed 1 --out build/pictures --force
+	$(BIN)/magtwin film build/pictures/run.parquet --size 640x400 --speed 8 --fps 10 --out docs/run.gif --force
 
 clean:  ## Remove the environment and what was built
 	rm -rf $(VENV) build demo
