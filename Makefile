@@ -62,7 +62,7 @@ pictures: $(VENV)/.installed  ## Take the README's pictures anew, but for the vi
 	$(BIN)/magtwin picture robots/turtlebot4/turtlebot4.usda --size 1100x900 --out docs/robot.png --force
 	$(BIN)/magtwin map plot maps/lab/lab.usdc --out docs/map.png --force
 	$(BIN)/magtwin run scenes/lab/lab.usda --seed 1 --out build/pictures --force
-	$(BIN)/magtwin film build/pictures/run.parquet --size 640x400 --speed 8 --fps 10 --out docs/run.gif --force
+	$(BIN)/magtwin film build/pictures/run.parquet --camera 0,-1.6,5.6:0,-0.2,0 --size 560x350 --speed 10 --fps 8 --out docs/run.gif --force
 
 clean:  ## Remove the environment and what was built
 	rm -rf $(VENV) build demo
