@@ -337,7 +337,7 @@ class _Fit:
         unknown = 1e12 * blind @ blind.T
         prior = np.diag(self.prior)
 
-        def shrunk(spread: Array) -> Array:
+        def shrunk(spread: NDArray[Any]) -> Array:
             spread = (spread + unknown)[:count, :count] / np.outer(scale[:count], scale[:count])
             return prior @ np.linalg.inv(prior + spread)
 

@@ -180,9 +180,8 @@ def split(
         )
     parts = _dealt(left, key, numbers, rng, by)
     parts["test"] |= held
-    return Split(
-        *(_in_order(recordings, parts[part]) for part in PARTS), by=by, held_out=_in_order(recordings, held)
-    )
+    train, validation, test = (_in_order(recordings, parts[part]) for part in PARTS)
+    return Split(train, validation, test, by, _in_order(recordings, held))
 
 
 def _dealt(
@@ -233,4 +232,4 @@ def _uniform(seed: int, name: str, count: int) -> NDArray[np.float64]:
         z = (z ^ (z >> np.uint64(30))) * np.uint64(_DEAL[1])
         z = (z ^ (z >> np.uint64(27))) * np.uint64(_DEAL[2])
         z = z ^ (z >> np.uint64(31))
-    return (z >> np.uint64(11)) * 2.0**-53
+    return (z >> np.uint64(11)).astype(float) * 2.0**-53
