@@ -13,7 +13,7 @@ from magtwin.io.formats import FORMATS, read_run, write_run
 from magtwin.io.rosbag import BagWriter
 from magtwin.io.tables import ParquetParts
 from magtwin.names import RefusedError
-from magtwin.run import Run
+from magtwin.run import Column, Run
 from magtwin.twin import Twin, open_twin, simulate
 
 EXACT = ("run.parquet", "run.csv", "run.npz", "run.rrd", "run.usd", "run.usda", "run.usdc")
@@ -66,6 +66,19 @@ def test_a_run_comes_back_to_the_last_bit_with_its_facts(name, run, written):
     again = read_run(written / name)
     assert_carried(run, again)
     assert_same(run, again)
+
+
+@pytest.mark.parametrize("name", [*EXACT, *BAGS])
+def test_columns_of_a_users_own_keep_unit_frame_parts_and_rule(name, tmp_path):
+    run = Run({"t": np.arange(5.0), "head_k": np.full(5, 290.0), "coil": np.arange(15.0).reshape(5, 3)})
+    run = run.with_columns(p_world_base=np.zeros((5, 3)), q_world_base_xyzw=np.tile([0, 0, 0, 1.0], (5, 1)))
+    run = run.with_columns(valve=np.arange(5) > 2, est_q_xyzw=np.tile([0, 0, 0, 1.0], (5, 1)))
+    coil = Column("A", "magnetometer", "currents", 3, ("a", "b", "c"))
+    run = run.with_specs(head_k=Column("K", "", "temperature", interpolation="hold"), coil=coil)
+    write_run(run, tmp_path / name, **BAGS.get(name, {}))
+    again = read_run(tmp_path / name)
+    assert_same(run, again)
+    assert {key: again.spec(key) for key in again} == {key: run.spec(key) for key in run}
 
 
 @pytest.mark.parametrize("name", BAGS)

@@ -20,7 +20,7 @@ from magtwin.io.rosbag import BagWriter
 from magtwin.io.tables import ParquetParts, read_parquet
 from magtwin.io.viewer import headless_viewer, live_viewer
 from magtwin.names import RefusedError
-from magtwin.run import Run
+from magtwin.run import Column, Run
 from magtwin.twin import open_twin, simulate
 
 CHILD = """
@@ -56,7 +56,7 @@ def equal(a: Run, b: Run) -> bool:
 
 
 def rows(run: Run, part: slice) -> Run:
-    return Run({name: values[part] for name, values in run.items()}, run.facts)
+    return run.take(part)
 
 
 def test_a_run_that_is_killed_leaves_files_that_lack_no_more_than_the_last_second(run, tmp_path):
@@ -113,6 +113,20 @@ def test_blocks_make_the_file_that_the_whole_run_makes(run, twin, tmp_path):
     assert equal(read_rrd(tmp_path / "run.rrd"), run)
     assert equal(read_parquet(tmp_path / "run.parquet"), run)
     assert read_run(tmp_path / "run.mcap").rows == run.rows
+
+
+def test_blocks_keep_what_is_said_of_columns_of_a_users_own(tmp_path):
+    spec = Column("K", "room", "temperature", 2, ("in", "out"), interpolation="hold")
+    run = Run({"t": np.arange(9.0), "heat": np.ones((9, 2))}, {"seed": 1}, {"heat": spec})
+    names = ["run.rrd", "run.parquet", "run.mcap"]
+    sinks = [
+        kind(tmp_path / name) for kind, name in zip((RrdWriter, ParquetParts, BagWriter), names, strict=True)
+    ]
+    with Recorder(sinks) as recorder:
+        for block in in_step(run, 1e3):
+            recorder.append(block)
+    for name in names:
+        assert read_run(tmp_path / name).spec("heat") == spec
 
 
 def test_a_fault_leaves_what_there_is_under_its_unfinished_name(run, tmp_path):

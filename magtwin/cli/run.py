@@ -591,7 +591,7 @@ def _show(driven: _Driven, live: _Live, outputs: _Outputs, *, quiet: bool) -> _D
             _wait(address, stop)
     rows, scans = recorder.rows, driven.scans
     if rows < run.rows:
-        run = type(run)({name: values[:rows] for name, values in run.items()}, run.facts)
+        run = run.take(slice(rows))
         if scans is not None:
             seen = scans.t <= run["t"][-1]
             scans = type(scans)(*(getattr(scans, f.name)[seen] for f in fields(scans)))

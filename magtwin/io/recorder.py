@@ -83,7 +83,8 @@ class Recorder:
         if not waiting:
             return
         first = waiting[0]
-        block = Run({name: np.concatenate([run[name] for run in waiting]) for name in first}, first.facts)
+        columns = {name: np.concatenate([run[name] for run in waiting]) for name in first}
+        block = Run(columns, first.facts, first.specs)
         for file in self._files:
             file.append(block)
 
@@ -137,6 +138,6 @@ def in_step(run: Run, pace: float = 1.0, *, stop: Event | None = None) -> Iterat
         if end == sent:
             stop.wait(max(TICK_S / 5, (t[sent] - t[0]) / pace - now))
             continue
-        yield Run({name: values[sent:end] for name, values in run.items()}, run.facts)
+        yield run.take(slice(sent, end))
         sent = end
         stop.wait(TICK_S)

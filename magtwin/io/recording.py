@@ -165,7 +165,7 @@ class Recording:
         if self._feed is not None:
             self._feed.send_until(float(run["t"][-1]))
         self._rows += run.rows
-        self._last = Run({name: run[name][-1:] for name in run}, run.facts)
+        self._last = run.take(slice(-1, None))
 
     def close(self) -> None:
         """No rows come any more."""

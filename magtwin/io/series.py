@@ -18,6 +18,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
+from magtwin.arrow import said_of, spec_said
 from magtwin.names import RefusedError
 from magtwin.run import COLUMNS, Column, Run
 
@@ -142,11 +143,7 @@ def send(rec: rr.RecordingStream, entity: str, t: Array, archetype: Any, **value
 
 def send_facts(rec: rr.RecordingStream, run: Run, name: str) -> None:
     """What is known of a run before its first row: facts, and the columns in their order."""
-    told = {
-        key: {"unit": column.unit, "frame": column.frame, "doc": column.doc}
-        for key in run
-        for column in [COLUMNS.get(key, Column("", "", ""))]
-    }
+    told = {key: said_of(run.spec(key), key) for key in run}
     texts = {FACTS: dict(run.facts), NAMES: told}
     as_json: dict[str, Any] = {key: [json.dumps(value, ensure_ascii=False)] for key, value in texts.items()}
     rec.log(entity_of(COLUMNS_ENTITY, name), rr.AnyValues(**as_json | {NAME: [name]}), static=True)
@@ -159,20 +156,28 @@ def send_rows(rec: rr.RecordingStream, rows: int, name: str) -> None:
 
 def send_columns(rec: rr.RecordingStream, run: Run, t: Array, name: str) -> None:
     """The columns of a run, or of a part of it, at times t [s]."""
-    _send_table(rec, entity_of(COLUMNS_ENTITY, name), t, run)
+    parts = {key: run.spec(key).parts for key in run}
+    _send_table(rec, entity_of(COLUMNS_ENTITY, name), t, run, parts)
     lines = {key: values.astype(np.float32) for key, values in derived(run).items()}
     if lines:
         _send_table(rec, entity_of(DERIVED_ENTITY, name), t, lines)
 
 
-def _send_table(rec: rr.RecordingStream, entity: str, t: Array, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Columns as the components of one entity, in blocks."""
+def _send_table(
+    rec: rr.RecordingStream,
+    entity: str,
+    t: Array,
+    columns: Mapping[str, NDArray[Any]],
+    parts: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
+) -> None:
+    """Columns as the components of one entity, in blocks; `parts` names those of vectors."""
     times, path = pa.array(nanoseconds(t)), f"/{entity}"
     for start in range(0, len(t), BLOCK):
         arrays, fields = [times.slice(start, BLOCK)], [pa.field(TIMELINE, times.type)]
         each = pa.array(np.arange(len(arrays[0]) + 1, dtype=np.int32))
         for key, values in columns.items():
-            one = pa.ListArray.from_arrays(each, _arrow(key, values[start : start + BLOCK]))
+            rows = _arrow(key, values[start : start + BLOCK], parts.get(key, ()))
+            one = pa.ListArray.from_arrays(each, rows)
             about = {"rerun:kind": "data", "rerun:component": key, "rerun:entity_path": path}
             arrays.append(one)
             fields.append(pa.field(key, one.type, metadata=about))
@@ -180,7 +185,7 @@ def _send_table(rec: rr.RecordingStream, entity: str, t: Array, columns: Mapping
         rec.send_chunks(Chunk.from_record_batch(batch, index=TIMELINE, entity_path=path))
 
 
-def _arrow(name: str, values: NDArray[Any]) -> pa.Array:
+def _arrow(name: str, values: NDArray[Any], parts: tuple[str, ...]) -> pa.Array:
     """A column, or a struct of the parts of one."""
     if values.ndim > 2 or values.dtype.kind not in "bfiu" or 0 in values.shape[1:]:
         raise RefusedError(
@@ -189,8 +194,6 @@ def _arrow(name: str, values: NDArray[Any]) -> pa.Array:
         )
     if values.ndim == 1:
         return pa.array(np.ascontiguousarray(values))
-    spec = COLUMNS.get(name)
-    parts = spec.parts if spec else [str(k) for k in range(values.shape[1])]
     return pa.StructArray.from_arrays([pa.array(row) for row in np.ascontiguousarray(values.T)], names=parts)
 
 
@@ -223,13 +226,21 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
             name: np.concatenate([_values(tables[k].column(name)) for k in order])
             for name in (names if tables else ())
         }
-        run = Run(columns, facts)
+        own = {name: _spec(tables[0].column(name), names[name]) for name in columns if name not in COLUMNS}
+        run = Run(columns, facts, own)
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, pa.ArrowException) as error:
         raise RefusedError(
             f"{what}: a Rerun recording, but not one of a run that magtwin can read "
             f"({type(error).__name__}: {error}); read the run's Parquet, or record it again"
         ) from error
     return str(told.get(NAME) or COLUMNS_ENTITY), run, rows
+
+
+def _spec(column: pa.Array, said: dict[str, str]) -> Column:
+    """What a column of the user's own holds; the fields of its struct are its parts."""
+    kind = column.type.value_type
+    parts = tuple(field.name for field in kind) if pa.types.is_struct(kind) else ()
+    return spec_said({key: str(text) for key, text in said.items()}, parts)
 
 
 def _values(column: pa.Array) -> NDArray[Any]:
