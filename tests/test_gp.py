@@ -139,7 +139,7 @@ def test_the_likelihood_is_the_normal_densitys():
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_mean_and_variance_are_the_textbooks_on_a_few_points(kernel, monkeypatch):
     readings = survey(rows=4, columns=4)
-    monkeypatch.setattr("magtwin.field.gp._patches", lambda p_xy: (PATCHES, APART))
+    monkeypatch.setattr("magtwin.field.gp._patches", lambda *_: (PATCHES, APART))
     model = fit_gp(readings, kernel=kernel)
     covariance, figures = model.covariance, model.figures
     p, yaw = model.poses

@@ -33,7 +33,10 @@ STEPS = 60
 """Steps of L-BFGS, once the best start is known."""
 
 PATCHES = 8
-"""Patches along the longer side of the floor, each with its own strength of field."""
+"""Patches along the longer side of the floor at most, each with its own strength of field."""
+
+PATCH_SPACINGS = 3.0
+"""Least distance between patches in spacings of the readings: fewer tell no strength from noise."""
 
 WIDEST = 6.0
 """How far a figure may go from its first guess: a logarithm by a factor of 400, the arm by 0.2 m."""
@@ -140,9 +143,9 @@ def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress
     poses, b = (bins.p_xy, bins.yaw), bins.b_nt - mean
     several = readings.grid is None and len(np.unique(bins.run)) > 1
     turned = np.ptp(np.abs(np.angle(np.exp(1j * (bins.yaw - bins.yaw[0]))))) > 1e-6
-    covariance = Covariance(kernel, 3 if turned else 1, several, *_patches(bins.p_xy))
-    order = np.random.default_rng(0).permutation(len(b))  # a fixed draw: which rows are learnt from
     spacing = spacing_m(readings)
+    covariance = Covariance(kernel, 3 if turned else 1, several, *_patches(bins.p_xy, spacing))
+    order = np.random.default_rng(0).permutation(len(b))  # a fixed draw: which rows are learnt from
     figures = _learn(covariance, bins, b, order, spacing, lambda done, what: say(done, total, what))
     say(total - 2, total, "conditioning")
     lower = _factor(covariance, figures, bins)
@@ -180,10 +183,10 @@ def _data(readings: Readings) -> tuple[Bins, float]:
     return bins, float(away @ away / freedom) if freedom else 0.0
 
 
-def _patches(p_xy: Array) -> tuple[Array, float]:
+def _patches(p_xy: Array, spacing: float) -> tuple[Array, float]:
     """Middles of even patches over the readings, and how far they are apart [m]."""
     low, high = p_xy.min(axis=0), p_xy.max(axis=0)
-    apart = float((high - low).max()) / PATCHES
+    apart = max(float((high - low).max()) / PATCHES, PATCH_SPACINGS * spacing)
     axes = [np.linspace(a, b, round((b - a) / apart) + 1) for a, b in zip(low, high, strict=True)]
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2), apart
 
