@@ -32,7 +32,7 @@ class Format:
     """Name of the reader, `read(path) -> Run`."""
 
     write: str
-    """Name of the writer, `write(run, path, *, force, ...)`."""
+    """Name of the writer, `write(run, path, *, force, ...)`; "" of a format that is only read."""
 
     reads: frozenset[str] = frozenset()
     """Options that the reader takes."""
@@ -80,6 +80,7 @@ FORMATS: Mapping[str, Format] = MappingProxyType(
             "write_rrd",
             takes=frozenset(("twin", "planned", "scans")),
         ),
+        ".json": Format("released package", "magtwin.io.release", "read_release", ""),
         ".mcap": _BAG,
         ".db3": _BAG,
         ".usd": _USD,
@@ -138,6 +139,9 @@ def write_run(
     """
     path = Path(path)
     format_ = format_of(path)
+    if not format_.write:
+        kinds = ", ".join(suffix for suffix, one in FORMATS.items() if one.write)
+        raise RefusedError(f"{path}: a recording of the {format_.name} is read, not written; write {kinds}")
     if unknown := sorted(options.keys() - format_.takes):
         raise RefusedError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
     check_clock(run, "the run to write")

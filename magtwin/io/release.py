@@ -1,0 +1,269 @@
+"""Recordings of the released package: what its node keeps with `save_json`, read as a Run.
+
+Such a file is a list of frames, a JSON object each, one for every message that came, with the latest of
+everything by then:
+
+    timestamp                wall clock [s]
+    nn_magnetic_magnitude    what the magnetometer read [nT]; 0.0 in a frame that carries no reading
+    map_magnetic_magnitude   the map there [nT]
+    pose_data                motion capture: x, y [m], yaw [rad]
+    odom                     linear velocity xyz [m/s], angular velocity xyz [rad/s]
+    imu_data                 orientation xyzw, angular velocity xyz [rad/s], acceleration xyz [m/s2]
+    battery_data             voltage [V], charge 0 to 1
+    lidar                    0 or 1
+
+It begins with a bracket and a frame ends in a comma, the last one too; a node that was killed leaves no
+bracket at the end, or half a frame. Such files are read all the same, frame by frame, so that their size does
+not matter but for the rows that are kept.
+"""
+
+import io
+import json
+import math
+import os
+import re
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.files import existing, sha256
+from magtwin.frames import canonical, quat_from_yaw, wrap_angle
+from magtwin.names import RefusedError, hint
+from magtwin.run import COLUMNS, Run
+
+CHUNK = 1 << 16
+"""Characters that are read at a time."""
+
+LONGEST_FRAME = 1 << 16
+"""Characters; a frame of the release has about 600."""
+
+_STUMP = re.compile(r"[A-Za-z-]{0,9}\s*")
+"""What may stand at the end of half a frame."""
+
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "timestamp": (),
+    "nn_magnetic_magnitude": (),
+    "map_magnetic_magnitude": (),
+    "pose_data": (3,),
+    "odom": (3, 3),
+    "imu_data": (4, 3, 3),
+    "battery_data": (2,),
+    "lidar": (),
+}
+"""Keys of a frame: a number, some numbers, or lists of so many."""
+
+_WIDTH = 25
+"""Numbers of a frame."""
+
+
+def read_release(path: str | os.PathLike[str]) -> Run:
+    """The run that the released node's `save_json` recorded.
+
+    A row is a frame with a reading; what it holds beside is the latest that was known by then, so that
+    nothing of the future is in it. t is the wall clock less that of the first reading, whose time is the fact
+    `start_s`. What has not been heard of yet is nan (the node writes nothing, or an empty list). Frames
+    between two readings count for what they tell; two at one time are one, the later.
+
+    Args:
+        path: The file.
+
+    Returns:
+        A Run with b_measured_nt, b_map_nt, mocap_p, mocap_q_xyzw (z is 0: it is not recorded), p_world_base,
+        q_world_base_xyzw, yaw, odom_v, odom_w, imu_q_xyzw, imu_w, imu_a, battery_v, battery_fraction,
+        lidar_on. Its facts say how many frames there were, and whether the end was missing.
+
+    Raises:
+        RefusedError: The file is missing or no such list, a frame is not as above (the text names it and
+            its place), its clock goes back, or none carries a reading.
+    """
+    path = existing(path, "recording")
+    if path.is_dir():
+        raise RefusedError(f"{path}: a folder; name the .json file in it")
+    table, frames, kept, last = array("d"), 0, 0, -math.inf
+    reader = _Frames(path)
+    for number, start, frame in reader:
+        frames = number
+        row = _numbers(frame, f"{path}, frame {number} (at character {start})")
+        if row[0] < last:
+            raise RefusedError(
+                f"{path}, frame {number} (at character {start}): its clock goes back from {last!r} to "
+                f"{row[0]!r} s; was it set while recording? cut the file in two there"
+            )
+        if row[1] == 0.0 or math.isnan(row[1]):
+            continue  # a message of another sensor, whose news the next reading holds too
+        if row[0] == last:
+            del table[-_WIDTH:]
+            kept -= 1
+        table.extend(row)
+        kept, last = kept + 1, row[0]
+    if not kept:
+        raise RefusedError(
+            f"{path}: {frames} frames, and none carries a reading (nn_magnetic_magnitude is 0 in all); was "
+            "the magnetometer's node running?"
+        )
+    rows = np.frombuffer(table, float).reshape(-1, _WIDTH)
+    facts: dict[str, Any] = {"recording": path.name, "recording_sha256": sha256(path), "frames": frames}
+    facts |= {"start_s": float(rows[0, 0]), "recording_end": reader.end, "truth": "motion capture"}
+    return Run(_columns(rows), facts)
+
+
+def _columns(rows: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+    """Columns of a Run from numbers in the order of `_SHAPES`."""
+    ends = np.cumsum([math.prod(shape) if len(shape) < 2 else sum(shape) for shape in _SHAPES.values()])
+    parts = np.split(rows, ends[:-1], axis=1)
+    clock, field, on_map, pose, odom, imu, battery, lidar = parts
+    yaw, q = wrap_angle(pose[:, 2]), canonical(quat_from_yaw(pose[:, 2]))
+    p = np.column_stack([pose[:, :2], np.where(np.isfinite(pose[:, 0]), 0.0, np.nan)])
+    columns: dict[str, NDArray[Any]] = {
+        "t": clock[:, 0] - clock[0, 0],
+        "p_world_base": p,
+        "q_world_base_xyzw": q,
+        "yaw": yaw,
+        "odom_v": odom[:, :3],
+        "odom_w": odom[:, 3:],
+        "imu_q_xyzw": canonical(imu[:, :4]),
+        "imu_w": imu[:, 4:7],
+        "imu_a": imu[:, 7:],
+        "mocap_p": p,
+        "mocap_q_xyzw": q,
+        "battery_v": battery[:, 0],
+        "battery_fraction": battery[:, 1],
+        "lidar_on": lidar[:, 0] > 0.5,
+        "b_map_nt": np.where(on_map[:, 0] == 0.0, np.nan, on_map[:, 0]),
+        "b_measured_nt": field[:, 0],
+    }
+    return {name: np.ascontiguousarray(columns[name]) for name in COLUMNS if name in columns}
+
+
+def _numbers(frame: dict[str, Any], where: str) -> list[float]:
+    """The numbers of a frame in the order of `_SHAPES`; nan where it has none yet."""
+    row: list[float] = []
+    for key, shape in _SHAPES.items():
+        if key not in frame:
+            known = list(frame)[:20]
+            raise RefusedError(f"{where}: no {key!r} in it, as `save_json` writes; {hint(key, known)}")
+        value = frame[key]
+        if not shape:
+            row.append(_number(value, key, where))
+        elif len(shape) == 1:
+            row += _some(value, shape[0], key, where)
+        elif value is None or value == []:
+            row += [math.nan] * sum(shape)
+        elif not isinstance(value, list) or len(value) != len(shape):
+            raise RefusedError(f"{where}: {key} must be {len(shape)} lists of numbers, got {_said(value)}")
+        else:
+            for part, width in zip(value, shape, strict=True):
+                row += _some(part, width, key, where)
+    if not math.isfinite(row[0]):
+        raise RefusedError(f"{where}: timestamp must be a time [s], got {_said(frame['timestamp'])}")
+    if row[-1] not in (0.0, 1.0) and not math.isnan(row[-1]):
+        raise RefusedError(f"{where}: lidar must be 0 or 1, got {_said(frame['lidar'])}")
+    return row
+
+
+def _some(value: Any, count: int, key: str, where: str) -> list[float]:
+    if value is None or value == []:
+        return [math.nan] * count
+    if not isinstance(value, list) or len(value) != count:
+        raise RefusedError(f"{where}: {key} must be {count} numbers here, got {_said(value)}")
+    return [_number(one, key, where) for one in value]
+
+
+def _number(value: Any, key: str, where: str) -> float:
+    if value is None:
+        return math.nan
+    if isinstance(value, int | float):
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if not math.isinf(number):
+            return number
+    raise RefusedError(f"{where}: {key} must be a finite number, got {_said(value)}")
+
+
+def _said(value: Any) -> str:
+    """What a refusal quotes."""
+    text = json.dumps(value, default=str)
+    return text if len(text) <= 60 else text[:60] + " ..."
+
+
+class _Frames:
+    """The frames of a file, as they come: number from 1, the character that it begins at, what it says.
+
+    The list is taken apart by hand, as its commas are not JSON's; each frame is JSON.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.end = "whole"
+        """How the file ended: whole, or where it was cut."""
+
+    def __iter__(self) -> Iterator[tuple[int, int, dict[str, Any]]]:
+        decoder = json.JSONDecoder()
+        with open(self.path, encoding="utf-8-sig", newline="") as file:
+            text, at, number, gone = self._more(file), 0, 0, 0
+            begun = text.lstrip()
+            if not begun.startswith("["):
+                seen = _said(begun[:20]) if begun else "nothing"
+                raise RefusedError(
+                    f"{self.path}: a recording of the release begins with '[', this with {seen}"
+                )
+            at = text.index("[") + 1
+            while True:
+                while True:  # to the next frame
+                    while at < len(text) and text[at] in " \t\r\n,":
+                        at += 1
+                    if at < len(text):
+                        break
+                    gone, text, at = gone + len(text), self._more(file), 0
+                    if not text:
+                        self.end = "without its bracket"
+                        return
+                if text[at] == "]":
+                    rest = (text[at + 1 :] + file.read(CHUNK)).strip()
+                    if rest:
+                        raise RefusedError(
+                            f"{self.path}: goes on after the end of its list, with {_said(rest[:20])}; are "
+                            "these two recordings? cut them apart"
+                        )
+                    return
+                if text[at] != "{":
+                    raise self._refused(
+                        number + 1, gone + at, f"a frame begins with '{{', this with {text[at]!r}"
+                    )
+                while True:  # the whole of it
+                    try:
+                        frame, stop = decoder.raw_decode(text, at)
+                        break
+                    except (ValueError, RecursionError) as error:
+                        more = self._more(file) if len(text) - at < LONGEST_FRAME else None
+                        if more == "" and _is_cut(error, text):
+                            self.end = f"within frame {number + 1}"
+                            return
+                        if not more:
+                            raise self._refused(number + 1, gone + at, f"not JSON: {error}") from error
+                        gone, text, at = gone + at, text[at:] + more, 0
+                number += 1
+                yield number, gone + at, frame
+                at = stop
+
+    def _more(self, file: io.TextIOWrapper) -> str:
+        try:
+            return file.read(CHUNK)
+        except UnicodeDecodeError as error:
+            raise RefusedError(f"{self.path}: not a text file ({error}); a recording is JSON") from error
+
+    def _refused(self, number: int, place: int, text: str) -> RefusedError:
+        return RefusedError(f"{self.path}, frame {number} (at character {place}): {text}")
+
+
+def _is_cut(error: Exception, text: str) -> bool:
+    """Whether JSON went wrong because it ended: within a text, or with the beginning of a number or word."""
+    if not isinstance(error, json.JSONDecodeError):
+        return False
+    return error.msg.startswith("Unterminated string") or bool(_STUMP.fullmatch(text, error.pos))
