@@ -157,6 +157,8 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         self.path = path if isinstance(path, Path) else resolve_path(path)
         check_on_floor(self.path, twin.scene.lab.floor_m, robot.footprint_radius_m)
         check_clear(self.path, twin.obstacles, robot.footprint_radius_m)
+        if not callable(reward):
+            raise RefusedError(f"reward must be a function of a Transition, got {reward!r}")
         if not step_s <= duration_s < math.inf:
             raise RefusedError(f"duration_s must be at least step_s, {step_s:g} s, got {duration_s!r}")
         self.signals = tuple(signals)

@@ -16,6 +16,9 @@ from magtwin.obstacles import Obstacles
 
 Array = NDArray[np.float64]
 
+MOST_POINTS = 1_000_000
+"""Most points that a path is made of: 5 km of a spline's, 16 MB."""
+
 _SAME_M = 1e-6
 """Neighbours nearer than this are one point; a line whose ends are nearer than this is closed [m]."""
 
@@ -201,7 +204,9 @@ def lawnmower(
     """
     if not step_m > 0:
         raise RefusedError(f"step_m of a lawnmower must be above 0 m, got {step_m}")
-    count = int(abs(x_last_m - x_first_m) / step_m + 1e-9) + 1
+    sweeps = abs(x_last_m - x_first_m) / step_m + 1
+    _check_points("lawnmower", 2 * sweeps, f"step_m {step_m:g} m from x {x_first_m:g} to {x_last_m:g} m")
+    count = int(sweeps + 1e-9)
     x = np.repeat(x_first_m + math.copysign(step_m, x_last_m - x_first_m) * np.arange(count), 2)
     y = y_first_m + height_m * np.tile([0.0, 1.0, 1.0, 0.0], count)[: 2 * count]
     return Path("lawnmower", np.column_stack([x, y]))
@@ -242,8 +247,12 @@ def curvilinear(
         half_length_m: a, which |x| does not exceed [m].
         half_width_m: b, which |y| does not exceed [m].
         lobes: n.
-        depth: c, 0 to 1; 0 gives an ellipse.
+        depth: c, from 0, an ellipse, to below 1.
     """
+    if not 0 <= depth < 1:
+        raise RefusedError(f"depth of a curvilinear path must be at least 0 and below 1, got {depth!r}")
+    if lobes % 1:
+        raise RefusedError(f"lobes of a curvilinear path must be a whole number, got {lobes!r}")
     u = np.linspace(0.0, 2 * np.pi, 2001)
     r = (1 + depth * np.cos(lobes * u)) / (1 + depth)
     points = np.column_stack([half_length_m * r * np.cos(u), half_width_m * r * np.sin(u)])
@@ -318,7 +327,7 @@ def spline(p_xy: ArrayLike, *, closed: bool = False, spacing_m: float = 0.01, na
         name: What it is called.
 
     Raises:
-        RefusedError: There are fewer than three points, or `spacing_m` is not above 0.
+        RefusedError: There are fewer than three points, or `spacing_m` is not above 0 or makes too many.
     """
     from scipy.interpolate import CubicSpline  # takes half a second
 
@@ -328,7 +337,9 @@ def spline(p_xy: ArrayLike, *, closed: bool = False, spacing_m: float = 0.01, na
     if len(chords.p_xy) < 3 + closed:
         raise RefusedError(f"path {name!r}: a spline needs three points that differ, got {len(chords.p_xy)}")
     curve = CubicSpline(chords.s, chords.p_xy, bc_type="periodic" if closed else "natural")
-    count = max(len(chords.s), math.ceil(chords.length / spacing_m) + 1)
+    points = chords.length / spacing_m + 1
+    _check_points(name, points, f"spacing_m {spacing_m:g} m over {chords.length:g} m")
+    count = max(len(chords.s), math.ceil(points))
     s = np.union1d(np.linspace(0.0, chords.length, count), chords.s)
     return Path(name, curve(s), closed)
 
@@ -482,6 +493,12 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
             f"({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, a robot of radius {footprint_radius_m:g} m is "
             f"{footprint_radius_m - distance[i]:.3f} m too near; move the path, or the obstacle"
         )
+
+
+def _check_points(name: str, points: float, what: str) -> None:
+    """Refuse a path of more points than there is room for, or of no number of them."""
+    if not points <= MOST_POINTS:
+        raise RefusedError(f"path {name!r}: {what} would make {points:.3g} points, more than {MOST_POINTS:,}")
 
 
 def _without_repeats(p: Array) -> Array:

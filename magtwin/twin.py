@@ -287,7 +287,7 @@ def simulate(
 
     twin, seed = _opened(twin, net, magnetometer, "simulate"), _seed(seed)
     network = twin.magnetometer
-    if path != "random" and isinstance(path, str | FilePath):
+    if isinstance(path, str | FilePath) and path != "random":
         path = resolve_path(path)
     outside_training: NDArray[np.bool_] | None = None
 
@@ -372,7 +372,7 @@ def simulate_robots(
     ways: dict[str, Path | Commands | Run | str] = {}
     for name, one in placed.items():
         way = (paths or {}).get(name, one.path or "figure8")
-        ways[name] = resolve_path(way) if way != "random" and isinstance(way, str | FilePath) else way  # type: ignore[assignment]
+        ways[name] = resolve_path(way) if isinstance(way, str | FilePath) and way != "random" else way  # type: ignore[assignment]
     wanted = [name for name in placed if robots is None or name in set(robots)]
     led = {name: led_by(twin, name) for name in placed}
     networks = {name: one.magnetometer for name, one in led.items()}

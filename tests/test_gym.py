@@ -232,6 +232,7 @@ def test_a_reward_of_ones_own_is_asked_for_each_step(twin):
         ({"step_s": float("nan")}, "step_s"),
         ({"duration_s": 0.0}, "duration_s"),
         ({"path": "figure9"}, "figure8"),
+        ({"reward": 1.0}, r"reward must be a function of a Transition, got 1\.0"),
         ({"render_mode": "human"}, "render_mode"),
     ],
 )

@@ -17,6 +17,7 @@ from magtwin.path import (
     Path,
     check_clear,
     check_on_floor,
+    curvilinear,
     lawnmower,
     path_named,
     read_path_csv,
@@ -247,6 +248,25 @@ def test_points_that_are_no_path_are_refused(points, says):
 def test_a_lawnmower_without_a_step_is_refused():
     with pytest.raises(RefusedError, match="step_m of a lawnmower must be above 0"):
         lawnmower(step_m=0.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (
+            lambda: lawnmower(step_m=1e-12),
+            r"'lawnmower': step_m 1e-12 m .* would make 1e\+13 points, more than",
+        ),
+        (lambda: lawnmower(x_last_m=math.inf), "'lawnmower': .* would make inf points"),
+        (lambda: spline([[0, 0], [3, 4], [0, 0]], spacing_m=1e-9), "'spline': spacing_m 1e-09 m over 10 m"),
+        (lambda: curvilinear(depth=-1.0), r"depth of .* at least 0 and below 1, got -1\.0"),
+        (lambda: curvilinear(depth=math.nan), "depth of .* got nan"),
+        (lambda: curvilinear(lobes=2.5), r"lobes of .* whole number, got 2\.5"),
+    ],
+)
+def test_a_path_of_no_size_that_could_be_driven_is_refused(make, says):
+    with pytest.raises(RefusedError, match=says):
+        make()
 
 
 def test_smooth_named_paths_can_be_driven_at_a_fifth_of_a_metre_a_second():

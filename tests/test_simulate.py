@@ -492,6 +492,8 @@ def test_a_single_reading_is_a_run_too():
             {"path": Path("far", np.array([[0.0, 0.0], [2.9, 0.0]]))},
             r"path far leaves the floor at point 2 of 2",
         ),
+        ({"path": np.array([[0.0, 0.0], [1.0, 0.0]])}, "what to drive must be a Path, Commands, a Run or"),
+        ({"path": "figure8"}, "what to drive must be a Path"),
         ({"disturbance_nt": lambda run: np.zeros(3)}, r"disturbance_nt must give shape \(\d+,\), got \(3,\)"),
     ],
 )

@@ -365,6 +365,7 @@ def test_a_model_whose_coefficients_do_not_fit_its_terms_is_refused(tmp_path):
         ({"rate_hz": 0.0}, "rate_hz must be above 0"),
         ({"band_hz": (0.9, 0.1)}, "band_hz must ascend"),
         ({"band_hz": (0.1, 10.0)}, "half the rate, 10 Hz"),
+        ({"terms": ("permanent", "bias")}, "a bias is in no pass band"),
         ({"ridge": -1.0}, "ridge must not be below 0"),
         ({"b_nt": np.full(400, np.nan)}, "b_nt must be finite, got nan in row 0"),
         ({"b_nt": np.ones(3)}, r"must have shape \(400,\)"),

@@ -37,7 +37,8 @@ def fit(
     out
         Model to write, a .json file.
     terms
-        Terms, comma between: permanent; induced3, induced5 or induced6; eddy3, eddy8 or eddy9; bias.
+        Terms, comma between: permanent; induced3, induced5 or induced6; eddy3, eddy8 or eddy9; bias, which
+        wants --no-band.
     band_hz
         Pass band of the manoeuvres [Hz].
     no_band

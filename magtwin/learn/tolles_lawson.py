@@ -241,8 +241,8 @@ def fit_tolles_lawson(
         The model.
 
     Raises:
-        RefusedError: Shapes do not fit, a value is not finite, the band does not fit the rate, or there
-            are fewer readings than coefficients.
+        RefusedError: Shapes do not fit, a value is not finite, the band does not fit the rate, a bias is
+            wanted in a band, or there are fewer readings than coefficients.
     """
     b = np.asarray(b_nt, float)
     matrix, names = design_matrix(b_vector_nt, rate_hz, terms)
@@ -255,6 +255,11 @@ def fit_tolles_lawson(
         raise RefusedError(f"{len(b)} readings are too few for {len(names)} coefficients")
     if ridge is not None and not 0 <= ridge < np.inf:
         raise RefusedError(f"ridge must not be below 0, and finite, got {ridge!r}")
+    if band_hz is not None and "bias" in terms:
+        raise RefusedError(
+            "a bias is in no pass band, so a fit to one cannot tell it; leave the bias out, or fit all "
+            "frequencies (band_hz=None, --no-band)"
+        )
     if band_hz is not None:
         matrix, b = (_band_pass(v, band_hz, rate_hz) for v in (matrix, b))
     elif "bias" not in terms:

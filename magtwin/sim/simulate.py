@@ -164,7 +164,7 @@ def travel(
     if isinstance(path, Commands):
         motion = play(path.rows, robot.drive, start=scene.start, **room)
         return motion, {"path": path.name, "controller": "commands", **facts}
-    if path != "random":
+    if not isinstance(path, str) or path != "random":
         raise RefusedError(f'what to drive must be a Path, Commands, a Run or "random", got {path!r}')
     room["duration_s"] = RANDOM_S if duration_s is None else duration_s
     driver = Driver(
