@@ -3,6 +3,7 @@
 from magtwin.cli import (  # noqa: F401 - each registers its commands
     compare,
     compensate,
+    dataset,
     drive,
     file,
     map,  # noqa: A004

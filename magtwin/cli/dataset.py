@@ -1,0 +1,218 @@
+"""`magtwin dataset`: recordings with labels on a map, to learn a magnetometer from."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import App, Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, Json, print_report, progress, say
+from magtwin.names import RefusedError
+
+if TYPE_CHECKING:
+    from magtwin.learn.dataset import Source
+
+dataset_app = App(name="dataset", help="Data sets: recordings with labels on a map, to learn from.")
+app.command(dataset_app)
+
+By = Literal["fact", "file", "folder"]
+
+
+@dataset_app.command
+def build(
+    run: Annotated[list[Path], Parameter(negative="")],
+    *,
+    map: Path,  # noqa: A002
+    out: Path,
+    align: Literal["fit", "none"] = "none",
+    lever_arm: tuple[float, float] | None = None,
+    latency: float | None = None,
+    session_by: By = "fact",
+    path_by: By = "fact",
+    rate_hz: float | None = None,
+    topic: Annotated[list[str] | None, Parameter(negative="")] = None,
+    field_unit: Literal["nT", "uT", "T", "mG", "G"] | None = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Label recordings on a map and write them as a data set: measured total field less the map.
+
+    Parameters
+    ----------
+    run
+        Recordings of any kind: Parquet, CSV, npz, Rerun, rosbag2, USD, the released node's own .json; a
+        folder that `magtwin runs` made stands for all of its runs.
+    map
+        Map that the labels are made on: a layer or stage, or a folder of survey CSVs.
+    out
+        Folder to make.
+    align
+        fit: find the sensor's lever arm and latency from all recordings together; none: take pose and
+        reading as they stand.
+    lever_arm
+        Where the sensor is, forward and left of where the map has it [m], if known.
+    latency
+        How much older a reading is than its stamp [s], if known.
+    session_by
+        What tells sessions apart, a day or a switching on: the recording's own fact "session" (its name where
+        it has none), its file, or its folder.
+    path_by
+        What tells which path was driven: the recording's own fact "path" (its name where it has none), its
+        file, or its folder.
+    rate_hz
+        Keep at most so many readings a second [Hz]; all unless given.
+    topic
+        What a topic is called in a robot's own bag, as NAME=THEIRS. Repeatable.
+    field_unit
+        Unit of the field in a robot's own bag; told by its size unless given.
+    force
+        Replace the folder if it exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.cli.file import _named
+    from magtwin.cli.map import _open_map
+    from magtwin.files import check_free, sha256
+    from magtwin.learn.dataset import build_dataset
+    from magtwin.learn.labels import Alignment
+
+    check_free(out, force=force)
+    given = lever_arm is not None or latency is not None
+    if given and align == "fit":
+        raise RefusedError("--align fit finds lever arm and latency; drop it, or --lever-arm and --latency")
+    options: dict[str, Any] = {"topics": _named(topic) if topic else None, "unit": field_unit}
+    options = {name: value for name, value in options.items() if value is not None}
+    sources = _sources(_files(run), session_by, path_by, options)
+    alignment: Any = "fit" if align == "fit" else None
+    if given:
+        alignment = Alignment(lever_arm or (0.0, 0.0), latency or 0.0)
+    with progress("Labelling") as advance:
+        made = build_dataset(
+            sources,
+            _open_map(map),
+            out,
+            alignment=alignment,
+            map_sha256=sha256(map) if map.is_file() else "",
+            rate_hz=rate_hz,
+            force=force,
+            progress=advance,
+        )
+    print_report(made.report(), json)
+    if not json:
+        say(f"Wrote {out}")
+
+
+@dataset_app.command
+def info(dataset: Path, *, json: Json = False) -> None:
+    """What a data set holds, each shard read against its checksum.
+
+    Parameters
+    ----------
+    dataset
+        Folder that `magtwin dataset build` made.
+    json
+        Print as JSON.
+    """
+    from dataclasses import replace
+
+    from magtwin.learn.dataset import open_dataset
+
+    found = open_dataset(dataset)
+    found.check()
+    report = found.report()
+    each = {
+        one.name: f"session {one.session}, path {one.path}, {one.rows:,} readings, {one.labelled:,} labels, "
+        f"{one.label_mean_nt:.0f} ± {one.label_sd_nt:.0f} nT"
+        for one in found.recordings
+    }
+    print_report(replace(report, facts={**report.facts, "recordings": each}), json)
+
+
+@dataset_app.command
+def correlate(
+    dataset: Path,
+    *,
+    features: str = "full",
+    out: Path | None = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """How each input goes with the disturbance: Spearman's rank correlation, as in the paper's Figure 2.
+
+    Parameters
+    ----------
+    dataset
+        Folder that `magtwin dataset build` made.
+    features
+        Set of inputs, or names with commas between.
+    out
+        Picture to write, .png or .svg.
+    force
+        Replace the picture if it exists.
+    json
+        Print as JSON.
+    """
+    import numpy as np
+
+    from magtwin.files import check_free
+    from magtwin.learn.correlation import correlations
+    from magtwin.learn.dataset import open_dataset
+    from magtwin.learn.features import SETS
+
+    if out is not None:
+        check_free(out, force=force)
+    names: str | list[str] = features
+    if features not in SETS and "," in features:
+        names = [name.strip() for name in features.split(",") if name.strip()]
+    found = open_dataset(dataset)
+    rows = found.rows(names)
+    sessions = [found.recording(name).session for name in rows.names]
+    of = rows.names if len(set(sessions)) < 2 else sessions
+    number = {key: i for i, key in enumerate(dict.fromkeys(of))}
+    groups = np.array([number[key] for key in of])[rows.recording]
+    result = correlations(rows.x, rows.y, rows.features, groups)
+    if out is not None:
+        from magtwin.io.correlations import plot_correlations
+
+        plot_correlations(result, out, title=f"{dataset}", force=force)
+    print_report(result.report(f"Correlation with the disturbance in {dataset}"), json)
+    if out is not None and not json:
+        say(f"Wrote {out}")
+
+
+def _files(given: Sequence[Path]) -> list[Path]:
+    """Recordings, a folder of `magtwin runs` by the files in it."""
+    found: list[Path] = []
+    for path in given:
+        if (path / "runs.csv").is_file():
+            inside = sorted(path.glob("run_*.parquet"))
+            if not inside:
+                raise RefusedError(f"{path}: its runs.csv stands alone, without run_*.parquet")
+            found += inside
+        else:
+            found.append(path)
+    return found
+
+
+def _sources(files: Sequence[Path], session_by: By, path_by: By, options: dict[str, Any]) -> "list[Source]":
+    """Recordings by a name each: that of the file, with its folder's before it where two have one name."""
+    from functools import partial
+
+    from magtwin.files import existing
+    from magtwin.io.formats import read_run
+    from magtwin.learn.dataset import Source
+
+    def named(word: str) -> str:
+        return re.sub(r"\.\.+", ".", re.sub(r"[^A-Za-z0-9_.+-]", "_", word)).lstrip(".+-")[:180] or "_"
+
+    short = [named(existing(path, "recording").resolve().stem) for path in files]
+    long = [named(f"{path.resolve().parent.name}_{path.resolve().stem}") for path in files]
+    names = [one if short.count(one) == 1 else other for one, other in zip(short, long, strict=True)]
+    by = {"fact": lambda path, name: "", "file": lambda path, name: name}
+    by["folder"] = lambda path, name: path.resolve().parent.name or name
+    return [
+        Source(name, partial(read_run, path, **options), by[session_by](path, name), by[path_by](path, name))
+        for path, name in zip(files, names, strict=True)
+    ]
