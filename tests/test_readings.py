@@ -321,6 +321,16 @@ REFUSALS = {
         {"quaternion": "a,b,c,d"},
         r"a\.csv:3: a quaternion's length is 1, got 1\.414",
     ),
+    "far away": (
+        "x,y,yaw,field\n0,0,0,41000\n1e308,0,0,41000\n",
+        {},
+        r"a\.csv:3: x and y are metres, within",
+    ),
+    "vectors of another size": (
+        "x,y,yaw,field,bx,by,bz\n0,0,0,41000,12,20,-33\n1,0,0,41000,12,20,-33\n",
+        {"vector": "bx,by,bz", "field": "field"},
+        r"a\.csv: bx,by,bz is 0\.000986 times as long as field in the median; give both in one unit",
+    ),
     "word": ("x,y,yaw,field\n0,0,0,high\n", {}, r"a\.csv:2: field must be a finite number, got 'high'"),
 }
 
@@ -369,6 +379,7 @@ def test_a_gridded_survey_is_not_one_of_several_sources(tmp_path, real_data):
         ({"created": "last May"}, "created of Readings must be a day YYYY-MM-DD, got 'last May'"),
         ({"created": 20260102}, "created of Readings must be a text, got 20260102"),
         ({"licence": None}, "licence of Readings must be a text, got None"),
+        ({"p_xy": [[0.0, -1e9]]}, r"p_xy of Readings lies within 1e\+08 m of the origin, got .* in row 0"),
     ],
 )
 def test_what_a_survey_says_of_itself_has_its_form(changes, said):

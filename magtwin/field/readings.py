@@ -13,6 +13,9 @@ from magtwin.report import Figure, Report
 
 Array = NDArray[np.float64]
 
+FARTHEST_M = 1e8
+"""Distance from the origin beyond which a coordinate is none: twice round the Earth [m]."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Readings:
@@ -103,6 +106,13 @@ class Readings:
                 raise RefusedError(f"{name} of Readings must be finite, got {array[row]} in row {row}")
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+        beyond = np.argwhere(np.abs(self.p_xy) > FARTHEST_M)
+        if len(beyond):
+            row = int(beyond[0][0])
+            raise RefusedError(
+                f"p_xy of Readings lies within {FARTHEST_M:g} m of the origin, got {self.p_xy[row]} in row "
+                f"{row}"
+            )
         if not np.all(self.b_nt > 0):
             raise RefusedError(
                 f"b_nt of Readings is a magnitude, above 0 nT, got {self.b_nt.min():g} in row "

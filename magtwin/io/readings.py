@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.grid import Grid
-from magtwin.field.readings import SHAPES, Readings
+from magtwin.field.readings import FARTHEST_M, SHAPES, Readings
 from magtwin.field.survey import NT_PER, check_unit, read_grid
 from magtwin.files import existing, output, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
@@ -30,6 +30,9 @@ PARQUET = (".parquet", ".pq")
 
 LARGEST_TURN = 2 * np.pi + 0.01
 """Headings beyond this are taken for degrees unless the caller says that they are radians."""
+
+APART = 2.0
+"""Times that vectors may be longer or shorter than magnitudes read beside them, in the median."""
 
 _SURVEY = b"magtwin_readings"
 _PARTS = {"p_xy": ("x", "y"), "b_body_nt": ("x", "y", "z"), "node": ("heading", "row", "column")}
@@ -279,6 +282,11 @@ def _of_sheet(sheet: Sheet, paths: list[Path], columns: Columns) -> Readings:
     known: NDArray[np.bool_] = np.all(np.isfinite(np.hstack(some)), axis=1)
     if not known.any():
         raise RefusedError(f"{sheet.path}: no row has all its values; {len(known)} have a cell empty or nan")
+    away = np.flatnonzero(known & (np.abs(p) > FARTHEST_M).any(axis=1))
+    if len(away):
+        row = int(away[0])
+        where = sheet.column(columns.x).where(row)
+        raise RefusedError(f"{where}: x and y are metres, within {FARTHEST_M:g} of the origin, got {p[row]}")
     if turn is not None and turn.ndim == 2:
         length = np.linalg.norm(turn, axis=1)
         off = np.flatnonzero(known & (np.abs(length - 1) > 0.01))
@@ -306,6 +314,8 @@ def _of_sheet(sheet: Sheet, paths: list[Path], columns: Columns) -> Readings:
         columns.unit or "nT",
         lambda k: _magnitude(sheet, columns).where(int(np.flatnonzero(known)[k])),
     )
+    if vector is not None:
+        _check_sizes(vector[known], b[known], sheet, columns)
     run, runs = _runs(sheet, columns, paths[0].stem, known)
     return Readings(
         p_xy=p[known],
@@ -379,6 +389,16 @@ def _field(sheet: Sheet, columns: Columns) -> tuple[Array | None, Array]:
             _magnitude(sheet, columns).name or columns.field
         )
     return vector, np.linalg.norm(vector, axis=1)
+
+
+def _check_sizes(vector_nt: Array, b_nt: Array, sheet: Sheet, columns: Columns) -> None:
+    """Refuse vectors that are not of their magnitudes' size: of another unit, or other columns."""
+    ratio = float(np.median(np.linalg.norm(vector_nt, axis=1) / b_nt))
+    if not 1 / APART <= ratio <= APART:
+        raise RefusedError(
+            f"{sheet.path}: {columns.vector} is {ratio:.3g} times as long as {columns.field} in the median; "
+            "give both in one unit, and the components of the whole field"
+        )
 
 
 def _runs(sheet: Sheet, columns: Columns, stem: str, known: NDArray[np.bool_]) -> Any:
