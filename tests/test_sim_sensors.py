@@ -6,13 +6,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
+from magtwin.names import RefusedError
+from magtwin.obstacles import Obstacles
+from magtwin.run import Run
 from magtwin.sim.battery import STEP_S, discharge, sense_battery
 from magtwin.sim.drive import Motion
 from magtwin.sim.imu import sense_imu
+from magtwin.sim.lidar import scans_of
 from magtwin.sim.mocap import sense_mocap
 from magtwin.sim.odometry import sense_odometry
 from magtwin.sim.sensors import held, moment_at
-from magtwin.spec import BatterySpec, DriveSpec, ImuSpec, MocapSpec
+from magtwin.spec import BatterySpec, DriveSpec, ImuSpec, LidarSpec, MocapSpec, RobotSpec
 
 T = np.arange(135 * 60) / 135.0
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -137,3 +141,38 @@ def test_each_sensor_changes_at_its_own_rate():
     assert np.count_nonzero(np.diff(imu["imu_a"][:, 0])) == np.floor(9.999 * 62)
     assert np.count_nonzero(np.diff(battery["battery_v"])) == np.floor(9.999 * 0.5)
     assert STEP_S < 0.1
+
+
+SCANNED = Run(
+    {"t": T, "p_world_base": np.zeros((len(T), 3)), "yaw": T * 0.0, "lidar_on": np.ones(len(T), bool)}
+)
+
+
+@pytest.mark.parametrize(
+    ("sense", "says"),
+    [
+        (
+            lambda: held(T, 1e12),
+            r"samples of a sensor of 1e\+12 Hz would be 6e\+13 in .* more than 20,000,000",
+        ),
+        (lambda: held(T, 62.0, latency_s=1e9), "samples of a sensor of 62 Hz would be"),
+        (
+            lambda: sense_mocap(
+                MocapSpec(dropout_every_s=1e-9, dropout_s=1e-9), 0.0, winding(), T, generator()
+            ),
+            r"dropouts of 5e\+08 Hz would be",
+        ),
+        (
+            lambda: scans_of(
+                SCANNED,
+                RobotSpec(name="r", asset="r.usda", lidar=LidarSpec(scan_rate_hz=1e9)),
+                Obstacles(),
+                generator(),
+            ),
+            r"a LiDAR's scans of 1e\+09 Hz would be",
+        ),
+    ],
+)
+def test_more_samples_than_memory_could_hold_are_refused(sense, says):
+    with pytest.raises(RefusedError, match=says):
+        sense()

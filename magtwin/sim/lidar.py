@@ -10,6 +10,7 @@ from magtwin.frames import matrix_from_quat, quat_from_yaw, quat_multiply, rotat
 from magtwin.names import RefusedError
 from magtwin.obstacles import Obstacles
 from magtwin.run import Run
+from magtwin.sim.sensors import check_count
 from magtwin.spec import LidarSpec, RobotSpec
 
 Array = NDArray[np.float64]
@@ -112,8 +113,12 @@ def scans_of(run: Run, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Ge
         robot: Its LiDAR, and where it sits.
         obstacles: What there is to see.
         rng: Source of delays and noise.
+
+    Raises:
+        RefusedError: There are more scans than memory could hold.
     """
     spec, t = robot.lidar, run["t"]
+    check_count("a LiDAR's scans", t[-1] - t[0], spec.scan_rate_hz)
     delays, noise = rng.spawn(2)
     stamps = t[0] + np.arange(int((t[-1] - t[0]) * spec.scan_rate_hz) + 1) / spec.scan_rate_hz
     spins = run["lidar_on"][np.searchsorted(t, stamps, side="right") - 1]

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.frames import canonical, quat_from_rpy, quat_from_yaw, quat_multiply
-from magtwin.sim.sensors import Moving, held, moment_at
+from magtwin.sim.sensors import Moving, check_count, held, moment_at
 from magtwin.spec import MocapSpec
 
 _ROUND = 64
@@ -53,6 +53,8 @@ def dropouts(spec: MocapSpec, stamps: ArrayLike, rng: np.random.Generator) -> ND
     stamps = np.asarray(stamps, float)
     if not (spec.dropout_every_s and spec.dropout_s):
         return np.zeros(len(stamps), bool)
+    each_s = spec.dropout_every_s + spec.dropout_s
+    check_count("dropouts", stamps[-1] - stamps[0], 1 / each_s)
     edges = stamps[:1]
     while edges[-1] <= stamps[-1]:
         lengths = rng.exponential((spec.dropout_every_s, spec.dropout_s), (_ROUND, 2))

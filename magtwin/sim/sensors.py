@@ -16,11 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.frames import matrix_from_quat
+from magtwin.names import RefusedError
 from magtwin.sim.drive import Moment
 from magtwin.spec import Quat
 
 Array = NDArray[np.float64]
 Columns = dict[str, NDArray[np.float64]]
+
+
+MOST_SAMPLES = 20_000_000
+"""Most samples of one sensor in a run: some GB of noise."""
 
 
 class Moving(Protocol):
@@ -51,8 +56,12 @@ def held(
         Times of the samples, k / rate_hz from the first that a reading can see up to the last that there
         was [s], shape (M,); and for each reading the index of the newest sample that has arrived by
         then, shape (N,). The first sample, of time 0 or before, has always arrived.
+
+    Raises:
+        RefusedError: There are more samples than memory could hold.
     """
     t = np.asarray(t, float)
+    check_count("samples of a sensor", t[-1] + latency_s, rate_hz)
     first = -math.ceil(latency_s * rate_hz)
     stamps = np.arange(first, int(t[-1] * rate_hz) + 2) / rate_hz
     stamps = stamps[: int(np.searchsorted(stamps, t[-1], side="right"))]
@@ -60,6 +69,15 @@ def held(
     if jitter_s > 0 and rng is not None:
         arrivals = np.maximum.accumulate(arrivals + rng.exponential(jitter_s, len(stamps)))
     return stamps, np.maximum(np.searchsorted(arrivals, t, side="right") - 1, 0)
+
+
+def check_count(what: str, duration_s: float, rate_hz: float) -> None:
+    """Refuse more of something in a run than memory could hold: `MOST_SAMPLES`."""
+    if not duration_s * rate_hz <= MOST_SAMPLES:
+        raise RefusedError(
+            f"{what} of {rate_hz:g} Hz would be {duration_s * rate_hz:.3g} in {duration_s:g} s, more than "
+            f"{MOST_SAMPLES:,}; make the rate lower, or the time shorter"
+        )
 
 
 def moment_at(motion: Moving, stamps: Array) -> Moment:
