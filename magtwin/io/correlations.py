@@ -47,7 +47,8 @@ def plot_correlations(
     for i in np.flatnonzero(np.isnan(found.rho)).tolist():
         ax.text(0.01, i, "never varies", va="center", fontsize=8, color="0.4")
     reach = np.nanmax(np.abs(np.append(rho, 0.4)) + np.nan_to_num(np.append(found.sd, 0.0)))
-    ax.set_xlim(-1.1 * reach, 1.1 * reach)
+    reach = min(1.1 * reach, 1.05)
+    ax.set_xlim(-reach, reach)
     ax.set_yticks(y, found.features, fontsize=8)
     ax.set_ylim(count - 0.4, -0.6)
     ax.axvline(0, color=INK, lw=0.8)
