@@ -223,8 +223,8 @@ def _step(rate_hz: float, drive: DriveSpec) -> float:
     if rate_hz * drive.command_timeout_s <= 1:
         raise RefusedError(
             f"rate_hz of a controller must be above {1 / drive.command_timeout_s:g} Hz, or the drive would "
-            f"stop between commands by its command_timeout_s, {drive.command_timeout_s:g} s; got {rate_hz!r}: "
-            "raise either"
+            f"stop between commands by its command_timeout_s, {drive.command_timeout_s:g} s; got "
+            f"{rate_hz!r}: raise either"
         )
     return 1.0 / rate_hz
 
