@@ -7,6 +7,8 @@ Names are loaded when first used, so that `import magtwin` costs nothing.
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from magtwin.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from magtwin.field.map import AnomalyMap
     from magtwin.names import RefusedError
@@ -14,8 +16,6 @@ if TYPE_CHECKING:
     from magtwin.run import COLUMNS, Run
     from magtwin.spec import Scene
     from magtwin.twin import Twin, open_twin, scene_from_toml, simulate, simulate_many, simulate_robots
-
-__version__ = "0.1.0"
 
 _HOME = {
     "AnomalyMap": "magtwin.field.map",

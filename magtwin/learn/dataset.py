@@ -22,7 +22,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-import magtwin
 from magtwin.arrow import run_of, table_of
 from magtwin.field.map import AnomalyMap
 from magtwin.files import existing, output, sha256
@@ -33,6 +32,7 @@ from magtwin.learn.split import Part, Split
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
 from magtwin.run import Facts, Run
+from magtwin.version import __version__
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -431,7 +431,7 @@ def build_dataset(
             done.append(_write(run, source, aside / RUNS / f"{source.name}.parquet"))
             columns.append(set(run))
         _check_labels(done, field)
-        facts: dict[str, Any] = {"alignment": how, "magtwin": magtwin.__version__}
+        facts: dict[str, Any] = {"alignment": how, "magtwin": __version__}
         facts |= {"map_method": field.method, "map_source": field.source, "map_licence": field.licence}
         shared = [c for c in KEPT if all(c in one for one in columns)]
         manifest = {
