@@ -7,9 +7,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.field.map import AnomalyMap
 from magtwin.io.tables import read_parquet
 from magtwin.learn import dataset as rooms
-from magtwin.learn.dataset import Source, build_dataset, open_dataset
+from magtwin.learn.dataset import build_dataset, open_dataset
 from magtwin.learn.features import SETS, features
 from magtwin.learn.labels import Alignment, labels
+from magtwin.learn.recording import Source
 from magtwin.learn.split import split
 from magtwin.names import RefusedError
 from magtwin.run import COLUMNS, Run

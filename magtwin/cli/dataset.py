@@ -12,7 +12,7 @@ from magtwin.cli.terminal import Force, Json, print_report, progress, say
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
-    from magtwin.learn.dataset import Source
+    from magtwin.learn.recording import Source
 
 dataset_app = App(name="dataset", help="Data sets: recordings with labels on a map, to learn from.")
 app.command(dataset_app)
@@ -202,7 +202,7 @@ def _sources(files: Sequence[Path], session_by: By, path_by: By, options: dict[s
 
     from magtwin.files import existing
     from magtwin.io.formats import read_run
-    from magtwin.learn.dataset import Source
+    from magtwin.learn.recording import Source
 
     def named(word: str) -> str:
         return re.sub(r"\.\.+", ".", re.sub(r"[^A-Za-z0-9_.+-]", "_", word)).lstrip(".+-")[:180] or "_"

@@ -10,7 +10,6 @@ The shards are Parquet in the form that every Run has, so that any program reads
 import hashlib
 import json
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,6 +27,7 @@ from magtwin.files import existing, output, sha256
 from magtwin.learn.features import FEATURES, SETS, columns_of, feature_names
 from magtwin.learn.features import features as features_of
 from magtwin.learn.labels import Alignment, fit_alignment, labelled
+from magtwin.learn.recording import Recording, Rows, Source, read, sources_of, thinned
 from magtwin.learn.split import Part, Split
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
@@ -57,103 +57,6 @@ KEPT = tuple(
     )
 )
 """Columns of a recording that a data set keeps, of those that it has."""
-
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
-_SHA = re.compile("[0-9a-f]{64}")
-
-
-@dataclass(frozen=True)
-class Source:
-    """A recording that goes into a data set."""
-
-    name: str
-    """What it is called; letters, digits and _ . + - make the name of its shard."""
-
-    read: Callable[[], Run]
-    """Gives the run; called once, or twice where an alignment is fitted."""
-
-    session: str = ""
-    """What it shares with others that were recorded between two switchings on; its run's own unless given."""
-
-    path: str = ""
-    """What was driven; its run's own unless given."""
-
-
-@dataclass(frozen=True)
-class Recording:
-    """A recording of a data set."""
-
-    name: str
-    """What it is called."""
-
-    session: str
-    """What was switched on and off with it; its own name where nobody said."""
-
-    path: str
-    """What was driven; its own name where nobody said."""
-
-    rows: int
-    """Readings."""
-
-    labelled: int
-    """Readings that have a label."""
-
-    duration_s: float
-    """From the first reading to the last [s]."""
-
-    sha256: str
-    """Checksum of its shard."""
-
-    label_mean_nt: float
-    """Mean of its labels [nT]."""
-
-    label_sd_nt: float
-    """Standard deviation of its labels [nT]."""
-
-    def __post_init__(self) -> None:
-        for name in ("name", "session", "path", "sha256"):
-            if not isinstance(getattr(self, name), str):
-                raise RefusedError(f"{name} of a recording must be a text, got {getattr(self, name)!r}")
-        for name in ("rows", "labelled"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-                raise RefusedError(f"{name} of a recording must be a whole number from 0, got {value!r}")
-        if self.labelled > self.rows:
-            raise RefusedError(f"{self.name[:80]!r} has {self.rows} rows and {self.labelled} labels")
-        for name in ("duration_s", "label_mean_nt", "label_sd_nt"):
-            value = getattr(self, name)
-            if not isinstance(value, int | float) or not np.isfinite(value):
-                raise RefusedError(f"{name} of a recording must be a finite number, got {value!r}")
-        if not _NAME.fullmatch(self.name) or ".." in self.name:
-            raise RefusedError(f"a recording is named by letters, digits and _ . + -, got {self.name[:80]!r}")
-        if not _SHA.fullmatch(self.sha256):
-            raise RefusedError(f"sha256 of recording {self.name!r} is not one: {self.sha256[:80]!r}")
-
-
-@dataclass(frozen=True)
-class Rows:
-    """What a network learns from: inputs and labels, row by row."""
-
-    x: Array
-    """Features in the units of `FEATURES`, shape (N, F); none is nan."""
-
-    y: Array
-    """Labels [nT], shape (N,)."""
-
-    sd: Array
-    """How well the map is known there [nT], shape (N,)."""
-
-    recording: NDArray[np.intp]
-    """Which of `names` each row is of, shape (N,), ascending."""
-
-    names: tuple[str, ...]
-    """Recordings."""
-
-    features: tuple[str, ...]
-    """Names of the columns of `x`."""
-
-    left_out: Mapping[str, int]
-    """How many rows there were without a label, and how many labelled ones with an input that is nan."""
 
 
 @dataclass(frozen=True)
@@ -400,7 +303,7 @@ def build_dataset(
         RefusedError: There is no recording, two have one name, one has no label on the map, lacks a pose
             or a field, all its labels are the same, or the folder exists.
     """
-    sources = _sources(recordings)
+    sources = sources_of(recordings)
     tell = progress or (lambda done, total, what: None)
     if rate_hz is not None and not 0 < rate_hz < np.inf:
         raise RefusedError(f"rate_hz must be above 0 Hz and finite, got {rate_hz!r}")
@@ -410,8 +313,8 @@ def build_dataset(
         how, runs = "fitted", []
         for i, source in enumerate(sources):
             tell(i, total, f"{source.name}: aligning")
-            run = _checked(source)
-            runs.append(_thinned(run.select(*(c for c in _ALIGNED if c in run)), 25.0))
+            run = read(source)
+            runs.append(thinned(run.select(*(c for c in _ALIGNED if c in run)), 25.0))
         alignment = fit_alignment(runs, field)
         del runs
     elif alignment is not None and not isinstance(alignment, Alignment):
@@ -422,7 +325,7 @@ def build_dataset(
         (aside / RUNS).mkdir(parents=True)
         for i, source in enumerate(sources):
             tell(total - len(sources) + i, total, source.name)
-            run = _thinned(_checked(source), rate_hz)
+            run = thinned(read(source), rate_hz)
             try:
                 run = labelled(run, field, alignment)
             except RefusedError as error:
@@ -502,47 +405,6 @@ def open_dataset(folder: str | os.PathLike[str]) -> Dataset:
     if not found.recordings or len(set(found.names)) < len(found.names):
         raise RefusedError(f"{path}: has no recording, or two of one name; build it anew")
     return found
-
-
-def _sources(recordings: Mapping[str, Run] | Sequence[Source]) -> list[Source]:
-    if isinstance(recordings, Mapping):
-        sources = [Source(name, lambda run=run: run) for name, run in recordings.items()]  # type: ignore[misc]
-    else:
-        sources = list(recordings)
-    if not sources:
-        raise RefusedError("a data set needs one recording at least, got none")
-    seen: set[str] = set()
-    for source in sources:
-        if not _NAME.fullmatch(source.name) or ".." in source.name:
-            raise RefusedError(
-                f"a recording is named by letters, digits and _ . + -, got {source.name[:80]!r}; rename it"
-            )
-        if source.name.casefold() in seen:
-            raise RefusedError(f"two recordings are called {source.name!r}; rename one")
-        seen.add(source.name.casefold())
-    return sources
-
-
-def _checked(source: Source) -> Run:
-    """A run that can be labelled."""
-    run = source.read()
-    posed = {"mocap_p", "mocap_q_xyzw"} <= set(run) or {"p_world_base", "yaw"} <= set(run)
-    if not posed or "b_measured_nt" not in run:
-        wanted = "b_measured_nt" if posed else "mocap_p with mocap_q_xyzw, or p_world_base with yaw"
-        raise RefusedError(f"{source.name}: nothing to label: it has no column {wanted}")
-    return run
-
-
-def _thinned(run: Run, rate_hz: float | None) -> Run:
-    """Every second, third, ... row, so that there are not more than some a second."""
-    if rate_hz is None or run.rows < 2:
-        return run
-    step = float(np.median(np.diff(run["t"])))
-    every = max(1, int(np.ceil(0.99 / (step * rate_hz))))  # to 1 %, as wall clocks go
-    if every == 1:
-        return run
-    columns = {name: values[::every] for name, values in run.items()}
-    return Run(columns, {**run.facts, "every": every}, run.specs)
 
 
 def _write(run: Run, source: Source, path: Path) -> Recording:
