@@ -1,7 +1,9 @@
 """A run as USD playback."""
 
+import struct
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +18,7 @@ from magtwin.names import RefusedError
 from magtwin.run import COLUMNS, Column, Run
 from magtwin.spec import PlacedRobot
 from magtwin.twin import open_twin, simulate
+from magtwin.usd import animation
 from magtwin.usd.animation import is_animation, read_animation, write_animation
 from magtwin.usd.geometry import read_links
 from magtwin.usd.scene import author_scene
@@ -238,7 +241,7 @@ def test_files_that_play_nothing_or_are_damaged_are_refused(played, lab_scene, t
 def test_damage_inside_a_playback_is_a_refusal_or_another_run_never_a_fault(played, tmp_path):
     whole, rng = played.read_bytes(), np.random.default_rng(0)
     refusals = 0
-    for _ in range(60):
+    for _ in range(10):
         content = bytearray(whole)
         at = rng.integers(88, len(content) - 8)  # behind the mark that it is USD
         content[at : at + 8] = rng.bytes(8)
@@ -247,7 +250,23 @@ def test_damage_inside_a_playback_is_a_refusal_or_another_run_never_a_fault(play
             assert read_animation(tmp_path / "run.usdc").rows
         except RefusedError:
             refusals += 1
-    assert refusals < 60
+    assert refusals < 10
+
+
+def test_bytes_that_end_the_process_of_usds_own_reader_are_refused_in_a_line(played, tmp_path, monkeypatch):
+    whole = played.read_bytes()
+    (contents,) = struct.unpack_from("<q", whole, 16)
+    parts = [struct.unpack_from("<16sqq", whole, contents + 8 + 32 * k) for k in range(6)]
+    start, size = next(part[1:] for part in parts if part[0].startswith(b"FIELDS\0"))  # where values lie
+    for share in np.linspace(0.3, 0.9, 8):
+        content = bytearray(whole)
+        content[start + int(size * share)] ^= 0x55
+        (tmp_path / "run.usdc").write_bytes(content)
+        with suppress(RefusedError):
+            read_animation(tmp_path / "run.usdc")
+    monkeypatch.setattr(animation, "_PROBE", "import os; os.abort()")
+    with pytest.raises(RefusedError, match="damaged: USD cannot decode it"):
+        read_animation(played)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,8 @@ Samples are authored on the layer itself: a stage would compose anew for each.
 
 import json
 import os
+import subprocess
+import sys
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -70,6 +72,21 @@ READINGS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 
 _BARE = WORLD.AppendChild("robot")
 """What stands for the robot where there is no scene."""
+
+_CRATE = b"PXR-USDC"
+"""What a binary USD file begins with."""
+
+_PROBE = """
+import sys
+from pxr import Sdf
+
+layer = Sdf.Layer.OpenAsAnonymous(sys.argv[1])
+layer.Traverse("/", lambda path: path.IsPropertyPath() and layer.GetObjectAtPath(path).GetInfo("default"))
+"""
+"""Takes every value out of a layer."""
+
+PATIENCE_S = 60.0
+"""How long that may take, and a second more a megabyte [s]."""
 
 _FACTS = "magtwinFacts"
 _KINDS = {
@@ -171,6 +188,7 @@ def read_animation(path: str | os.PathLike[str]) -> Run:
     Raises:
         RefusedError: The file is missing, is not USD, is cut short, or plays no run of magtwin's.
     """
+    _check_decodes(path)
     layer = _open_layer(path)
     try:
         run = _read(layer, path)
@@ -190,6 +208,24 @@ def is_animation(path: str | os.PathLike[str]) -> bool:
     """
     layer = _open_layer(path)
     return bool(layer.GetAttributeAtPath(_run_path(layer).AppendProperty("magtwin:run:t")))
+
+
+def _check_decodes(path: str | os.PathLike[str]) -> None:
+    """Refuse a binary file in which bytes were changed, so that USD's own reader ends its process."""
+    path = existing(path, "USD file")
+    if path.is_dir():
+        return
+    with open(path, "rb") as file:
+        if file.read(len(_CRATE)) != _CRATE:
+            return
+    command = [sys.executable, "-P", "-c", _PROBE, str(path)]
+    patience = PATIENCE_S + path.stat().st_size / 1e6
+    try:
+        done = subprocess.run(command, capture_output=True, check=False, timeout=patience)
+    except subprocess.TimeoutExpired as error:
+        raise RefusedError(f"{path}: damaged: USD does not come to its end; copy it again") from error
+    if done.returncode not in (0, 1):  # what Python itself refuses is said when it is read here
+        raise RefusedError(f"{path}: damaged: USD cannot decode it; copy it again, or write it again")
 
 
 def _open_layer(path: str | os.PathLike[str]) -> Sdf.Layer:
