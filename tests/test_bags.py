@@ -603,8 +603,7 @@ def test_a_chunk_that_says_it_is_a_thousand_times_its_size_is_refused_unread(bag
 
 
 def test_readings_for_a_map_are_read_from_our_own_bags(bags, made):
-    readings = read_bag_readings(
-        bags / "bag", pose_topic="/robot/enu/pose", field_topic="/robot/qtfm/magnitude"
-    )
+    readings = read_bag_readings(bags / "bag", field_topic="/robot/qtfm/magnitude")
+    assert "(poses /robot/enu/pose, field /robot/qtfm/magnitude" in readings.source
     assert len(readings) > 0.9 * made[0].rows
     assert "in T, told by its size" in readings.source

@@ -151,6 +151,12 @@ def test_a_source_that_is_not_all_files_with_checksums_names_none(source):
     assert source_files(source) == {}
 
 
+def test_files_of_one_name_that_differ_are_all_told():
+    other = SHA[::-1].replace("a", "b")
+    source = f"lab.usda sha256:{SHA}; room.usda sha256:{SHA}; lab.usda sha256:{other}; room.usda sha256:{SHA}"
+    assert source_files(source) == {"lab.usda": SHA, "room.usda": SHA, "lab.usda (2)": other}
+
+
 def test_the_drift_is_the_slope_of_the_line_through_the_epochs():
     maps = [on("2026-01-01", 0), on("2026-01-11", 10), on("2026-01-21", 60)]
     figures = {f.name: f for f in drift(maps).figures}

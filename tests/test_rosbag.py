@@ -216,14 +216,24 @@ def test_messages_out_of_order_are_put_in_order(tmp_path):
 
 def test_of_several_topics_one_has_to_be_chosen_and_a_near_name_is_told(tmp_path):
     field = at_middle(np.full(40, 41_000.0))
-    bag = write_bag(tmp_path / "bag", {"/pose": drive(), "/odom": drive(odometry), "/mag": field})
-    with pytest.raises(RefusedError, match="2 topics of a pose, /odom, /pose; choose with --pose-topic"):
+    bag = write_bag(tmp_path / "bag", {"/pose": drive(), "/pose2": drive(), "/mag": field})
+    with pytest.raises(RefusedError, match="2 topics of a pose, /pose, /pose2; choose with --pose-topic"):
         read_bag_readings(bag)
-    assert len(read_bag_readings(bag, pose_topic="/odom")) == 40
-    with pytest.raises(RefusedError, match="no topic '/odm'; did you mean '/odom'"):
-        read_bag_readings(bag, pose_topic="/odm")
+    assert len(read_bag_readings(bag, pose_topic="/pose2")) == 40
+    with pytest.raises(RefusedError, match="no topic '/pos'; did you mean '/pose'"):
+        read_bag_readings(bag, pose_topic="/pos")
     with pytest.raises(RefusedError, match="topic /mag is a sensor_msgs/msg/MagneticField; a pose is one of"):
         read_bag_readings(bag, pose_topic="/mag")
+
+
+def test_a_pose_that_does_not_drift_is_taken_before_odometry(tmp_path):
+    fields = at_middle(np.full(40, 41_000.0))
+    bag = write_bag(tmp_path / "a", {"/odom": drive(odometry), "/pose": drive(), "/mag": fields})
+    assert "poses /pose," in read_bag_readings(bag).source
+    assert "poses /odom," in read_bag_readings(bag, pose_topic="/odom").source
+    two = write_bag(tmp_path / "b", {"/odom": drive(odometry), "/odom2": drive(odometry), "/mag": fields})
+    with pytest.raises(RefusedError, match="2 topics of a pose, /odom, /odom2; choose with --pose-topic"):
+        read_bag_readings(two)
 
 
 def test_a_bag_without_a_field_or_without_a_pose_is_refused_with_its_topics(tmp_path):

@@ -58,10 +58,20 @@ def source_files(source: str) -> dict[str, str]:
     """Files of a map's source with their SHA-256, by name; none where it names no such files.
 
     Args:
-        source: As `AnomalyMap.source` has it: "name sha256:hex; name sha256:hex".
+        source: As `AnomalyMap.source` has it: "name sha256:hex; name sha256:hex". Of files that differ and
+            have one name, as those of two days, the later ones are numbered: "name (2)".
     """
-    parts = [_FILE.fullmatch(part) for part in source.split("; ")]
-    return {m["name"]: m["sha256"] for m in parts if m} if all(parts) else {}
+    files: dict[str, str] = {}
+    for part in source.split("; "):
+        found = _FILE.fullmatch(part)
+        if found is None:
+            return {}
+        name, count = found["name"], 1
+        while files.get(name, found["sha256"]) != found["sha256"]:
+            count += 1
+            name = f"{found['name']} ({count})"
+        files[name] = found["sha256"]
+    return files
 
 
 def _deviation(field: AnomalyMap) -> Figure:

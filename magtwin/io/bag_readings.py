@@ -20,11 +20,13 @@ from magtwin.names import RefusedError, hint
 
 Array = NDArray[np.float64]
 
+ODOMETRY = "nav_msgs/msg/Odometry"
+
 POSES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
     "geometry_msgs/msg/PoseStamped": lambda m: (m.pose.position, m.pose.orientation),
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: (m.pose.pose.position, m.pose.pose.orientation),
     "geometry_msgs/msg/TransformStamped": lambda m: (m.transform.translation, m.transform.rotation),
-    "nav_msgs/msg/Odometry": lambda m: (m.pose.pose.position, m.pose.pose.orientation),
+    ODOMETRY: lambda m: (m.pose.pose.position, m.pose.pose.orientation),
 }
 """Types of messages that tell a pose: where in them position and orientation stand."""
 
@@ -58,7 +60,8 @@ def read_bag_readings(
 
     Args:
         path: Folder of a rosbag2, or its storage file (.db3, .mcap).
-        pose_topic: Topic of the poses, of a type in `POSES`; the only such topic unless given.
+        pose_topic: Topic of the poses, of a type in `POSES`; the only such topic unless given, or the only
+            one that is not odometry, which drifts.
         field_topic: Topic of the field, of a type in `FIELDS`; the only such topic unless given.
         unit: Unit of the field; that which makes it the Earth's unless given: 1e-5..1e-4 is T,
             10,000..100,000 nT, and so on, which do not overlap.
@@ -154,7 +157,7 @@ class _Bag:
     def read(
         self, kind: str, topic: str | None, known: dict[str, Callable[[Any], tuple[Any, ...]]]
     ) -> _Topic:
-        """All messages of a topic, or of the only one of a known type."""
+        """All messages of a topic, or of the only one of a known type, odometry last."""
         topic = self._choose(kind, topic, known)
         messages: _Topic = self._refusing(lambda: self._messages(topic, known[self.types[topic]]))
         if not messages.values:
@@ -178,6 +181,9 @@ class _Bag:
             raise RefusedError(
                 f"{self.path}: no topic of a {kind} ({', '.join(known)}); topics in it: {seen}"
             )
+        fixed = [t for t in fitting if self.types[t] != ODOMETRY]
+        if len(fitting) > 1 and len(fixed) == 1:
+            return fixed[0]
         if len(fitting) > 1:
             raise RefusedError(
                 f"{self.path}: {len(fitting)} topics of a {kind}, {', '.join(fitting)}; choose with {option}"
