@@ -306,11 +306,15 @@ def compensate_run(run: Run, model: TollesLawson) -> tuple[Run, Report]:
     after = before - interference[rows]
     if not before.std() > 0:
         raise RefusedError("b_measured_nt less b_map_nt never changes, so there is nothing to take out of it")
+    removed = float(1 - after.var() / before.var())
+    worse = (
+        "below 0: they vary more than before, as the model was fitted to too few headings or another field"
+    )
     figures = (
         Figure("readings", int(rows.stop - rows.start)),
         Figure("before", float(before.std()), "nT", note="standard deviation of measured less map"),
         Figure("after", float(after.std()), "nT", note="standard deviation, compensated"),
-        Figure("variance removed", float(1 - after.var() / before.var()), "", note="share, 1 is all of it"),
+        Figure("variance removed", removed, "", note="share, 1 is all of it" if removed >= 0 else worse),
     )
     compensated = run.with_columns(b_measured_nt=run["b_measured_nt"] - interference)
     told = {"terms": list(model.terms), "vector": VECTORS[model.vector]}
