@@ -136,6 +136,19 @@ def test_where_runs_keep_to_one_line_at_one_speed_nothing_is_claimed():
     assert abs(late) < 2 * found.latency_sd_s
 
 
+def test_the_motors_torque_where_a_robot_slows_is_taken_for_neither(monkeypatch):
+    run = a_run(swing=2.0)
+    p, t, yaw = run["p_world_base"][:, :2], run["t"], run["yaw"]
+    vx, vy = np.gradient(p, t, axis=0).T
+    speed = np.cos(yaw) * vx + np.sin(yaw) * vy
+    torque = 2500 * np.gradient(speed, t) * (1 + 0.5 * np.cos(yaw))
+    run = run.with_columns(b_measured_nt=run["b_measured_nt"] + torque)
+    found = fit_alignment([run], FIELD)
+    assert (*found.lever_arm_m, found.latency_s) == pytest.approx((0, 0, 0), abs=0.005)
+    monkeypatch.setattr("magtwin.learn.labels._slope", lambda values, t, at: np.zeros(len(at)))
+    assert abs(fit_alignment([run], FIELD).lever_arm_m[0]) > 0.02
+
+
 def test_on_a_level_map_the_alignment_is_what_was_known_before():
     level = dataclasses.replace(FIELD, values_nt=np.full(FIELD.values_nt.shape, 41e3))
     run = a_run()

@@ -354,8 +354,8 @@ def build_dataset(
 
 
 _ALIGNED = (
-    *("t", "p_world_base", "yaw", "mocap_p", "mocap_q_xyzw", "odom_v", "lidar_on", "b_measured_nt"),
-    *("flag_lost_lock", "flag_pose_lost"),
+    *("t", "p_world_base", "yaw", "mocap_p", "mocap_q_xyzw", "odom_v", "odom_w"),
+    *("battery_a", "lidar_on", "b_measured_nt", "flag_lost_lock", "flag_pose_lost"),
 )
 
 

@@ -38,6 +38,9 @@ LATENCY_PRIOR_S = 0.1
 FIT_RATE_HZ = 20.0
 """Readings a second that an alignment is fitted to; more are too alike to tell more."""
 
+SLOPE_S = 0.2
+"""Over how long the rates of speed and turning are taken [s]: a motor's torque lasts about so long."""
+
 STARTS = 3
 """Latencies, of those that leave least, that are refined."""
 
@@ -185,15 +188,16 @@ def fit_alignment(
 ) -> Alignment:
     """Lever arm and latency that make readings agree best with a map.
 
-    Least squares on label = c + heading terms + speed + LiDAR + gradient terms, where the gradient terms
-    are the first order of the map in both,
+    Least squares on label = c + platform + gradient terms, where c is each run's own, as no day is like
+    another, and the gradient terms are the first order of the map in both,
 
         map(p(t - tau) + R l) = map(p) + (R^T grad B) . l - tau dB/dt,
 
     relinearised until they stay, from each of the `STARTS` latencies of `LATENCIES_S` that leave least; of
-    what they lead to the likeliest is kept. The other terms (cos and sin of the heading and of twice it)
-    stand for the platform, so that its hard iron is not taken for a place. Its covariance V is that of
-    blocks of `BLOCK_S`, whose readings err alike. Along a straight line at one speed a lever arm forward
+    what they lead to the likeliest is kept. The platform is what is fixed to the robot, seen by its
+    heading: iron, turning, speed, their rates, LiDAR and battery current, so that iron is not taken for a
+    place, nor the motors' torque before a turn for a latency. The covariance V is that of blocks of
+    `BLOCK_S`, whose readings err alike. Along a straight line at one speed a lever arm forward
     and a latency are the same, so each has a weak prior about 0 of covariance P: what is found is
     P (P + V)^-1 of the least squares', which is theirs where the runs tell the two apart, and is shared
     between them, with spreads that say so, where they do not.
@@ -296,25 +300,25 @@ class _Fit:
             label = run["b_measured_nt"][rows] - value
             kept = usable & np.isfinite(label)
             slopes = _slopes(gradient, yaw, rates)[:, self.free]
-            terms = [np.ones(len(rows)), np.cos(yaw), np.sin(yaw), np.cos(2 * yaw), np.sin(2 * yaw)]
-            terms += [run["odom_v"][rows, 0]] if "odom_v" in run else []
-            terms += [run["lidar_on"][rows].astype(float)] if "lidar_on" in run else []
-            matrix = np.column_stack([slopes, *terms])
-            kept &= np.isfinite(matrix).all(axis=1)
+            platform = _platform(run, rows, yaw, rates)
+            kept &= np.isfinite(platform).all(axis=1) & np.isfinite(slopes).all(axis=1)
             if not kept.any():
                 continue
-            parts_x.append(matrix[kept])
-            parts_y.append(label[kept])
+            matrix = np.column_stack([slopes, platform])[kept]
+            parts_x.append(matrix - matrix.mean(axis=0))
+            parts_y.append(label[kept] - label[kept].mean())
             block = ((run["t"][rows][kept] - run["t"][0]) // BLOCK_S).astype(int)
             parts_block.append(blocks + np.unique(block, return_inverse=True)[1])
             blocks = int(parts_block[-1][-1]) + 1
         if not parts_x:
             return _Linearised(place, place, np.diag(self.prior), np.inf, np.inf, 1.0)
         x, y, block = np.vstack(parts_x), np.concatenate(parts_y), np.concatenate(parts_block)
-        return self._solved(place, x, y, block)
+        count = len(self.prior)
+        left = _beside(x[:, count:], np.column_stack([x[:, :count], y]))
+        return self._solved(place, left[:, :-1], left[:, -1], block)
 
     def _solved(self, place: Array, x: Array, y: Array, block: NDArray[np.intp]) -> _Linearised:
-        rows, count, at = len(y), len(self.prior), place[self.free]
+        rows, at = len(y), place[self.free]
         scale = np.sqrt(np.mean(x**2, axis=0))
         scale[scale == 0] = 1.0  # on a level map no place differs from another
         x = x / scale
@@ -323,28 +327,26 @@ class _Fit:
         solved = inverse @ (x.T @ y)
         error = y - x @ solved
         promised = max(float(np.mean(error**2)), 1e-12)
-        platform = x[:, count:]
-        here = y - platform @ np.linalg.lstsq(platform, y, rcond=None)[0]
         score = np.zeros((int(block.max()) + 1, x.shape[1]))
         np.add.at(score, block, x * error[:, None])
         # Few blocks make their own scatter small.
         few = len(score) / max(len(score) - x.shape[1], 1)
         blocked = few * (inverse @ (score.T @ score) @ inverse)
-        alike = np.trace(blocked[:count, :count]) / max(promised * np.trace(inverse[:count, :count]), 1e-300)
+        alike = np.trace(blocked) / max(promised * np.trace(inverse), 1e-300)
         # Along what the runs do not tell, the pseudo-inverse claims a variance of 0: there the prior stands.
         values, vectors = np.linalg.eigh(normal)
-        blind = vectors[:, values < 1e-10 * values[-1]]
+        blind = vectors[:, values <= 1e-10 * values[-1]]
         unknown = 1e12 * blind @ blind.T
         prior = np.diag(self.prior)
 
         def shrunk(spread: NDArray[Any]) -> Array:
-            spread = (spread + unknown)[:count, :count] / np.outer(scale[:count], scale[:count])
+            spread = (spread + unknown) / np.outer(scale, scale)
             return prior @ np.linalg.inv(prior + spread)
 
         wanted = place.copy()
-        wanted[self.free] = shrunk(self.alike * promised * inverse) @ (at + solved[:count] / scale[:count])
+        wanted[self.free] = shrunk(self.alike * promised * inverse) @ (at + solved / scale)
         covariance = prior - shrunk(blocked) @ prior
-        left = max(float(np.mean(here**2)), 1e-12)
+        left = max(float(np.mean(y**2)), 1e-12)
         cost = rows / self.alike * np.log(left) + float(np.sum(at**2 / self.prior))
         return _Linearised(place, wanted, (covariance + covariance.T) / 2, cost, promised, max(alike, 1.0))
 
@@ -380,3 +382,37 @@ def _slopes(gradient: Array, yaw: Array, rates: Array) -> Array:
     """What the map changes by for a metre forward, a metre left, and a second of latency, shape (N, 3)."""
     late = -np.sum(gradient * rates, axis=1)
     return np.column_stack([into_base(gradient[:, :2], yaw), late])
+
+
+def _platform(run: Run, rows: NDArray[np.intp], yaw: Array, rates: Array) -> Array:
+    """Columns (M, K) that stand for the platform: what is fixed to it adds along the field by its heading.
+
+    Beside what is always there: turning and speed (eddy currents, drag), their rates (the torque of the
+    motors, which comes where a robot slows to turn, and so would pass for a latency), LiDAR and battery.
+    """
+    t, ahead = run["t"], np.cos(yaw) * rates[:, 0] + np.sin(yaw) * rates[:, 1]
+    speed = run["odom_v"][:, 0] if "odom_v" in run else np.interp(t, t[rows], ahead)
+    turning = run["odom_w"][:, 2] if "odom_w" in run else np.interp(t, t[rows], rates[:, 2])
+    currents = [np.ones(len(rows)), speed[rows], turning[rows]]
+    currents += [_slope(values, t, t[rows]) for values in (speed, turning)]
+    currents += [run["lidar_on"][rows].astype(float)] if "lidar_on" in run else []
+    currents += [run["battery_a"][rows]] if "battery_a" in run else []
+    ways = (np.ones(len(rows)), np.cos(yaw), np.sin(yaw))
+    return np.column_stack(
+        [*(current * way for current in currents for way in ways), np.cos(2 * yaw), np.sin(2 * yaw)]
+    )
+
+
+def _slope(values: Array, t: Array, at: Array) -> Array:
+    """What a signal changes by in a second, over `SLOPE_S` about each instant."""
+    early, late = (np.interp(at + way * SLOPE_S / 2, t, values) for way in (-1, 1))
+    return (late - early) / SLOPE_S
+
+
+def _beside(platform: Array, values: Array) -> Array:
+    """What the platform's terms (N, K) leave of columns (N, M); nothing of one that they explain."""
+    scale = np.sqrt(np.mean(platform**2, axis=0))
+    platform = platform[:, scale > 0] / scale[scale > 0]
+    left = values - platform @ np.linalg.lstsq(platform, values, rcond=1e-10)[0]
+    explained = np.sum(left**2, axis=0) <= 1e-16 * np.sum(values**2, axis=0)
+    return np.where(explained, 0.0, left)
