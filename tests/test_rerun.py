@@ -14,6 +14,7 @@ from rerun.chunk import RrdReader
 from magtwin.cli import main
 from magtwin.field.map import AnomalyMap
 from magtwin.frames import quat_from_rpy, quat_from_yaw, rotate
+from magtwin.io import recording
 from magtwin.io.live import RrdWriter
 from magtwin.io.rerun import read_run, read_runs, view, write_comparison, write_rrd
 from magtwin.io.series import DERIVED, STATES
@@ -23,7 +24,7 @@ from magtwin.names import RefusedError
 from magtwin.path import figure8
 from magtwin.run import COLUMNS, Run
 from magtwin.spec import MagnetometerSpec, RobotSpec, Scene
-from magtwin.twin import Twin
+from magtwin.twin import Twin, scan
 
 HEADER = """#usda 1.0
 (
@@ -602,6 +603,7 @@ def test_a_full_disk_is_said_in_a_line_and_earlier_files_stay(parts, tmp_path):
     script = """
 import resource, signal, sys
 from magtwin.io.rerun import write_rrd
+from magtwin.io import recording
 from magtwin.io.live import RrdWriter
 from magtwin.io.tables import read_parquet
 from magtwin.names import RefusedError
@@ -637,6 +639,19 @@ except RefusedError as error:
         "size.rrd",
         "live.partial.rrd",
     }
+
+
+@pytest.mark.parametrize("rows", [20, 540])
+@pytest.mark.parametrize("shown", [False, True])
+def test_the_room_asked_of_a_disk_is_enough_and_no_multiple_of_it(rows, shown, parts, tmp_path, monkeypatch):
+    run, rest = parts
+    asked = []
+    monkeypatch.setattr(recording, "check_room", lambda file, size, said: asked.append(size))
+    run = run.take(slice(rows))
+    scans = scan(rest["twin"], run.with_columns(lidar_on=np.ones(run.rows, bool)))
+    write_rrd(run, tmp_path / "run.rrd", **({**rest, "scans": scans} if shown else {}))
+    (size,) = asked
+    assert size / 4 < (tmp_path / "run.rrd").stat().st_size < size
 
 
 def test_a_folder_that_cannot_be_written_is_refused(parts, tmp_path):

@@ -27,7 +27,7 @@ from magtwin.io.recording import (
 )
 from magtwin.io.series import STATES, TIMELINE
 from magtwin.io.viewer import live_viewer
-from magtwin.io.world import Room, heading_of, mesh_of
+from magtwin.io.world import Interior, Room, heading_of, mesh_of
 from magtwin.names import RefusedError
 from magtwin.path import Path as Planned
 from magtwin.run import Run
@@ -186,7 +186,8 @@ class _Growing:
         if self._recording is None:
             self._recording = self._begun(run)
         if self._file is not None:
-            check_room(self._file, self._file.stat().st_size + size_of(run) + ROOM, self._said)
+            size = size_of(run, self._scans)
+            check_room(self._file, self._file.stat().st_size + size + ROOM, self._said)
         try:
             self._recording.append(run)
             self._recording.rec.flush(timeout_sec=10.0)
@@ -210,6 +211,7 @@ class _Growing:
         lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, known))
         events = None if self._expected else list(STATES)
         views = layout(known, lab, heading=heading, events=events, whole=self._expected is not None)
+        interior = None if twin is None else Interior.of(twin)
         rec = self._stack.enter_context(
             stream(
                 uuid.uuid4().hex,
@@ -218,14 +220,15 @@ class _Growing:
                 file=self._file,
                 address=self._address,
                 said=self._said,
+                room=ROOM + (interior.size if interior else 0),
             )
         )
         send_properties(rec, run.facts)
         rec.log("facts", facts_page(run.facts), static=True)
         robot = None
-        if twin is not None:
+        if interior is not None:
             rate = run.facts.get("rate_hz", 0.0)
-            room = Room.enter(rec, twin, known, planned=self._planned)
+            room = Room.enter(rec, interior, known, planned=self._planned)
             robot = room.robot(rate if isinstance(rate, float) else 0.0)
         return Recording(rec, robot=robot, scans=self._scans)
 

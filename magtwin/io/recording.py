@@ -31,8 +31,8 @@ PATIENCE_S = 60.0
 END = b"RRF2FOOT"
 """What stands at the end of a file that Rerun finished."""
 
-ROOM = 1 << 23
-"""Bytes that a lab, a robot and a layout take, or more."""
+ROOM = 1 << 20
+"""Bytes that a layout, the facts and what names all columns take, or more."""
 
 POSED = frozenset(("p_world_base", "q_world_base_xyzw"))
 """Columns that place a robot."""
@@ -60,15 +60,19 @@ def check_room(file: FilePath, size: int, said: FilePath | None = None) -> None:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     except OSError as error:
         raise RefusedError(
-            f"{said or file}: cannot be written ({error.strerror}): it needs up to "
-            f"{size / 1e6:.1f} MB; make room"
+            f"{said or file}: cannot be written ({error.strerror}): up to {size / 1e6:.1f} MB are needed; "
+            "make room"
         ) from error
 
 
-def size_of(run: Run) -> int:
-    """Bytes that the rows of a run take in a recording, or more."""
+def size_of(run: Run, scans: Scans | None = None) -> int:
+    """Bytes that the rows of a run take in a recording, or more, and the scans while it lasts."""
     own = sum(values.nbytes + 4 * run.rows for values in run.values())
-    return own + 24 * run.rows + 2 * (24 + 4 * 8) * run.rows
+    seen = 0
+    if scans is not None and run.rows:
+        first, last = np.searchsorted(scans.t, run["t"][[0, -1]])
+        seen = (int(last - first) + 2) * (16 * scans.ranges_m.shape[1] + 64)
+    return own + 24 * run.rows + 2 * (24 + 4 * 8) * run.rows + seen
 
 
 @contextmanager

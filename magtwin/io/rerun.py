@@ -26,7 +26,7 @@ from magtwin.io.recording import (
 )
 from magtwin.io.series import COLUMNS_ENTITY, entity_of, table_of
 from magtwin.io.viewer import check_decodes, show
-from magtwin.io.world import Room, heading_of
+from magtwin.io.world import Interior, Room, heading_of
 from magtwin.names import RefusedError
 from magtwin.path import Path
 from magtwin.run import Run
@@ -64,19 +64,19 @@ def write_rrd(
     """
     _check_rows(run, path)
     lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, run))
+    interior = None if twin is None else Interior.of(twin)
+    room = ROOM + size_of(run, scans) + (interior.size if interior else 0)
     views = layout(run, lab, heading=heading)
     name = title_of(run) or FilePath(path).stem
     with (
         output(path, force=force) as aside,
-        stream(
-            content_id(run), name, views, file=aside, said=FilePath(path), room=ROOM + size_of(run)
-        ) as rec,
+        stream(content_id(run), name, views, file=aside, said=FilePath(path), room=room) as rec,
     ):
         send_properties(rec, run.facts)
         rec.log("facts", facts_page(run.facts, run.rows), static=True)
         robot = None
-        if twin is not None:
-            robot = Room.enter(rec, twin, run, planned=planned).robot()
+        if interior is not None:
+            robot = Room.enter(rec, interior, run, planned=planned).robot()
         recording = Recording(rec, robot=robot, scans=scans)
         recording.append(run)
         recording.close()
@@ -131,6 +131,8 @@ def write_comparison(
     ]
     first = next(iter(runs.values()))
     lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, first))
+    interior = None if twin is None else Interior.of(twin)
+    size = sum(map(size_of, runs.values())) + (interior.size if interior else 0)
     title = " and ".join(runs) if len(runs) < 4 else f"{len(runs)} runs"
     with (
         output(path, force=force) as aside,
@@ -140,10 +142,10 @@ def write_comparison(
             comparison_layout(shown, lab, heading=heading),
             file=aside,
             said=FilePath(path),
-            room=ROOM + sum(map(size_of, runs.values())),
+            room=ROOM + size,
         ) as rec,
     ):
-        room = None if twin is None else Room.enter(rec, twin, first, planned=planned)
+        room = None if interior is None else Room.enter(rec, interior, first, planned=planned)
         for one in shown:
             robot = None
             if room is not None:

@@ -86,6 +86,32 @@ def heading_of(field: AnomalyMap, run: Run) -> float:
 
 
 @dataclass(frozen=True)
+class Interior:
+    """What a twin's stage shows, read and not yet sent."""
+
+    twin: Twin
+    shapes: Sequence[Shape]
+    links: dict[str, Link]
+
+    @classmethod
+    def of(cls, twin: Twin) -> "Interior":
+        """Read it.
+
+        Raises:
+            RefusedError: The stage cannot be read.
+        """
+        stage = open_alone(twin.scene_file, twin.scene.robot.name)  # of the others nothing is known here
+        return cls(twin, list(read_shapes(stage)), read_links(stage))
+
+    @property
+    def size(self) -> int:
+        """Bytes that it takes in a recording, or more: corners, normals and colours; the map twice."""
+        corners = 3 * sum(len(shape.faces) for shape in self.shapes)
+        _, width, height = _pixels(self.twin.field)
+        return 28 * corners + 8 * width * height
+
+
+@dataclass(frozen=True)
 class Room:
     """A twin's lab in a recording, in which robots can be set down."""
 
@@ -99,7 +125,7 @@ class Room:
     def enter(
         cls,
         rec: rr.RecordingStream,
-        twin: Twin,
+        interior: Interior,
         known: Run,
         *,
         planned: Path | None = None,
@@ -108,24 +134,20 @@ class Room:
 
         Args:
             rec: Where to.
-            twin: Whose lab it is.
+            interior: What is there.
             known: What is known of the run: readings for the scale of colours, and its first heading.
             planned: The path that is to be driven.
-
-        Raises:
-            RefusedError: The stage cannot be read.
         """
-        stage = open_alone(twin.scene_file, twin.scene.robot.name)  # of the others nothing is known here
-        shapes, links = list(read_shapes(stage)), read_links(stage)
+        twin = interior.twin
         scale = Scale.over(twin.field, known.get("b_total_nt", np.empty(0)))
         rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         _send_map(rec, twin.field, scale, heading_of(twin.field, known))
         _send_scale(rec, twin.field, scale)
-        for prim, things in _things(shapes).items():
+        for prim, things in _things(interior.shapes).items():
             rec.log(f"world/lab/{_entity(prim)}", mesh_of(things), static=True)
         if planned is not None:
             _send_planned(rec, planned)
-        return cls(rec, twin.scene.robot, shapes, links, scale)
+        return cls(rec, twin.scene.robot, interior.shapes, interior.links, scale)
 
     def robot(self, rate_hz: float = 0.0) -> "Robot":
         """The robot of a run that is alone, its readings in the colours of the map."""
@@ -149,8 +171,7 @@ def _send_planned(rec: rr.RecordingStream, planned: Path) -> None:
 def _send_map(rec: rr.RecordingStream, field: AnomalyMap, scale: Scale, heading: float) -> None:
     """The floor in the colours of the map at a heading [rad], linear between nodes."""
     x0, x1, y0, y1 = field.extent
-    cell = max(0.02, (x1 - x0) / 1024, (y1 - y0) / 1024)
-    width, height = (max(1, round((b - a) / cell)) for a, b in ((x0, x1), (y0, y1)))
+    cell, width, height = _pixels(field)
     x = x0 + (np.arange(width) + 0.5) * (x1 - x0) / width
     y = y1 - (np.arange(height) + 0.5) * (y1 - y0) / height  # images begin at the top
     grid = np.stack(np.meshgrid(x, y), axis=-1)
@@ -161,6 +182,14 @@ def _send_map(rec: rr.RecordingStream, field: AnomalyMap, scale: Scale, heading:
     rec.log("floor/map", rr.Image(pixels, draw_order=-1.0), static=True)
     upwards = rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])  # pictures have y downwards
     rec.log("floor/paths", upwards, static=True)
+
+
+def _pixels(field: AnomalyMap) -> tuple[float, int, int]:
+    """Side of a pixel of the floor [m], and how many there are along x and y."""
+    x0, x1, y0, y1 = field.extent
+    cell = max(0.02, (x1 - x0) / 1024, (y1 - y0) / 1024)
+    width, height = (max(1, round((b - a) / cell)) for a, b in ((x0, x1), (y0, y1)))
+    return cell, width, height
 
 
 def _send_scale(rec: rr.RecordingStream, field: AnomalyMap, scale: Scale) -> None:
