@@ -197,6 +197,27 @@ def test_a_height_below_the_floor_or_among_the_dipoles_is_refused():
     )  # up from where it was fitted
 
 
+def test_between_a_layer_below_and_one_above_a_field_goes_both_ways_and_through_neither():
+    sheet = a_sheet(1.0)
+    x, y = (c.ravel() for c in np.meshgrid(np.arange(-3, 3.1, 0.25), np.arange(-3, 3.1, 0.25)))
+    layers = np.concatenate([np.column_stack([x, y, np.full(x.size, z)]) for z in (-0.2, 1.5)])
+    both = replace(
+        sheet,
+        p_world_dipole=layers,
+        m_world=np.tile([0, 0, 0.1], (len(layers), 1)),
+        p_base_sensor=(0, 0, 0.5),
+    )
+    field = a_map(both, harmonic=both, height_m=0.5)
+    for height in (0.06, 1.24):
+        there = at_height(field, height)
+        assert_allclose(there.values_nt, both.magnitude_nt(*field.grid.poses(), height_m=height))
+    with pytest.raises(RefusedError, match=r"lies too low .* below 0\.05 m"):
+        at_height(field, 0.04)
+    for height in (1.26, 1.5, 2.0):
+        with pytest.raises(RefusedError, match=r"lies too high .* above 1\.25 m are the dipoles"):
+            at_height(field, height)
+
+
 @pytest.mark.parametrize(
     ("height", "said"),
     [

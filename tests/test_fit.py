@@ -95,6 +95,13 @@ def test_a_raster_off_the_readings_is_refused():
         raster(fit(readings, "cubic"), readings, extent=(50, 52, 50, 52))
 
 
+def test_readings_on_one_line_are_refused_by_the_harmonic_fit_too():
+    x = np.linspace(0, 5, 60)
+    line = Readings(p_xy=np.column_stack([x, 0 * x]), yaw=0 * x, b_nt=41_000 + 500 * np.sin(x), name="line")
+    with pytest.raises(RefusedError, match=r"readings of 'line' lie on one line, x 0\.\.5, y 0\.\.0 m"):
+        raster(fit(line, "harmonic"), line)
+
+
 def test_every_method_has_its_own_name():
     readings = survey(rows=4, columns=4)
     for method in QUICK:

@@ -47,7 +47,7 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
             sensor, nobody knows how far above the floor.
         height_m: Height of the sensor above the floor [m]. A grid goes down by a quarter of a cell at
             most, for its noise grows as exp(dz |k|); a harmonic field down to the floor, and not nearer to a
-            layer of dipoles than these are to each other.
+            layer of dipoles, below the sensor or above it, than these are to each other.
 
     Returns:
         The map there, with `method` and `parameters` that say how; valid where the map is. Its variance
@@ -77,11 +77,16 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
 def _of_the_dipoles(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap:
     harmonic = field.harmonic
     assert harmonic is not None
-    lowest = _lowest_m(harmonic)
+    lowest, highest = _reach_m(harmonic, start)
     if height_m < min(lowest, start):
         raise RefusedError(
             f"height_m {height_m:g} lies too low for map {field.name!r}: below {lowest:.4g} m is the floor, "
             "or its dipoles are so near that each shows by itself"
+        )
+    if height_m > max(highest, start):
+        raise RefusedError(
+            f"height_m {height_m:g} lies too high for map {field.name!r}: above {highest:.4g} m are dipoles, "
+            "which stand for iron above the robot, so near that each shows by itself"
         )
     variance = None
     if field.variance_nt2 is not None and height_m - start >= -LARGEST_STEP_DOWN * min(field.cell_m):
@@ -97,21 +102,29 @@ def _of_the_dipoles(field: AnomalyMap, start: float, height_m: float) -> Anomaly
     )
 
 
-def _lowest_m(harmonic: HarmonicField) -> float:
-    """Height that a harmonic field holds down to: the floor, or the dipoles' own spacing above them [m].
+def _reach_m(harmonic: HarmonicField, start: float) -> tuple[float, float]:
+    """Heights that a harmonic field holds from and up to [m]: the floor, or dipoles' own spacing off them.
 
     A layer of equivalent dipoles s apart is a smooth field but for ripples of about exp(-2 pi d / s) at a
     distance d, two parts in a thousand at d = s. Dipoles at heights of their own have no such spacing.
     """
+    places = harmonic.p_world_dipole
+    below, above = places[places[:, 2] <= start], places[places[:, 2] > start]
+    lowest, highest = 0.0, np.inf
+    if len(below):
+        top = float(below[:, 2].max())
+        lowest = max(0.0, top + _apart_m(below[below[:, 2] > top - GRAIN_M]))
+    if len(above):
+        bottom = float(above[:, 2].min())
+        highest = bottom - _apart_m(above[above[:, 2] < bottom + GRAIN_M])
+    return lowest, highest
+
+
+def _apart_m(layer: Array) -> float:
+    """Median distance of dipoles of one height to the next of them [m]."""
     from scipy.spatial import cKDTree
 
-    places = harmonic.p_world_dipole
-    if not len(places):
-        return 0.0
-    top = float(places[:, 2].max())
-    layer = places[places[:, 2] > top - GRAIN_M]
-    spacing = float(np.median(cKDTree(layer).query(layer, 2)[0][:, 1])) if len(layer) > 1 else GRAIN_M
-    return max(0.0, top + spacing)
+    return float(np.median(cKDTree(layer).query(layer, 2)[0][:, 1])) if len(layer) > 1 else GRAIN_M
 
 
 def _of_the_grid(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap:

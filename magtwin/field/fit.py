@@ -156,7 +156,8 @@ def raster(
         x0, x1, y0, y1 = grid.extent
         raise RefusedError(
             f"no node of x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m is known to the {model.method} fit of "
-            f"{readings.name!r}; keep the extent within the readings"
+            f"{readings.name!r}: each is too far from a good reading, or its sd is above {MOST_DOUBT:g} of "
+            "theirs; keep the extent within the readings, and leave out what contradicts itself"
         )
     return AnomalyMap(
         values_nt=values,
@@ -194,6 +195,13 @@ def _grid(
         headings_rad = own.headings_rad if own is not None else _headings(readings)
     if extent is None:
         extent = readings.grid.extent if readings.grid is not None else _box(readings)
+        if readings.grid is None and spacing is None:
+            x0, x1, y0, y1 = extent
+            if min(x1 - x0, y1 - y0) < spacing_m(readings) / FINER:
+                raise RefusedError(
+                    f"the readings of {readings.name!r} lie on one line, x {x0:g}..{x1:g}, y {y0:g}..{y1:g} "
+                    "m; a map needs an area"
+                )
     return Grid.over(extent, spacing_m(readings) / FINER if spacing is None else spacing, headings_rad)
 
 

@@ -244,7 +244,7 @@ class HarmonicModel:
         return value.reshape(shape), variance.reshape(shape)
 
     def predict_vector(self, p_world: ArrayLike) -> tuple[Array, Array]:
-        """The field without the robot, at any height above the dipoles, and its variance.
+        """The field without the robot, at any height between the layers of dipoles, and its variance.
 
         Args:
             p_world: Points [m], shape (..., 3).
