@@ -214,7 +214,7 @@ def test_between_a_layer_below_and_one_above_a_field_goes_both_ways_and_through_
     with pytest.raises(RefusedError, match=r"lies too low .* below 0\.05 m"):
         at_height(field, 0.04)
     for height in (1.26, 1.5, 2.0):
-        with pytest.raises(RefusedError, match=r"lies too high .* above 1\.25 m are the dipoles"):
+        with pytest.raises(RefusedError, match=r"lies too high .* above 1\.25 m are dipoles"):
             at_height(field, height)
 
 
