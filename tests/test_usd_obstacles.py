@@ -1,6 +1,7 @@
 """Obstacles of a stage: colliders that stand still, cut at the robot's height."""
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
@@ -61,6 +62,50 @@ def test_a_thing_is_cut_at_the_robot_s_height():
     UsdPhysics.CollisionAPI.Apply(mesh.GetPrim())
     (outline,) = read_obstacles(made, height_m=0.3).outlines
     assert_allclose(np.abs(outline), 0.3, atol=1e-7)
+
+
+def faces(made: Usd.Stage, path: str, points, quads) -> UsdGeom.Mesh:
+    mesh = UsdGeom.Mesh.Define(made, path)
+    mesh.CreatePointsAttr(points)
+    mesh.CreateFaceVertexCountsAttr([4] * len(quads))
+    mesh.CreateFaceVertexIndicesAttr(np.ravel(quads).tolist())
+    UsdPhysics.CollisionAPI.Apply(mesh.GetPrim())
+    return mesh
+
+
+@pytest.mark.parametrize("apart_m", [0.0, 0.05])  # walls that share their corners, or none
+def test_the_walls_of_a_room_in_one_mesh_leave_its_floor_free(apart_m):
+    made = stage()
+    far = 3 + apart_m
+    points, quads = [], []
+    for x0, y0, x1, y1 in ((-3, 2, 3, 3), (-3, -3, 3, -2), (far, -3, 4, 3), (-4, -3, -far, 3)):
+        sides = [(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
+        quads += [[len(points) + k for k in side] for side in sides]
+        points += [(x, y, z) for z in (0, 0.5) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+    faces(made, "/Room", points, quads)
+    found = read_obstacles(made)
+    assert set(found.names) == {"/Room"}
+    distance, _ = found.clearance(np.array([[0.0, 1.5], [0.0, 0.0], [2.5, 0.0]]))
+    assert_allclose(distance, [0.5, 2.0, 0.5 + apart_m], atol=0.001)
+
+
+def test_a_wall_without_thickness_stops_a_robot():
+    made = stage()
+    faces(made, "/Sheet", [(0, -1, 0), (1, 1, 0), (1, 1, 1), (0, -1, 1)], [[0, 1, 2, 3]])
+    found = read_obstacles(made)
+    assert found.names == ("/Sheet",)
+    assert_allclose(found.clearance(np.array([[0.5, 0.0], [3.0, 1.0]]))[0], [-0.0005, 2.0], atol=1e-3)
+
+
+def test_what_a_tall_robot_would_run_into_is_an_obstacle_to_it():
+    made = stage()
+    box(made, "/Shelf", (0, 0, 1.0), (1, 1, 0.1))
+    robot = UsdGeom.Xform.Define(made, "/Robot")
+    UsdPhysics.RigidBodyAPI.Apply(robot.GetPrim())
+    box(made, "/Robot/Mast", (2, 0, 0.6), (0.1, 0.1, 1.2))
+    assert read_obstacles(made).names == ()
+    robot.GetPrim().AddAppliedSchema("MagtwinRobotAPI")
+    assert read_obstacles(made).names == ("/Shelf",)
 
 
 def test_a_body_that_moves_is_no_obstacle():

@@ -9,26 +9,37 @@ from pxr import Usd, UsdGeom, UsdPhysics
 from magtwin.obstacles import Obstacles
 from magtwin.usd.geometry import SHOWN, read_triangles
 from magtwin.usd.layers import open_stage
+from magtwin.usd.schema import prims_with
 
 LOWEST_M = 0.01
 """What does not rise above this is driven over, as a floor is, or its joints [m]."""
 
 ROBOT_HEIGHT_M = 0.4
-"""What hangs higher than this is driven under [m]; the TurtleBot 4 is 0.351 m high."""
+"""What hangs higher is driven under [m], unless a robot is taller; the TurtleBot 4 is 0.351 m high."""
+
+SAME_M = 1e-5
+"""Corners nearer than this belong to one piece [m]."""
+
+SHEET_M = 0.001
+"""Thickness that a wall without any is given [m]."""
+
+MOST_FACES = 1000
+"""Triangles up to which a part of a mesh that is not convex is met face by face; others are their hull."""
 
 
-def read_obstacles(
-    stage: Usd.Stage | str | os.PathLike[str], *, height_m: float = ROBOT_HEIGHT_M
-) -> Obstacles:
+def read_obstacles(stage: Usd.Stage | str | os.PathLike[str], *, height_m: float | None = None) -> Obstacles:
     """The colliders of a stage that no rigid body carries, in order of their prims.
 
     Each prim with CollisionAPI that is not switched off is an obstacle if any of it lies between the floor
-    and `height_m`: its outline is the hull of what lies there, its surface all of it. Colliders need not be
-    drawn: those of purpose guide and proxy count, those made invisible do not.
+    and `height_m`. Its outlines go by its name: the hull of what lies there, of each gprim, and of each part
+    of a mesh that hangs together; of a part that is not convex, such as the walls of a room in one mesh, each
+    of its faces. Its surface is all of it. Colliders need not be drawn: those of purpose guide and proxy
+    count, those made invisible do not.
 
     Args:
         stage: A stage, or the path of a USD file.
-        height_m: Height of the robot [m].
+        height_m: Height of the robot [m]; None takes that of the tallest on the stage, and at least
+            `ROBOT_HEIGHT_M`.
 
     Raises:
         RefusedError: The file is missing or is not USD, or a mesh contradicts itself; the text names
@@ -37,19 +48,18 @@ def read_obstacles(
     stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
     purposes = (*SHOWN, UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy)
     collider = functools.cache(_collider)
-    things: dict[str, list[np.ndarray]] = {}
+    height = _tallest_m(stage) if height_m is None else height_m
+    names, outlines, triangles = [], [], []
     for path, corners in read_triangles(
         stage, purposes=purposes, wanted=lambda prim, carried: not carried and bool(collider(prim))
     ).items():
-        things.setdefault(collider(stage.GetPrimAtPath(path)), []).append(corners)
-    names, outlines, triangles = [], [], []
-    for name, parts in things.items():
-        corners = np.concatenate(parts)
+        prim = stage.GetPrimAtPath(path)
         triangles.append(corners)
-        outline = _outline(corners, height_m)
-        if outline is not None:
-            names.append(name)
-            outlines.append(outline)
+        for piece in _pieces(corners) if prim.IsA(UsdGeom.Mesh) else [corners]:
+            outline = _outline(piece, height)
+            if outline is not None:
+                names.append(collider(prim))
+                outlines.append(outline)
     surface = np.concatenate(triangles) if triangles else np.empty((0, 3, 3))
     return Obstacles(tuple(names), tuple(outlines), surface)
 
@@ -64,8 +74,49 @@ def _collider(prim: Usd.Prim) -> str:
     return ""
 
 
+def _tallest_m(stage: Usd.Stage) -> float:
+    """How high the tallest robot of a stage is above the floor, at least `ROBOT_HEIGHT_M` [m]."""
+    cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), [*SHOWN, UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy])
+    tops = [
+        cache.ComputeWorldBound(prim).ComputeAlignedRange().GetMax()[2]
+        for prim in prims_with(stage.GetPseudoRoot(), "robot")
+    ]
+    return max([ROBOT_HEIGHT_M, *tops])
+
+
+def _pieces(corners: np.ndarray) -> list[np.ndarray]:
+    """Triangles (T, 3, 3) by the parts that hang together at their corners and are convex, or one by one."""
+    from scipy.sparse import coo_array  # a tenth of a second, which stages without such meshes do not pay
+    from scipy.sparse.csgraph import connected_components
+
+    flat = np.round(corners.reshape(-1, 3) / SAME_M).astype(np.int64)
+    vertex = np.unique(flat, axis=0, return_inverse=True)[1].reshape(-1, 3)
+    links = np.concatenate([vertex[:, :2], vertex[:, 1:]])
+    count = int(vertex.max(initial=-1)) + 1
+    graph = coo_array((np.ones(len(links)), links.T), shape=(count, count))
+    which = connected_components(graph, directed=False)[1][vertex[:, 0]]
+    first = np.unique(which, return_index=True)[1]
+    pieces: list[np.ndarray] = []
+    for k in np.sort(first):
+        piece = corners[which == which[k]]
+        pieces += list(piece[:, None]) if len(piece) <= MOST_FACES and not _convex(piece) else [piece]
+    return pieces
+
+
+def _convex(corners: np.ndarray) -> bool:
+    """Whether all corners of triangles (T, 3, 3) lie on one side of each of them."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(normal, axis=1)
+    normal, start = normal[size > 0] / size[size > 0, None], corners[size > 0, 0]
+    off = np.unique(corners.reshape(-1, 3), axis=0) @ normal.T - np.einsum("ni,ni->n", start, normal)
+    return bool(np.all((off.max(axis=0) < SAME_M) | (off.min(axis=0) > -SAME_M)))
+
+
 def _outline(corners: np.ndarray, height_m: float) -> np.ndarray | None:
-    """Points (K, 2) of triangles (T, 3, 3) within the robot's height; none if there is no area to them."""
+    """Points (K, 2) of triangles (T, 3, 3) within the robot's height; none if they are nowhere or at a point.
+
+    A wall without thickness is given `SHEET_M`.
+    """
     points = []
     for k in range(3):
         a, b = corners[:, k], corners[:, (k + 1) % 3]
@@ -76,6 +127,12 @@ def _outline(corners: np.ndarray, height_m: float) -> np.ndarray | None:
             part = ((level - a[crosses, 2]) / rise[crosses])[:, None]
             points.append((a[crosses] + part * (b[crosses] - a[crosses]))[:, :2])
     found = np.unique(np.round(np.concatenate(points), 9), axis=0)
-    if len(found) < 3 or np.linalg.matrix_rank(found - found[0], tol=1e-6) < 2:
+    if len(found) < 2:
         return None
-    return found
+    away = found - found.mean(axis=0)
+    along, across = np.linalg.svd(away, full_matrices=False)[2]
+    if np.abs(away @ across).max() > SAME_M:
+        return found
+    ends = found[[np.argmin(away @ along), np.argmax(away @ along)]]
+    side = across * (SHEET_M / 2)
+    return np.concatenate([ends - side, ends + side])
