@@ -176,7 +176,7 @@ def compare(a: Run, b: Run, *, align: Align = "time") -> Comparison:
         raise RefusedError(
             f"nothing to compare: neither a position nor a field of {', '.join(FIELDS)} is in both"
         )
-    track_a, track_b = _Track.of(a, position, align), _Track.of(b, position, align)
+    track_a, track_b = _Track.of(a, position, align, "first"), _Track.of(b, position, align, "second")
     shift = 0.0 if position is None or align == "none" else _shift(track_a, track_b)
     wanted = track_a.place - shift
     over = (wanted >= track_b.place[0]) & (wanted <= track_b.place[-1])
@@ -221,7 +221,7 @@ class _Track:
     """Position of each [m], shape (N, 2); no columns without positions."""
 
     @classmethod
-    def of(cls, run: Run, position: str | None, align: Align) -> "_Track":
+    def of(cls, run: Run, position: str | None, align: Align, which: str) -> "_Track":
         if position is None:
             return cls(np.arange(run.rows), run["t"], np.empty((run.rows, 0)))
         p_xy = run[position][:, :2]
@@ -232,7 +232,12 @@ class _Track:
             on = np.diff(place, prepend=-1.0) > 0
             rows, place = rows[on], place[on]
         if len(rows) < 2:
-            raise RefusedError(f"a run has {len(rows)} places to compare; did the robot move?")
+            what = (
+                f"its robot moves no {STEP_M:g} m; align by time"
+                if align == "path"
+                else "its positions are unknown"
+            )
+            raise RefusedError(f"the {which} run cannot be laid over the other: {what}")
         return cls(rows, place, p_xy[rows])
 
     def at(self, place: Array, values: NDArray[Any]) -> Array:

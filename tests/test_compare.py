@@ -134,7 +134,7 @@ def test_the_figures_are_json_for_scripts():
             circle(),
             Run({"t": np.arange(9.0), "p_world_base": np.zeros((9, 3))}),
             "path",
-            "1 places to compare; did the robot move",
+            "the second run cannot be laid over the other: its robot moves no 0.01 m; align by time",
         ),
     ],
 )
