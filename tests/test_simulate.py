@@ -286,7 +286,7 @@ def test_a_network_gives_the_disturbance_from_columns_that_are_filled():
     run = drive(SURVEYED, disturbance_nt=network)
     assert len(seen) == 1
     late = {"b_disturbance_nt", "b_total_nt", "b_noise_nt", "b_measured_nt"}
-    late |= {"b_vector_measured_nt", "flag_lost_lock"}
+    late |= {"flag_lost_lock"}
     assert set(seen[0]) == set(COLUMNS) - late
     for name in set(COLUMNS) - late:
         assert_array_equal(seen[0][name], run[name])
@@ -304,6 +304,21 @@ def test_the_maps_gradient_is_what_a_step_forward_or_to_the_left_changes_it_by()
         change = (MAP.lookup(p + step, yaw) - MAP.lookup(p, yaw)) / h
         inside = np.isfinite(change) & (np.abs(change - run["b_map_gradient_nt_m"][:, i]) < 1)
         assert inside.mean() > 0.99  # but where a step leads into the next cell
+
+
+def test_a_network_reads_the_vector_axes_as_the_run_will_have_them():
+    loud = dataclasses.replace(ROBOT.magnetometer, vector_noise_density_nt=5.0, dropout_share=0.1)
+    seen: list[Run] = []
+
+    def network(run: Run) -> np.ndarray:
+        seen.append(run)
+        return np.full(run.rows, 100.0)
+
+    run = drive(with_robot(KNOWN, magnetometer=loud), disturbance_nt=network)
+    read = seen[0]["b_vector_measured_nt"]
+    assert np.isnan(read).any()
+    assert np.isfinite(read).any()
+    assert_array_equal(read, run["b_vector_measured_nt"])
 
 
 def test_with_a_network_the_exact_field_is_still_given_where_it_is_known():

@@ -10,6 +10,7 @@ holds by construction. Noise is drawn reading by reading, so a longer run begins
 a shorter one.
 """
 
+import copy
 import math
 from typing import Any
 
@@ -82,6 +83,29 @@ def sense_magnetometer(
         for dropping in (read, *columns.values()):
             dropping[dropped] = np.nan
     return columns | {"b_measured_nt": read, "b_noise_nt": read - true, "flag_lost_lock": lost}
+
+
+def sense_axes(
+    spec: MagnetometerSpec,
+    b_vector_nt: ArrayLike,
+    rng: np.random.Generator,
+    *,
+    rate_hz: float,
+    steep: ArrayLike = False,
+) -> Array:
+    """The b_vector_measured_nt that `sense_magnetometer` will give from the same generator, which is kept.
+
+    The axes read the field whatever the magnitude is thought to be, so a network that predicts that may
+    read them first. The arguments are those of `sense_magnetometer`.
+    """
+    _, noise, _, drop = copy.deepcopy(rng).spawn(4)
+    vector = np.asarray(b_vector_nt, float)
+    along = _along_axis(vector) if feels_direction(spec) else np.full(len(vector), np.nan)
+    lost = np.broadcast_to(np.asarray(steep, bool), along.shape) | _in_dead_zone(spec, along)
+    read = sense_vector(spec, vector, noise, rate_hz=rate_hz, lost=lost)
+    if spec.dropout_share:
+        read[drop.random(len(read)) < spec.dropout_share] = np.nan
+    return read
 
 
 def sense_vector(

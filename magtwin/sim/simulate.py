@@ -26,7 +26,7 @@ from magtwin.sim.follow import follow, play
 from magtwin.sim.imu import sense_imu
 from magtwin.sim.interference import field_at_sensor_nt, level_gradient_nt_m, sensor_places
 from magtwin.sim.lidar import lidar_on
-from magtwin.sim.magnetometer import LOCK_RATE_HZ, feels_direction, lost_in, sense_magnetometer
+from magtwin.sim.magnetometer import LOCK_RATE_HZ, feels_direction, lost_in, sense_axes, sense_magnetometer
 from magtwin.sim.mocap import sense_mocap
 from magtwin.sim.odometry import sense_odometry
 from magtwin.sim.replay import replayed
@@ -96,7 +96,7 @@ def simulate(
         rate_hz: Magnetometer readings a second, at t = k / rate_hz [Hz]; None takes the scene's.
         obstacles: What the path must be clear of, and what stops the robot if it leaves its path.
         controller: A name of `magtwin.sim.controllers.CONTROLLERS`, or a controller of one's own.
-        disturbance_nt: From a Run whose columns up to `lidar_on` and `b_map_nt` are filled to the
+        disturbance_nt: From a Run in which every other sensor has been read, the vector axes too, to the
             disturbance of each reading [nT], shape (N,). Called once.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
@@ -305,8 +305,10 @@ def sense(
     robot, wanted = scene.robot, frozenset(wanted)
     needed = wanted | frozenset(inputs if network else ())
     read = bool(wanted & _READ)
+    felt = network and "b_vector_measured_nt" in needed
     exact = bool(
-        wanted & _EXACT
+        felt
+        or wanted & _EXACT
         or (not network and robot.magnetometer.kind == "physical")
         or (read and feels_direction(robot.magnetometer))
         or (companions and scene.earth is not None)
@@ -336,6 +338,11 @@ def sense(
                 alone = columns["b_truth_nt"]
                 columns |= _with(columns["b_vector_nt"], into_sensor(added, robot.q_base_magnetometer_xyzw))
                 beside = columns["b_truth_nt"] - alone
+    steep = _steep(scene, anomaly_map, motion, t) if read or felt else np.zeros(len(t), bool)
+    if felt:
+        columns["b_vector_measured_nt"] = sense_axes(
+            robot.magnetometer, columns["b_vector_nt"], draws["magnetometer"], rate_hz=rate_hz, steep=steep
+        )
     columns |= _flags(scene, true)
     if companions:
         columns["flag_bump"] = columns["flag_bump"] | touching(t, motion, robot, companions)
@@ -353,7 +360,7 @@ def sense(
         run=Run(columns, told),
         scene=scene,
         rate_hz=rate_hz,
-        steep=_steep(scene, anomaly_map, motion, t) if read else np.zeros(len(t), bool),
+        steep=steep,
         rng=draws["magnetometer"],
         wanted=wanted,
         beside_nt=beside,
