@@ -120,6 +120,11 @@ def test_any_run_in_blocks_of_any_size_comes_back_to_the_last_bit(
         assert a[~gone].tobytes() == b[~gone].tobytes(), name
 
 
+def test_a_unit_for_a_bag_that_says_its_own_is_refused(bags):
+    with pytest.raises(RefusedError, match="says its unit itself; drop 'uT'"):
+        read_bag(bags / "run.mcap", unit="uT")
+
+
 def test_fields_in_nt_come_back_to_the_last_bit(bags, made):
     assert_same(read_bag(bags / "nt.mcap"), made[0], unit="nT")
 

@@ -292,7 +292,7 @@ def test_what_cannot_be_a_run_is_refused_with_what_is_there(tmp_path):
         r"/robot/qtfm/magnetude \(sensor_msgs": ({"/robot/qtfm/magnetude": readings()}, None),
         r"no topic /robot/qtfm/magnitude; topics in it: none": ({}, None),
         r"no topic /vrpn; topics in it: /robot/qtfm/magnitude": ({MAG: readings()}, {POSE: "/vrpn"}),
-        r"no topic '/robot/pose'; did you mean '/robot/enu/pose'": ({MAG: readings()}, {"/robot/pose": "/a"}),
+        "^no topic '/robot/pose'; did you mean '/robot/enu/pose'": ({MAG: readings()}, {"/robot/pose": "/a"}),
         r"/robot/enu/pose is a sensor_msgs/msg/MagneticField; read is geometry_msgs/msg/PoseStamped or": (
             {MAG: readings(), POSE: readings()},
             None,

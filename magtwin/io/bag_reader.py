@@ -102,6 +102,8 @@ def read_bag(
             stamps run backwards; the unit cannot be.
     """
     path = existing(path, "bag")
+    for name in topics or ():
+        find("topic", name, {topic.name: topic for topic in _RECORDED})
     with _refusing(path), _Bag(path) as bag, np.errstate(over="ignore", invalid="ignore"):
         if not bag.whole and not recover and PARTIAL not in path.name:
             raise RefusedError(
@@ -109,6 +111,8 @@ def read_bag(
                 f"{partial_of(path).name}, under which what is whole is read"
             )
         if READING.name in bag.kinds and NAMES.name in bag.kinds and not topics:
+            if unit:
+                raise RefusedError(f"{path}: magtwin wrote it and it says its unit itself; drop {unit!r}")
             return _own(bag)
         return _recorded(bag, topics or {}, unit)
 
@@ -417,8 +421,6 @@ _RECORDED = (MAGNITUDE, POSE, ODOMETRY, IMU, BATTERY, COMMAND, JOINTS, SCAN, VEC
 def _signals(bag: _Bag, names: Mapping[str, str]) -> dict[Topic, _Signal]:
     """The topics that a recording has."""
     known = {topic.name: topic for topic in _RECORDED}
-    for name in names:
-        find("topic", name, known)
     chosen: dict[Topic, str] = {}
     for name, topic in known.items():
         here = names.get(name, name)
