@@ -223,7 +223,7 @@ def test_every_figure_is_authored_also_one_that_equals_the_schemas_fallback():
     magnetometer = sensors.define_magnetometer(stage, f"{LINK}/mag", MagnetometerSpec(link="some_link"))
     platform = sensors.define_platform(stage.GetPrimAtPath("/robot"), PlatformFieldSpec())
     footprint = sensors.define_footprint(stage.GetPrimAtPath("/robot"), 0.171)
-    for prim, noun in ((battery, "battery"), (platform, "platform"), (footprint, "robot")):
+    for prim, noun in ((battery, "battery"), (platform, "platform"), (footprint, "robot:footprint")):
         assert all(
             a.HasAuthoredValue() for a in prim.GetAttributes() if a.GetName().startswith(f"magtwin:{noun}:")
         )
