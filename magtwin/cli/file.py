@@ -26,7 +26,8 @@ def info(file: Path, *, json: Json = False) -> None:
     ----------
     file
         A run (.parquet, .rrd, .mcap, .db3, .csv, .npz, .usd, a .json of the released node, or the folder of a
-        bag, of Parquet parts, or of magtwin run), a stage (.usd, .usda, .usdc, .usdz), or a network (.safetensors, .pth).
+        bag, of Parquet parts, or of magtwin run), a stage (.usd, .usda, .usdc, .usdz), or a network
+        (.safetensors, .pth).
     json
         Print it as JSON.
     """
