@@ -250,6 +250,10 @@ def test_a_check_takes_the_kernel_of_the_gaussian_process_and_leaves_headings_ou
         (("--method", "gp", "--earth", "1,2,3"), "--earth is for --method harmonic alone"),
         (("--earth", "1,2,south"), "--earth is a scene; latitude,longitude,height,date; or x,y,z in nT"),
         (("--earth", "0,0,0"), "earth_nt must be three numbers"),
+        (
+            ("--earth", "29.65,-82.35,50"),
+            "is a field of 100.8 nT, and the Earth's is some 22,000 to 67,000",
+        ),
         (("--earth", "29,-82,50,2050-01-01"), "lies beyond the IGRF-14"),
         (("--earth", "lab.usda"), "there is no file 'lab.usda'"),
     ],

@@ -152,8 +152,8 @@ def map_fit(
         trilinear between nodes, cubic, a Gaussian process, or the harmonic field of equivalent dipoles
         with the platform that the survey was made with.
     kernel
-        Covariance of the Gaussian process: Matern's of order 5/2, or Poisson's, that of a field above uncorrelated
-        sources; poisson unless given.
+        Covariance of the Gaussian process: Matern's of order 5/2, or Poisson's, that of a field above
+        uncorrelated sources; poisson unless given.
     earth
         The Earth's field for the harmonic fit: a scene or stage that knows it; latitude,longitude,height,date
         [deg, deg, m, YYYY-MM-DD], where the world's y is true north; or its x,y,z in the world [nT]. That
@@ -218,10 +218,11 @@ def map_check(
         Method to check; may be given several times; all of them unless given.
     split
         What is left out: every other node at all its headings, one heading at a time, one run at a time, or
-        blocks of the floor; nodes of a gridded survey, runs where there are several, else blocks, unless given.
+        blocks of the floor; nodes of a gridded survey, runs where there are several, else blocks, unless
+        given.
     kernel
-        Covariance of the Gaussian process: Matern's of order 5/2, or Poisson's, that of a field above uncorrelated
-        sources; poisson unless given.
+        Covariance of the Gaussian process: Matern's of order 5/2, or Poisson's, that of a field above
+        uncorrelated sources; poisson unless given.
     earth
         The Earth's field for the harmonic fit: a scene or stage that knows it; latitude,longitude,height,date
         [deg, deg, m, YYYY-MM-DD], where the world's y is true north; or its x,y,z in the world [nT]. That
@@ -568,12 +569,21 @@ def _earth_nt(text: str) -> tuple[float, float, float]:
     if len(words) in (3, 4) and not Path(text).exists():
         from magtwin.field.earth import earth_field_nt
         from magtwin.field.readings import checked_earth_nt
+        from magtwin.field.survey import GREATEST_MEAN_NT, LEAST_MEAN_NT
 
         try:
             x, y, z = (float(word) for word in words[:3])
         except ValueError as error:
             raise RefusedError(f"--earth is {forms}; got {text!r}") from error
-        return checked_earth_nt((x, y, z)) if len(words) == 3 else earth_field_nt(x, y, z, words[3])
+        if len(words) == 4:
+            return earth_field_nt(x, y, z, words[3])
+        size = sum(c * c for c in checked_earth_nt((x, y, z))) ** 0.5
+        if not LEAST_MEAN_NT <= size <= GREATEST_MEAN_NT:
+            raise RefusedError(
+                f"--earth {text} is a field of {size:.6g} nT, and the Earth's is some 22,000 to 67,000; give it "
+                "in nT, or its place with the day, latitude,longitude,height,date"
+            )
+        return x, y, z
     from magtwin.usd.scene import read_scene
 
     if not Path(text).is_file():
