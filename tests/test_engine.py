@@ -93,6 +93,12 @@ def test_a_run_that_cannot_be_replayed_is_refused(t, x, what):
         replayed(run, DRIVE)
 
 
+def test_a_script_is_no_run_to_replay():
+    script = Run({"t": np.arange(3.0)})
+    with pytest.raises(RefusedError, match=r"needs p_world_base, yaw or q_world_base_xyzw, and has only t; "):
+        replayed(script, DRIVE)
+
+
 def test_commands_are_read_as_they_were_written(tmp_path):
     rows = np.column_stack([np.arange(5) / 50, np.linspace(0, 1, 5) / 3, np.full(5, 0.1)])
     write_commands(Commands("mine", rows), tmp_path / "mine.csv")

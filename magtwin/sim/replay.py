@@ -35,6 +35,14 @@ def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
         RefusedError: A column is missing, there are fewer than two rows, time does not go on, or a pose is
             not finite; the text gives the row.
     """
+    lacking = [name for name in ("t", "p_world_base") if name not in run]
+    if "yaw" not in run and "q_world_base_xyzw" not in run:
+        lacking.append("yaw or q_world_base_xyzw")
+    if lacking:
+        raise RefusedError(
+            f"a run to replay needs {', '.join(lacking)}, and has only {', '.join(run)}; a script of "
+            "t,v,w is for --commands"
+        )
     if run.rows < 2:
         raise RefusedError(f"a run of {run.rows} rows is no motion to replay; two or more are needed")
     t = run["t"]
