@@ -580,8 +580,8 @@ def _earth_nt(text: str) -> tuple[float, float, float]:
         size = sum(c * c for c in checked_earth_nt((x, y, z))) ** 0.5
         if not LEAST_MEAN_NT <= size <= GREATEST_MEAN_NT:
             raise RefusedError(
-                f"--earth {text} is a field of {size:.6g} nT, and the Earth's is some 22,000 to 67,000; give it "
-                "in nT, or its place with the day, latitude,longitude,height,date"
+                f"--earth {text} is a field of {size:.6g} nT, and the Earth's is some 22,000 to 67,000; give "
+                "it in nT, or its place with the day, latitude,longitude,height,date"
             )
         return x, y, z
     from magtwin.usd.scene import read_scene
