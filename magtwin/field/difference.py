@@ -238,8 +238,8 @@ def _compared(a: AnomalyMap, b: AnomalyMap) -> tuple[str, ...]:
         if first != second and first and second:
             raise RefusedError(
                 f"map {a.name!r} has the {name} {first!r} and {b.name!r} {second!r}, so that one x and y are "
-                "two places; bring the readings of one into the other's before its map is made, or, where both "
-                f"mean the same, make both with one --{name}"
+                "two places; bring the readings of one into the other's before its map is made, or, where "
+                f"both mean the same, make both with one --{name}"
             )
     if a.height_m is not None and b.height_m is not None and abs(a.height_m - b.height_m) > GRAIN_M:
         raise RefusedError(
