@@ -160,11 +160,14 @@ def scene_of(
 
 
 def locate(file: str, near: str | FilePath | None = None) -> FilePath | None:
-    """A file that facts name, as seen from here or from the folder of `near`; None where neither has it."""
+    """A file or folder that facts name, seen from here or from the folder of `near`, or none.
+
+    A device or pipe is none: facts come with files of anyone's, and reading it might never end.
+    """
     places = [FilePath(file)]
     if near is not None:  # a run may be a folder of its own
         places += [FilePath(near) / file, FilePath(near).parent / file]
-    return next((place for place in places if place.exists()), None)
+    return next((place for place in places if place.is_file() or place.is_dir()), None)
 
 
 def scene_from_toml(

@@ -228,7 +228,7 @@ def _twin(run: "Run", file: Path, scene: Path | None) -> "Twin | None":
         _note(f"without a scene: {error}")
         return None
     then = run.facts.get("scene_sha256")
-    if then is not None and then != twin.facts.get("scene_sha256"):
+    if then is not None and then != twin.facts.get("scene_sha256") and scene != file:
         _note(f"{twin.scene_file}: has changed since the run; it is shown as it is now")
     return twin
 

@@ -231,6 +231,8 @@ def differences(run: Run, again: Run) -> tuple[Difference, ...]:
 def _same(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
     """Rows that are the same, shape (N,)."""
     same = (a == b) | ((a != a) & (b != b))
+    if a.dtype.kind == "f" and b.dtype.kind == "f":
+        same &= (a != 0) | (np.signbit(a) == np.signbit(b))  # -0 is not 0
     return same if same.ndim == 1 else same.all(axis=1)
 
 
