@@ -17,6 +17,7 @@ from magtwin.field.survey import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER, check_
 from magtwin.files import existing, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 from magtwin.names import RefusedError, hint
+from magtwin.resample import linear, quaternion
 
 Array = NDArray[np.float64]
 
@@ -246,24 +247,9 @@ def poses_at(t: Array, pose_t: Array, pose: Array) -> tuple[Array, Array, NDArra
     part = (t - pose_t[low]) / steps[low]
     bridged = (steps[low] <= widest) | (part == 0) | (part == 1)
     inside = (part >= 0) & (part <= 1) & bridged
-    w = np.clip(part, 0, 1)[:, None]
-    p = (1 - w) * pose[low, :3] + w * pose[low + 1, :3]
-    return p, _slerp(pose[low, 3:], pose[low + 1, 3:], w), inside
-
-
-def _slerp(a: Array, b: Array, w: Array) -> Array:
-    """Orientations a fraction `w` (N, 1) of the way from `a` to `b` along the shorter arc, (N, 4)."""
-    a, b = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (a, b))
-    cosine = np.sum(a * b, axis=1, keepdims=True)
-    b, cosine = np.where(cosine < 0, -b, b), np.minimum(np.abs(cosine), 1)
-    angle = np.arccos(cosine)
-    sine = np.sin(angle)
-    near = sine < 1e-6
-    safe = np.where(near, 1, sine)
-    wa = np.where(near, 1 - w, np.sin((1 - w) * angle) / safe)
-    wb = np.where(near, w, np.sin(w * angle) / safe)
-    q = wa * a + wb * b
-    return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
+    share = np.clip(part, 0, 1)
+    q = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    return linear(pose[:, :3], low, share), quaternion(q, low, share), inside
 
 
 def unit_of(mean: float, path: Path, topic: str) -> Any:
