@@ -85,10 +85,10 @@ def test_a_survey_of_the_lab_has_that_wave_over_its_four_headings(scene):
 
 def test_labels_have_the_mean_and_the_scale_of_the_real_ones(drives):
     _, label = drives
-    # 45 days: the constant that days differ by, 210 nT, leaves 31 nT in the mean, the LiDAR's share as much;
-    # the bands are three of both, and as much for the real robot's few days
-    assert label.mean() == pytest.approx(367, abs=130)
-    assert label.std() == pytest.approx(525, rel=0.2)
+    # 45 days: the constant that days differ by, 154 nT, leaves 23 nT in the mean, the LiDAR's share 31; the
+    # bands are three of both, for the published labels are of few days
+    assert label.mean() == pytest.approx(367, abs=115)
+    assert label.std() == pytest.approx(525, rel=0.12)
 
 
 def test_labels_rank_with_heading_speed_and_quaternion_by_the_signs_of_the_real_ones(drives):
@@ -112,10 +112,10 @@ def test_a_survey_of_one_day_errs_on_another_by_heading_as_said(scene):
     off = np.array([np.linalg.norm(platform_field_nt(day, b), axis=1) for day in days]) - then
     mean, wave = off.mean(axis=1), off @ np.exp(1j * headings) / 2
     # the figures in the docstring of draw_platform, whose second-order terms are some per cent
-    assert mean.mean() == pytest.approx(380, abs=25)
-    assert abs(wave.mean()) == pytest.approx(175, abs=20)
-    assert mean.std() == pytest.approx(210, rel=0.08)
-    assert np.sqrt(np.mean(np.abs(wave - wave.mean()) ** 2)) == pytest.approx(190, rel=0.08)
+    assert mean.mean() == pytest.approx(460, abs=25)
+    assert abs(wave.mean()) == pytest.approx(180, abs=20)
+    assert mean.std() == pytest.approx(154, rel=0.08)
+    assert np.sqrt(np.mean(np.abs(wave - wave.mean()) ** 2)) == pytest.approx(141, rel=0.08)
 
 
 def test_the_default_lab_never_costs_the_robot_its_lock(scene):
