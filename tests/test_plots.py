@@ -320,6 +320,18 @@ def test_a_run_off_the_map_is_drawn_with_gaps(tmp_path):
     plot_run(a_run(rows=1), None, tmp_path / "one.png")
 
 
+def test_a_name_with_dollars_is_a_name_and_no_formula(tmp_path):
+    field = dataclasses.replace(field_map(), name=r"a $\frac{ b$")
+    plot_map(field, tmp_path / "a.svg", what="mask")
+    assert r"a $\frac{ b$" in (tmp_path / "a.svg").read_text()
+
+
+def test_more_headings_than_a_picture_has_room_for_are_refused(tmp_path):
+    with pytest.raises(RefusedError, match="headings to show are 36 at most, a panel each, got 37"):
+        plot_map(field_map(), tmp_path / "a.png", headings=np.linspace(0, 6, 37))
+    assert not list(tmp_path.iterdir())
+
+
 def test_nothing_to_draw_is_refused_and_nothing_is_written(tmp_path):
     out = tmp_path / "a.png"
     with pytest.raises(RefusedError, match="headings must name one heading at least"):

@@ -39,6 +39,9 @@ MOST_NODES_A_SIDE = 600
 MOST_PANELS = 8
 """Headings that are drawn unasked; of a map with more four are, evenly spaced where its own are."""
 
+MOST_ASKED = 36
+"""Headings that are drawn at most: a picture has no room for more."""
+
 MOST_SHAPES = 10_000
 """Cells beyond which an SVG holds them as a picture: as shapes they would fill megabytes."""
 
@@ -85,6 +88,8 @@ def plot_map(
     quantity = find("quantity", what, QUANTITIES)
     if headings is not None and len(headings) == 0:
         raise RefusedError("headings must name one heading at least, got none")
+    if headings is not None and len(headings) > MOST_ASKED:
+        raise RefusedError(f"headings to show are {MOST_ASKED} at most, a panel each, got {len(headings)}")
     if what != "mask" and not field.valid.any():
         raise RefusedError(f"map {field.name!r} has no valid node to draw")
     layers = quantity.layers(field)
@@ -560,8 +565,11 @@ def drawn(figure: "Figure", suffix: str) -> bytes:
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.text import Text
 
     picture = io.BytesIO()
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)  # type: ignore[attr-defined]  # a name may hold dollars; none is a formula
     if suffix == ".png":
         FigureCanvasAgg(figure).print_png(picture, metadata={"Software": None})  # no version, no date
     else:  # names of its parts; text as text
