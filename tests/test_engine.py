@@ -224,7 +224,7 @@ def test_run_drives_at_random_by_commands_and_by_replay(lab_scene, tmp_path, cap
     ("options", "what"),
     [
         (["--path", "sine", "--commands", "c.csv"], "--path and --commands"),
-        (["--engine", "replay"], "--replay RUN.parquet"),
+        (["--engine", "replay"], "--replay RUN"),
         (["--path", "random", "--controller", "stanley"], "--controller stanley follows a path"),
         (["--commands", "c.csv", "--speed", "0.1"], "--speed is for a path"),
         (["--engine", "newton", "--replay", "r.parquet"], "--engine newton cannot"),

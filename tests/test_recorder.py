@@ -140,6 +140,13 @@ def test_a_fault_leaves_what_there_is_under_its_unfinished_name(run, tmp_path):
         RrdWriter(tmp_path / "run.rrd")
 
 
+def test_a_fault_before_the_first_rows_leaves_nothing_in_the_way(tmp_path):
+    sinks = [RrdWriter(tmp_path / "run.rrd"), ParquetParts(tmp_path / "run.parquet")]
+    with pytest.raises(ZeroDivisionError), Recorder([*sinks, BagWriter(tmp_path / "run.mcap")]):
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_unfinished_recording_under_a_finished_name_is_refused(run, tmp_path):
     writer = RrdWriter(tmp_path / "run.rrd")
     writer.append(run)

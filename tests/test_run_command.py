@@ -65,7 +65,7 @@ def test_outputs_that_cannot_all_be_written_leave_none(lab_scene, tmp_path, caps
     for option, name, said in (
         ("--usd", "file/a.usd", "cannot be written"),
         ("--bag", "file/a.mcap", "cannot be written"),
-        ("--bag", "a.bag", "ends in .mcap"),
+        ("--bag", "a.bag", "ends in .mcap or .db3"),
         ("--csv", "a.txt", "ends in .csv"),
         ("--csv", "a.rrd", "two outputs have one name"),
     ):

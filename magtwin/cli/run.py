@@ -132,7 +132,7 @@ def run(
     engine
         What moves the robot: kinematic (default), newton for physics in the stage itself, or replay.
     replay
-        Parquet file of a run to drive once more as it was recorded, with the sensors as they are set now.
+        Run, in any format, to drive once more as it was recorded, with the sensors as they are set now.
     controller
         What drives: magtwin's follower; that of the released package, which drives the real robot; Stanley's;
         or pure pursuit.
@@ -161,7 +161,7 @@ def run(
     parquet
         Parquet table to write.
     bag
-        rosbag2 to write: a .mcap file, or a folder.
+        rosbag2 to write: a .mcap or .db3 file, or a folder.
     csv
         CSV table to write.
     usd
@@ -270,7 +270,7 @@ def run(
 _SUFFIXES = {
     "rrd": (".rrd",),
     "parquet": (".parquet",),
-    "bag": (".mcap",),
+    "bag": (".mcap", ".db3"),
     "csv": (".csv",),
     "usd": (".usd", ".usda", ".usdc"),
 }
@@ -644,7 +644,7 @@ def _way(path: str | None, commands: Path | None, engine: str | None, replay: Pa
     if len(named) > 1:
         raise RefusedError(f"{' and '.join(named)} each say what to drive; give one of them")
     if engine == "replay" and replay is None:
-        raise RefusedError("the engine replay needs the run that it drives once more: --replay RUN.parquet")
+        raise RefusedError("the engine replay needs the run that it drives once more: --replay RUN")
     if engine not in (None, "replay") and replay is not None:
         raise RefusedError(
             f"--replay drives a run as it was recorded, which --engine {engine} cannot; drop one"

@@ -103,8 +103,10 @@ class RrdWriter:
         self.partial.replace(self.path)
 
     def abort(self) -> None:
-        """Leave what there is under the name that says that it did not end."""
+        """Leave what there is under the name that says that it did not end; without rows nothing."""
         self._growing.abort()
+        if not self._growing.rows:
+            self.partial.unlink(missing_ok=True)
 
 
 class LiveViewer:
@@ -180,7 +182,7 @@ class _Growing:
         self._file, self._address, self._said = file, address, said or Path(str(address))
         self._stack = ExitStack()
         self._recording: Recording | None = None
-        self._rows = 0
+        self.rows = 0
 
     def append(self, run: Run) -> None:
         if self._recording is None:
@@ -193,14 +195,14 @@ class _Growing:
             self._recording.rec.flush(timeout_sec=10.0)
         except RuntimeError as error:
             raise RefusedError(f"{self._said}: cannot be written ({error}); is the disk full?") from error
-        self._rows += run.rows
+        self.rows += run.rows
 
     def close(self) -> int:
         """Complete it; gives the rows that it has."""
         if self._recording is not None:
             self._recording.close()
         self._stack.close()
-        return self._rows
+        return self.rows
 
     def abort(self) -> None:
         with suppress(RefusedError):

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Event
 from types import TracebackType
@@ -35,6 +36,9 @@ class Sink(Protocol):
 
     def close(self) -> None:
         """Complete what was written, and give it its name: no rows come any more."""
+
+    def abort(self) -> None:
+        """Let go of it: what was written stays as it is, and where nothing was, nothing does."""
 
 
 class Recorder:
@@ -109,12 +113,8 @@ class Recorder:
     def _abort(self, sinks: Sequence[Sink]) -> None:
         """Let go of what cannot be completed any more."""
         for sink in sinks:
-            abort = getattr(sink, "abort", None)  # a folder of whole parts needs none
-            if abort is not None:
-                try:
-                    abort()
-                except (RefusedError, OSError, RuntimeError):
-                    continue
+            with suppress(RefusedError, OSError, RuntimeError):
+                sink.abort()
 
 
 def in_step(run: Run, pace: float = 1.0, *, stop: Event | None = None) -> Iterator[Run]:

@@ -168,14 +168,21 @@ class ParquetParts:
             write_parquet(read_parquet(self.folder), self.path, force=self._force)
         shutil.rmtree(self.folder, ignore_errors=True)
 
+    def abort(self) -> None:
+        """Leave the parts that there are, for whoever wants them; without one nothing is left."""
+        if not self._count:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
     def __enter__(self) -> "ParquetParts":
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:  # after a fault the parts stay, for whoever wants them
+        if kind is None:
             self.close()
+        else:
+            self.abort()
 
 
 def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
