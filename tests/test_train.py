@@ -114,3 +114,153 @@ def test_what_cannot_be_trained_on_is_refused(x, y, options, text):
     with pytest.raises(RefusedError) as refused:
         train(x, y, X, Y, rng=np.random.default_rng(0), **(SMALL | {"epochs": 2} | options))
     assert str(refused.value) == text
+
+
+class KilledError(Exception):
+    """What ends a training before its time."""
+
+
+def killed_after(number):
+    def progress(epoch):
+        if epoch.number == number:
+            raise KilledError
+
+    return progress
+
+
+def same(a, b):
+    return all(torch.equal(value, b.state_dict()[name]) for name, value in a.state_dict().items())
+
+
+SHORT = {"n": 600, "epochs": 3, "dropout": 0.3, "batch": 64}
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_a_training_that_was_killed_and_resumed_gives_the_weights_of_one_that_was_not(tmp_path, number):
+    whole, history = a_training(**SHORT)
+    state = tmp_path / "state"
+    with pytest.raises(KilledError):
+        a_training(**SHORT, checkpoint=state, progress=killed_after(number))
+    rest = []
+    net, again = a_training(**SHORT, checkpoint=state, resume=True, progress=rest.append)
+    assert same(net, whole)
+    assert again == history
+    assert net.residual_sd_nt == whole.residual_sd_nt
+    assert tuple(rest) == history[number:]
+
+
+def test_a_training_resumed_after_its_patience_ended_goes_no_further(tmp_path):
+    x, y = rows(300, 1)
+    options = {**SMALL, "epochs": 50, "patience": 2, "checkpoint": tmp_path / "state"}
+    first, history = train(x, y, x, -y, rng=np.random.default_rng(0), **options)
+    net, again = train(x, y, x, -y, rng=np.random.default_rng(0), resume=True, **options)
+    assert len(history) < 50
+    assert again == history
+    assert same(net, first)
+
+
+def test_a_fine_tuning_is_resumed_to_the_bit_too(tmp_path):
+    init, _ = a_training(n=300, epochs=1)
+    options = {**SHORT, "seed": 5, "init": init, "freeze": ["layers.1"]}
+    whole, history = a_training(**options)
+    with pytest.raises(KilledError):
+        a_training(**options, checkpoint=tmp_path / "state", progress=killed_after(1))
+    net, again = a_training(**options, checkpoint=tmp_path / "state", resume=True)
+    assert [epoch.number for epoch in history] == [0, 1, 2, 3]
+    assert again == history
+    assert same(net, whole)
+
+
+def test_frozen_layers_stay_as_they_were_and_the_others_learn():
+    init, _ = a_training(n=300, epochs=1)
+    net, _ = a_training(seed=3, n=2000, epochs=2, init=init, freeze=["layers.0", "layers.1"])
+    before, after = init.state_dict(), net.state_dict()
+    for name in ("layers.0.weight", "layers.0.bias", "layers.1.weight", "x_mean", "y_scale"):
+        assert torch.equal(after[name], before[name])
+    assert not torch.equal(after["layers.2.weight"], before["layers.2.weight"])
+    assert all(p.requires_grad for p in net.parameters())
+
+
+def test_fine_tuning_that_does_no_good_leaves_the_weights_as_they_were():
+    init, _ = a_training(n=2000, epochs=10)
+    x, y = rows(50, 1)
+    net, history = train(x, -y, *rows(500, 2), rng=np.random.default_rng(0), init=init, **SMALL, epochs=2)
+    assert [epoch.best for epoch in history] == [True, False, False]
+    assert torch.equal(net.state_dict()["layers.1.weight"], init.state_dict()["layers.1.weight"])
+    error = rows(500, 2)[1] - net(torch.from_numpy(rows(500, 2)[0])).detach().numpy()
+    assert_allclose(history[0].val_mae_nt, np.abs(error).mean())
+
+
+def test_fine_tuning_widens_the_training_ranges_and_leaves_unknown_ones_unknown():
+    init, _ = a_training(n=300, epochs=1)
+    init.x_max[1] = np.nan
+    x, y = rows(300, 1)
+    net, _ = train(x + 30, y, x, y, rng=np.random.default_rng(0), init=init, **SMALL, epochs=1)
+    assert_allclose(net.x_min, x.min(axis=0))
+    assert_allclose(net.x_max, [x[:, 0].max() + 30, np.nan])
+
+
+def test_how_many_rows_are_done_is_told_step_by_step():
+    told = []
+    a_training(n=600, epochs=2, advance=lambda done, total: told.append((done, total)))
+    assert told == [(n, 1200) for n in (256, 512, 600, 856, 1112, 1200)]
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"seed": 1}, "the checkpoint of another training: its seed is"),
+        ({"lr": 1e-2}, "its lr is 0.003, here 0.01; go on with what it was begun with, or start anew"),
+        ({"n": 599}, "the checkpoint of another training: its rows is"),
+        ({"layers": (16, 16)}, "its layers is [32, 32], here [16, 16]"),
+        ({"patience": 0}, "patience must be 1 epoch at least, got 0; leave it out to run them all"),
+        ({"freeze": ["layers.0"]}, "freeze keeps layers of trained weights: give init too"),
+        ({"checkpoint": None}, "there is no checkpoint to resume from; name one"),
+    ],
+)
+def test_a_checkpoint_of_another_training_is_refused(tmp_path, options, text):
+    state = tmp_path / "state"
+    with pytest.raises(KilledError):
+        a_training(**SHORT, checkpoint=state, progress=killed_after(1))
+    with pytest.raises(RefusedError) as refused:
+        a_training(**(SHORT | {"checkpoint": state, "resume": True} | options))
+    assert text in str(refused.value)
+
+
+@pytest.mark.parametrize("harm", ["gone", "cut", "pickle", "net", "tensor", "epochs", "keys"])
+def test_a_damaged_checkpoint_is_refused(tmp_path, harm):
+    state = tmp_path / "state"
+    with pytest.raises(KilledError):
+        a_training(**SHORT, checkpoint=state, progress=killed_after(1))
+    whole = state.read_bytes()
+    changed = {
+        "cut": whole[:-100],
+        "pickle": b"\x80\x04N.",
+        "tensor": whole.replace(b'"rng"', b'"rnh"'),
+        "epochs": whole.replace(b'\\"number\\": 1', b'\\"number\\": 2'),
+        "keys": whole.replace(b'\\"best\\": true', b'\\"bast\\": true'),
+    }
+    if harm == "gone":
+        state.unlink()
+    elif harm == "net":
+        a_training(n=300, epochs=1)[0].save(state, force=True)
+    else:
+        assert changed[harm] != whole
+        state.write_bytes(changed[harm])
+    with pytest.raises(RefusedError, match=r"start anew|no such checkpoint"):
+        a_training(**SHORT, checkpoint=state, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"layers": (16, 16)}, "and layers of (32, 32), this training yaw_deg, odom_v_x and (16, 16)"),
+        ({"freeze": ["layer.0"]}, "no layer 'layer.0'; did you mean 'layers.0'?"),
+        ({"freeze": [f"layers.{i}" for i in range(3)]}, "every layer is frozen; there is nothing left"),
+    ],
+)
+def test_weights_that_cannot_be_gone_on_from_are_refused(options, text):
+    init, _ = a_training(n=300, epochs=1)
+    with pytest.raises(RefusedError) as refused:
+        a_training(n=300, epochs=1, init=init, **options)
+    assert text in str(refused.value)

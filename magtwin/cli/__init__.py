@@ -15,6 +15,7 @@ from magtwin.cli import (  # noqa: F401 - each registers its commands
     run,
     runs,
     scene,
+    train,
 )
 from magtwin.cli.app import main
 

@@ -1,9 +1,12 @@
 """Training: from features and labels to a FieldNet, judged on runs that it never saw."""
 
 import copy
+import hashlib
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.learn.features import feature_names
 from magtwin.learn.model import Fact, FieldNet
-from magtwin.names import RefusedError
+from magtwin.learn.state import load_state, save_state
+from magtwin.names import RefusedError, find
 
 Array = NDArray[np.float64]
 
@@ -21,10 +25,10 @@ class Epoch:
     """How a network stood after one pass over the training rows."""
 
     number: int
-    """1 is the first."""
+    """1 is the first; 0 is how the weights stood that training went on from."""
 
     train_rmse_nt: float
-    """Root mean square of label minus prediction in training, with dropout at work [nT]."""
+    """Root mean square of label minus prediction in training, with dropout at work but in epoch 0 [nT]."""
 
     val_rmse_nt: float
     """The same on the validation rows, without dropout [nT]."""
@@ -51,7 +55,12 @@ def train(
     lr: float = 1e-3,
     patience: int | None = None,
     facts: Mapping[str, Fact] | None = None,
+    init: FieldNet | None = None,
+    freeze: Sequence[str] = (),
+    checkpoint: str | os.PathLike[str] | None = None,
+    resume: bool = False,
     progress: Callable[[Epoch], None] | None = None,
+    advance: Callable[[int, int], None] | None = None,
 ) -> tuple[FieldNet, tuple[Epoch, ...]]:
     """Fit a network by Adam to the mean squared error of scaled labels.
 
@@ -74,15 +83,21 @@ def train(
         lr: Largest step size of Adam.
         patience: Stop after so many epochs without a better one; None runs them all.
         facts: Provenance to keep in the weights file.
+        init: Network of the same inputs and layers whose weights and scalers are gone on from. It is an
+            epoch 0 of its own, so that what is kept is never worse on the validation rows than it was.
+        freeze: Names of layers that stay as `init` has them: "layers.0" is the first.
+        checkpoint: File that the state of the training is written to after each epoch.
+        resume: Go on from `checkpoint`; the weights are those of a training that was never stopped.
         progress: Called after each epoch.
+        advance: Called after each step with how many rows are done, and of how many in all epochs.
 
     Returns:
         The network, in evaluation mode, its `residual_sd_nt` the root mean square error on the
         validation rows, and how each epoch went.
 
     Raises:
-        RefusedError: Rows that are nan or of the wrong shape, a label that never varies, or a step
-            size at which training diverged.
+        RefusedError: Rows that are nan or of the wrong shape, a label that never varies, a step size at
+            which training diverged, an `init` of other inputs or layers, or a checkpoint of another training.
     """
     names = feature_names(features)
     x, y = _rows("training", x, y, names)
@@ -91,68 +106,213 @@ def train(
         raise RefusedError(f"the label is {y[0]:g} nT in every training row; there is nothing to learn")
     if not (epochs > 0 and batch > 0 and lr > 0):
         raise RefusedError(f"epochs, batch and lr must be above 0, got {epochs}, {batch} and {lr}")
+    if patience is not None and patience < 1:
+        raise RefusedError(f"patience must be 1 epoch at least, got {patience}; leave it out to run them all")
+    if resume and checkpoint is None:
+        raise RefusedError("there is no checkpoint to resume from; name one")
     with torch.random.fork_rng(devices=[]):  # first weights and dropout draw from torch's own generator
-        torch.manual_seed(int(rng.integers(2**62)))
+        seed = int(rng.integers(2**62))
+        torch.manual_seed(seed)
         net = FieldNet(names, layers, dropout=dropout, facts=facts)
-        net.set_scalers(x, y)
-        history = _fit(net, x, y, x_val, y_val, epochs, batch, lr, patience, progress)
-    net.residual_sd_nt = min(epoch.val_rmse_nt for epoch in history)
-    return net.eval(), tuple(history)
-
-
-def _fit(
-    net: FieldNet,
-    x: Array,
-    y: Array,
-    x_val: Array,
-    y_val: Array,
-    epochs: int,
-    batch: int,
-    lr: float,
-    patience: int | None,
-    progress: Callable[[Epoch], None] | None,
-) -> list[Epoch]:
-    """Train `net` in place and leave it with the weights of its best epoch."""
-    scale = float(net.y_scale)
-    z = ((torch.from_numpy(x) - net.x_mean) / net.x_scale).float()
-    label = ((torch.from_numpy(y) - net.y_mean) / net.y_scale).float()
-    val = torch.from_numpy(x_val)
-    steps = math.ceil(len(z) / batch)
-    optimizer = torch.optim.Adam(net.parameters(), lr=lr, fused=True)
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, _Schedule(epochs * steps, max(1, steps // 2)))
-    history: list[Epoch] = []
-    best, kept = math.inf, copy.deepcopy(net.state_dict())
-    since = 0
-    for number in range(1, epochs + 1):
-        net.train()
-        squares = 0.0
-        for rows in torch.randperm(len(z)).split(batch):
-            optimizer.zero_grad(set_to_none=True)
-            loss = torch.nn.functional.mse_loss(net.body(z[rows]), label[rows])
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-            squares += float(loss.detach()) * len(rows)
-        net.eval()
-        with torch.inference_mode():
-            error = np.concatenate([net(part).numpy() for part in val.split(8192)]) - y_val
-        rmse = float(np.sqrt(np.mean(error**2)))
-        if not math.isfinite(squares + rmse):
-            raise RefusedError(f"training diverged in epoch {number}; give a step size lr below {lr:g}")
-        better = rmse < best
-        history.append(
-            Epoch(number, scale * math.sqrt(squares / len(z)), rmse, float(np.abs(error).mean()), better)
-        )
-        if progress:
-            progress(history[-1])
-        if better:
-            best, kept, since = rmse, copy.deepcopy(net.state_dict()), 0
+        if init is None:
+            net.set_scalers(x, y)
         else:
-            since += 1
-        if patience is not None and since >= patience:
-            break
-    net.load_state_dict(kept)
-    return history
+            _go_on_from(net, init, x)
+        _freeze(net, freeze, init)
+        settings = {
+            "features": list(names),
+            "layers": list(net.hidden),
+            "dropout": dropout,
+            "epochs": epochs,
+            "batch": batch,
+            "lr": lr,
+            "patience": patience,
+            "freeze": sorted(freeze),
+            "seed": seed,
+            "threads": torch.get_num_threads(),
+            "torch": str(torch.__version__),
+        }
+        training = _Training(net, x, y, x_val, y_val, settings, started=init is not None)
+        if checkpoint is not None:
+            settings["rows"] = _digest(x, y, x_val, y_val)
+            settings["init"] = _digest(*init.state_dict().values()) if init is not None else ""
+        if resume and checkpoint is not None:
+            training.load(checkpoint)
+        training.run(checkpoint, progress, advance)
+    net.requires_grad_(True)
+    net.residual_sd_nt = training.best
+    return net.eval(), tuple(training.history)
+
+
+class _Training:
+    """A network on its way, and all that its next step depends on."""
+
+    def __init__(
+        self,
+        net: FieldNet,
+        x: Array,
+        y: Array,
+        x_val: Array,
+        y_val: Array,
+        settings: dict[str, Any],
+        *,
+        started: bool,
+    ) -> None:
+        self.net, self.settings, self.started = net, settings, started
+        self.z = ((torch.from_numpy(x) - net.x_mean) / net.x_scale).float()
+        self.label = ((torch.from_numpy(y) - net.y_mean) / net.y_scale).float()
+        self.x_val, self.y_val = torch.from_numpy(x_val), y_val
+        self.trained = {name: p for name, p in net.named_parameters() if p.requires_grad}
+        self.adam = torch.optim.Adam(self.trained.values(), lr=settings["lr"], fused=True)
+        self.kept = copy.deepcopy(net.state_dict())
+        self.history: list[Epoch] = []
+
+    @property
+    def best(self) -> float:
+        """Smallest error on the validation rows so far [nT]; inf before the first epoch."""
+        return min((epoch.val_rmse_nt for epoch in self.history), default=math.inf)
+
+    @property
+    def ended(self) -> bool:
+        """Whether as many epochs as patience admits have passed since the best one."""
+        patience = self.settings["patience"]
+        last = max((i for i, epoch in enumerate(self.history) if epoch.best), default=0)
+        return patience is not None and len(self.history) - 1 - last >= patience
+
+    def run(
+        self,
+        checkpoint: str | os.PathLike[str] | None,
+        progress: Callable[[Epoch], None] | None,
+        advance: Callable[[int, int], None] | None,
+    ) -> None:
+        """Train until the last epoch or the end of patience, and leave the network with its best weights."""
+        if self.started and not self.history:
+            self._note(0, self._train_error(), progress)
+        first = self.history[-1].number + 1 if self.history else 1
+        for number in range(first, self.settings["epochs"] + 1):
+            if self.ended:
+                break
+            self._note(number, self._pass(number, advance), None)
+            if checkpoint is not None:
+                save_state(checkpoint, self._tensors(), self.settings, [asdict(e) for e in self.history])
+            if progress:
+                progress(self.history[-1])
+        self.net.load_state_dict(self.kept)
+
+    def load(self, checkpoint: str | os.PathLike[str]) -> None:
+        """Take the state that a checkpoint holds."""
+        found, told = load_state(checkpoint, self._tensors(), self.settings)
+        try:
+            self.history = [Epoch(**epoch) for epoch in told]
+            numbers = [epoch.number for epoch in self.history]
+            sound = numbers == list(range(0 if self.started else 1, self.settings["epochs"] + 1))[: len(told)]
+            sound &= any(epoch.best for epoch in self.history) and math.isfinite(self.best)
+        except TypeError:
+            sound = False
+        if not sound:
+            raise RefusedError(f"{checkpoint}: its epochs are not those of a training; start anew")
+        self.net.load_state_dict(_part(found, "net."))
+        self.kept = _part(found, "kept.")
+        for name, parameter in self.trained.items():
+            self.adam.state[parameter] = {key: found[f"adam.{name}.{key}"] for key in _ADAM}
+        torch.set_rng_state(found["rng"])
+
+    def _pass(self, number: int, advance: Callable[[int, int], None] | None) -> float:
+        """Go over the training rows once; gives the error in training, with dropout at work [nT]."""
+        rows, batch, lr = len(self.z), self.settings["batch"], self.settings["lr"]
+        steps = math.ceil(rows / batch)
+        schedule = _Schedule(self.settings["epochs"] * steps, max(1, steps // 2))
+        self.net.train()
+        squares, done = 0.0, (number - 1) * rows
+        for step, chosen in enumerate(torch.randperm(rows).split(batch), (number - 1) * steps):
+            for group in self.adam.param_groups:
+                group["lr"] = lr * schedule(step)
+            self.adam.zero_grad(set_to_none=True)
+            loss = torch.nn.functional.mse_loss(self.net.body(self.z[chosen]), self.label[chosen])
+            loss.backward()
+            self.adam.step()
+            squares += float(loss.detach()) * len(chosen)
+            done += len(chosen)
+            if advance:
+                advance(done, self.settings["epochs"] * rows)
+        return self._in_nt(squares)
+
+    def _train_error(self) -> float:
+        """Error on the training rows as the network stands, without dropout [nT]."""
+        self.net.eval()
+        with torch.inference_mode():
+            parts = zip(self.z.split(8192), self.label.split(8192), strict=True)
+            return self._in_nt(sum(float(((self.net.body(z) - y) ** 2).sum()) for z, y in parts))
+
+    def _in_nt(self, squares: float) -> float:
+        return float(self.net.y_scale) * math.sqrt(squares / len(self.z)) if squares >= 0 else math.nan
+
+    def _note(self, number: int, train_rmse: float, progress: Callable[[Epoch], None] | None) -> None:
+        """Judge the network on the validation rows and keep it if it is the best so far."""
+        self.net.eval()
+        with torch.inference_mode():
+            parts = [self.net(part).numpy() for part in self.x_val.split(8192)]
+        error = np.concatenate(parts) - self.y_val
+        rmse = float(np.sqrt(np.mean(error**2)))
+        if not math.isfinite(train_rmse + rmse):
+            lr = self.settings["lr"]
+            raise RefusedError(f"training diverged in epoch {number}; give a step size lr below {lr:g}")
+        better = rmse < self.best
+        self.history.append(Epoch(number, train_rmse, rmse, float(np.abs(error).mean()), better))
+        if better:
+            self.kept = copy.deepcopy(self.net.state_dict())
+        if progress:
+            progress(self.history[-1])
+
+    def _tensors(self) -> dict[str, torch.Tensor]:
+        """Everything that a checkpoint holds, by name."""
+        found = {f"net.{name}": value for name, value in self.net.state_dict().items()}
+        found |= {f"kept.{name}": value for name, value in self.kept.items()}
+        for name, parameter in self.trained.items():
+            state = self.adam.state.get(parameter) or {}
+            for key in _ADAM:
+                empty = torch.zeros(()) if key == "step" else torch.zeros_like(parameter)
+                found[f"adam.{name}.{key}"] = state.get(key, empty)
+        return found | {"rng": torch.get_rng_state()}
+
+
+_ADAM = ("step", "exp_avg", "exp_avg_sq")
+"""What Adam keeps of each parameter."""
+
+
+def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+
+def _go_on_from(net: FieldNet, init: FieldNet, x: Array) -> None:
+    """Take over weights and scalers; the training ranges grow by the new rows, or stay unknown."""
+    if init.features != net.features or init.hidden != net.hidden:
+        raise RefusedError(
+            f"the network to go on from has inputs {', '.join(init.features)} and layers of {init.hidden}, "
+            f"this training {', '.join(net.features)} and {net.hidden}; give it the same features and layers"
+        )
+    net.load_state_dict(init.state_dict())
+    net.x_min.copy_(torch.from_numpy(np.minimum(net.x_min.numpy(), x.min(axis=0))))
+    net.x_max.copy_(torch.from_numpy(np.maximum(net.x_max.numpy(), x.max(axis=0))))
+
+
+def _freeze(net: FieldNet, names: Sequence[str], init: FieldNet | None) -> None:
+    """Leave layers out of the training."""
+    if names and init is None:
+        raise RefusedError("freeze keeps layers of trained weights: give init too")
+    layers = {f"layers.{i}": layer for i, layer in enumerate(net.linears)}
+    for name in names:
+        find("layer", name, layers).requires_grad_(False)
+    if set(names) == set(layers):
+        raise RefusedError("every layer is frozen; there is nothing left to train")
+
+
+def _digest(*arrays: Array | torch.Tensor) -> str:
+    """SHA-256 of the numbers of arrays."""
+    found = hashlib.sha256()
+    for array in arrays:
+        found.update(np.ascontiguousarray(array).data)
+    return found.hexdigest()
 
 
 @dataclass(frozen=True)

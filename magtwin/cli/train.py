@@ -1,0 +1,195 @@
+"""`magtwin train`: a neural magnetometer from a data set."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, Json, Whole, check_suffix, print_report, progress, say
+from magtwin.names import RefusedError
+
+if TYPE_CHECKING:
+    from magtwin.learn.config import TrainConfig
+    from magtwin.learn.train import Epoch
+
+Flag = Annotated[bool, Parameter(negative="")]
+Names = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]
+
+
+@app.command
+def train(
+    dataset: Path,
+    *,
+    out: Path,
+    config: Path | None = None,
+    model: Literal["paper", "released"] | None = None,
+    layers: str | None = None,
+    features: str | None = None,
+    dropout: float | None = None,
+    epochs: Whole | None = None,
+    batch: Whole | None = None,
+    lr: float | None = None,
+    patience: Whole | None = None,
+    seed: Whole | None = None,
+    split: Literal["session", "run", "path", "row"] | None = None,
+    hold_out: Names = None,
+    threads: Whole | None = None,
+    init: Path | None = None,
+    freeze: Names = None,
+    resume: Flag = False,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Train a network on a data set and judge it on recordings that it never saw.
+
+    Beside F.safetensors it writes F.md, the model card, and the learning curve as F.png and F.csv. After each
+    epoch the state goes to F.checkpoint, which is removed at the end.
+
+    Parameters
+    ----------
+    dataset
+        Folder that `magtwin dataset build` made.
+    out
+        Weights to write, .safetensors.
+    config
+        TOML of the options below, with _ for -; options given here go first.
+    model
+        paper: 20-512-512-512-512-1, the default; released: 20-512-512-512-128-1.
+    layers
+        Widths of the hidden layers in place of the model's, as 256,256.
+    features
+        Set of inputs, or names with commas between; full, the paper's 20, unless given.
+    dropout
+        Share of units dropped in training; 0.3 unless given.
+    epochs
+        Passes over the training rows; 20 unless given.
+    batch
+        Rows a step; 1024 unless given.
+    lr
+        Largest step size of Adam; 0.001 unless given.
+    patience
+        Stop after so many epochs without a better one on the validation recordings.
+    seed
+        Of the split, the first weights, the order of rows and dropout; 0 unless given.
+    split
+        What is never on two sides of training, validation and test: session, unless given, run or path;
+        row shows what a split by row hides.
+    hold_out
+        Sessions, runs or paths that are all in the test.
+    threads
+        Threads to train with; another number gives other bits.
+    init
+        Weights to go on from, .safetensors or a released .pth, of the same inputs and layers.
+    freeze
+        Layers that stay as they are: layers.0 is the first.
+    resume
+        Go on from F.checkpoint, which a training that was killed left; the weights are those of one that
+        was not.
+    force
+        Replace what exists, an unfinished training too.
+    json
+        Print the figures as JSON.
+    """
+    import numpy as np
+
+    from magtwin.files import check_free, output, sha256
+    from magtwin.io.learning_curves import plot_learning_curve, write_learning_curve
+    from magtwin.learn.config import TrainConfig, read_config
+    from magtwin.learn.dataset import open_dataset
+    from magtwin.learn.split import split as split_of
+    from magtwin.learn.trained import fit
+
+    check_suffix(out, (".safetensors",), "a network")
+    card, picture, table, checkpoint = (
+        out.with_suffix(end) for end in (".md", ".png", ".csv", ".checkpoint")
+    )
+    for path in (out, card, picture, table):
+        check_free(path, force=force)
+    if checkpoint.exists() and not (resume or force):
+        raise RefusedError(
+            f"{checkpoint}: an unfinished training; give --resume to go on with it, or --force to start anew"
+        )
+    given = {
+        "model": model,
+        "layers": None if layers is None else _widths(layers),
+        "features": features,
+        "dropout": dropout,
+        "epochs": epochs,
+        "batch": batch,
+        "lr": lr,
+        "patience": patience,
+        "seed": seed,
+        "split": split,
+        "hold_out": None if hold_out is None else tuple(hold_out),
+        "threads": threads,
+        "init": init,
+        "freeze": None if freeze is None else tuple(freeze),
+    }
+    options = _given(TrainConfig() if config is None else read_config(config), given)
+    found = open_dataset(dataset)
+    deals, draws = np.random.default_rng(options.seed).spawn(2)
+    parts = split_of(found.recordings, options.split, hold_out=options.hold_out, rng=deals)
+    with progress("Training") as show:
+        pace = _Pace(show)
+        trained = fit(
+            options,
+            found,
+            parts,
+            rng=draws,
+            checkpoint=checkpoint,
+            resume=resume,
+            progress=pace.epoch,
+            advance=pace.rows,
+        )
+    naive = trained.parts[0].naive_rmse_nt
+    plot_learning_curve(trained.history, picture, naive_rmse_nt=naive, title=out.name, force=force)
+    write_learning_curve(trained.history, table, force=force)
+    trained.net.save(out, force=force)
+    with output(card, force=force) as aside:
+        aside.write_text(trained.card(out.name, sha256(out)), encoding="utf-8")
+    checkpoint.unlink(missing_ok=True)
+    print_report(trained.report(str(out)), json)
+    if not json:
+        say(f"Wrote {out}, {card.name}, {picture.name} and {table.name}")
+
+
+class _Pace:
+    """What a progress bar says of a training: rows a second, and how the last epoch ended."""
+
+    def __init__(self, show: Any) -> None:
+        self.show, self.ended = show, ""
+        self.start: tuple[float, int] | None = None
+
+    def rows(self, done: int, total: int) -> None:
+        """Rows that are done, of those of all epochs."""
+        now = time.perf_counter()
+        if self.start is None:
+            self.start = now, done
+        spent, more = now - self.start[0], done - self.start[1]
+        rate = f"{more / spent:,.0f} rows/s" if more and spent > 0 else ""
+        self.show(done, total, f"{rate} {self.ended}".strip())
+
+    def epoch(self, epoch: "Epoch") -> None:
+        """An epoch that has ended."""
+        self.ended = f"epoch {epoch.number}: validation RMSE {epoch.val_rmse_nt:.1f} nT"
+
+
+def _widths(text: str) -> tuple[int, ...]:
+    """Widths of layers from words such as 256,256."""
+    try:
+        return tuple(int(word) for word in text.split(","))
+    except ValueError:
+        raise RefusedError(f"--layers are whole numbers with commas between, got {text!r}") from None
+
+
+def _given(config: "TrainConfig", options: dict[str, Any]) -> "TrainConfig":
+    """A configuration with the options that were given in place of its own."""
+    found = {name: value for name, value in options.items() if value is not None}
+    if "model" in found and "layers" not in found:
+        found["layers"] = ()  # the file's layers are those of another model
+    elif {"model", "layers"} <= set(found):
+        raise RefusedError("--model and --layers both say the widths; give one of them")
+    return replace(config, **found)

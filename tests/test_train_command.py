@@ -1,0 +1,180 @@
+"""`magtwin train`: from a data set to weights that a simulation runs, with card and curve."""
+
+import json
+
+import numpy as np
+import pytest
+
+from magtwin.cli import main
+from magtwin.field.map import AnomalyMap
+from magtwin.files import sha256
+from magtwin.io.formats import read_run
+from magtwin.learn.config import read_config
+from magtwin.learn.dataset import build_dataset, open_dataset
+from magtwin.learn.magnetometer import NeuralMagnetometer
+from magtwin.learn.model import load_net
+from magtwin.learn.split import LEAK
+from magtwin.learn.train import _Training
+from magtwin.run import COLUMNS, Run
+
+FIELD = AnomalyMap(
+    values_nt=np.full((1, 9, 9), 41e3),
+    origin_m=(-2.0, -2.0),
+    cell_m=(0.5, 0.5),
+    headings_rad=np.zeros(1),
+    name="flat",
+)
+TINY = ["--layers", "12,12", "--epochs", "6", "--batch", "32", "--lr", "0.01", "--dropout", "0"]
+
+
+def a_run(seed, path):
+    """A drive whose disturbance is 100 nT a m/s of speed, and 300."""
+    rng = np.random.default_rng(seed)
+    columns = {}
+    for name, spec in COLUMNS.items():
+        values = rng.normal(size=(200,) if spec.width == 1 else (200, spec.width))
+        columns[name] = values > 0 if spec.unit == "bool" else values
+    columns = {name: values for name, values in columns.items() if not name.startswith("mocap")}
+    columns |= {"t": np.arange(200) / 10, "p_world_base": rng.uniform(-1, 1, (200, 3))}
+    columns |= {name: np.zeros(200, bool) for name in columns if name.startswith("flag")}
+    columns["b_measured_nt"] = 41e3 + 300 + 100 * columns["odom_v"][:, 0] + rng.normal(0, 2, 200)
+    return Run(columns, {"path": path})
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    runs = {name: a_run(i, "eight" if i % 2 else "sine") for i, name in enumerate("abcdefg")}
+    folder = tmp_path_factory.mktemp("data") / "set"
+    build_dataset(runs, FIELD, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory):
+    out = tmp_path_factory.mktemp("trained") / "f.safetensors"
+    main(["train", str(data), "--out", str(out), *TINY, "--hold-out", "f", "g", "--json"])
+    return out
+
+
+def refused(capsys, *words):
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    assert ended.value.code == 1
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def test_the_error_told_is_that_of_the_weights_on_what_was_held_out(data, trained):
+    net = load_net(trained)
+    rows = open_dataset(data).rows("full", ["f", "g"])
+    error = NeuralMagnetometer(net).predict(rows.x) - rows.y
+    assert net.facts["test_mae_nt"] == pytest.approx(np.abs(error).mean())
+    assert net.residual_sd_nt == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert net.facts["test_mae_nt"] < 0.5 * net.facts["test_naive_mae_nt"]
+    assert net.facts["dataset_sha256"] == sha256(data / "dataset.json")
+
+
+def test_the_card_tells_checksum_errors_by_path_and_how_to_repeat(trained):
+    card = trained.with_suffix(".md").read_text()
+    assert sha256(trained) in card
+    mae = load_net(trained).facts["test_mae_nt"]
+    assert f"| test | 2 | 400 | {mae:.1f} |" in card
+    assert "| test, path eight | 1 | 200 |" in card
+    assert "Test: f, g." in card
+    assert "Warning" not in card
+
+
+def test_the_configuration_in_the_weights_repeats_them_to_the_byte(data, trained, tmp_path):
+    (tmp_path / "c.toml").write_text(load_net(trained).facts["config"])
+    assert read_config(tmp_path / "c.toml").hold_out == ("f", "g")
+    again = tmp_path / "g.safetensors"
+    main(["train", str(data), "--out", str(again), "--config", str(tmp_path / "c.toml"), "--json"])
+    assert again.read_bytes() == trained.read_bytes()
+
+
+def test_the_learning_curve_is_drawn_and_tabled(trained):
+    table = trained.with_suffix(".csv").read_text().splitlines()
+    assert table[0] == "number,train_rmse_nt,val_rmse_nt,val_mae_nt,best"
+    assert [line.split(",")[0] for line in table[1:]] == ["1", "2", "3", "4", "5", "6"]
+    assert trained.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    assert not trained.with_suffix(".checkpoint").exists()
+
+
+def test_a_simulation_runs_the_trained_network(trained, lab_scene, tmp_path, capsys):
+    out = tmp_path / "a.parquet"
+    main(["run", str(lab_scene), "--net", str(trained), "--duration", "1", "--parquet", str(out), "--json"])
+    run = read_run(out)
+    assert run.facts["network_sha256"] == sha256(trained)
+    assert run["b_sd_nt"][0] == pytest.approx(load_net(trained).residual_sd_nt)
+    assert np.isfinite(run["b_disturbance_nt"]).all()
+
+
+def test_a_killed_training_is_resumed_to_the_byte(data, trained, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "f.safetensors"
+    words = ["train", str(data), "--out", str(out), *TINY, "--hold-out", "f", "g", "--json"]
+
+    def killed(self, number, advance):
+        if number == 3:
+            raise KeyboardInterrupt
+        return one_pass(self, number, advance)
+
+    one_pass = _Training._pass
+    with monkeypatch.context() as patch:
+        patch.setattr(_Training, "_pass", killed)
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+    assert ended.value.code == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["f.checkpoint"]
+    assert "an unfinished training; give --resume to go on with it" in refused(capsys, *words)
+    main([*words, "--resume"])
+    assert out.read_bytes() == trained.read_bytes()
+    assert not (tmp_path / "f.checkpoint").exists()
+
+
+def test_fine_tuning_tells_the_error_before_and_after(data, trained, tmp_path, capsys):
+    out = tmp_path / "g.safetensors"
+    words = ["--init", str(trained), "--freeze", "layers.0", "layers.1", "--layers", "12,12", "--epochs", "2"]
+    main(["train", str(data), "--out", str(out), *words, "--hold-out", "f", "g", "--json"])
+    figures = json.loads(capsys.readouterr().out)["figures"]
+    assert figures["test MAE before"]["value"] == pytest.approx(load_net(trained).facts["test_mae_nt"])
+    net = load_net(out)
+    assert net.facts["init_sha256"] == sha256(trained)
+    assert net.layers[0].weight.equal(load_net(trained).layers[0].weight)
+    card = out.with_suffix(".md").read_text()
+    assert (
+        f"It goes on from `f.safetensors` (SHA-256 `{sha256(trained)}`), layers.0, layers.1 frozen." in card
+    )
+    assert out.with_suffix(".csv").read_text().splitlines()[1].startswith("0,")
+
+
+def test_a_split_by_row_carries_its_warning_everywhere(data, tmp_path, capsys):
+    out = tmp_path / "f.safetensors"
+    main(["train", str(data), "--out", str(out), *TINY[:2], "--epochs", "1", "--split", "row", "--json"])
+    assert json.loads(capsys.readouterr().out)["facts"]["warning"] == LEAK
+    assert load_net(out).facts["warning"] == LEAK
+    assert LEAK in out.with_suffix(".md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--layers", "8,x"], "--layers are whole numbers with commas between, got '8,x'"),
+        (["--layers", "8", "--model", "paper"], "--model and --layers both say the widths; give one of them"),
+        (["--features", "ful"], "no feature set 'ful'; did you mean 'full'?"),
+        (["--hold-out", "h"], "no session or recording to hold out 'h'"),
+        (["--resume"], "f.checkpoint: no such checkpoint"),
+        (["--init", "DATA/none.safetensors"], "none.safetensors: no such weights file"),
+        (["--config", "DATA/dataset.json"], "dataset.json: not TOML"),
+        (["--out", "DATA/f.onnx"], "a network ends in .safetensors"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_and_writes_nothing(data, tmp_path, capsys, words, text):
+    words = [word.replace("DATA", str(data)) for word in words]
+    out = [] if "--out" in words else ["--out", str(tmp_path / "f.safetensors")]
+    assert text in refused(capsys, "train", data, *out, *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_beside_the_weights_are_not_written_over(data, trained, tmp_path, capsys):
+    (tmp_path / "f.csv").write_text("mine")
+    said = refused(capsys, "train", data, "--out", tmp_path / "f.safetensors", *TINY)
+    assert "f.csv: exists already; give --force" in said

@@ -1,0 +1,50 @@
+import pytest
+
+from magtwin.learn.config import TrainConfig, read_config
+from magtwin.learn.features import SETS
+from magtwin.names import RefusedError
+
+
+def test_what_is_not_said_is_as_the_paper_has_it():
+    config = TrainConfig()
+    assert (config.hidden, config.dropout, config.inputs) == ((512,) * 4, 0.3, SETS["full"])
+    assert TrainConfig(model="released").hidden == (512, 512, 512, 128)
+
+
+def test_a_configuration_comes_back_from_its_own_toml(tmp_path):
+    config = TrainConfig(
+        layers=(64, 32), features="yaw_sin, lidar_on", epochs=3, lr=2e-4, patience=5, split="path",
+        hold_out=('a "b"', "ü"), threads=2, init=tmp_path / "a.safetensors", freeze=("layers.0",),
+    )  # fmt: skip
+    for one in (config, TrainConfig(), TrainConfig(model="released", features="lidar_on")):
+        (tmp_path / "c.toml").write_text(one.to_toml(), encoding="utf-8")
+        assert read_config(tmp_path / "c.toml") == one
+    assert config.inputs == ("yaw_sin", "lidar_on")
+
+
+def test_weights_to_go_on_from_lie_beside_the_file_that_names_them(tmp_path):
+    (tmp_path / "c.toml").write_text('init = "a.safetensors"\n')
+    assert read_config(tmp_path / "c.toml").init == tmp_path / "a.safetensors"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("epoch = 3", "c.toml:1: unknown key 'epoch'; did you mean 'epochs'?"),
+        ("seed = 1\nepochs = 2.5", "c.toml:2: epochs must be a whole number, got 2.5"),
+        ("epochs = 0", "c.toml:1: epochs must be above 0, got 0"),
+        ("patience = 0", "c.toml:1: patience must be 1 at least, got 0; leave it out for none"),
+        ("dropout = 1", "c.toml:1: dropout must lie in 0..1, 1 left out, got 1.0"),
+        ("seed = -1", "c.toml:1: seed must be 0 or more, got -1"),
+        ("layers = [8, 0]", "c.toml:1: layers must be above 0 wide, got (8, 0)"),
+        ('split = "day"', "c.toml:1: split must be one of 'session', 'run', 'path', 'row', got 'day'"),
+        ('features = "ful"', "no feature set 'ful'; did you mean 'full'?"),
+        ('features = "yaw_sin, lidar"', "no feature 'lidar'; did you mean 'lidar_on'?"),
+        ('freeze = ["layers.0"]', "freeze keeps layers of trained weights: give init too"),
+    ],
+)
+def test_a_file_that_says_what_cannot_be_is_refused(tmp_path, text, said):
+    (tmp_path / "c.toml").write_text(text + "\n")
+    with pytest.raises(RefusedError) as refused:
+        read_config(tmp_path / "c.toml")
+    assert str(refused.value).endswith(said)
