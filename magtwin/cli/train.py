@@ -157,7 +157,7 @@ def train(
 
 
 class _Pace:
-    """What a progress bar says of a training: rows a second, and how the last epoch ended."""
+    """What a progress bar says of a training: rows a second, and the last epoch's error on validation."""
 
     def __init__(self, show: Any) -> None:
         self.show, self.ended = show, ""
@@ -174,7 +174,7 @@ class _Pace:
 
     def epoch(self, epoch: "Epoch") -> None:
         """An epoch that has ended."""
-        self.ended = f"epoch {epoch.number}: validation RMSE {epoch.val_rmse_nt:.1f} nT"
+        self.ended = f"epoch {epoch.number}: {epoch.val_rmse_nt:.1f} nT"
 
 
 def _widths(text: str) -> tuple[int, ...]:
