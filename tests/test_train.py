@@ -10,6 +10,15 @@ NAMES = ("yaw_deg", "odom_v_x")
 SMALL = {"features": NAMES, "layers": (32, 32), "dropout": 0.0, "batch": 256, "lr": 3e-3}
 
 
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Networks as small as these take longer in two threads than in one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def rows(n, seed):
     """A disturbance of known form: a turn of heading and a share of speed, with 10 nT of noise."""
     rng = np.random.default_rng(seed)

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 from magtwin.cli import main
 from magtwin.field.map import AnomalyMap
@@ -25,6 +26,15 @@ FIELD = AnomalyMap(
     name="flat",
 )
 TINY = ["--layers", "12,12", "--epochs", "6", "--batch", "32", "--lr", "0.01", "--dropout", "0"]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Networks as small as these take longer in two threads than in one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def a_run(seed, path):
@@ -144,6 +154,16 @@ def test_fine_tuning_tells_the_error_before_and_after(data, trained, tmp_path, c
         f"It goes on from `f.safetensors` (SHA-256 `{sha256(trained)}`), layers.0, layers.1 frozen." in card
     )
     assert out.with_suffix(".csv").read_text().splitlines()[1].startswith("0,")
+
+
+def test_threads_are_those_asked_for_while_training_and_told(data, tmp_path, capsys, monkeypatch):
+    seen = []
+    one_pass = _Training._pass
+    monkeypatch.setattr(_Training, "_pass", lambda *a: seen.append(torch.get_num_threads()) or one_pass(*a))
+    words = ["--layers", "4", "--epochs", "1", "--threads", "2", "--json"]
+    main(["train", str(data), "--out", str(tmp_path / "f.safetensors"), *words])
+    assert (seen, torch.get_num_threads()) == ([2], 1)
+    assert json.loads(capsys.readouterr().out)["facts"]["threads"] == 2
 
 
 def test_a_split_by_row_carries_its_warning_everywhere(data, tmp_path, capsys):
