@@ -145,6 +145,17 @@ def test_a_fit_like_a_model_takes_its_figures_and_finds_its_field(lab):
     )
 
 
+def test_nobody_has_to_say_where_the_earths_field_points():
+    field = truth()
+    readings = survey(field)
+    p, yaw = off_grid(400)
+    want = field.magnitude_nt(p, yaw)
+    told, found = (fit_harmonic(readings, earth_nt=earth) for earth in (EARTH, None))
+    off = [rms(model.predict(p, yaw)[0] - want) for model in (told, found)]
+    assert off[1] < 1.3 * off[0]
+    assert_allclose(found.parameters["uniform field [nT]"], EARTH, atol=4_000)
+
+
 def test_vectors_bring_the_vector_field_at_this_height_and_at_others():
     field = truth()
     model = fit_harmonic(survey(field, vectors=True), earth_nt=EARTH)

@@ -89,6 +89,10 @@ TURN_M = 0.1
 
 LEAST_READINGS = 8
 
+BEGINNINGS, BEGUN_DIP = 4, np.radians(60.0)
+"""Directions of the compass, and dip, that a fit begins with beside straight down where nothing tells the
+Earth's field: several fields explain magnitudes, and steps find the one that is near."""
+
 EARTH_SD_NT = 1000.0
 """How far the uniform part may lie from `earth_nt` [nT], each way."""
 
@@ -307,9 +311,10 @@ def fit_harmonic(
 
     Magnitudes alone leave the field's sign open: B and -B read the same, with the hard iron turned too.
     Where the Earth's field is unknown the uniform part is thought to point down with the readings' median
-    magnitude, give or take half of it each way, as nowhere but in the northern hemisphere: name it where
-    it is known (`magtwin.field.earth`), above all where vectors are wanted. Where vectors are read it is
-    thought to be their mean, as loosely.
+    magnitude, give or take half of it each way, as nowhere but in the northern hemisphere; the fit is begun
+    in several directions, and goes on from the likeliest. Name the Earth's field where it is known
+    (`magtwin.field.earth`), above all where vectors are wanted. Where vectors are read it is thought to be
+    their mean, as loosely.
 
     Args:
         readings: A survey; those that are not `good` count for nothing.
@@ -347,12 +352,19 @@ def fit_harmonic(
         problem = _Problem.of(good, _of_model(like), like.forward.height_m, earth_nt, earth_sd_nt)
         return problem.solve(like, progress).model(good)
     ladders = _ladders(depth_m, good, max(height, 0.0))
-    fits = []
+    fits: list[_State] = []
     for k, depths in enumerate(ladders):
         problem = _Problem.of(good, _layers(good, depths, spacing_m, height), height, earth_nt, earth_sd_nt)
         told = _part(progress, k, len(ladders))
-        fits.append(problem.solve(None, told))
+        fits.append(problem.solve(None, told, [fits[0].uniform] if fits else None))
     return max(fits, key=_State.evidence).model(good)
+
+
+def _tilted(magnitude_nt: float) -> list[Array]:
+    """Fields that dip by `BEGUN_DIP` towards each of some directions of the compass."""
+    level, down = magnitude_nt * np.cos(BEGUN_DIP), magnitude_nt * np.sin(BEGUN_DIP)
+    angles = 2 * np.pi * np.arange(BEGINNINGS) / BEGINNINGS
+    return [np.array([level * np.cos(a), level * np.sin(a), -down]) for a in angles]
 
 
 def _part(progress: Progress | None, k: int, count: int) -> Progress | None:
@@ -445,6 +457,7 @@ class _Problem:
     cell: NDArray[np.intp]  # of each good reading
     mean: Array  # of the unknowns' priors
     rest_sd: Array  # standard deviations of the priors of all unknowns but the moments
+    begins: list[Array]  # uniform fields to begin with
 
     @classmethod
     def of(
@@ -467,12 +480,15 @@ class _Problem:
         yaw = np.arctan2(mean(np.sin(good.yaw)), mean(np.cos(good.yaw)))
         typical = float(np.median(good.b_nt))
         uniform, sd = np.array([0.0, 0.0, -typical]), typical / 2
+        begins = [uniform, *_tilted(typical)]
         if earth_nt is not None:
             uniform, sd = np.asarray(earth_nt, float), earth_sd_nt
+            begins = [uniform]
         elif good.b_body_nt is not None:
             c, s = np.cos(yaw), np.sin(yaw)
             turned = [c * read[:, 0] - s * read[:, 1], s * read[:, 0] + c * read[:, 1], read[:, 2]]
             uniform = np.array([part.mean() for part in turned])
+            begins = [uniform]
         forward = Forward(layers.p_world_dipole, height)
         prior = np.zeros(forward.size)
         count = 3 * len(layers.p_world_dipole)
@@ -480,7 +496,7 @@ class _Problem:
         rest = np.repeat([sd, HARD_IRON_SD_NT, SOFT_IRON_SD, LEVER_SD_M], [3, 3, 8, 2])
         if abs(np.mean(np.exp(1j * yaw))) > ONE_HEADING:
             rest[3:] = 0.0  # a platform that never turned cannot be told from the field
-        return cls(forward, layers, p, yaw, read, cell, prior, rest)
+        return cls(forward, layers, p, yaw, read, cell, prior, rest, begins)
 
     @property
     def vectors(self) -> bool:
@@ -499,13 +515,17 @@ class _Problem:
     def at(self, unknowns: Array) -> Reading:
         return self.forward.read(unknowns, self.p_xy, self.yaw, vectors=self.vectors)
 
-    def solve(self, like: HarmonicModel | None, progress: Progress | None) -> "_State":
-        """Fit, and learn the figures unless a model brings them."""
+    def solve(
+        self, like: HarmonicModel | None, progress: Progress | None, begins: list[Array] | None = None
+    ) -> "_State":
+        """Fit, and learn the figures unless a model brings them; begun with these uniform fields."""
         if like is not None:
             return _State(self, like.figures, like.unknowns, self.at(like.unknowns)).settle()
-        state = _State.start(self, self._first())
-        for _ in range(FIRST_STEPS):
-            state = state.step()
+        begun = [_State.start(self, self._first(), uniform) for uniform in begins or self.begins]
+        if len(begun) > 1:
+            for _ in range(LAYERWISE):
+                begun = [state.learnt(None).step() for state in begun]
+        state = max(begun, key=_State.evidence) if len(begun) > 1 else begun[0]
         shares, rounds = _shares(self.layers), ROUNDS
         for done in range(rounds):
             if progress is not None:
@@ -600,12 +620,24 @@ class _State:
     reading: Reading
 
     @classmethod
-    def start(cls, problem: _Problem, figures: Figures) -> "_State":
-        """One step from the prior's mean, all readings trusted alike and little."""
-        state = cls(problem, figures, problem.mean, problem.at(problem.mean))
+    def start(cls, problem: _Problem, figures: Figures, uniform: Array) -> "_State":
+        """Steps from a uniform field, in the first of which all readings are trusted alike and little."""
+        unknowns = problem.mean.copy()
+        count = 3 * len(figures.strength)
+        unknowns[count : count + 3] = uniform
+        state = cls(problem, figures, unknowns, problem.at(unknowns))
         off = problem.read_nt - state.reading.values_nt
         coarse = np.full(off.shape, max(float(np.mean(off**2)) / 100, figures.noise_nt**2))
-        return state._moved(state._towards(1 / coarse), 1.0)
+        state = state._moved(state._towards(1 / coarse), 1.0)
+        for _ in range(FIRST_STEPS):
+            state = state.step()
+        return state
+
+    @property
+    def uniform(self) -> Array:
+        """The uniform part of the field [nT]."""
+        count = 3 * len(self.figures.strength)
+        return self.unknowns[count : count + 3]
 
     @property
     def prior_sd(self) -> Array:
