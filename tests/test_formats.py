@@ -156,6 +156,16 @@ def test_every_format_refuses_a_file_cut_short_or_of_another_kind(name, written,
         assert "\n" not in str(refused.value)
 
 
+def test_a_csv_cut_short_at_the_end_of_a_line_is_refused_by_its_count_of_rows(written, tmp_path):
+    lines = (written / "run.csv").read_bytes().splitlines(keepends=True)
+    (tmp_path / "run.csv").write_bytes(b"".join(lines[:-7]))
+    with pytest.raises(RefusedError, match="cut short, or edited"):
+        read_run(tmp_path / "run.csv")
+    edited = [line for line in lines[:-7] if not line.startswith(b"# rows")]
+    (tmp_path / "run.csv").write_bytes(b"".join(edited))
+    assert read_run(tmp_path / "run.csv").rows == read_run(written / "run.csv").rows - 7
+
+
 @pytest.mark.parametrize("name", [*EXACT, "run.mcap", "run.db3"])
 def test_every_format_refuses_a_run_whose_time_goes_backwards(name, tmp_path):
     back = every_column().take(slice(None, None, -1))

@@ -337,7 +337,8 @@ def test_numpy_reads_the_npz_without_pickle(tables):
 
 def test_a_csv_tells_people_facts_units_and_frames_before_its_rows(tables):
     lines = (tables / "run.csv").read_text().splitlines()
-    assert lines[1].startswith('# facts {"path": "figure8", "seed": 7')
+    assert lines[1] == f"# rows {some_run().rows}"
+    assert lines[2].startswith('# facts {"path": "figure8", "seed": 7')
     assert any(line.startswith("# column odom_v_y {") and '"frame": "base_link"' in line for line in lines)
 
 

@@ -202,6 +202,7 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
     """
     table = table_of(run)
     lines = [f"# {_ABOUT} run: facts, then columns by name with unit, frame and meaning, in JSON"]
+    lines.append(f"# rows {table.num_rows}")
     lines.append(f"# facts {_line_safe(facts_to_json(run))}")
     for field in table.schema:
         said = {key.decode(): text.decode() for key, text in field.metadata.items()}
@@ -234,7 +235,7 @@ def read_csv(path: str | os.PathLike[str]) -> Run:
         about, names, skipped = _csv_head(file, path)
         file.seek(-1, os.SEEK_END)
         cut = file.read(1) != b"\n"
-    facts, said = _csv_about(about, path)
+    rows, facts, said = _csv_about(about, path)
     types = {name: pa.bool_() if _is_flag(name) else pa.float64() for name in names}
     for name in said.keys() & types.keys():
         try:
@@ -260,6 +261,11 @@ def read_csv(path: str | os.PathLike[str]) -> Run:
     except (pa.ArrowException, OSError) as error:
         reason = " ".join(str(error).split())
         raise RefusedError(f"{path}: not a CSV file of a run: {_short(reason)}") from error
+    if rows not in ("", str(table.num_rows)):
+        raise RefusedError(
+            f"{path}: holds {table.num_rows} rows where its line '# rows' says {rows[:20]!r}: cut short, or "
+            "edited; copy it again, or take that line out"
+        )
     fields = [f.with_metadata(said.get(f.name) or None) for f in table.schema]
     return run_of(table.cast(pa.schema(fields, metadata={FACTS: facts})), path)
 
@@ -284,17 +290,19 @@ def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str]
     raise RefusedError(f"{path}: has no line of column names; it is empty, or cut short")
 
 
-def _csv_about(lines: list[str], path: Path) -> tuple[str, dict[str, dict[str, str]]]:
-    """The facts of a CSV in JSON, and what it says of its columns."""
-    facts, said = "{}", {}
+def _csv_about(lines: list[str], path: Path) -> tuple[str, str, dict[str, dict[str, str]]]:
+    """What a CSV says of the number of its rows, "" if nothing, its facts in JSON, and of its columns."""
+    rows, facts, said = "", "{}", {}
     for number, line in enumerate(lines, 1):
         kind, _, rest = line[1:].strip().partition(" ")
-        if kind == "facts":
+        if kind == "rows":
+            rows = rest
+        elif kind == "facts":
             facts = rest
         elif kind == "column":
             name, _, text = rest.partition(" ")
             said[name] = _texts(text, f"{path}:{number}")
-    return facts, said
+    return rows, facts, said
 
 
 def _texts(text: str, where: str) -> dict[str, str]:
