@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from magtwin.names import RefusedError
-from magtwin.sim.drive import Motion, advance, integrate_twist, limiter, twist_from_wheels, wheel_rates
+from magtwin.sim.drive import Motion, advance, integrate_twist, limiter, wheel_rates
 from magtwin.spec import DriveSpec
 
 DRIVE = DriveSpec()
@@ -51,8 +51,9 @@ def test_a_step_in_parts_is_the_step(v, w, parts):
 
 
 @given(v=speeds, w=turns)
-def test_wheels_and_twists_are_each_others_inverse(v, w):
-    assert_allclose(twist_from_wheels(wheel_rates(v, w, DRIVE), DRIVE), [v, w], atol=1e-12)
+def test_rims_go_forward_by_their_mean_and_turn_by_their_difference(v, w):
+    left, right = wheel_rates(v, w, DRIVE) * DRIVE.wheel_radius_m
+    assert_allclose([(left + right) / 2, (right - left) / DRIVE.wheel_separation_m], [v, w], atol=1e-12)
 
 
 def test_turning_left_turns_the_right_wheel_forward():

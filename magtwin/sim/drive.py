@@ -68,12 +68,6 @@ def wheel_rates(v: ArrayLike, w: ArrayLike, drive: DriveSpec) -> Array:
     return np.stack([v - side, v + side], axis=-1) / drive.wheel_radius_m
 
 
-def twist_from_wheels(rates: ArrayLike, drive: DriveSpec) -> tuple[Array, Array]:
-    """Forward speed [m/s] and yaw rate [rad/s] from wheel rates [rad/s], shape (..., 2) -> (...)."""
-    left, right = np.moveaxis(np.asarray(rates, float) * drive.wheel_radius_m, -1, 0)
-    return (left + right) / 2, (right - left) / drive.wheel_separation_m
-
-
 def limits(drive: DriveSpec, dt: float) -> tuple[float, float, float, float, float, float]:
     """A drive's limits as `magtwin.sim.loop.limited` takes them, for steps of `dt` [s]."""
     rim = drive.wheel_rate_max * drive.wheel_radius_m
