@@ -70,9 +70,9 @@ def test_the_real_robot_goes_as_far_and_turns_as_much_as_it_is_told(tmp_path, re
     assert_allclose(seen["mass_kg"], 5.39, rtol=1e-5)
     assert seen["dofs"] == 6 + 2
     assert seen["bodies"] == (3 if merge else 41)
-    assert_allclose(ahead["forward_m"], 0.612, rtol=0.03)  # issue 3
+    assert_allclose(ahead["forward_m"], 0.612, rtol=0.03)
     assert abs(ahead["turned_rad"]) < 0.02
-    assert_allclose(turn["turned_rad"], 2.0, rtol=0.08)  # issue 3
+    assert_allclose(turn["turned_rad"], 2.0, rtol=0.08)
     assert turn["forward_m"] < 0.02
     for trial in (ahead, turn, still):
         assert abs(trial["rise_m"]) < 1e-3  # nothing sinks, hops or tips

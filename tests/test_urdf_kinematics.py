@@ -14,7 +14,7 @@ from magtwin.usd.urdf.options import Options
 
 POSES = 100
 TOLERANCE = 1e-6
-"""Of positions [m], as issue 3 asks; frames of joints are single precision, some 1e-8 of their lengths."""
+"""Of positions [m]; frames of joints are single precision, some 1e-8 of their lengths."""
 
 
 class StageKinematics:
