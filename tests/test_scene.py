@@ -535,6 +535,17 @@ def test_a_toml_of_several_robots_gives_each_its_name_start_path_and_network(own
         scene.led_by("bobby")
 
 
+def test_a_robot_of_several_stands_where_its_path_begins_unless_it_is_said(own_parts):
+    two_robots(own_parts)
+    (own_parts / "there.csv").write_text("0.5,0.25\n0.5,1.25\n")
+    scene = scene_from_toml(own_parts / "scene.toml")
+    assert [placed.start for placed in scene.robots] == [
+        (-1, 0.5, 0),
+        (0.5, 0.25, pytest.approx(np.pi / 2)),
+        (0, -1, 0),
+    ]
+
+
 @pytest.mark.parametrize("by_reference", [True, False])
 def test_several_robots_survive_their_layers_each_a_prim_of_its_own(own_parts, tmp_path, by_reference, capfd):
     scene = two_robots(own_parts)

@@ -325,9 +325,11 @@ def scene_from_toml(
         where = f"{path}: [robot]" if alone else f"{path}: [[robot]] {one.name!r}"
         robot = _robot(one, keys, where, workshop, named=not alone)
         robot = _with_network(robot, one, network, where, inputs_of)
-        first = given.start if not robots else ZERO3
         way = _way(one.path, Path(path).parent, where)
-        robots.append(PlacedRobot(robot=robot, start=first if one.start is None else one.start, path=way))
+        start = one.start
+        if start is None:
+            start = given.start if alone or (not robots and "start" in table) else _beginning(way)
+        robots.append(PlacedRobot(robot=robot, start=start, path=way))
     own_map = map_layer is None
     sources, furniture = given.source, tuple(table.spec for table in given.furniture)
     if given.sources and own_map:
@@ -420,6 +422,15 @@ def _way(path: str, folder: Path, where: str) -> str | Path:
     except RefusedError as error:
         raise RefusedError(f"{where} path: {error}") from error
     return path if named else file
+
+
+def _beginning(way: str | Path) -> Vec3:
+    """Where a path begins and whither it goes, so that robots of one scene do not stand in each other."""
+    if way in ("", "random"):
+        return ZERO3
+    path = resolve_path(way)
+    x, y = path.p_xy[0].tolist()
+    return x, y, float(path.heading(0.0))
 
 
 def _earth(table: _EarthTable, path: str | os.PathLike[str]) -> EarthFieldSpec:
