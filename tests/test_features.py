@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from magtwin.learn.features import EDDY, FEATURES, FULL, INDUCED, SETS, columns_of, features
+from magtwin.learn.features import EDDY, FEATURES, FULL, INDUCED, SETS, columns_of, feature_names, features
 from magtwin.learn.tolles_lawson import design_matrix
 from magtwin.names import RefusedError
 from magtwin.run import COLUMNS, Run
@@ -148,3 +148,11 @@ def test_columns_of_a_set_are_all_that_it_needs():
     for name in SETS:
         run = a_run().select(*columns_of(name))
         assert features(run, name).shape == (50, len(SETS[name]))
+
+
+def test_names_in_one_text_are_a_set_a_feature_or_several_with_commas():
+    assert feature_names("full") == FULL
+    assert feature_names("lidar_on") == ("lidar_on",)
+    assert feature_names("yaw_deg, lidar_on") == ("yaw_deg", "lidar_on")
+    with pytest.raises(RefusedError, match="no feature 'lidar_of'; did you mean 'lidar_on'"):
+        feature_names("yaw_deg,lidar_of")

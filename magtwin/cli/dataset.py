@@ -159,15 +159,11 @@ def correlate(
     from magtwin.files import check_free
     from magtwin.learn.correlation import correlations
     from magtwin.learn.dataset import open_dataset
-    from magtwin.learn.features import SETS
 
     if out is not None:
         check_free(out, force=force)
-    names: str | list[str] = features
-    if features not in SETS and "," in features:
-        names = [name.strip() for name in features.split(",") if name.strip()]
     found = open_dataset(dataset)
-    rows = found.rows(names)
+    rows = found.rows(features)
     sessions = [found.recording(name).session for name in rows.names]
     of = rows.names if len(set(sessions)) < 2 else sessions
     number = {key: i for i, key in enumerate(dict.fromkeys(of))}

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from magtwin.files import from_table, read_toml
-from magtwin.learn.features import FEATURES, feature_names
+from magtwin.learn.features import feature_names
 from magtwin.learn.split import By
 from magtwin.names import RefusedError
 
@@ -98,8 +98,6 @@ class TrainConfig:
         Raises:
             RefusedError: One is not known, or is named twice.
         """
-        if "," in self.features or self.features in FEATURES:
-            return feature_names([name.strip() for name in self.features.split(",") if name.strip()])
         return feature_names(self.features)
 
     def to_toml(self) -> str:

@@ -172,11 +172,16 @@ latency make of the map; "vector" what the vector axes tell of the platform's at
 def feature_names(names: str | Sequence[str]) -> tuple[str, ...]:
     """The features of a named set, or the names given, each known and none twice.
 
+    Args:
+        names: A name of `SETS`; a feature, or several with commas between; or their names.
+
     Raises:
         RefusedError: An unknown set or feature (the text names the near one), or one named twice.
     """
     if isinstance(names, str):
-        return find("feature set", names, SETS)
+        if "," not in names and names not in FEATURES:
+            return find("feature set", names, SETS)
+        names = [name.strip() for name in names.split(",") if name.strip()]
     for name in names:
         find("feature", name, FEATURES)
     if len(set(names)) < len(names):
