@@ -41,6 +41,8 @@ class Picture:
     kind: str
     """"png" or "svg+xml"."""
     data: bytes
+    tall: bool = False
+    """Whether it stands beside two of the others."""
 
 
 def pictures_of_run(
@@ -95,7 +97,7 @@ def pictures_of_comparison(a: Run, b: Run, found: Comparison, names: tuple[str, 
     for panel in _panels(a, b, found, names):
         figure = new_figure(WIDTH_IN, 2.5 * panel.height)
         panel.draw(figure.subplots())
-        made.append(Picture(panel.title, panel.title, "svg+xml", drawn(figure, ".svg")))
+        made.append(Picture(panel.title, panel.title, "svg+xml", drawn(figure, ".svg"), panel.height > 1))
     return made
 
 
@@ -174,6 +176,7 @@ def _path(run: Run, field: AnomalyMap | None, planned: ArrayLike | None) -> Pict
         f"{over}, coloured by the field along it",
         "png",
         drawn(figure, ".png"),
+        tall=True,
     )
 
 

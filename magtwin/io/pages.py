@@ -366,8 +366,9 @@ def _html_section(section: Section, k: int, *, titled: bool) -> str:
     parts.append('<div class="pictures">')
     for picture in section.pictures:
         data = base64.b64encode(picture.data).decode("ascii")
+        tall = " class=tall" if picture.tall else ""
         parts.append(
-            f'<figure><img alt="{_escaped(picture.alt)}" src="data:image/{picture.kind};base64,{data}">'
+            f'<figure{tall}><img alt="{_escaped(picture.alt)}" src="data:image/{picture.kind};base64,{data}">'
             f"<figcaption>{_escaped(picture.title)}</figcaption></figure>"
         )
     parts.append("</div>")
