@@ -243,6 +243,15 @@ def engine_named(
     return Newton(twin.scene_file, twin.scene.robot, progress)
 
 
+def way_of(way: "Path | Commands | Run | str | FilePath") -> "Path | Commands | Run | str":
+    """What is to be driven: the path that a name or a CSV file stands for, all else ("random" too) as it is.
+
+    Raises:
+        RefusedError: There is no such path.
+    """
+    return resolve_path(way) if isinstance(way, str | FilePath) and way != "random" else way  # type: ignore[return-value]
+
+
 def simulate(
     twin: Twin | str | FilePath,
     path: "Path | Commands | Run | str" = "figure8",
@@ -290,8 +299,7 @@ def simulate(
 
     twin, seed = _opened(twin, net, magnetometer, "simulate"), _seed(seed)
     network = twin.magnetometer
-    if isinstance(path, str | FilePath) and path != "random":
-        path = resolve_path(path)
+    path = way_of(path)
     outside_training: NDArray[np.bool_] | None = None
 
     def disturbance_nt(run: Run) -> NDArray[Any]:
@@ -374,8 +382,7 @@ def simulate_robots(
         find("robot", name, placed)
     ways: dict[str, Path | Commands | Run | str] = {}
     for name, one in placed.items():
-        way = (paths or {}).get(name, one.path or "figure8")
-        ways[name] = resolve_path(way) if isinstance(way, str | FilePath) and way != "random" else way  # type: ignore[assignment]
+        ways[name] = way_of((paths or {}).get(name, one.path or "figure8"))
     wanted = [name for name in placed if robots is None or name in set(robots)]
     led = {name: led_by(twin, name) for name in placed}
     networks = {name: one.magnetometer for name, one in led.items()}
@@ -479,9 +486,7 @@ def simulate_many(
         )
     count = len(numbers)
     given = _each("paths", paths, count)
-    resolved: dict[Any, Path] = {
-        path: resolve_path(path) for path in given if isinstance(path, str | FilePath) and path != "random"
-    }
+    resolved: dict[Any, Any] = {path: way_of(path) for path in given if isinstance(path, str | FilePath)}
     scenes: dict[int, Scene] = {}
     jobs = []
     for seed, path, speed, robot in zip(
@@ -496,7 +501,7 @@ def simulate_many(
             scenes[id(robot)] = dataclasses.replace(twin.scene, robot=robot)
         scene = twin.scene if robot is None else scenes[id(robot)]
         if isinstance(path, str | FilePath):
-            path = resolved.get(path, path)
+            path = resolved[path]
         jobs.append(Job(scene, path, seed, speed))
     network = twin.magnetometer
     configs = {id(scene): _config_sha256(scene) for scene in (twin.scene, *scenes.values())}

@@ -370,10 +370,9 @@ def _run_together(
     """Drive the robots of a scene of several, and write a run of each, or of the one that is named."""
     from magtwin.io.formats import read_run
     from magtwin.path import Path as Planned
-    from magtwin.path import resolve_path
     from magtwin.report import Report
     from magtwin.sim.commands import read_commands
-    from magtwin.twin import led_by, open_twin, scan, simulate_robots
+    from magtwin.twin import led_by, open_twin, scan, simulate_robots, way_of
 
     steps = announcer(quiet=quiet)
     if options.pop("engine") == "newton":
@@ -385,7 +384,7 @@ def _run_together(
     ways: dict[str, Any] = {one.robot.name: one.path or "figure8" for one in twin.scene.robots}
     if robot is not None and (commands or replay or path):
         ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path
-    ways = {n: resolve_path(w) if isinstance(w, str | Path) and w != "random" else w for n, w in ways.items()}
+    ways = {name: way_of(way) for name, way in ways.items()}
     names = list(ways) if robot is None else [robot]
     with ExitStack() as stack:
         written = {}
