@@ -1,0 +1,1 @@
+"""Export: a stage as other programs take it whole, and whether they would."""
