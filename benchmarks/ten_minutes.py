@@ -26,8 +26,8 @@ from magtwin.files import shipped
 from magtwin.io.rerun import write_rrd
 from magtwin.io.tables import write_parquet
 from magtwin.learn.features import features
-from magtwin.learn.magnetometer import in_threads
 from magtwin.learn.model import FieldNet
+from magtwin.learn.perceptron import in_threads
 from magtwin.path import path_named
 from magtwin.sim.course import warm_up
 from magtwin.twin import Twin, open_twin, scene_from_toml, simulate

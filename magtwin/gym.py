@@ -153,6 +153,12 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         if isinstance(scene, Twin) and (net is not None or magnetometer is not None):
             raise RefusedError("net and magnetometer go to open_twin where scene is a Twin")
         twin = scene if isinstance(scene, Twin) else open_twin(scene, net=net, magnetometer=magnetometer)
+        if twin.magnetometer and twin.magnetometer.net.context:
+            raise RefusedError(
+                f"{twin.magnetometer.name}: a {twin.magnetometer.net.kind} looks at "
+                f"{twin.magnetometer.net.context} earlier readings, which MagNav does not keep; give a "
+                "network that reads one row at a time"
+            )
         robot = twin.scene.robot
         self.path = path if isinstance(path, Path) else resolve_path(path)
         check_on_floor(self.path, twin.scene.lab.floor_m, robot.footprint_radius_m)

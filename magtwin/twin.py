@@ -23,7 +23,7 @@ Kind = Literal["physical", "neural", "map-only"]
 Facts = dict[str, str | int | float | bool]
 
 if TYPE_CHECKING:
-    from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.learn.magnetometer import NeuralMagnetometer, Read
     from magtwin.sim.commands import Commands
     from magtwin.sim.controllers import Controller
     from magtwin.sim.engine import Engine
@@ -191,9 +191,9 @@ def scene_from_toml(
     from magtwin.usd.scene import scene_from_toml as scene_of
 
     def inputs_of(weights: FilePath) -> tuple[str, ...]:
-        from magtwin.learn.model import load_net
+        from magtwin.learn.predictor import load_predictor
 
-        return load_net(weights).features
+        return load_predictor(weights).features
 
     return scene_of(path, map_layer=map_layer, network=network, workshop=workshop, inputs_of=inputs_of)
 
@@ -300,13 +300,13 @@ def simulate(
     twin, seed = _opened(twin, net, magnetometer, "simulate"), _seed(seed)
     network = twin.magnetometer
     path = way_of(path)
-    outside_training: NDArray[np.bool_] | None = None
+    read: Read | None = None
 
     def disturbance_nt(run: Run) -> NDArray[Any]:
-        nonlocal outside_training
+        nonlocal read
         assert network is not None
-        ((disturbance, outside_training),) = network.read([run])
-        return disturbance
+        (read,) = network.read([run])
+        return read.disturbance_nt
 
     run = run_scene(
         twin.scene,
@@ -323,7 +323,7 @@ def simulate(
         controller=controller,
         engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
     )
-    return run.with_columns(**_known(twin.scene, run, network, outside_training)).with_facts(
+    return run.with_columns(**_known(twin.scene, run, read)).with_facts(
         **_facts(twin, seed, path, duration_s, _config_sha256(twin.scene))
     )
 
@@ -385,7 +385,19 @@ def simulate_robots(
         ways[name] = way_of((paths or {}).get(name, one.path or "figure8"))
     wanted = [name for name in placed if robots is None or name in set(robots)]
     led = {name: led_by(twin, name) for name in placed}
-    networks = {name: one.magnetometer for name, one in led.items()}
+    reads: dict[str, Read] = {}
+
+    def disturbance_of(name: str, network: "NeuralMagnetometer") -> Callable[[Run], NDArray[Any]]:
+        def disturbance_nt(run: Run) -> NDArray[Any]:
+            (reads[name],) = network.read([run])
+            return reads[name].disturbance_nt
+
+        return disturbance_nt
+
+    disturbances = {
+        name: disturbance_of(name, one.magnetometer) if one.magnetometer else None
+        for name, one in led.items()
+    }
     runs = simulate_together(
         twin.scene,
         ways,
@@ -398,14 +410,13 @@ def simulate_robots(
         rate_hz=rate_hz,
         obstacles=twin.obstacles,
         controller=controller,
-        disturbances_nt={name: net.disturbance_nt if net else None for name, net in networks.items()},
+        disturbances_nt=disturbances,
         outside=outside,
         lidar=lidar,
     )
     for name, run in runs.items():
-        own, network = led[name], networks[name]
-        outside_training = network.outside_training(run) if network else None
-        runs[name] = run.with_columns(**_known(own.scene, run, network, outside_training)).with_facts(
+        own = led[name]
+        runs[name] = run.with_columns(**_known(own.scene, run, reads.get(name))).with_facts(
             **_facts(own, seed, ways[name], duration_s, _config_sha256(own.scene))
         )
     return runs
@@ -509,11 +520,11 @@ def simulate_many(
     def finish(jobs: Sequence[Job], sensed: Sequence["Sensed"]) -> list[Run]:
         rows = [one.run for one in sensed]
         flagged = "flag_out_of_distribution" in sensed[0].wanted
-        read = network.read(rows, outside=flagged) if network else [(None, None)] * len(rows)
+        told = network.read(rows, outside=flagged) if network else [None] * len(rows)
         runs = []
-        for job, one, (disturbance, outside_training) in zip(jobs, sensed, read, strict=True):
-            run = one.read(disturbance)
-            known = _known(job.scene, run, network, outside_training)
+        for job, one, read in zip(jobs, sensed, told, strict=True):
+            run = one.read(read.disturbance_nt if read else None)
+            known = _known(job.scene, run, read)
             run = run.with_columns(**{name: known[name] for name in known.keys() & run.keys()})
             config = configs[id(job.scene)]
             runs.append(run.with_facts(**_facts(twin, job.seed, job.path, duration_s, config)))
@@ -571,17 +582,14 @@ def _check_magnetometer(twin: Twin, robot: RobotSpec) -> None:
         )
 
 
-def _known(
-    scene: Scene, run: Run, network: "NeuralMagnetometer | None", outside_training: NDArray[np.bool_] | None
-) -> dict[str, NDArray[Any]]:
+def _known(scene: Scene, run: Run, read: "Read | None") -> dict[str, NDArray[Any]]:
     """Columns that only who knows the network can fill; none without one."""
-    if network is None:
+    if read is None:
         return {}
     spec = scene.robot.magnetometer
     noise = spec.noise_density_nt * np.sqrt(float(run.facts["rate_hz"]) / 2)
-    sd = np.full(run.rows, np.hypot(network.residual_sd_nt, noise))
-    known: dict[str, NDArray[Any]] = {"b_sd_nt": sd}
-    return known if outside_training is None else known | {"flag_out_of_distribution": outside_training}
+    known: dict[str, NDArray[Any]] = {"b_sd_nt": np.hypot(read.sd_nt, noise)}
+    return known if read.outside is None else known | {"flag_out_of_distribution": read.outside}
 
 
 def _facts(

@@ -10,7 +10,8 @@ from test_model import RELEASED, a_net
 
 from magtwin.files import sha256, shipped
 from magtwin.learn.features import FULL, features
-from magtwin.learn.magnetometer import NeuralMagnetometer, in_threads
+from magtwin.learn.magnetometer import NeuralMagnetometer
+from magtwin.learn.perceptron import in_threads
 from magtwin.names import RefusedError
 from magtwin.path import path_named
 

@@ -209,9 +209,9 @@ def _info_of_run(file: Path) -> Any:
 
 
 def _info_of_net(file: Path) -> Any:
-    from magtwin.learn.model import load_net
+    from magtwin.learn.predictor import load_predictor
 
-    return load_net(file).report(str(file))
+    return load_predictor(file).report(str(file))
 
 
 def _twin(run: "Run", file: Path, scene: Path | None) -> "Twin | None":

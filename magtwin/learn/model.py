@@ -1,7 +1,6 @@
 """FieldNet: a network that predicts the disturbance, with all it needs to be used, in one file."""
 
 import itertools
-import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -10,22 +9,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from numpy.typing import ArrayLike, NDArray
 
-from magtwin.files import existing, output, sha256
-from magtwin.learn.checkpoint import Checkpoint, read_checkpoint
-from magtwin.learn.features import FEATURES, FULL, feature_names
+from magtwin.files import existing, sha256
+from magtwin.learn.checkpoint import read_checkpoint
+from magtwin.learn.features import FULL, feature_names
+from magtwin.learn.inputs import Inputs, inputs_of
+from magtwin.learn.perceptron import outputs
+from magtwin.learn.weights import Fact, Weights, is_checkpoint, read_weights, say, write_weights
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
 
-FORMAT_VERSION = 1
-"""Version of the weights file; a reader refuses a later one."""
+Array = NDArray[np.float64]
 
-Fact = str | int | float | bool
-
-_ZIP = b"PK\x03\x04"
 _SCALERS = ("x_mean", "x_scale", "x_min", "x_max", "y_mean", "y_scale")
 
 
@@ -39,6 +35,12 @@ class FieldNet(torch.nn.Module):
     Inputs are scaled in float64, because folding the scaler into float32 weights raises the error
     from 0.003 to 0.1 nT. In training, dropout follows every hidden layer but the last.
     """
+
+    kind = "mlp"
+    """Among the predictors: a multilayer perceptron."""
+
+    context = 0
+    """A row's prediction looks at no earlier one."""
 
     x_mean: torch.Tensor
     """Means of the training inputs, in the units of the features, shape (F,), float64."""
@@ -124,6 +126,32 @@ class FieldNet(torch.nn.Module):
                 z = torch.nn.functional.dropout(z, self.dropout, self.training)
         return last(z).squeeze(-1)
 
+    @property
+    def layers_text(self) -> str:
+        """Widths from inputs to output, as 20-512-1."""
+        return "-".join(str(n) for n in (len(self.features), *self.hidden, 1))
+
+    @property
+    def inputs(self) -> Inputs:
+        """Scaler and ranges of the inputs."""
+        scalers = (self.x_mean, self.x_scale, self.x_min, self.x_max)
+        return Inputs(self.features, *(value.detach().cpu().numpy() for value in scalers))
+
+    def predict(self, x: ArrayLike) -> tuple[Array, Array]:
+        """Disturbances and their standard deviations [nT], each (N,), from features in their units (N, F).
+
+        The standard deviation is `residual_sd_nt` on every row. A row with a nan gives nan. Products are
+        float32, scaling is float64: against float64 throughout the released network errs by under 0.01 nT.
+        """
+        inputs = self.inputs
+        layers = [(layer.weight.detach(), layer.bias.detach()) for layer in self.linears]
+        found = outputs(layers, inputs, inputs.checked(x))[:, 0]
+        return float(self.y_mean) + float(self.y_scale) * found, np.full(len(found), self.residual_sd_nt)
+
+    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
+        """Whether an input of a row left the range of the training rows; see `Inputs.outside`."""
+        return self.inputs.outside(x)
+
     def set_scalers(self, x: ArrayLike, y: ArrayLike) -> None:
         """Take scalers and training ranges from training rows.
 
@@ -132,13 +160,12 @@ class FieldNet(torch.nn.Module):
             y: Labels [nT], shape (N,).
         """
         x, y = np.asarray(x, float), np.asarray(y, float)
-        scale = x.std(axis=0)
-        scale[scale < 1e-12 * np.maximum(1.0, np.abs(x).max(axis=0))] = 1.0
+        of = inputs_of(x, self.features)
         for name, value in (
-            ("x_mean", x.mean(axis=0)),
-            ("x_scale", scale),
-            ("x_min", x.min(axis=0)),
-            ("x_max", x.max(axis=0)),
+            ("x_mean", of.mean),
+            ("x_scale", of.scale),
+            ("x_min", of.low),
+            ("x_max", of.high),
             ("y_mean", y.mean()),
             ("y_scale", y.std()),
         ):
@@ -150,27 +177,22 @@ class FieldNet(torch.nn.Module):
         Raises:
             RefusedError: The file exists and `force` was not given.
         """
-        about = {
-            "format_version": FORMAT_VERSION,
-            "features": self.features,
-            "units": [FEATURES[name].unit for name in self.features],
-            "hidden": self.hidden,
-            "dropout": self.dropout,
-            "output": "disturbance of the field's magnitude",
-            "output_unit": "nT",
-            "residual_sd_nt": None if math.isnan(self.residual_sd_nt) else self.residual_sd_nt,
-            "facts": self.facts,
-        }
-        tensors = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
-        # One key, because safetensors orders several at random.
-        metadata = {"magtwin": json.dumps(about, sort_keys=True, allow_nan=False)}
-        with output(path, force=force) as aside:
-            aside.write_bytes(save(tensors, metadata))  # save_file would leave it readable by its owner alone
+        write_weights(
+            path,
+            self.kind,
+            self.state_dict(),
+            features=self.features,
+            residual_sd_nt=self.residual_sd_nt,
+            facts=self.facts,
+            hidden=self.hidden,
+            dropout=self.dropout,
+            force=force,
+        )
 
     def report(self, title: str) -> Report:
         """What the network is, in figures."""
         figures = [
-            Figure("layers", "-".join(str(n) for n in (len(self.features), *self.hidden, 1))),
+            Figure("layers", self.layers_text),
             Figure("parameters", self.parameters_count),
             Figure("inputs", ", ".join(self.features)),
             Figure("label mean", float(self.y_mean), "nT"),
@@ -187,16 +209,12 @@ def load_net(path: str | os.PathLike[str]) -> FieldNet:
     Raises:
         RefusedError: Neither of the two, damaged, or parts that do not fit each other.
     """
-    path = existing(path, "weights file")
-    if path.is_dir():
-        raise RefusedError(f"{path}: a folder; give a weights file, .safetensors or .pth")
-    with path.open("rb") as file:
-        head = file.read(9)
-    if head[:4] == _ZIP or path.suffix in (".pth", ".pt"):
-        return _from_checkpoint(read_checkpoint(path, len(FULL)), path)
-    if head[8:9] != b"{":
-        raise RefusedError(f"{path}: no weights: neither safetensors nor a PyTorch checkpoint (.pth)")
-    return _from_safetensors(path)
+    if is_checkpoint(path):
+        return net_of_checkpoint(path)
+    weights = read_weights(path)
+    if weights.kind != "mlp":
+        raise RefusedError(f"{path}: holds a {weights.kind}, no multilayer perceptron; give one of those")
+    return net_of(weights)
 
 
 def convert(
@@ -212,13 +230,19 @@ def convert(
     Raises:
         RefusedError: Not such a checkpoint, or `out` exists.
     """
-    path = existing(checkpoint, "checkpoint")
-    net = _from_checkpoint(read_checkpoint(path, len(FULL)), path)
+    net = net_of_checkpoint(existing(checkpoint, "checkpoint"))
     net.save(out, force=force)
     return net
 
 
-def _from_checkpoint(saved: Checkpoint, path: Path) -> FieldNet:
+def net_of_checkpoint(path: str | os.PathLike[str]) -> FieldNet:
+    """The network of a released `.pth`, in evaluation mode.
+
+    Raises:
+        RefusedError: Not such a checkpoint.
+    """
+    path = Path(path)
+    saved = read_checkpoint(path, len(FULL))
     net = FieldNet(
         FULL,
         [len(bias) for _, bias in saved.layers[:-1]],
@@ -239,87 +263,38 @@ def _from_checkpoint(saved: Checkpoint, path: Path) -> FieldNet:
     return net.eval()
 
 
-def _from_safetensors(path: Path) -> FieldNet:
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError) as error:
-        raise RefusedError(f"{path}: damaged safetensors ({error}); get the file again") from error
-    about = _about(path, metadata)
+def net_of(weights: Weights) -> FieldNet:
+    """The network that a weights file of the kind "mlp" holds, in evaluation mode.
+
+    Raises:
+        RefusedError: Its parts do not fit each other.
+    """
+    path, tensors = weights.path, weights.tensors
+    dropout = weights.expect("dropout", float)
     layers = sum(name.startswith("layers.") and name.endswith(".weight") for name in tensors)
     missing = [name for name in _SCALERS if name not in tensors]
     missing += [f"layers.{i}.{p}" for i in range(max(layers, 2)) for p in ("weight", "bias")
                 if f"layers.{i}.{p}" not in tensors]  # fmt: skip
     if missing:
         raise RefusedError(f"{path}: tensor {missing[0]!r} is missing; train or convert the network again")
-    weights = [tensors[f"layers.{i}.weight"] for i in range(layers)]
-    for i, weight in enumerate(weights):
+    held = [tensors[f"layers.{i}.weight"] for i in range(layers)]
+    for i, weight in enumerate(held):
         if weight.ndim != 2:
             raise RefusedError(
-                f"{path}: tensor 'layers.{i}.weight' is {_say(weight)}; a layer's have shape (out, in)"
+                f"{path}: tensor 'layers.{i}.weight' is {say(weight)}; a layer's have shape (out, in)"
             )
     try:
         net = FieldNet(
-            about["features"],
-            [len(weight) for weight in weights[:-1]],
-            dropout=about["dropout"],
-            residual_sd_nt=math.nan if about["residual_sd_nt"] is None else about["residual_sd_nt"],
-            facts=about["facts"],
+            weights.features,
+            [len(weight) for weight in held[:-1]],
+            dropout=dropout,
+            residual_sd_nt=weights.residual_sd_nt,
+            facts=weights.about["facts"],
         )
     except RefusedError as error:
         raise RefusedError(f"{path}: {error}") from error
-    for name, expected in net.state_dict().items():
-        found = tensors[name]
-        if found.shape != expected.shape or found.dtype != expected.dtype:
-            raise RefusedError(
-                f"{path}: tensor {name!r} is {_say(found)}, the {len(net.features)} features and the "
-                f"other layers ask for {_say(expected)}"
-            )
-        if name not in ("x_min", "x_max") and not bool(torch.isfinite(found).all()):
-            raise RefusedError(f"{path}: tensor {name!r} has numbers that are nan or infinite")
-    if extra := sorted(set(tensors) - set(net.state_dict())):
-        raise RefusedError(f"{path}: tensor {extra[0]!r} belongs to no layer of a FieldNet")
+    state = weights.fit(net.state_dict())
     if not (bool((tensors["x_scale"] > 0).all()) and bool(tensors["y_scale"] > 0)):
         raise RefusedError(f"{path}: a scale of its scalers is not above 0")
-    net.load_state_dict(tensors)
+    net.load_state_dict(state)
     return net.eval()
-
-
-def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """What the file says of the network, every key there and of its type."""
-    if "magtwin" not in metadata:
-        raise RefusedError(f"{path}: safetensors without magtwin's metadata; not a network of magtwin's")
-    try:
-        about = json.loads(metadata["magtwin"])
-    except ValueError as error:
-        raise RefusedError(f"{path}: its metadata is not JSON ({error})") from error
-    version = about.get("format_version") if isinstance(about, dict) else None
-    if version != FORMAT_VERSION:
-        raise RefusedError(
-            f"{path}: format version {version!r}, this magtwin reads {FORMAT_VERSION}; update magtwin"
-        )
-    types = {"features": list, "units": list, "dropout": float, "residual_sd_nt": float | None, "facts": dict}
-    for key, kind in types.items():
-        if key not in about or not isinstance(about[key], kind):
-            raise RefusedError(f"{path}: {key!r} of its metadata is missing or of the wrong type")
-    if not about["features"] or not all(isinstance(name, str) for name in about["features"]):
-        raise RefusedError(f"{path}: 'features' of its metadata must be names, one at least")
-    sd = about["residual_sd_nt"]
-    if sd is not None and not 0 <= sd < math.inf:
-        raise RefusedError(
-            f"{path}: 'residual_sd_nt' of its metadata must be from 0 nT up and finite, got {sd}"
-        )
-    for key, value in about["facts"].items():
-        if not isinstance(value, Fact):
-            raise RefusedError(f"{path}: fact {key!r} of its metadata must be text, a number, true or false")
-    for name, unit in zip(about["features"], about["units"], strict=False):
-        if name in FEATURES and FEATURES[name].unit != unit:
-            raise RefusedError(
-                f"{path}: reads {name} in {unit!r}, magtwin gives it in {FEATURES[name].unit!r}"
-            )
-    return about
-
-
-def _say(tensor: torch.Tensor) -> str:
-    return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"

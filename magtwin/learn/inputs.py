@@ -1,0 +1,91 @@
+"""Inputs: what a predictor reads in a row, how it is scaled, and what it was trained within."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.learn.features import FEATURES, feature_names
+from magtwin.names import RefusedError
+
+Array = NDArray[np.float64]
+
+FAR = 5.0
+"""Scales from the mean beyond which an input is outside, where the training range is unknown."""
+
+_BLOCK = 512
+"""Rows compared at once, so that what is compared stays in a core's cache."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The features of a row in order, with the scaler and the ranges of the training rows."""
+
+    features: tuple[str, ...]
+    """Names, of `magtwin.learn.features.FEATURES`."""
+
+    mean: Array
+    """Means of the training inputs, in the units of the features, shape (F,)."""
+
+    scale: Array
+    """Scales of the training inputs, shape (F,), above 0."""
+
+    low: Array
+    """Smallest training inputs, shape (F,); nan where unknown."""
+
+    high: Array
+    """Largest training inputs, shape (F,); nan where unknown."""
+
+    @property
+    def columns(self) -> frozenset[str]:
+        """Columns of a Run that the features are made of."""
+        return frozenset(column for name in self.features for column in FEATURES[name].columns)
+
+    def checked(self, x: ArrayLike) -> Array:
+        """`x` as rows of float64, if they are as wide as the features are many.
+
+        Raises:
+            RefusedError: They are not.
+        """
+        x = np.ascontiguousarray(x, float)
+        wanted = len(self.features)
+        if x.ndim != 2 or x.shape[1] != wanted:
+            raise RefusedError(
+                f"this network reads {wanted} features a row, shape (N, {wanted}); got {x.shape}"
+            )
+        return x
+
+    def scaled(self, x: ArrayLike) -> Array:
+        """Rows (x - mean) / scale, shape (N, F)."""
+        return (np.asarray(x, float) - self.mean) / self.scale
+
+    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
+        """Whether an input of a row left the range of the training rows, shape (N,).
+
+        Where that range is unknown (the released weights do not hold it), an input is outside when it lies
+        more than 5 scales from its mean. nan is outside.
+        """
+        x = self.checked(x)
+        low = np.where(np.isnan(self.low), self.mean - FAR * self.scale, self.low)
+        high = np.where(np.isnan(self.high), self.mean + FAR * self.scale, self.high)
+        slack = 1e-9 * np.maximum(np.abs(low), np.abs(high))  # rounding of inputs that never vary
+        low, high = low - slack, high + slack
+        inside = np.empty(len(x), bool)
+        for start in range(0, len(x), _BLOCK):
+            block = x[start : start + _BLOCK]
+            np.all((block >= low) & (block <= high), axis=1, out=inside[start : start + _BLOCK])
+        return ~inside
+
+
+def inputs_of(x: ArrayLike, features: str | Sequence[str]) -> Inputs:
+    """Scaler and ranges of training rows.
+
+    Args:
+        x: Features, shape (N, F). One that does not vary keeps a scale of 1.
+        features: Their names, or that of a set of them.
+    """
+    x = np.asarray(x, float)
+    scale = x.std(axis=0)
+    scale[scale < 1e-12 * np.maximum(1.0, np.abs(x).max(axis=0))] = 1.0
+    return Inputs(feature_names(features), x.mean(axis=0), scale, x.min(axis=0), x.max(axis=0))
