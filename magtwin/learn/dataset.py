@@ -341,7 +341,7 @@ def build_dataset(
             "kind": KIND,
             "version": VERSION,
             "facts": {key: text for key, text in facts.items() if text},
-            "map": {"name": field.name, "sha256": map_sha256 or _sha256_of(field)},
+            "map": {"name": field.name, "sha256": map_sha256 or values_sha256(field)},
             "alignment": asdict(alignment or Alignment()),
             "columns": shared,
             "recordings": [asdict(one) for one in done],
@@ -452,8 +452,8 @@ def _some(words: Sequence[str], most: int = 6) -> str:
     return ", ".join(words[:most]) + (", ..." if len(words) > most else "")
 
 
-def _sha256_of(field: AnomalyMap) -> str:
-    """Checksum of a map's nodes."""
+def values_sha256(field: AnomalyMap) -> str:
+    """Checksum of a map's nodes: what names a map that came from no file of its own."""
     digest = hashlib.sha256(json.dumps([field.origin_m, field.cell_m, field.values_nt.shape]).encode())
     for array in (field.values_nt, field.valid, field.headings_rad):
         digest.update(np.ascontiguousarray(array).tobytes())

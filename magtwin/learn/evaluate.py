@@ -1,0 +1,586 @@
+"""Evaluation: models on their maps against recordings that they never saw, as in the paper's Table 1.
+
+Every error is of the total field at the sensor, predicted less measured, so that models which learned on
+different maps compare: each looks up its own map, with its own lever arm and latency, and adds what it
+predicts of the robot. The naive model is the paper's: the first map and the mean training label, on every
+row.
+"""
+
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.field.map import AnomalyMap
+from magtwin.learn.baselines import Mean, fit_ridge
+from magtwin.learn.dataset import Dataset, values_sha256
+from magtwin.learn.features import CARRIED, CIRCULAR, FEATURES, GRADIENT, features
+from magtwin.learn.labels import Alignment, labelled
+from magtwin.learn.magnetometer import NeuralMagnetometer
+from magtwin.learn.recording import thinned
+from magtwin.learn.scores import LEVEL, Errors, Score, scores
+from magtwin.names import RefusedError
+from magtwin.path import CASES
+from magtwin.report import Figure, Report
+from magtwin.run import Run
+
+Array = NDArray[np.float64]
+
+PAPER: Mapping[str, tuple[float, float, float]] = MappingProxyType(
+    {
+        "A": (217.6, 225.2, 0.966),
+        "B": (307.9, 407.1, 0.756),
+        "C": (267.0, 381.4, 0.700),
+        "D": (284.6, 333.1, 0.855),
+        "E": (323.6, 409.3, 0.791),
+    }
+)
+"""Table 1 of the paper (Penumarti et al. 2025): MAE and naive MAE [nT], and their ratio."""
+
+NAIVE = "naive"
+"""Name of the naive model."""
+
+TRAINED_AT_HZ = 10.0
+"""Training rows a second that a baseline is fitted to: more are too alike to tell more."""
+
+GAUSSIAN_MAE = math.sqrt(2 / math.pi)
+"""Mean absolute error of a normal distribution, in standard deviations."""
+
+
+class Model(Protocol):
+    """What predicts a disturbance."""
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Names of its inputs."""
+
+    def predict(self, x: Array) -> tuple[Array, Array]:
+        """Means and standard deviations [nT], each (N,), of the rows of a run in order of time (N, F)."""
+
+    def outside(self, x: Array) -> NDArray[np.bool_]:
+        """Whether an input of a row is beyond the training ranges, shape (N,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """A map that models are judged on."""
+
+    name: str
+    """What to call it; the name of its file."""
+
+    field: AnomalyMap
+
+    checksums: frozenset[str]
+    """Those that may name it: of its file, and of its values."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """A model with the map, lever arm and latency that it learned with."""
+
+    name: str
+    model: Model
+    chart: Chart
+    alignment: Alignment = field(default_factory=Alignment)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    """What its file tells, or how it was made."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A recording to judge by."""
+
+    name: str
+    read: Callable[[], Run]
+    session: str = ""
+    """What was switched on and off with it; what its run says, else its name, unless given."""
+    path: str = ""
+    """What was driven; what its run says, else its name, unless given."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What every model made of a recording; M models, N readings."""
+
+    name: str
+    session: str
+    path: str
+    case: str
+    """Row of the table that it belongs to."""
+
+    run: Run
+    """The recording, as it was read."""
+
+    p_xy: Array
+    """Where the robot was seen [m], shape (N, 2)."""
+
+    measured_nt: Array
+    """Total field at the sensor [nT], shape (N,): the reading, or the exact field where asked for."""
+
+    kept: NDArray[np.bool_]
+    """Readings that all models are judged on, shape (N,)."""
+
+    map_nt: Array
+    """Each model's map where it takes the sensor to be [nT], shape (M, N)."""
+
+    map_sd_nt: Array
+    """How well that is known [nT], shape (M, N)."""
+
+    total_nt: Array
+    """Predicted total field [nT], shape (M, N)."""
+
+    sd_nt: Array
+    """Its predicted standard deviation [nT], shape (M, N); nan where there is none."""
+
+    outside: NDArray[np.bool_]
+    """Whether an input was beyond the training ranges, shape (M, N)."""
+
+    def errors(self) -> Errors:
+        """Errors on the readings that all are judged on."""
+        kept = self.kept
+        return Errors(
+            self.session,
+            self.case,
+            self.run["t"][kept],
+            self.total_nt[:, kept] - self.measured_nt[kept],
+            self.sd_nt[:, kept],
+            self.outside[:, kept],
+        )
+
+
+@dataclass(frozen=True)
+class Case:
+    """A row of the table."""
+
+    name: str
+    recordings: int
+    sessions: int
+    scores: tuple[Score, ...]
+    """One a model, the naive one first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Models against recordings."""
+
+    contenders: tuple[Contender, ...]
+    """The naive model first."""
+
+    charts: tuple[Chart, ...]
+    """Maps, the first that of the naive model."""
+
+    cases: tuple[Case, ...]
+    """Paths, in the order of the paper's cases and then by name; "all", every reading; and where there are
+    several paths "mean", the mean of the rows above."""
+
+    judged: tuple[Judged, ...]
+    """Recordings, one by one."""
+
+    left_out: Mapping[str, int]
+    """Readings that not all models can be judged on, by the reason that was first found."""
+
+    truth: bool = False
+    """Whether errors are against the exact field, not the reading."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the models."""
+        return tuple(one.name for one in self.contenders)
+
+    @property
+    def every(self) -> Case:
+        """The row of all readings."""
+        return next(case for case in self.cases if case.name == "all")
+
+    def floor(self, chart: Chart) -> tuple[float, float]:
+        """What a map's own variances say that its error is: MAE and RMS over the readings judged on [nT].
+
+        No model of the robot gets below, as nothing that it reads tells the map's error at a place. nan of a
+        map without variances.
+        """
+        m = next(i for i, one in enumerate(self.contenders) if one.chart is chart)
+        sd = np.concatenate([one.map_sd_nt[m, one.kept] for one in self.judged])
+        if chart.field.variance_nt2 is None:
+            return math.nan, math.nan
+        return GAUSSIAN_MAE * float(np.mean(sd)), float(np.sqrt(np.mean(sd**2)))
+
+    def report(self, title: str = "Evaluation") -> Report:
+        """The table's rows in figures, for people and scripts."""
+        figures = []
+        for case in self.cases:
+            naive = case.scores[0]
+            figures.append(
+                Figure(
+                    f"{case.name} naive MAE",
+                    naive.mae_nt,
+                    "nT",
+                    note=f"{naive.rows:,} readings, {case.recordings} recordings",
+                )
+            )
+            for name, score in zip(self.names[1:], case.scores[1:], strict=True):
+                low, high = score.ratio_interval
+                note = f"ratio {score.ratio:.3f}, {LEVEL:.0%} interval {low:.3f} to {high:.3f}"
+                if not math.isnan(score.coverage):
+                    note += f"; 90 % intervals hold {score.coverage:.1%}"
+                if score.outside:
+                    note += f"; {score.outside:.1%} out of distribution"
+                figures.append(Figure(f"{case.name} {name} MAE", score.mae_nt, "nT", note=note))
+        facts: dict[str, Any] = {
+            "errors against": "exact field" if self.truth else "reading",
+            "maps": ", ".join(chart.name for chart in self.charts),
+            "recordings": len(self.judged),
+            "readings": self.every.scores[0].rows,
+        }
+        return Report(title, tuple(figures), facts | {f"left out, {k}": n for k, n in self.left_out.items()})
+
+    def summary(self) -> dict[str, Any]:
+        """Everything in plain figures, for JSON."""
+        return {
+            "errors_against": "b_truth_nt" if self.truth else "b_measured_nt",
+            "models": [
+                {
+                    "name": one.name,
+                    "map": one.chart.name,
+                    "features": list(one.model.features),
+                    "lever_arm_m": list(one.alignment.lever_arm_m),
+                    "latency_s": one.alignment.latency_s,
+                    "facts": dict(one.facts),
+                }
+                for one in self.contenders
+            ],
+            "maps": [
+                {
+                    "name": chart.name,
+                    "sha256": sorted(chart.checksums),
+                    "method": chart.field.method,
+                    "own_mae_nt": self.floor(chart)[0],
+                    "own_rms_nt": self.floor(chart)[1],
+                }
+                for chart in self.charts
+            ],
+            "cases": [
+                {
+                    "name": case.name,
+                    "recordings": case.recordings,
+                    "sessions": case.sessions,
+                    "rows": case.scores[0].rows,
+                    "models": {
+                        name: {key: value for key, value in vars(score).items() if key != "rows"}
+                        for name, score in zip(self.names, case.scores, strict=True)
+                    },
+                }
+                for case in self.cases
+            ],
+            "recordings": [
+                {
+                    "name": one.name,
+                    "session": one.session,
+                    "path": one.path,
+                    "case": one.case,
+                    "rows": int(one.kept.sum()),
+                }
+                for one in self.judged
+            ],
+            "left_out": dict(self.left_out),
+        }
+
+
+def evaluate(
+    contenders: Sequence[Contender],
+    trials: Sequence[Trial],
+    *,
+    rng: np.random.Generator,
+    cases: Mapping[str, str] | None = None,
+    truth: bool = False,
+    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
+) -> Evaluation:
+    """Judge models by recordings.
+
+    Args:
+        contenders: The models, the naive one first.
+        trials: The recordings.
+        rng: Source of the draws of intervals.
+        cases: Rows of the table by the path that they are of; the paper's A to E and every other path by its
+            own name unless given. What is given goes before.
+        truth: Whether errors are against the exact field b_truth_nt in place of the reading.
+        progress: Told of recordings done, of how many, and which.
+
+    Raises:
+        RefusedError: There is no recording or model, a recording lacks a column that a model reads or lies
+            off a map, its readings are a network's own, all labels are the same, or no reading is left.
+    """
+    if not trials or not contenders:
+        raise RefusedError("nothing to evaluate: name weights, and recordings that they never saw")
+    row_of = {path: letter for letter, path in CASES.items()} | {v: k for k, v in (cases or {}).items()}
+    judged: list[Judged] = []
+    left_out: dict[str, int] = {}
+    for k, trial in enumerate(trials):
+        progress(k, len(trials), trial.name)
+        one, lost = _judge(contenders, trial, row_of, truth)
+        judged.append(one)
+        for why, count in lost.items():
+            left_out[why] = left_out.get(why, 0) + count
+    progress(len(trials), len(trials), "")
+    told = {why: count for why, count in left_out.items() if count}
+    some = [one for one in judged if one.kept.any()]
+    if not some:
+        said = "; ".join(f"{count:,} {why}" for why, count in told.items())
+        raise RefusedError(
+            f"no reading that every model can be judged on: {said}; leave a model or a map out"
+        )
+    _check_labels(some)
+    order = [*CASES, *sorted({one.case for one in some} - set(CASES))]
+    some.sort(key=lambda one: order.index(one.case))
+    by_case, every, mean = scores([one.errors() for one in some], rng=rng)
+    rows = [_case(name, [one for one in some if one.case == name], by_case[name]) for name in by_case]
+    rows.append(_case("all", some, every))
+    if len(by_case) > 1:
+        rows.append(_case("mean", some, mean))
+    charts = tuple(dict.fromkeys(one.chart for one in contenders))
+    return Evaluation(tuple(contenders), charts, tuple(rows), tuple(some), MappingProxyType(told), truth)
+
+
+def _case(name: str, own: Sequence[Judged], found: tuple[Score, ...]) -> Case:
+    return Case(name, len(own), len({one.session for one in own}), found)
+
+
+def _judge(
+    contenders: Sequence[Contender], trial: Trial, row_of: Mapping[str, str], truth: bool
+) -> tuple[Judged, dict[str, int]]:
+    """What every model makes of a recording, and why readings are left out."""
+    run = trial.read()
+    _check_readings(trial.name, run, truth)
+    session, path = told_by(run, trial)
+    measured = run["b_truth_nt" if truth else "b_measured_nt"]
+    kept = np.isfinite(measured)
+    lost = {"hold no field": int(np.count_nonzero(~kept))}
+    on: dict[tuple[int, Alignment], Run] = {}
+    shape = (len(contenders), run.rows)
+    map_nt, map_sd, total, sd = (np.full(shape, np.nan) for _ in range(4))
+    outside = np.zeros(shape, bool)
+    for m, one in enumerate(contenders):
+        key = (id(one.chart), one.alignment)
+        try:
+            if key not in on:
+                on[key] = labelled(run, one.chart.field, one.alignment)
+            here = on[key]
+            x = features(here, one.model.features)
+        except RefusedError as error:
+            raise RefusedError(f"{trial.name}: {one.name}: {error}") from error
+        mean, sd[m] = one.model.predict(x)
+        map_nt[m], map_sd[m], outside[m] = here["b_map_nt"], here["label_sd_nt"], one.model.outside(x)
+        total[m] = map_nt[m] + mean
+        for why, known in (
+            (f"have no label on {one.chart.name}", np.isfinite(here["label_nt"])),
+            (f"lack an input of {one.name}", np.isfinite(total[m])),
+        ):
+            lost[why] = lost.get(why, 0) + int(np.count_nonzero(kept & ~known))
+            kept = kept & known
+    p = run["mocap_p"] if {"mocap_p", "mocap_q_xyzw"} <= set(run) else run["p_world_base"]
+    row = row_of.get(path, path)
+    found = Judged(
+        trial.name, session, path, row, run, p[:, :2], measured, kept, map_nt, map_sd, total, sd, outside
+    )
+    return found, lost
+
+
+def told_by(run: Run, trial: Trial) -> tuple[str, str]:
+    """Session and path of a recording: as given, as its run says, else its name."""
+    session, facts = trial.session, run.facts
+    if not session and "session" in facts:
+        session = f"{facts['session_seed']}-" if "session_seed" in facts else ""
+        session += str(facts["session"])
+    return session or trial.name, trial.path or str(facts.get("path", "")) or trial.name
+
+
+def _check_readings(name: str, run: Run, truth: bool) -> None:
+    """Refuse what cannot judge a model."""
+    wanted = "b_truth_nt" if truth else "b_measured_nt"
+    if wanted not in run or not np.isfinite(run[wanted]).any():
+        advice = "; leave --truth out" if truth else ""
+        raise RefusedError(f"{name}: tells no {wanted}, so there is nothing to judge by{advice}")
+    kind = run.facts.get("magnetometer")
+    if kind in ("neural", "map-only") and not truth:
+        raise RefusedError(
+            f"{name}: its readings are those of a {kind} magnetometer, a model's own; judge by a robot's "
+            "recordings, by runs made with --magnetometer physical, or by the exact field (--truth)"
+        )
+
+
+def _check_labels(judged: Sequence[Judged]) -> None:
+    """Refuse readings that do not differ from the map but by a constant."""
+    label = np.concatenate([one.measured_nt[one.kept] - one.map_nt[0, one.kept] for one in judged])
+    if np.ptp(label) < 1e-6:
+        raise RefusedError(
+            f"every label is {label[0]:g} nT on all {len(label):,} readings: there is nothing to predict; "
+            "were the runs made by a map-only magnetometer?"
+        )
+
+
+def chart_of(name: str, found: AnomalyMap, *checksums: str) -> Chart:
+    """A map under the checksums that weights may name it by.
+
+    Args:
+        name: What to call it.
+        found: The map.
+        checksums: Of its file, where it has one; that of its values is added.
+    """
+    return Chart(name, found, frozenset({*filter(None, checksums), values_sha256(found)}))
+
+
+def contender(
+    path: str | os.PathLike[str], charts: Sequence[Chart], *, any_map: bool = False, name: str = ""
+) -> Contender:
+    """A weights file with the map that it was trained on, its lever arm and its latency.
+
+    Weights that name no map, as the released ones, take the first.
+
+    Args:
+        path: The weights, of any kind that magtwin reads.
+        charts: The maps at hand.
+        any_map: Whether the first map is taken where none is the right one.
+        name: What to call it; the name of the file unless given.
+
+    Raises:
+        RefusedError: Not a weights file, or it was trained on a map that is not at hand.
+    """
+    magnetometer = NeuralMagnetometer.load(path)
+    facts = dict(magnetometer.net.facts)
+    wanted = str(facts.get("map_sha256", ""))
+    fits = [chart for chart in charts if wanted in chart.checksums]
+    if wanted and not fits and not any_map:
+        held = "; ".join(f"{chart.name} has {', '.join(sorted(chart.checksums))}" for chart in charts)
+        raise RefusedError(
+            f"{path}: was trained on the map {facts.get('map', '')!r} of sha256 {wanted}, and {held}; name "
+            "its own map with --map, or take the first one all the same with --any-map"
+        )
+    chart = fits[0] if fits else charts[0]
+    told = {"sha256": magnetometer.sha256, **facts}
+    return Contender(name or magnetometer.name, magnetometer.net, chart, alignment_of(facts, path), told)
+
+
+def alignment_of(facts: Mapping[str, Any], where: object = "") -> Alignment:
+    """Lever arm and latency as weights tell them; none where they do not.
+
+    Raises:
+        RefusedError: They are no numbers.
+    """
+    try:
+        arm = [float(part) for part in str(facts.get("lever_arm_m", "0, 0")).split(",")]
+        forward, left = arm
+        return Alignment((forward, left), float(facts.get("latency_s", 0.0)))
+    except ValueError as error:
+        raise RefusedError(
+            f"{where}: lever_arm_m {facts.get('lever_arm_m')!r} and latency_s {facts.get('latency_s')!r} of "
+            f"its facts are no lengths and time ({error}); train it again"
+        ) from error
+
+
+def naive(
+    chart: Chart,
+    *,
+    dataset: Dataset | None = None,
+    names: Sequence[str] | None = None,
+    weights: Sequence[Contender] = (),
+) -> Contender:
+    """The naive model: a map and the mean training label on every row.
+
+    Args:
+        chart: The map, the paper's trilinear one.
+        dataset: Training recordings, which are labelled on this map.
+        names: Which of them; all unless given.
+        weights: Without a data set, models that were trained on this map and tell its mean label.
+
+    Raises:
+        RefusedError: Nothing tells the mean.
+    """
+    if dataset is not None:
+        rows = training_rows(dataset, names, chart, ())
+        model = Mean(float(rows.y.mean()), float(rows.y.std()))
+        alignment = _alignment(dataset, chart)
+        return Contender(NAIVE, model, chart, alignment, {"fitted to": dataset.folder.name})
+    for one in weights:
+        mean = one.facts.get("label_mean_nt")
+        if one.facts.get("map_sha256") in chart.checksums and isinstance(mean, int | float):
+            sd = one.facts.get("label_sd_nt", math.nan)
+            told = {"mean label of": one.name}
+            return Contender(NAIVE, Mean(float(mean), float(sd)), chart, one.alignment, told)
+    raise RefusedError(
+        f"nothing tells the mean training label on the map {chart.name}, which the naive model takes: give "
+        "the training recordings (--train SET), or weights trained on it, with that map first"
+    )
+
+
+def tolles_lawson(
+    chart: Chart, dataset: Dataset, names: Sequence[str] | None = None, *, gradient: bool = False
+) -> Contender:
+    """A ridge in Tolles and Lawson's manner on a map: heading, motion, currents; and the map's gradient.
+
+    Args:
+        chart: The map.
+        dataset: Training recordings, which are labelled on it.
+        names: Which of them; all unless given.
+        gradient: Whether the terms of a lever arm and a latency are among the inputs.
+
+    Raises:
+        RefusedError: A recording has no label on the map.
+    """
+    wanted = (*CIRCULAR, *GRADIENT, *CARRIED) if gradient else CIRCULAR
+    able = set(dataset.columns) | {"yaw", "b_map_gradient_nt_m"}
+    inputs = tuple(name for name in wanted if set(FEATURES[name].columns) <= able)
+    rows = training_rows(dataset, names, chart, inputs)
+    model = fit_ridge(rows.x, rows.y, rows.recording, inputs)
+    what = "Tolles-Lawson and gradient" if gradient else "Tolles-Lawson"
+    told = {"fitted to": dataset.folder.name, "penalty": model.penalty, "training rows": len(rows.y)}
+    return Contender(f"{what} on {chart.name}", model, chart, _alignment(dataset, chart), told)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingRows:
+    """Training recordings on a map."""
+
+    x: Array
+    y: Array
+    recording: NDArray[np.intp]
+
+
+def training_rows(
+    dataset: Dataset, names: Sequence[str] | None, chart: Chart, inputs: Sequence[str]
+) -> TrainingRows:
+    """Inputs (N, F) and labels (N,) of training recordings on a map, at most `TRAINED_AT_HZ` rows a second.
+
+    The alignment is the data set's own where it was labelled on this map, else none.
+    """
+    xs, ys, recording = [], [], []
+    for k, (_, run) in enumerate(aligned_runs(dataset, names, chart)):
+        x, y = features(run, inputs), run["label_nt"]
+        known = np.isfinite(y) & np.isfinite(x).all(axis=1)
+        xs.append(x[known])
+        ys.append(y[known])
+        recording.append(np.full(int(known.sum()), k, np.intp))
+    rows = TrainingRows(np.concatenate(xs), np.concatenate(ys), np.concatenate(recording))
+    if not len(rows.y):
+        raise RefusedError(f"{dataset.folder}: no training row has a label on {chart.name} and all inputs")
+    return rows
+
+
+def aligned_runs(dataset: Dataset, names: Sequence[str] | None, chart: Chart) -> Iterator[tuple[str, Run]]:
+    """Training recordings, thinned and labelled on a map, with their names."""
+    alignment = _alignment(dataset, chart)
+    for one, run in dataset.runs(names):
+        try:
+            yield one.name, labelled(thinned(run, TRAINED_AT_HZ), chart.field, alignment)
+        except RefusedError as error:
+            raise RefusedError(f"{dataset.folder}, {one.name}: {error}") from error
+
+
+def _alignment(dataset: Dataset, chart: Chart) -> Alignment:
+    """That of a data set which was labelled on a map; of another it says nothing of this one."""
+    if dataset.map_sha256 not in chart.checksums:
+        return Alignment()
+    return Alignment(dataset.alignment.lever_arm_m, dataset.alignment.latency_s)
