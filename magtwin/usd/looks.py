@@ -30,16 +30,16 @@ LOOKS: Mapping[str, Look] = MappingProxyType(
     {
         "Floor": Look((0.33, 0.34, 0.36), 0.7, friction=0.05),  # dark vinyl
         "Wall": Look((0.62, 0.53, 0.40), 0.6, friction=0.4),  # plywood
-        "Post": Look((0.70, 0.71, 0.73), 0.35, 1.0),  # anodised aluminium
+        "Post": Look((0.70, 0.71, 0.73), 0.35, 1.0, friction=0.4),  # anodised aluminium
         "Camera": Look((0.03, 0.03, 0.035), 0.5),
         "Lens": Look((0.02, 0.08, 0.35), 0.1),  # a blue ring
-        "Steel": Look((0.24, 0.20, 0.18), 0.75, 0.4),  # mill scale and rust
-        "PaintedSteel": Look((0.28, 0.31, 0.33), 0.5),  # grey powder coat
-        "Door": Look((0.45, 0.49, 0.50), 0.45),  # a lighter one
-        "Chrome": Look((0.55, 0.56, 0.57), 0.2, 1.0),
-        "Wood": Look((0.50, 0.33, 0.17), 0.55),  # beech
-        "Concrete": Look((0.42, 0.41, 0.39), 0.85),
-        "Plastic": Look((0.02, 0.02, 0.02), 0.6),
+        "Steel": Look((0.24, 0.20, 0.18), 0.75, 0.4, friction=0.4),  # mill scale and rust
+        "PaintedSteel": Look((0.28, 0.31, 0.33), 0.5, friction=0.4),  # grey powder coat
+        "Door": Look((0.45, 0.49, 0.50), 0.45, friction=0.4),  # a lighter one
+        "Chrome": Look((0.55, 0.56, 0.57), 0.2, 1.0, friction=0.3),
+        "Wood": Look((0.50, 0.33, 0.17), 0.55, friction=0.4),  # beech
+        "Concrete": Look((0.42, 0.41, 0.39), 0.85, friction=0.6),
+        "Plastic": Look((0.02, 0.02, 0.02), 0.6, friction=0.4),
     }
 )
 

@@ -1,0 +1,286 @@
+"""Isaac Sim: what a scene needs there beside what every USD has, ROS 2 topics above all.
+
+An Action Graph a robot publishes clock, odometry, inertial unit, pose, joints and scan, and drives the robot
+by the commands that come in, on the topics and in the frames of `magtwin.io.messages`. Isaac Sim has no
+magnetometer: whoever reads these topics has what the network reads, and computes the field. None of this has
+been run in Isaac Sim; the graph is held against the definitions of its nodes, see `magtwin.export.ogn`.
+"""
+
+from dataclasses import dataclass
+
+from pxr import Sdf, Usd, UsdPhysics
+
+from magtwin.export.ogn import Graph
+from magtwin.frames import IDENTITY_XYZW
+from magtwin.names import RefusedError
+from magtwin.spec import ZERO3, MountSpec, RobotSpec, Scene
+from magtwin.usd.layers import WORLD
+from magtwin.usd.schema import only_prim_with, place, prims_with
+from magtwin.usd.sensors import BASE, IMU_TYPE, LIDAR_TYPE
+from magtwin.usd.urdf.sensor import EMITTER_API
+
+GRAPHS = WORLD.AppendChild("Graphs")
+"""Scope of the graphs, each called as its robot."""
+
+ROBOT = "robot"
+"""Namespace of the topics of a robot that is alone."""
+
+ROBOT_API, LINKS, JOINTS = "IsaacRobotAPI", "isaac:physics:robotLinks", "isaac:physics:robotJoints"
+
+BRIDGE = "isaacsim.ros2.bridge."
+CORE = "isaacsim.core.nodes."
+SENSORS = "isaacsim.sensors.physics."
+BREAK = "omni.graph.nodes.BreakVector"
+
+UINT_MAX = 2**32 - 1
+
+DEFAULT_QOS, SENSOR_QOS, CLOCK_QOS = "qos", "sensor_qos", "clock_qos"
+"""Nodes that say how topics are offered."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Parts:
+    """Prims of a robot that its graph names."""
+
+    root: Sdf.Path
+    base: Sdf.Path
+    imu: Sdf.Path
+    lidar: Sdf.Path
+
+
+def author_graph(stage: Usd.Stage, scene: Scene) -> list[Usd.Prim]:
+    """Author an Action Graph for each robot of a scene, and what its LiDAR lacks to scan in Isaac Sim.
+
+    The topics of a robot that is alone are /robot/odom and so on; of several, each has its own name there.
+
+    Args:
+        stage: The scene's stage; written to in its edit target.
+        scene: Its robots' drives, LiDARs and names.
+
+    Returns:
+        The graphs' prims.
+
+    Raises:
+        RefusedError: A robot is not in the stage, is none to Isaac Sim, or lacks a sensor.
+    """
+    robots = {prim.GetName(): prim for prim in prims_with(stage.GetPseudoRoot(), "robot")}
+    alone, graphs = len(scene.robots) == 1, []
+    for k, placed in enumerate(scene.robots):
+        robot = placed.robot
+        if robot.name not in robots:
+            raise RefusedError(f"the stage has no robot {robot.name!r}; it has {', '.join(robots) or 'none'}")
+        parts = _parts(robots[robot.name])
+        _complete_lidar(stage.GetPrimAtPath(parts.lidar), robot.lidar.rays)
+        if not stage.GetPrimAtPath(GRAPHS):
+            stage.DefinePrim(GRAPHS, "Scope")
+        graph = Graph(stage, GRAPHS.AppendChild(robot.name))
+        _author(graph, robot, parts, ROBOT if alone else robot.name, clock=k == 0)
+        graphs.append(stage.GetPrimAtPath(graph.path))
+    return graphs
+
+
+def _author(graph: Graph, robot: RobotSpec, parts: _Parts, namespace: str, *, clock: bool) -> None:
+    """The nodes of one robot's graph."""
+    graph.node("tick", "omni.graph.action.OnPlaybackTick")
+    graph.node("time", f"{CORE}IsaacReadSimulationTime", resetOnStop=True)
+    graph.node("context", f"{BRIDGE}ROS2Context", useDomainIDEnvVar=True)
+    _qos(graph)
+    if clock:
+        graph.node("clock", f"{BRIDGE}ROS2PublishClock", topicName="/clock")
+        _published(graph, "clock", CLOCK_QOS)
+    _odometry(graph, parts, f"/{namespace}/odom")
+    _imu(graph, parts, f"/{namespace}/imu", frame_of(robot.imu, "imu"))
+    _pose(graph, parts, f"/{namespace}/enu/pose")
+    _joints(graph, parts, f"/{namespace}/joint_states")
+    _scan(graph, parts, f"/{namespace}/scan", frame_of(robot.lidar, "lidar"))
+    _drive(graph, robot, parts, f"/{namespace}/cmd_vel")
+
+
+def _qos(graph: Graph) -> None:
+    """As `magtwin.io.messages` offers its topics."""
+    kind = f"{BRIDGE}ROS2QoSProfile"
+    reliable, best = {"reliability": "reliable"}, {"reliability": "bestEffort"}
+    graph.node(DEFAULT_QOS, kind, createProfile="Default for publishers/subscribers", depth=10, **reliable)
+    graph.node(SENSOR_QOS, kind, createProfile="Sensor Data", depth=5, **best)
+    graph.node(CLOCK_QOS, kind, createProfile="Custom", depth=1, **best)
+
+
+def _published(graph: Graph, node: str, qos: str, after: str = "tick.tick", *, stamp: bool = True) -> None:
+    """Connect what every node that talks to ROS 2 takes."""
+    graph.connect(after, f"{node}.execIn")
+    graph.connect("context.context", f"{node}.context")
+    graph.connect(f"{qos}.qosProfile", f"{node}.qosProfile")
+    if stamp:
+        graph.connect("time.simulationTime", f"{node}.timeStamp")
+
+
+def _odometry(graph: Graph, parts: _Parts, topic: str) -> None:
+    """Pose from where the robot began, and velocities in its own axes: exact, with no wheel that slips."""
+    graph.node("odometry", f"{CORE}IsaacComputeOdometry", chassisPrim=parts.base)
+    graph.node(
+        "publish_odometry",
+        f"{BRIDGE}ROS2PublishOdometry",
+        topicName=topic,
+        odomFrameId="odom",
+        chassisFrameId=BASE,
+        publishRawVelocities=True,  # they are in the robot's axes already, and would be turned twice
+    )
+    graph.connect("tick.tick", "odometry.execIn")
+    _published(graph, "publish_odometry", SENSOR_QOS, "odometry.execOut")
+    for name in ("position", "orientation", "linearVelocity", "angularVelocity"):
+        graph.connect(f"odometry.{name}", f"publish_odometry.{name}")
+
+
+def _imu(graph: Graph, parts: _Parts, topic: str, frame: str) -> None:
+    graph.node("imu", f"{SENSORS}IsaacReadIMU", imuPrim=parts.imu, readGravity=True)
+    graph.node("publish_imu", f"{BRIDGE}ROS2PublishImu", topicName=topic, frameId=frame)
+    graph.connect("tick.tick", "imu.execIn")
+    _published(graph, "publish_imu", SENSOR_QOS, "imu.execOut")
+    graph.connect("imu.orientation", "publish_imu.orientation")
+    graph.connect("imu.angVel", "publish_imu.angularVelocity")
+    graph.connect("imu.linAcc", "publish_imu.linearAcceleration")
+
+
+def _pose(graph: Graph, parts: _Parts, topic: str) -> None:
+    """What motion capture sees: Isaac Sim has no node for it, so its message is put together from numbers."""
+    graph.node("pose", f"{CORE}IsaacReadWorldPose", prim=parts.base)
+    graph.node("place", f"{BREAK}3")
+    graph.node("turn", f"{BREAK}4")
+    graph.node("stamp", f"{CORE}IsaacTimeSplitter")
+    graph.node(
+        "publish_pose",
+        f"{BRIDGE}ROS2Publisher",
+        message="geometry_msgs/msg/PoseStamped",
+        topicName=topic,
+        **{"header:frame_id": "map"},
+    )
+    _published(graph, "publish_pose", DEFAULT_QOS, stamp=False)
+    graph.connect("time.simulationTime", "stamp.time")
+    graph.connect("stamp.seconds", "publish_pose.header:stamp:sec")
+    graph.connect("stamp.nanoseconds", "publish_pose.header:stamp:nanosec")
+    graph.connect("pose.translation", "place.tuple")
+    graph.connect("pose.orientation", "turn.tuple")
+    for axis in "xyz":
+        graph.connect(f"place.{axis}", f"publish_pose.pose:position:{axis}")
+    for axis in "xyzw":
+        graph.connect(f"turn.{axis}", f"publish_pose.pose:orientation:{axis}")
+
+
+def _joints(graph: Graph, parts: _Parts, topic: str) -> None:
+    graph.node("joints", f"{SENSORS}IsaacReadJointState", prim=parts.root)
+    graph.node("publish_joints", f"{BRIDGE}ROS2PublishJointState", topicName=topic)
+    graph.connect("tick.tick", "joints.execIn")
+    _published(graph, "publish_joints", DEFAULT_QOS, "joints.execOut")
+    for name in ("Names", "Positions", "Velocities", "Efforts", "DofTypes"):
+        graph.connect(f"joints.joint{name}", f"publish_joints.joint{name}")
+    graph.connect("joints.stageMetersPerUnit", "publish_joints.stageMetersPerUnit")
+    graph.connect("joints.sensorTime", "publish_joints.sensorTime")
+
+
+def _scan(graph: Graph, parts: _Parts, topic: str, frame: str) -> None:
+    graph.node("once", f"{CORE}OgnIsaacRunOneSimulationFrame")
+    graph.node("beams", f"{CORE}IsaacCreateRenderProduct", cameraPrim=parts.lidar)
+    graph.node(
+        "publish_scan", f"{BRIDGE}ROS2RtxLidarHelper", topicName=topic, frameId=frame, type="laser_scan"
+    )
+    graph.connect("tick.tick", "once.execIn")
+    graph.connect("once.step", "beams.execIn")
+    _published(graph, "publish_scan", SENSOR_QOS, "beams.execOut", stamp=False)
+    graph.connect("beams.renderProductPath", "publish_scan.renderProductPath")
+
+
+def _drive(graph: Graph, robot: RobotSpec, parts: _Parts, topic: str) -> None:
+    """The latest command, within the drive's limits, as rates of the wheels."""
+    drive = robot.drive
+    graph.node("command", f"{BRIDGE}ROS2SubscribeTwist", topicName=topic)
+    graph.node("forward", f"{BREAK}3")
+    graph.node("turning", f"{BREAK}3")
+    graph.node(
+        "controller",
+        "isaacsim.robot.wheeled_robots.DifferentialController",
+        wheelRadius=drive.wheel_radius_m,
+        wheelDistance=drive.wheel_separation_m,
+        maxLinearSpeed=drive.v_max,
+        maxAngularSpeed=drive.w_max,
+        maxAcceleration=drive.a_max,
+        maxDeceleration=drive.a_max,
+        maxAngularAcceleration=drive.alpha_max,
+        maxWheelSpeed=drive.wheel_rate_max,
+    )
+    graph.node(
+        "wheels",
+        f"{CORE}IsaacArticulationController",
+        targetPrim=parts.root,
+        jointNames=[drive.left_wheel_joint, drive.right_wheel_joint],
+    )
+    _published(graph, "command", DEFAULT_QOS, stamp=False)
+    graph.connect("tick.tick", "controller.execIn")  # each frame, as its limits of acceleration go by time
+    graph.connect("tick.deltaSeconds", "controller.dt")
+    graph.connect("tick.tick", "wheels.execIn")
+    graph.connect("command.linearVelocity", "forward.tuple")
+    graph.connect("command.angularVelocity", "turning.tuple")
+    graph.connect("forward.x", "controller.linearVelocity")
+    graph.connect("turning.z", "controller.angularVelocity")
+    graph.connect("controller.velocityCommand", "wheels.velocityCommand")
+
+
+def frame_of(mount: MountSpec, name: str) -> str:
+    """The frame that a sensor's messages name: its link, or a frame of its own where it stands aslant."""
+    straight = (mount.p_link_sensor, mount.q_link_sensor_xyzw) == (ZERO3, IDENTITY_XYZW)
+    return mount.link if straight else name
+
+
+def _parts(root: Usd.Prim) -> _Parts:
+    """The prims that Isaac Sim needs of a robot; refused where one is missing."""
+    if ROBOT_API not in root.GetMetadata("apiSchemas").GetAppliedItems():
+        raise RefusedError(
+            f"{place(root)}: has no {ROBOT_API}, so it is no robot to Isaac Sim; convert it from its URDF "
+            "with `magtwin robot`"
+        )
+    links = root.GetRelationship(LINKS).GetForwardedTargets()
+    joints = root.GetRelationship(JOINTS).GetForwardedTargets()
+    if not links or not joints:
+        raise RefusedError(f"{place(root)}: {LINKS if not links else JOINTS} lists none; list them in order")
+    base = root.GetStage().GetPrimAtPath(links[0])
+    if not base or not base.HasAPI(UsdPhysics.RigidBodyAPI):
+        raise RefusedError(f"{place(root)}: {LINKS} begins with {links[0]}, which is no rigid body")
+    return _Parts(
+        root=root.GetPath(),
+        base=links[0],
+        imu=_child(only_prim_with(root, "imu"), IMU_TYPE).GetPath(),
+        lidar=_child(only_prim_with(root, "lidar"), LIDAR_TYPE).GetPath(),
+    )
+
+
+def _child(mount: Usd.Prim, kind: str) -> Usd.Prim:
+    found = [prim for prim in mount.GetChildren() if prim.GetTypeName() == kind]
+    if len(found) != 1:
+        raise RefusedError(f"{place(mount)}: has {len(found)} children of type {kind}; it needs one")
+    return found[0]
+
+
+def _complete_lidar(lidar: Usd.Prim, rays: int) -> None:
+    """One emitter that fires `rays` times a turn; without it Isaac Sim's default has 128, one above another.
+
+    A sensor whose emitters are said already is left alone.
+    """
+    core, names = "omni:sensor:Core:", Sdf.ValueTypeNames
+    if lidar.GetAttribute(f"{core}numberOfEmitters"):
+        return
+    turns = lidar.GetAttribute(f"{core}scanRateBaseHz").Get()
+    firings = min(rays * turns, UINT_MAX)
+    if EMITTER_API not in lidar.GetMetadata("apiSchemas").GetAppliedItems():
+        lidar.AddAppliedSchema(EMITTER_API)
+    state = f"{core}emitterState:s001:"
+    for name, kind, value in (
+        # Isaac Sim 6.0.1 reads the first of these names, the sensor's own documentation has the second.
+        (f"{core}patternFiringRateHz", names.UInt, firings),
+        (f"{core}reportRateBaseHz", names.UInt, firings),
+        (f"{core}numberOfEmitters", names.UInt, 1),
+        (f"{core}numberOfChannels", names.UInt, 1),
+        (f"{state}azimuthDeg", names.FloatArray, [0.0]),
+        (f"{state}elevationDeg", names.FloatArray, [0.0]),
+        (f"{state}fireTimeNs", names.UIntArray, [0]),
+        (f"{state}channelId", names.UIntArray, [1]),
+    ):
+        lidar.CreateAttribute(name, kind, custom=False).Set(value)

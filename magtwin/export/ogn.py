@@ -1,0 +1,245 @@
+"""OmniGraph: the node types that Isaac Sim's graphs are made of, and graphs of them as USD prims.
+
+`ogn.toml` holds what is known of each type, with where it was read. Nothing is authored that it does not
+have: a misspelt attribute, or a connection of types that do not go together, is found here, not in Isaac Sim.
+"""
+
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pxr import Gf, Sdf, Usd
+
+from magtwin.names import RefusedError, hint
+
+TABLE = Path(__file__).with_name("ogn.toml")
+
+ROLES = ("vector", "quat", "point", "normal", "color")
+"""Roles that OmniGraph lets go with plain tuples: vectord[3] fits double[3]."""
+
+_BASES = {"d": "double", "f": "float", "h": "half"}
+_SHAPE = re.compile(r"(?P<base>[a-z]+(?:64)?)(?P<tuple>\[\d\])?(?P<array>\[\])?")
+
+_USD = {
+    "execution": Sdf.ValueTypeNames.UInt,
+    "bool": Sdf.ValueTypeNames.Bool,
+    "uchar": Sdf.ValueTypeNames.UChar,
+    "int": Sdf.ValueTypeNames.Int,
+    "int[]": Sdf.ValueTypeNames.IntArray,
+    "int[2]": Sdf.ValueTypeNames.Int2,
+    "int64": Sdf.ValueTypeNames.Int64,
+    "uint": Sdf.ValueTypeNames.UInt,
+    "uint64": Sdf.ValueTypeNames.UInt64,
+    "uchar[]": Sdf.ValueTypeNames.UCharArray,
+    "float": Sdf.ValueTypeNames.Float,
+    "double": Sdf.ValueTypeNames.Double,
+    "double[]": Sdf.ValueTypeNames.DoubleArray,
+    "vectord[3]": Sdf.ValueTypeNames.Vector3d,
+    "quatd[4]": Sdf.ValueTypeNames.Quatd,
+    "string": Sdf.ValueTypeNames.String,
+    "token": Sdf.ValueTypeNames.Token,
+    "token[]": Sdf.ValueTypeNames.TokenArray,
+}
+"""Type of a USD attribute by OmniGraph's name; for one of several kinds OmniGraph writes a token."""
+
+Kind = str | tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NodeType:
+    """What is known of a type of node."""
+
+    name: str
+    version: int
+
+    inputs: Mapping[str, Kind]
+    """Kind of each input by its name: OmniGraph's name of a type, or several that it takes one of."""
+
+    outputs: Mapping[str, Kind]
+
+    tokens: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Values that an input may have, where it is a choice."""
+
+    source: str = ""
+    """Where this was read: version and file."""
+
+
+@cache
+def node_types() -> dict[str, NodeType]:
+    """Every known type of node by its name."""
+    table = _table()
+    return {
+        name: NodeType(
+            name=name,
+            version=given["version"],
+            inputs=_kinds(given.get("inputs", {})),
+            outputs=_kinds(given.get("outputs", {})),
+            tokens={key: tuple(values) for key, values in given.get("tokens", {}).items()},
+            source=f"{_said(table['sources'][given['source']])}: {given['file']}",
+        )
+        for name, given in table["nodes"].items()
+    }
+
+
+@cache
+def message_fields(message: str) -> dict[str, Kind]:
+    """Inputs that a ROS2Publisher makes for a type of message, such as geometry_msgs/msg/PoseStamped."""
+    return _kinds(_table()["messages"][message])
+
+
+def isaac_version() -> str:
+    """Version of Isaac Sim whose definitions these are."""
+    return str(_table()["sources"]["isaac"]["version"])
+
+
+def fits(given: Kind, taken: Kind) -> bool:
+    """Whether an output of one kind may be connected to an input of another.
+
+    Base type, tuple and array must be the same; roles need not be, as a vectord[3] goes into what takes a
+    double[3]. Of several kinds one must fit.
+    """
+    sides = [{_shape(k) for k in ((kind,) if isinstance(kind, str) else kind)} for kind in (given, taken)]
+    return bool(sides[0] & sides[1])
+
+
+class Graph:
+    """An Action Graph that is being authored in a stage's edit target."""
+
+    def __init__(self, stage: Usd.Stage, path: Sdf.Path) -> None:
+        """Define the graph's prim.
+
+        Raises:
+            RefusedError: Something else is there already.
+        """
+        there = stage.GetPrimAtPath(path)
+        if there and there.IsDefined() and there.GetTypeName() != "OmniGraph":
+            raise RefusedError(f"<{path}>: is taken by a {there.GetTypeName() or 'prim'}; rename that")
+        self.stage, self.path = stage, path
+        self._kinds: dict[str, Mapping[str, Kind]] = {}
+        prim = stage.DefinePrim(path, "OmniGraph")
+        settings = {
+            "evaluationMode": "Automatic",
+            "evaluator:type": "execution",
+            "fabricCacheBacking": "Shared",
+            "fileFormatVersion": Gf.Vec2i(1, 9),
+            "pipelineStage": "pipelineStageSimulation",
+        }
+        known = _kinds({k: v for k, v in _table()["graph"].items() if k not in ("source", "file")})
+        for name, value in settings.items():
+            prim.CreateAttribute(name, _usd_type(known[name]), custom=False).Set(value)
+
+    def node(self, name: str, kind: str, *, message: str = "", **values: Any) -> Usd.Prim:
+        """Define a node.
+
+        Args:
+            name: Of its prim.
+            kind: Its type, one of `node_types`.
+            message: Type of message that a ROS2Publisher publishes, whose fields become inputs.
+            **values: Of its inputs; of a target, the path or paths of prims.
+
+        Raises:
+            RefusedError: There is no such type, it has no such input, or the input no such value.
+        """
+        types = node_types()
+        if kind not in types:
+            raise RefusedError(f"no node type {kind!r}; {hint(kind, types)}")
+        known = types[kind]
+        prim = self.stage.DefinePrim(self.path.AppendChild(name), "OmniGraphNode")
+        names = Sdf.ValueTypeNames
+        prim.CreateAttribute("node:type", names.Token, custom=False).Set(kind)
+        prim.CreateAttribute("node:typeVersion", names.Int, custom=False).Set(known.version)
+        inputs = dict(known.inputs)
+        if message:
+            package, folder, short = message.split("/")
+            values |= {"messagePackage": package, "messageSubfolder": folder, "messageName": short}
+            inputs |= message_fields(message)
+            for key, its in message_fields(message).items():
+                self._attribute(prim, f"inputs:{key}", its)
+        self._kinds[name] = {f"inputs:{key}": its for key, its in inputs.items()} | {
+            f"outputs:{key}": its for key, its in known.outputs.items()
+        }
+        for key, value in values.items():
+            if key not in inputs:
+                raise RefusedError(f"{kind} has no input {key!r}; {hint(key, inputs)}")
+            if key in known.tokens and value not in known.tokens[key]:
+                raise RefusedError(f"{kind}: {key} {value!r} is none; {hint(str(value), known.tokens[key])}")
+            self._set(prim, key, inputs[key], value)
+        return prim
+
+    def connect(self, given: str, taken: str) -> None:
+        """Connect an output to an input, each as NODE.ATTRIBUTE with no namespace: tick.tick, clock.execIn.
+
+        Raises:
+            RefusedError: One of them is not there, or their types do not go together.
+        """
+        output, input_ = self._end(given, "outputs"), self._end(taken, "inputs")
+        if not fits(output[2], input_[2]):
+            raise RefusedError(f"{given} is {_words(output[2])}, {taken} takes {_words(input_[2])}")
+        self._attribute(*output)
+        attribute = self._attribute(*input_)
+        attribute.AddConnection(output[0].GetPath().AppendProperty(output[1]))
+
+    def _end(self, text: str, namespace: str) -> tuple[Usd.Prim, str, Kind]:
+        node, _, name = text.partition(".")
+        kinds = self._kinds.get(node)
+        if kinds is None:
+            raise RefusedError(f"{text}: no node {node!r}; {hint(node, self._kinds)}")
+        full = f"{namespace}:{name}"
+        if full not in kinds:
+            raise RefusedError(f"{text}: no such attribute; {hint(full, kinds)}")
+        return self.stage.GetPrimAtPath(self.path.AppendChild(node)), full, kinds[full]
+
+    @staticmethod
+    def _attribute(prim: Usd.Prim, name: str, kind: Kind) -> Usd.Attribute:
+        """An attribute of a node, as OmniGraph itself writes it."""
+        attribute = prim.CreateAttribute(name, _usd_type(kind), custom=True)
+        if kind == "execution":
+            attribute.SetCustomDataByKey("isExecution", True)
+        return attribute
+
+    def _set(self, prim: Usd.Prim, name: str, kind: Kind, value: Any) -> None:
+        if kind == "target":
+            paths: Sequence[Any] = [value] if isinstance(value, (str, Sdf.Path)) else value
+            prim.CreateRelationship(f"inputs:{name}", custom=True).SetTargets(
+                [Sdf.Path(str(p)) for p in paths]
+            )
+        else:
+            self._attribute(prim, f"inputs:{name}", kind).Set(value)
+
+
+@cache
+def _table() -> dict[str, Any]:
+    return tomllib.loads(TABLE.read_text(encoding="utf-8"))
+
+
+def _kinds(given: Mapping[str, str | list[str]]) -> dict[str, Kind]:
+    return {name: kind if isinstance(kind, str) else tuple(kind) for name, kind in given.items()}
+
+
+def _said(source: Mapping[str, str]) -> str:
+    at = f" at {source['commit']}" if "commit" in source else ""
+    return f"{source['name']} {source['version']}, {source['repository']}{at}"
+
+
+def _words(kind: Kind) -> str:
+    return kind if isinstance(kind, str) else " or ".join(kind)
+
+
+def _usd_type(kind: Kind) -> Sdf.ValueTypeName:
+    return _USD[kind] if isinstance(kind, str) else Sdf.ValueTypeNames.Token
+
+
+def _shape(kind: str) -> tuple[str, str, str]:
+    """Base type, tuple and array of a kind, without its role."""
+    found = _SHAPE.fullmatch(kind)
+    if found is None:
+        raise RefusedError(f"{kind!r} is no type of OmniGraph")
+    base, count, array = found["base"], found["tuple"] or "", found["array"] or ""
+    role = next((r for r in ROLES if base.startswith(r)), "")
+    if role:
+        base = _BASES[base.removeprefix(role)]
+    return base, count, array

@@ -1,0 +1,301 @@
+"""Isaac Sim: the Action Graph has what its nodes' definitions have, and what magtwin's ROS 2 topics are."""
+
+from dataclasses import replace
+
+import pytest
+from pxr import Sdf, Usd, UsdPhysics, UsdShade
+
+from magtwin.export.isaac import GRAPHS, author_graph
+from magtwin.export.ogn import Graph, fits, message_fields, node_types
+from magtwin.io.messages import TOPICS, sender_of
+from magtwin.names import RefusedError
+from magtwin.spec import PlacedRobot
+from magtwin.usd.layers import open_stage
+from magtwin.usd.scene import author_scene, read_scene
+from magtwin.usd.schema import only_prim_with
+
+USD_TYPES = {
+    "execution": "uint",
+    "vectord[3]": "vector3d",
+    "quatd[4]": "quatd",
+}
+"""OmniGraph's types that USD calls otherwise."""
+
+
+@pytest.fixture(scope="module")
+def authored(lab_scene):
+    stage, scene = open_stage(lab_scene), read_scene(lab_scene)
+    stage.SetEditTarget(stage.GetSessionLayer())
+    (graph,) = author_graph(stage, scene)
+    return stage, scene, graph
+
+
+def kind_of(attribute):
+    """The kind of an authored input or output by its node's definition, and the fields of its message."""
+    prim = attribute.GetPrim()
+    known = node_types()[prim.GetAttribute("node:type").Get()]
+    namespace, name = attribute.GetName().split(":", 1)
+    kinds = dict(getattr(known, namespace))
+    if prim.GetAttribute("inputs:messageName"):
+        package, folder, short = (
+            prim.GetAttribute(f"inputs:message{part}").Get() for part in ("Package", "Subfolder", "Name")
+        )
+        kinds |= message_fields(f"{package}/{folder}/{short}")
+    assert name in kinds, f"{prim.GetPath()}: {known.name} has no {attribute.GetName()}"
+    return kinds[name]
+
+
+def ports(prim):
+    return [
+        prop
+        for prop in prim.GetAuthoredProperties()
+        if prop.GetName().split(":")[0] in ("inputs", "outputs") and prop.GetName() != "node:type"
+    ]
+
+
+def test_every_node_input_and_output_is_one_of_its_definition_and_of_its_type(authored):
+    _, _, graph = authored
+    assert graph.GetTypeName() == "OmniGraph"
+    assert graph.GetAttribute("evaluator:type").Get() == "execution"
+    for prim in graph.GetChildren():
+        assert prim.GetTypeName() == "OmniGraphNode"
+        known = node_types()[prim.GetAttribute("node:type").Get()]
+        assert prim.GetAttribute("node:typeVersion").Get() == known.version
+        assert known.source
+        for prop in ports(prim):
+            kind = kind_of(prop)
+            if kind == "target":
+                assert isinstance(prop, Usd.Relationship)
+                continue
+            wanted = USD_TYPES.get(kind, kind) if isinstance(kind, str) else "token"
+            assert str(prop.GetTypeName()) == wanted, prop.GetPath()
+            assert bool(prop.GetCustomDataByKey("isExecution")) == (kind == "execution")
+
+
+def test_every_connection_goes_from_an_output_to_an_input_that_takes_it(authored):
+    stage, _, graph = authored
+    count = 0
+    for prim in graph.GetChildren():
+        for attribute in prim.GetAttributes():
+            for path in attribute.GetConnections():
+                source = stage.GetAttributeAtPath(path)
+                assert source, path
+                assert source.GetName().startswith("outputs:")
+                assert attribute.GetName().startswith("inputs:")
+                assert fits(kind_of(source), kind_of(attribute)), (path, attribute.GetPath())
+                count += 1
+    assert count > 60
+
+
+def test_each_frame_comes_to_every_node_that_something_must_run(authored):
+    _, _, graph = authored
+    reached, seen = {graph.GetPath().AppendChild("tick")}, set()
+    while reached - seen:
+        seen |= (now := reached - seen)
+        for prim in graph.GetChildren():
+            attribute = prim.GetAttribute("inputs:execIn")
+            if attribute and any(path.GetPrimPath() in now for path in attribute.GetConnections()):
+                reached.add(prim.GetPath())
+    for prim in graph.GetChildren():
+        known = node_types()[prim.GetAttribute("node:type").Get()]
+        assert ("execIn" in known.inputs) <= (prim.GetPath() in reached), prim.GetPath()
+
+
+def test_topics_messages_and_qos_are_those_of_magtwins_own_robot(authored):
+    stage, _, graph = authored
+    seen = {}
+    for prim in graph.GetChildren():
+        topic = prim.GetAttribute("inputs:topicName")
+        if not topic:
+            continue
+        name, short = topic.Get(), prim.GetAttribute("node:type").Get().split("ROS2")[1]
+        known = TOPICS[name]
+        message = prim.GetAttribute("inputs:messageName")
+        said = message.Get() if message else short.removeprefix("Publish").removeprefix("Subscribe")
+        said = {"Odometry": "Odometry", "RtxLidarHelper": "LaserScan"}.get(said, said)
+        assert known.kind.endswith(f"/{said}")
+        qos = stage.GetPrimAtPath(prim.GetAttribute("inputs:qosProfile").GetConnections()[0].GetPrimPath())
+        assert qos.GetAttribute("inputs:depth").Get() == known.qos.depth
+        assert (qos.GetAttribute("inputs:reliability").Get() == "reliable") == known.qos.reliable
+        seen[name] = short
+    assert set(seen) == {
+        *("/clock", "/robot/odom", "/robot/imu", "/robot/enu/pose"),
+        *("/robot/joint_states", "/robot/scan", "/robot/cmd_vel"),
+    }
+    assert seen["/robot/cmd_vel"].startswith("Subscribe")
+
+
+def test_a_message_has_every_field_that_its_publisher_makes_so_that_isaac_keeps_the_connections(authored):
+    _, _, graph = authored
+    node = graph.GetChild("publish_pose")
+    own = set(node_types()["isaacsim.ros2.bridge.ROS2Publisher"].inputs)
+    made = {prop.GetName().removeprefix("inputs:") for prop in ports(node)} - own
+    assert made == set(message_fields("geometry_msgs/msg/PoseStamped"))
+    for axis in "xyz":
+        (path,) = node.GetAttribute(f"inputs:pose:position:{axis}").GetConnections()
+        assert path.name == f"outputs:{axis}"
+
+
+def test_frames_of_messages_are_those_that_a_bag_of_the_robot_names(authored):
+    _, scene, graph = authored
+    who = sender_of(scene.robot)
+    assert graph.GetChild("publish_imu").GetAttribute("inputs:frameId").Get() == who.imu_frame
+    assert graph.GetChild("publish_scan").GetAttribute("inputs:frameId").Get() == who.lidar_frame
+    assert graph.GetChild("publish_pose").GetAttribute("inputs:header:frame_id").Get() == who.map_frame
+    odometry = graph.GetChild("publish_odometry")
+    assert odometry.GetAttribute("inputs:odomFrameId").Get() == who.odom_frame
+    assert odometry.GetAttribute("inputs:chassisFrameId").Get() == who.base_frame
+    assert graph.GetChild("wheels").GetAttribute("inputs:jointNames").Get() == list(who.wheel_joints)
+
+
+def test_the_drive_of_the_robot_limits_its_wheels(authored):
+    _, scene, graph = authored
+    drive, controller = scene.robot.drive, graph.GetChild("controller")
+    for name, want in {
+        "wheelRadius": drive.wheel_radius_m,
+        "wheelDistance": drive.wheel_separation_m,
+        "maxLinearSpeed": drive.v_max,
+        "maxAngularSpeed": drive.w_max,
+        "maxAcceleration": drive.a_max,
+        "maxDeceleration": drive.a_max,
+        "maxAngularAcceleration": drive.alpha_max,
+        "maxWheelSpeed": drive.wheel_rate_max,
+    }.items():
+        assert controller.GetAttribute(f"inputs:{name}").Get() == want
+
+
+def test_prims_that_nodes_name_are_what_isaac_looks_for(authored):
+    stage, _, graph = authored
+
+    def target(node, name):
+        (path,) = graph.GetChild(node).GetRelationship(f"inputs:{name}").GetTargets()
+        return stage.GetPrimAtPath(path)
+
+    assert target("odometry", "chassisPrim").HasAPI(UsdPhysics.RigidBodyAPI)
+    assert target("pose", "prim") == target("odometry", "chassisPrim")
+    assert target("wheels", "targetPrim").HasAPI(UsdPhysics.ArticulationRootAPI)
+    assert target("joints", "prim") == target("wheels", "targetPrim")
+    imu, lidar = target("imu", "imuPrim"), target("beams", "cameraPrim")
+    assert imu.GetTypeName() == "IsaacImuSensor"
+    assert imu.GetParent().GetParent().HasAPI(UsdPhysics.RigidBodyAPI)
+    assert lidar.GetTypeName() == "OmniLidar"
+    names = [joint.GetName() for joint in target("wheels", "targetPrim").GetChild("joints").GetChildren()]
+    assert set(graph.GetChild("wheels").GetAttribute("inputs:jointNames").Get()) <= set(names)
+
+
+def test_a_lidar_scans_a_plane_with_as_many_rays_as_its_figures_say(authored):
+    stage, scene, graph = authored
+    (path,) = graph.GetChild("beams").GetRelationship("inputs:cameraPrim").GetTargets()
+    lidar, core = stage.GetPrimAtPath(path), "omni:sensor:Core:"
+    turns = lidar.GetAttribute(f"{core}scanRateBaseHz").Get()
+    for name in ("patternFiringRateHz", "reportRateBaseHz"):
+        assert lidar.GetAttribute(core + name).Get() == scene.robot.lidar.rays * turns
+    count = lidar.GetAttribute(f"{core}numberOfEmitters").Get()
+    assert count == 1
+    for name in ("azimuthDeg", "elevationDeg", "fireTimeNs", "channelId"):
+        assert len(lidar.GetAttribute(f"{core}emitterState:s001:{name}").Get()) == count
+
+
+def test_the_robot_lists_its_links_and_joints_from_the_base_on(authored):
+    stage, _, _ = authored
+    root = only_prim_with(stage.GetPseudoRoot(), "robot")
+    links = root.GetRelationship("isaac:physics:robotLinks").GetForwardedTargets()
+    joints = root.GetRelationship("isaac:physics:robotJoints").GetForwardedTargets()
+    bodies = [p.GetPath() for p in Usd.PrimRange(root) if p.HasAPI(UsdPhysics.RigidBodyAPI)]
+    assert sorted(links) == sorted(bodies)
+    assert sorted(joints) == sorted(p.GetPath() for p in Usd.PrimRange(root) if p.IsA(UsdPhysics.Joint))
+    assert links[0].name == "base_link"
+    known = {links[0]}
+    for path in joints:  # each hangs on what came before, and brings the link of its own place
+        joint = UsdPhysics.Joint(stage.GetPrimAtPath(path))
+        (parent,), (child,) = (
+            rel.GetForwardedTargets() for rel in (joint.GetBody0Rel(), joint.GetBody1Rel())
+        )
+        assert parent in known
+        known.add(child)
+        assert links[len(known) - 1] == child
+
+
+def test_every_collider_has_a_physics_material(authored):
+    stage, _, _ = authored
+    colliders = [p for p in stage.Traverse() if p.HasAPI(UsdPhysics.CollisionAPI)]
+    assert len(colliders) > 10
+    for prim in colliders:
+        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")
+        assert material, prim.GetPath()
+        assert material.GetPrim().HasAPI(UsdPhysics.MaterialAPI), prim.GetPath()
+
+
+def test_robots_that_share_a_lab_have_topics_of_their_own_and_one_clock(lab_scene, tmp_path):
+    scene = read_scene(lab_scene)
+    second = PlacedRobot(robot=replace(scene.robot, name="second"), start=(1.0, 1.0, 0.0))
+    file = author_scene(replace(scene, others=(second,)), tmp_path / "two", by_reference=True)
+    stage = open_stage(file)
+    graphs = author_graph(stage, read_scene(file))
+    assert [g.GetPath().name for g in graphs] == [scene.robot.name, "second"]
+    topics = [
+        prim.GetAttribute("inputs:topicName").Get()
+        for graph in graphs
+        for prim in graph.GetChildren()
+        if prim.GetAttribute("inputs:topicName")
+    ]
+    assert len(topics) == len(set(topics)) == 13
+    assert {"/clock", "/second/odom", f"/{scene.robot.name}/odom"} <= set(topics)
+
+
+def test_what_is_no_robot_to_isaac_is_refused_with_what_to_do(lab_scene):
+    scene = read_scene(lab_scene)
+    stage = open_stage(lab_scene)
+    stage.SetEditTarget(stage.GetSessionLayer())
+    root = only_prim_with(stage.GetPseudoRoot(), "robot")
+    with pytest.raises(RefusedError, match="the stage has no robot 'nobody'; it has turtlebot4"):
+        author_graph(stage, replace(scene, robot=replace(scene.robot, name="nobody")))
+    imu = only_prim_with(root, "imu").GetChildren()[0]
+    imu.SetActive(False)
+    with pytest.raises(RefusedError, match="has 0 children of type IsaacImuSensor"):
+        author_graph(stage, scene)
+    imu.SetActive(True)
+    root.GetRelationship("isaac:physics:robotLinks").SetTargets([])
+    with pytest.raises(RefusedError, match="robotLinks lists none"):
+        author_graph(stage, scene)
+    assert not stage.GetPrimAtPath(GRAPHS)
+
+
+@pytest.mark.parametrize(
+    ("given", "taken", "yes"),
+    [
+        ("vectord[3]", ("double[3]", "float[3]"), True),
+        ("quatd[4]", ("double[4]",), True),
+        (("double", "double[]"), "double", True),
+        ("double", "double[]", False),
+        ("vectord[3]", "vectorf[3]", False),
+        ("int", "uint", False),
+        ("quatd[4]", "vectord[3]", False),
+        ("execution", "uint", False),
+    ],
+)
+def test_types_go_together_where_base_tuple_and_array_are_the_same(given, taken, yes):
+    assert fits(given, taken) is yes
+
+
+def test_what_a_definition_does_not_have_is_refused_when_it_is_authored():
+    graph = Graph(Usd.Stage.CreateInMemory(), Sdf.Path("/Graph"))
+    clock = "isaacsim.ros2.bridge.ROS2PublishClock"
+    with pytest.raises(RefusedError, match=r"did you mean 'isaacsim\.ros2\.bridge\.ROS2PublishClock'"):
+        graph.node("a", "isaacsim.ros2.bridge.ROS2PublishClocks")
+    with pytest.raises(RefusedError, match="no input 'topic'"):
+        graph.node("a", clock, topic="/clock")
+    with pytest.raises(RefusedError, match="type 'laserscan' is none; did you mean 'laser_scan'"):
+        graph.node("a", "isaacsim.ros2.bridge.ROS2RtxLidarHelper", type="laserscan")
+    graph.node("tick", "omni.graph.action.OnPlaybackTick")
+    graph.node("clock", clock)
+    with pytest.raises(RefusedError, match=r"tick\.tick is execution, clock\.timeStamp takes double"):
+        graph.connect("tick.tick", "clock.timeStamp")
+    with pytest.raises(RefusedError, match=r"clock\.exec: no such attribute"):
+        graph.connect("tick.tick", "clock.exec")
+    with pytest.raises(RefusedError, match="no node 'tock'"):
+        graph.connect("tock.tick", "clock.execIn")
+    stage = Usd.Stage.CreateInMemory()
+    stage.DefinePrim("/Graph", "Xform")
+    with pytest.raises(RefusedError, match="is taken by a Xform"):
+        Graph(stage, Sdf.Path("/Graph"))
