@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q install -c constraint
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow simready physics lint bench wheel-test schema assets pictures clean help
+.PHONY: demo test test-slow simready ros physics lint bench wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -26,6 +26,14 @@ simready: $(VENV)/.dev  ## Hold robots against NVIDIA's SimReady profiles, in an
 	test -x build/simready/bin/simready-validate || $(PYTHON) -m venv build/simready
 	build/simready/bin/python -m pip --disable-pip-version-check -q install 'simready-validate>=2026.8' 'simready-foundation-tier-core>=2026.8' 'simready-foundation-tier-sensors>=2026.8'
 	MAGTWIN_SIMREADY=$(CURDIR)/build/simready/bin/simready-validate $(BIN)/python -m pytest tests/test_urdf_layout.py
+
+ros: $(VENV)/.dev build/ros-jazzy/.installed  ## Cross our nodes with rclpy of ROS 2 Jazzy, in an environment of its own
+	$(ONE_THREAD) $(BIN)/python -m pytest tests/test_ros_bus.py
+
+build/ros-jazzy/.installed:
+	$(PYTHON) -m venv build/ros-jazzy
+	build/ros-jazzy/bin/python -m pip --disable-pip-version-check -q install numpy 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-sensor-msgs ros-jazzy-geometry-msgs ros-jazzy-nav-msgs ros-jazzy-rosgraph-msgs ros-jazzy-diagnostic-msgs
+	@touch $@
 
 lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies
 	$(BIN)/ruff format --check .

@@ -1,0 +1,256 @@
+"""Bus: what a node needs of ROS 2, whoever carries it.
+
+Two carry it: rclpy, where it can be imported, and cyclonedds, which meets any ROS 2 on the network over DDS
+from any Python. Both are handed messages as bytes, which `magtwin.io.cdr` makes of fields by the one table
+of types, `magtwin.io.messages.TYPES`; so a node says and hears the same with either.
+"""
+
+import importlib
+import importlib.util
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from magtwin.io.cdr import Messages, decode, encode, leaves
+from magtwin.io.messages import TYPES, Qos
+from magtwin.names import RefusedError, find
+
+Backend = Literal["auto", "rclpy", "cyclonedds"]
+
+BACKENDS: Mapping[str, tuple[str, str]] = {
+    "rclpy": ("magtwin.ros.rclpy_bus", "RclpyBus"),
+    "cyclonedds": ("magtwin.ros.dds", "DdsBus"),
+}
+"""Modules and classes of those that carry a bus, the first that can be imported being taken."""
+
+MISSING = (
+    "no ROS 2 can be imported: source an installation (source /opt/ros/jazzy/setup.bash), or install "
+    "cyclonedds, which meets ROS 2 over the network (pip install 'magtwin[ros]')"
+)
+
+NS = 10**9
+"""Nanoseconds in a second."""
+
+
+def form_of(kind: str, fields: Mapping[str, Any] | None = None) -> str:
+    """Leaves of a type of messages; those with parts of their own (`transforms`) come along in `fields`."""
+    if fields is not None and "form" in fields:
+        return str(fields["form"])
+    return find("type of messages", kind, TYPES)
+
+
+def to_bytes(kind: str, fields: Mapping[str, Any]) -> bytes:
+    """One message in CDR.
+
+    Args:
+        kind: Its type, such as `sensor_msgs/msg/Imu`.
+        fields: By the leaves' names, as `magtwin.io.cdr.encode` takes them; `form` in place of the table's
+            leaves, where parts are counted.
+    """
+    return encode(leaves(form_of(kind, fields)), fields, 1).tobytes()
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message as it came in."""
+
+    kind: str
+    data: bytes
+    """CDR, its header included."""
+
+    sent_ns: int
+    """When it was sent, by the sender's wall clock [ns]."""
+
+    received_ns: int
+    """When it was taken in, by ours [ns]."""
+
+    def read(self, wanted: Iterable[str], form: str | None = None) -> dict[str, Any]:
+        """What stands in some leaves: numbers, arrays, strings; stamps as whole nanoseconds.
+
+        Args:
+            wanted: Names of the leaves.
+            form: Leaves in place of the table's, where parts are counted.
+
+        Raises:
+            RefusedError: It is too short for its type, or not plain CDR.
+        """
+        buffer = np.frombuffer(self.data, np.uint8)
+        one = Messages(np.zeros(1, np.int64), buffer, np.zeros(1, np.int64), np.array([len(buffer)]))
+        return {
+            name: value[0] for name, value in decode(leaves(form or TYPES[self.kind]), one, wanted).items()
+        }
+
+
+Heard = Callable[[Message], None]
+
+
+class Publisher(Protocol):
+    """Where messages of one topic go."""
+
+    topic: str
+    kind: str
+
+    def publish(self, data: bytes) -> None:
+        """Send a message, in CDR."""
+
+    def subscribers(self) -> int:
+        """How many listen."""
+
+
+class Subscription(Protocol):
+    """Where messages of one topic come from."""
+
+    topic: str
+    kind: str
+
+    def publishers(self) -> int:
+        """How many send."""
+
+
+class Timer(Protocol):
+    """What is called in even steps of the bus's clock."""
+
+    def cancel(self) -> None:
+        """Call it no more."""
+
+
+class Bus(Protocol):
+    """A node of ROS 2."""
+
+    name: str
+    backend: str
+
+    def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
+        """Offer a topic; its name is namespaced and remapped by the bus's `Names`."""
+
+    def subscribe(self, topic: str, kind: str, heard: Heard, qos: Qos) -> Subscription:
+        """Have `heard` called for each message of a topic, in the thread that spins."""
+
+    def types(self, topic: str) -> tuple[str, ...]:
+        """Types in which others offer a topic, as far as they have been discovered."""
+
+    def timer(self, period_s: float, due: Callable[[], None]) -> Timer:
+        """Have `due` called each `period_s` of the bus's clock, in the thread that spins."""
+
+    def now_ns(self) -> int:
+        """Time on the bus's clock [ns]: wall time, or /clock's in sim time (0 before the first)."""
+
+    def spin_once(self, timeout_s: float) -> None:
+        """Take in what has come, waiting for it at most `timeout_s`; timers that are due are called."""
+
+    def close(self) -> None:
+        """Leave the network."""
+
+
+@dataclass(frozen=True)
+class Names:
+    """How a node's names are found on the network: its namespace, and what is called otherwise."""
+
+    namespace: str = "/robot"
+    """Where relative names stand; "" is the root."""
+
+    remaps: Mapping[str, str] = field(default_factory=dict)
+    """By the name that a node uses, with or without its namespace, the one that it has on the network."""
+
+    def resolve(self, name: str) -> str:
+        """The name of a topic on the network, from the root.
+
+        A relative name (`odom`) is in the namespace, `/clock` is global. `/robot/...` of
+        `magtwin.io.messages.TOPICS` counts as relative.
+        """
+        relative = name.removeprefix("/robot/")
+        whole = relative if relative.startswith("/") else f"{self._space}/{relative}"
+        for candidate in (name, relative, whole):
+            if candidate in self.remaps:
+                target = self.remaps[candidate]
+                return target if target.startswith("/") else f"{self._space}/{target}"
+        return whole
+
+    @property
+    def _space(self) -> str:
+        space = self.namespace.strip("/")
+        return f"/{space}" if space else ""
+
+
+def names_of(namespace: str = "robot", remaps: Iterable[str] = ()) -> Names:
+    """Names from a command line: `remaps` of the form a:=b.
+
+    Raises:
+        RefusedError: One is not of that form, or not a name of ROS.
+    """
+    table = {}
+    for remap in remaps:
+        left, sign, right = remap.partition(":=")
+        if not sign or not _is_name(left) or not _is_name(right):
+            raise RefusedError(f"a remap is a name:=another, such as odom:=/vicon/odom; got {remap!r}")
+        table[left] = right
+    if namespace and not _is_name(namespace):
+        raise RefusedError(f"namespace {namespace!r} is none of ROS: letters, digits, _ and / are")
+    return Names(namespace, table)
+
+
+def _is_name(name: str) -> bool:
+    parts = name.strip("/").split("/")
+    return all(part.isidentifier() and part.isascii() for part in parts)
+
+
+def available() -> tuple[str, ...]:
+    """Names of the backends that can be imported here, the preferred one first."""
+    return tuple(name for name in BACKENDS if importlib.util.find_spec(name) is not None)
+
+
+def open_bus(
+    name: str,
+    *,
+    names: Names | None = None,
+    sim_time: bool = False,
+    backend: Backend = "auto",
+    domain: int | None = None,
+    parameters: Mapping[str, Any] | None = None,
+) -> Bus:
+    """Join ROS 2 as a node.
+
+    Args:
+        name: The node's.
+        names: Namespace and remaps.
+        sim_time: Whether its clock is /clock's.
+        backend: Who carries it; "auto" takes rclpy where it can be imported, else cyclonedds.
+        domain: The domain; None takes ROS_DOMAIN_ID, or 0.
+        parameters: What the node is set to, for those who ask it (rclpy alone can be asked).
+
+    Raises:
+        RefusedError: The backend cannot be imported, or the domain is none.
+    """
+    if not name.isidentifier():
+        raise RefusedError(f"a node's name has letters, digits and _; got {name!r}")
+    if domain is None:
+        told = os.environ.get("ROS_DOMAIN_ID", "0") or "0"
+        if not told.isdigit():
+            raise RefusedError(f"ROS_DOMAIN_ID must be a whole number from 0 to 232, it is {told!r}")
+        domain = int(told)
+    if not 0 <= domain <= 232:
+        raise RefusedError(f"a domain of ROS must be from 0 to 232, got {domain}")
+    there = available()
+    if backend == "auto":
+        if not there:
+            raise RefusedError(MISSING)
+        backend = there[0]  # type: ignore[assignment]
+    elif backend not in there:
+        find("backend", backend, BACKENDS)
+        raise RefusedError(MISSING if not there else f"{backend} cannot be imported here; {there[0]} can")
+    module, kind = BACKENDS[backend]
+    try:
+        opened = getattr(importlib.import_module(module), kind)
+    except ImportError as error:
+        raise RefusedError(f"{backend} is there but cannot be imported ({error}); {MISSING}") from error
+    bus: Bus = opened(name, names or Names(), sim_time=sim_time, domain=domain, parameters=parameters or {})
+    return bus
+
+
+def localhost_only() -> bool:
+    """Whether the environment asks to stay on this machine, by the variables of ROS 2."""
+    reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
+    return os.environ.get("ROS_LOCALHOST_ONLY", "") == "1" or reach == "LOCALHOST"

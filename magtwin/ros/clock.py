@@ -1,0 +1,75 @@
+"""Clock: a node's time and its timers, by the wall or by /clock."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+NS = 10**9
+
+
+@dataclass(eq=False)
+class Alarm:
+    """A timer."""
+
+    period_ns: int
+    due: Callable[[], None]
+    next_ns: int
+    live: bool = True
+
+    def cancel(self) -> None:
+        """Call it no more."""
+        self.live = False
+
+
+class Clock:
+    """Time that goes on with the wall's, or as it is told.
+
+    A timer keeps its step: one that could not be called in time is called once, and its next time is the
+    next of its even steps. Where time jumps back, as when a simulation begins anew, steps count from there.
+    """
+
+    def __init__(self, *, sim_time: bool = False) -> None:
+        """Begin; a clock of sim time stands at 0 until it is told."""
+        self.sim_time = sim_time
+        self._now_ns = 0
+        self._alarms: list[Alarm] = []
+
+    def now_ns(self) -> int:
+        """Time [ns]."""
+        return self._now_ns if self.sim_time else time.time_ns()
+
+    def tell(self, now_ns: int) -> None:
+        """Set sim time [ns]."""
+        back = now_ns < self._now_ns
+        self._now_ns = now_ns
+        for alarm in self._alarms:
+            if back or not alarm.next_ns:
+                alarm.next_ns = now_ns + alarm.period_ns
+
+    def timer(self, period_s: float, due: Callable[[], None]) -> Alarm:
+        """Call `due` in steps of `period_s` [s] from now on."""
+        period_ns = max(round(period_s * NS), 1)
+        now = self._time_ns()
+        alarm = Alarm(period_ns, due, now + period_ns if now else 0)
+        self._alarms.append(alarm)
+        return alarm
+
+    def left_s(self, most_s: float) -> float:
+        """Wall time until the next timer, at most `most_s` [s]; sim time cannot be foreseen."""
+        live = [alarm.next_ns for alarm in self._alarms if alarm.live]
+        if self.sim_time or not live:
+            return most_s
+        return min(max((min(live) - self._time_ns()) / NS, 0.0), most_s)
+
+    def run_due(self) -> None:
+        """Call the timers whose time has come."""
+        self._alarms = [alarm for alarm in self._alarms if alarm.live]
+        now = self._time_ns()
+        for alarm in list(self._alarms):
+            if alarm.live and alarm.next_ns and alarm.next_ns <= now:
+                alarm.next_ns += alarm.period_ns * ((now - alarm.next_ns) // alarm.period_ns + 1)
+                alarm.due()
+
+    def _time_ns(self) -> int:
+        # Steps of wall time are the monotonic clock's, which nobody sets.
+        return self._now_ns if self.sim_time else time.monotonic_ns()

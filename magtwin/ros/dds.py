@@ -1,0 +1,212 @@
+"""DdsBus: a node over cyclonedds, a DDS that meets any ROS 2 on the network from any Python.
+
+It follows ROS 2's own mapping: `/robot/odom` is the DDS topic `rt/robot/odom`, QoS is what ROS calls it, and
+messages are plain CDR. Such a node sends and hears like any other, but is not in `ros2 node list`, nor can
+it be asked for parameters: those are rclpy's own doing.
+"""
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.core import (
+    DDSException,
+    InstanceState,
+    Policy,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
+from cyclonedds.core import Qos as DdsQos
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic as DdsTopic
+
+from magtwin.io.messages import CLOCK, Qos
+from magtwin.names import RefusedError
+from magtwin.ros.bus import Heard, Message, Names, localhost_only
+from magtwin.ros.clock import Alarm, Clock
+from magtwin.ros.types import raw, ros_name, struct_of
+
+NS = 10**9
+
+MOST_TAKEN = 256
+"""Messages of a topic that are taken at a time."""
+
+_COMMON = (
+    "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"  # Kilted's is other
+    "<Tracing><Verbosity>none</Verbosity></Tracing>"
+)
+_HERE = (
+    '<General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
+    "<AllowMulticast>false</AllowMulticast></General>"
+    "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+    '<Peers><Peer address="127.0.0.1"/></Peers></Discovery>'
+)
+_ANYWHERE = "<Discovery><ParticipantIndex>auto</ParticipantIndex></Discovery>"
+
+_DOMAINS: dict[int, Domain] = {}
+"""Domains that were configured, which must be so before their first participant, and live as long as it."""
+
+
+def qos_of(qos: Qos) -> DdsQos:
+    """What ROS calls a topic's quality of service, as DDS policies."""
+    reliable = Policy.Reliability.Reliable(max_blocking_time=NS // 10)
+    return DdsQos(
+        reliable if qos.reliable else Policy.Reliability.BestEffort,
+        Policy.History.KeepLast(qos.depth),
+        Policy.Durability.TransientLocal if qos.latched else Policy.Durability.Volatile,
+        Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
+    )
+
+
+class DdsPublisher:
+    """As `magtwin.ros.bus.Publisher`."""
+
+    def __init__(self, topic: str, kind: str, writer: DataWriter[Any]) -> None:
+        self.topic, self.kind, self._writer = topic, kind, writer
+
+    def publish(self, data: bytes) -> None:
+        """Send a message."""
+        self._writer.write(raw(self.kind, data))
+
+    def subscribers(self) -> int:
+        """How many listen."""
+        return len(self._writer.get_matched_subscriptions())
+
+
+class DdsSubscription:
+    """As `magtwin.ros.bus.Subscription`."""
+
+    def __init__(self, topic: str, kind: str, reader: DataReader[Any], heard: Heard) -> None:
+        self.topic, self.kind, self.reader, self.heard = topic, kind, reader, heard
+
+    def publishers(self) -> int:
+        """How many send."""
+        return len(self.reader.get_matched_publications())
+
+
+class DdsBus:
+    """As `magtwin.ros.bus.Bus`."""
+
+    backend = "cyclonedds"
+
+    def __init__(
+        self, name: str, names: Names, *, sim_time: bool, domain: int, parameters: Mapping[str, Any]
+    ) -> None:
+        self.name, self._names = name, names
+        try:
+            if domain not in _DOMAINS and "CYCLONEDDS_URI" not in os.environ:
+                where = _HERE if localhost_only() else _ANYWHERE
+                xml = f'<CycloneDDS><Domain Id="any">{where}{_COMMON}</Domain></CycloneDDS>'
+                _DOMAINS[domain] = Domain(domain, xml)
+            self._participant = DomainParticipant(domain)
+        except DDSException as error:
+            raise RefusedError(
+                f"cyclonedds cannot join domain {domain} ({error}); is CYCLONEDDS_URI right, the network up, "
+                "and are there fewer than 32 nodes on this machine?"
+            ) from error
+        self._waiting = WaitSet(self._participant)
+        self._topics: dict[str, tuple[str, DdsTopic[Any]]] = {}
+        self._publishers: list[DdsPublisher] = []
+        self._subscriptions: list[DdsSubscription] = []
+        self._conditions: list[ReadCondition] = []
+        self._offers: BuiltinDataReader | None = None
+        self._offered: dict[str, set[str]] = {}
+        self.clock = Clock(sim_time=sim_time)
+        if sim_time:
+            self.subscribe(CLOCK.name, CLOCK.kind, self._told, CLOCK.qos)
+
+    def publisher(self, topic: str, kind: str, qos: Qos) -> DdsPublisher:
+        """As for `Bus`."""
+        whole = self._names.resolve(topic)
+        writer: DataWriter[Any] = DataWriter(self._participant, self._topic(whole, kind), qos_of(qos))
+        publisher = DdsPublisher(whole, kind, writer)
+        self._publishers.append(publisher)  # what is latched goes with its writer
+        return publisher
+
+    def subscribe(self, topic: str, kind: str, heard: Heard, qos: Qos) -> DdsSubscription:
+        """As for `Bus`."""
+        whole = self._names.resolve(topic)
+        reader: DataReader[Any] = DataReader(self._participant, self._topic(whole, kind), qos_of(qos))
+        subscription = DdsSubscription(whole, kind, reader, heard)
+        fresh = ReadCondition(reader, SampleState.NotRead | ViewState.Any | InstanceState.Any)
+        self._waiting.attach(fresh)
+        self._conditions.append(fresh)
+        self._subscriptions.append(subscription)
+        return subscription
+
+    def types(self, topic: str) -> tuple[str, ...]:
+        """As for `Bus`."""
+        if self._offers is None:
+            self._offers = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        while taken := self._offers.take(N=MOST_TAKEN):
+            for offer in taken:
+                if offer.sample_info.valid_data:
+                    self._offered.setdefault(offer.topic_name, set()).add(ros_name(offer.type_name))
+        return tuple(sorted(self._offered.get(f"rt{self._names.resolve(topic)}", set()) - {""}))
+
+    def timer(self, period_s: float, due: Callable[[], None]) -> Alarm:
+        """As for `Bus`."""
+        return self.clock.timer(period_s, due)
+
+    def now_ns(self) -> int:
+        """As for `Bus`."""
+        return self.clock.now_ns()
+
+    def spin_once(self, timeout_s: float) -> None:
+        """As for `Bus`."""
+        left = self.clock.left_s(timeout_s)
+        if self._conditions and left > 0:
+            self._waiting.wait(round(left * NS))
+        elif left > 0:
+            time.sleep(left)
+        self._take()
+        self.clock.run_due()
+
+    def close(self) -> None:
+        """As for `Bus`."""
+        for subscription in self._subscriptions:
+            subscription.heard = _deaf
+        self._conditions.clear()
+        self._subscriptions.clear()
+        self._publishers.clear()
+        self._topics.clear()
+        del self._waiting, self._participant
+
+    def _topic(self, whole: str, kind: str) -> "DdsTopic[Any]":
+        known = self._topics.get(whole)
+        if known is None:
+            known = kind, DdsTopic(self._participant, f"rt{whole}", struct_of(kind))
+            self._topics[whole] = known
+        if known[0] != kind:
+            raise RefusedError(f"topic {whole} has messages of {known[0]} in this node, not also of {kind}")
+        return known[1]
+
+    def _take(self) -> None:
+        """Hand on all messages that have come, in the order in which they were sent."""
+        come: list[tuple[int, int, DdsSubscription, bytes]] = []
+        for subscription in self._subscriptions:
+            while taken := subscription.reader.take(N=MOST_TAKEN):
+                for sample in taken:
+                    if sample.sample_info.valid_data:
+                        come.append(
+                            (sample.sample_info.source_timestamp, len(come), subscription, sample.cdr)
+                        )
+                if len(taken) < MOST_TAKEN:
+                    break
+        come.sort(key=lambda one: one[:2])
+        now = time.time_ns()
+        for sent_ns, _, subscription, data in come:
+            subscription.heard(Message(subscription.kind, data, sent_ns, now))
+
+    def _told(self, message: Message) -> None:
+        self.clock.tell(int(message.read(["clock"])["clock"]))
+
+
+def _deaf(message: Message) -> None:
+    """What hears after a bus was closed."""

@@ -1,0 +1,148 @@
+"""RclpyBus: a node by rclpy, of a sourced installation of ROS 2 or of its wheels."""
+
+import importlib
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from magtwin.io.messages import Qos
+from magtwin.names import RefusedError
+from magtwin.ros.bus import Heard, Message, Names
+
+MOST_AT_ONCE = 256
+"""Callbacks that are run before `spin_once` gives back."""
+
+
+def qos_of(qos: Qos) -> QoSProfile:
+    """A topic's quality of service as rclpy has it."""
+    return QoSProfile(
+        depth=qos.depth,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE if qos.reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if qos.latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def class_of(kind: str) -> Any:
+    """Rclpy's class of a type of messages.
+
+    Raises:
+        RefusedError: Its package is not installed.
+    """
+    package, space, name = kind.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.{space}"), name)
+    except ImportError as error:
+        raise RefusedError(
+            f"the ROS package {package} is not installed, so there are no messages {kind}; install "
+            f"ros-jazzy-{package.replace('_', '-')} or that of your distribution, or take cyclonedds"
+        ) from error
+
+
+class RclpyPublisher:
+    """As `magtwin.ros.bus.Publisher`."""
+
+    def __init__(self, topic: str, kind: str, publisher: Any) -> None:
+        self.topic, self.kind, self._publisher = topic, kind, publisher
+
+    def publish(self, data: bytes) -> None:
+        """Send a message; rclpy takes bytes as one that is serialized."""
+        self._publisher.publish(data)
+
+    def subscribers(self) -> int:
+        """How many listen."""
+        return int(self._publisher.get_subscription_count())
+
+
+class RclpySubscription:
+    """As `magtwin.ros.bus.Subscription`."""
+
+    def __init__(self, topic: str, kind: str, node: Node) -> None:
+        self.topic, self.kind, self._node = topic, kind, node
+
+    def publishers(self) -> int:
+        """How many send."""
+        return int(self._node.count_publishers(self.topic))
+
+
+class RclpyBus:
+    """As `magtwin.ros.bus.Bus`."""
+
+    backend = "rclpy"
+
+    def __init__(
+        self, name: str, names: Names, *, sim_time: bool, domain: int, parameters: Mapping[str, Any]
+    ) -> None:
+        self.name, self._names = name, names
+        self._context = Context()
+        rclpy.init(args=[], context=self._context, domain_id=domain)
+        self._node = Node(
+            name,
+            context=self._context,
+            namespace=names.namespace or "/",
+            use_global_arguments=False,
+            parameter_overrides=[Parameter("use_sim_time", value=sim_time)],
+        )
+        for key, value in parameters.items():
+            self._node.declare_parameter(key, value)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._calls = 0
+
+    def publisher(self, topic: str, kind: str, qos: Qos) -> RclpyPublisher:
+        """As for `Bus`."""
+        whole = self._names.resolve(topic)
+        return RclpyPublisher(whole, kind, self._node.create_publisher(class_of(kind), whole, qos_of(qos)))
+
+    def subscribe(self, topic: str, kind: str, heard: Heard, qos: Qos) -> RclpySubscription:
+        """As for `Bus`."""
+        whole = self._names.resolve(topic)
+
+        def come(data: bytes, info: Mapping[str, Any]) -> None:
+            self._calls += 1
+            heard(Message(kind, bytes(data), int(info["source_timestamp"]), time.time_ns()))
+
+        self._node.create_subscription(class_of(kind), whole, come, qos_of(qos), raw=True)
+        return RclpySubscription(whole, kind, self._node)
+
+    def types(self, topic: str) -> tuple[str, ...]:
+        """As for `Bus`."""
+        whole = self._names.resolve(topic)
+        offers = self._node.get_publishers_info_by_topic(whole)
+        return tuple(sorted({offer.topic_type for offer in offers}))
+
+    def timer(self, period_s: float, due: Callable[[], None]) -> Any:
+        """As for `Bus`."""
+
+        def call() -> None:
+            self._calls += 1
+            due()
+
+        return self._node.create_timer(period_s, call)
+
+    def now_ns(self) -> int:
+        """As for `Bus`."""
+        return int(self._node.get_clock().now().nanoseconds)
+
+    def spin_once(self, timeout_s: float) -> None:
+        """As for `Bus`."""
+        before = self._calls
+        self._executor.spin_once(timeout_sec=timeout_s)
+        for _ in range(MOST_AT_ONCE):
+            if self._calls == before:
+                return
+            before = self._calls
+            self._executor.spin_once(timeout_sec=0.0)
+
+    def close(self) -> None:
+        """As for `Bus`."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.shutdown(context=self._context)
