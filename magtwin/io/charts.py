@@ -43,6 +43,8 @@ class Picture:
     data: bytes
     tall: bool = False
     """Whether it stands beside two of the others."""
+    file: str = ""
+    """Where it lies, seen from a page of Markdown; "" where that shows no pictures."""
 
 
 def pictures_of_run(

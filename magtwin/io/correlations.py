@@ -1,11 +1,15 @@
 """The paper's Figure 2 from data of one's own: how each input goes with the disturbance."""
 
 import os
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magtwin.io.plots import INK, MAP_INK, new_figure, save
 from magtwin.learn.correlation import PAPER, Correlations
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def plot_correlations(
@@ -22,6 +26,11 @@ def plot_correlations(
     Raises:
         RefusedError: `out` is no picture or exists.
     """
+    save(figure_of_correlations(found, title=title), out, force)
+
+
+def figure_of_correlations(found: Correlations, *, title: str = "") -> "Figure":
+    """The same as a figure, for a page."""
     count = len(found.features)
     figure = new_figure(6.4, 1.3 + 0.24 * count)
     ax = figure.subplots()
@@ -59,4 +68,4 @@ def plot_correlations(
     if title:
         ax.set_title(title, fontsize=10)
     figure.legend(loc="outside lower center", ncols=3, fontsize=7.5, frameon=False)
-    save(figure, out, force)
+    return figure

@@ -347,7 +347,7 @@ def to_html(page: Page) -> str:
         links = {f"#run-{k}": section for k, section in enumerate(page.sections)}
         parts.append(f"<section>{_html_table(page.overview, list(links))}</section>")
     for k, section in enumerate(page.sections):
-        parts.append(_html_section(section, k, titled=page.overview is not None))
+        parts.append(_html_section(section, k, titled=len(page.sections) > 1))
     template = Template(Path(__file__).with_name("page.html").read_text(encoding="utf-8"))
     return template.substitute(
         title=_escaped(page.title),
@@ -422,17 +422,21 @@ def _escaped(text: str) -> str:
 
 
 def to_markdown(page: Page) -> str:
-    """A page as Markdown, without its pictures."""
+    """A page as Markdown, with those of its pictures that lie beside it."""
     parts = [f"# {_marked(page.title)}", _marked(page.lead)]
     if page.overview:
         parts += _markdown_table(page.overview, 2)
     for section in page.sections:
-        if page.overview:
+        several = len(page.sections) > 1
+        if several:
             parts.append(f"## {_marked(section.title)}")
         if section.lead:
             parts.append(_marked(section.lead))
+        for picture in section.pictures:
+            if picture.file:
+                parts.append(f"![{_marked(picture.alt)}]({picture.file})\n\n{_marked(picture.title)}")
         for table in section.tables:
-            parts += _markdown_table(table, 3 if page.overview else 2)
+            parts += _markdown_table(table, 3 if several else 2)
     parts.append(f"Written by magtwin {_marked(magtwin.__version__)}.")
     return "\n\n".join(parts) + "\n"
 
