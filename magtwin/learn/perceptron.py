@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from magtwin.learn.inputs import Inputs
+from magtwin.learn.sparse import Skipping
 
 Array = NDArray[np.float64]
 Layer = tuple[torch.Tensor, torch.Tensor]
@@ -77,12 +78,18 @@ def outputs(layers: Sequence[Layer], inputs: Inputs, x: Array) -> Array:
     starts = itertools.count(0, CHUNK)  # next() on it is atomic
     threads = min(torch.get_num_threads(), math.ceil(len(x) / CHUNK))
     transposed = [(weight.t(), bias) for weight, bias in layers]
-    in_threads(lambda: _work(transposed, inputs, x, y, starts), threads)
+    skipping = Skipping(transposed)
+    in_threads(lambda: _work(transposed, skipping, inputs, x, y, starts), threads)
     return y
 
 
 def _work(
-    layers: Sequence[Layer], inputs: Inputs, x: Array, y: Array, starts: "itertools.count[int]"
+    layers: Sequence[Layer],
+    skipping: Skipping,
+    inputs: Inputs,
+    x: Array,
+    y: Array,
+    starts: "itertools.count[int]",
 ) -> None:
     """Go through chunks until none is left; nothing is allocated between the first and the last."""
     rows = CHUNK if len(x) > CHUNK else -(-len(x) // TILE) * TILE
@@ -99,6 +106,8 @@ def _work(
             np.divide(z[:n], inputs.scale, out=z[:n])
             blocks[0].copy_(scaled)
             for i, (weight, bias) in enumerate(layers):
+                if 0 < i < len(layers) - 1 and skipping.forward(i, blocks[i], blocks[i + 1]):
+                    continue
                 torch.addmm(bias, blocks[i], weight, out=blocks[i + 1])
                 if i < len(layers) - 1:
                     blocks[i + 1].relu_()
