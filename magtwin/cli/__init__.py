@@ -16,6 +16,7 @@ from magtwin.cli import (  # noqa: F401 - each registers its commands
     runs,
     scene,
     train,
+    validate,
 )
 from magtwin.cli.app import main
 

@@ -80,7 +80,7 @@ def print_report(report: Any, as_json: bool) -> None:
     for figure in report.figures:
         if isinstance(figure.value, str):
             note = f"  ({figure.note})" if figure.note else ""
-            words.add_row(Text(figure.name), Text(_printable(f"{figure.value} {figure.unit}{note}".strip())))
+            words.add_row(Text(figure.name), Text(printable(f"{figure.value} {figure.unit}{note}".strip())))
         else:
             value = f"{figure.value:,.6g}" if isinstance(figure.value, float) else f"{figure.value:,}"
             spread = f"± {_rounded(figure.spread)}" if figure.spread is not None else ""
@@ -90,8 +90,8 @@ def print_report(report: Any, as_json: bool) -> None:
         if isinstance(fact, (dict, list)):
             lists.append((name, fact))
         elif fact != "":
-            words.add_row(Text(name), Text(_printable(str(fact))))
-    console.print(Text(_printable(report.title), style="bold"))
+            words.add_row(Text(name), Text(printable(str(fact))))
+    console.print(Text(printable(report.title), style="bold"))
     for table in (numbers, words):
         if table.row_count:
             console.print(table)
@@ -99,10 +99,10 @@ def print_report(report: Any, as_json: bool) -> None:
         console.print(Text(name))
         entries = fact.items() if isinstance(fact, dict) else (("", entry) for entry in fact)
         for key, entry in entries:
-            _print_entry(console, _printable(str(key)), _printable(str(entry)))
+            _print_entry(console, printable(str(key)), printable(str(entry)))
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
     """A file's own text, with its control characters written out: a terminal would obey them."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 

@@ -132,6 +132,20 @@ def read_map(prim: Usd.Prim) -> AnomalyMap:
     return _read(prim, None)
 
 
+def checksums(prim: Usd.Prim) -> list[tuple[str, str]]:
+    """What a map's checksum says and what its arrays give, of the default and then of each epoch.
+
+    Raises:
+        RefusedError: An array is missing or of another type; names the prim.
+    """
+    pairs = []
+    for sample in (None, *_samples(prim)):
+        values, valid, variance = (np.array(_get(prim, n, sample)) for n in ("values", "valid", "variance"))
+        taken = _checksum(values, valid, variance, _read_harmonic(prim, sample))
+        pairs.append((_get(prim, "checksum", sample), taken))
+    return pairs
+
+
 @dataclass(frozen=True)
 class _Sample:
     """A time of the layer that holds a map's epochs: read there, so that no offset or scale rounds it."""
