@@ -5,6 +5,7 @@ from magtwin.cli import (  # noqa: F401 - each registers its commands
     compensate,
     dataset,
     drive,
+    evaluate,
     file,
     map,  # noqa: A004
     net,

@@ -93,7 +93,7 @@ def write_evaluation(page: Page, folder: str | os.PathLike[str], *, force: bool 
         (aside / PICTURES).mkdir(parents=True)
         sections = []
         for section in page.sections:
-            placed = []
+            placed: list[Picture] = []
             for picture in section.pictures:
                 end = "svg" if picture.kind.startswith("svg") else picture.kind
                 file = f"{PICTURES}/{picture.file or f'picture_{len(placed)}'}.{end}"

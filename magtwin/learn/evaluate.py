@@ -8,8 +8,10 @@ row.
 
 import math
 import os
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -17,13 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.field.map import AnomalyMap
+from magtwin.files import sha256
 from magtwin.learn.baselines import Mean, fit_ridge
-from magtwin.learn.dataset import Dataset, values_sha256
+from magtwin.learn.dataset import MANIFEST, Dataset, values_sha256
 from magtwin.learn.features import CARRIED, CIRCULAR, FEATURES, GRADIENT, features
 from magtwin.learn.labels import Alignment, labelled
 from magtwin.learn.magnetometer import NeuralMagnetometer
 from magtwin.learn.recording import thinned
 from magtwin.learn.scores import LEVEL, Errors, Score, scores
+from magtwin.learn.split import split
 from magtwin.names import RefusedError
 from magtwin.path import CASES
 from magtwin.report import Figure, Report
@@ -537,7 +541,7 @@ def tolles_lawson(
     model = fit_ridge(rows.x, rows.y, rows.recording, inputs)
     what = "Tolles-Lawson and gradient" if gradient else "Tolles-Lawson"
     told = {"fitted to": dataset.folder.name, "penalty": model.penalty, "training rows": len(rows.y)}
-    return Contender(f"{what} on {chart.name}", model, chart, _alignment(dataset, chart), told)
+    return Contender(f"{what}, {chart.name}", model, chart, _alignment(dataset, chart), told)
 
 
 @dataclass(frozen=True, eq=False)
@@ -584,3 +588,70 @@ def _alignment(dataset: Dataset, chart: Chart) -> Alignment:
     if dataset.map_sha256 not in chart.checksums:
         return Alignment()
     return Alignment(dataset.alignment.lever_arm_m, dataset.alignment.latency_s)
+
+
+def unseen(dataset: Dataset, contenders: Sequence[Contender]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Recordings of a data set that no model learned from, and those that each of them may have.
+
+    Of a set that weights were trained on, what is left is their test recordings, by the split that their
+    facts repeat; of any other set, all of it.
+
+    Raises:
+        RefusedError: Nothing is left, or weights were trained on rows of every recording.
+    """
+    checksum = sha256(dataset.folder / MANIFEST)
+    names, learned = list(dataset.names), list(dataset.names)
+    for one in contenders:
+        if one.facts.get("dataset_sha256") != checksum:
+            continue
+        try:
+            config = tomllib.loads(str(one.facts.get("config", "")))
+            by, seed, hold_out = config["split"], int(config["seed"]), tuple(config.get("hold_out", ()))
+        except (ValueError, KeyError, TypeError) as error:
+            raise RefusedError(
+                f"{one.name}: was trained on {dataset.folder}, and its facts do not say how that was split "
+                f"({error}); judge it by recordings of another set"
+            ) from error
+        if by == "row":
+            raise RefusedError(
+                f"{one.name}: was trained on rows of every recording of {dataset.folder}; judge it by others"
+            )
+        deals = np.random.default_rng(seed).spawn(2)[0]
+        parts = split(dataset.recordings, by, hold_out=hold_out, rng=deals)
+        names = [name for name in names if name in parts.test]
+        learned = [name for name in learned if name in parts.train]
+    if not names:
+        raise RefusedError(
+            f"{dataset.folder}: the models learned from every recording of it; judge them by others"
+        )
+    return tuple(names), tuple(learned)
+
+
+def trials_of(dataset: Dataset, names: Sequence[str]) -> list[Trial]:
+    """Recordings of a data set, to judge by."""
+
+    def read(name: str) -> Run:
+        return next(run for _, run in dataset.runs([name]))
+
+    told = [dataset.recording(name) for name in names]
+    return [Trial(one.name, partial(read, one.name), one.session, one.path) for one in told]
+
+
+def check_apart(train: Dataset, names: Sequence[str], judged: Dataset, of: Sequence[str]) -> None:
+    """Refuse to judge baselines by recordings that they are fitted to.
+
+    Raises:
+        RefusedError: A recording is on both sides: of one name, session, path and length.
+    """
+
+    def known(dataset: Dataset, kept: Sequence[str]) -> dict[tuple[Any, ...], str]:
+        told = [dataset.recording(name) for name in kept]
+        return {(one.name, one.session, one.path, one.rows, one.duration_s): one.name for one in told}
+
+    both = known(train, names).keys() & known(judged, of).keys()
+    if both:
+        name = sorted(one[0] for one in both)[0]
+        raise RefusedError(
+            f"{name!r} and {len(both) - 1} more recordings of {judged.folder} are in {train.folder} too, "
+            "which baselines learn from; judge by others"
+        )

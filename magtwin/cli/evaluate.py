@@ -1,0 +1,215 @@
+"""`magtwin evaluate`: weights judged by recordings that they never saw, as in the paper's Table 1."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, Json, Seed, progress, say
+from magtwin.names import RefusedError
+
+if TYPE_CHECKING:
+    from magtwin.learn.dataset import Dataset
+    from magtwin.learn.evaluate import Chart, Contender, Evaluation, Trial
+
+Flag = Annotated[bool, Parameter(negative="")]
+Files = Annotated[list[Path] | None, Parameter(negative="", consume_multiple=True)]
+Names = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]
+
+MOST_CASES = 7
+"""Rows of the table that a terminal has room for."""
+
+
+@app.command
+def evaluate(
+    *weights: Annotated[Path, Parameter(required=True)],
+    out: Path,
+    runs: Files = None,
+    dataset: Path | None = None,
+    map: Files = None,  # noqa: A002
+    train: Path | None = None,
+    case: Names = None,
+    scene: Path | None = None,
+    any_map: Flag = False,
+    truth: Flag = False,
+    seed: Seed = 0,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Judge weights by recordings, each on its own map, beside the naive model and Tolles and Lawson's.
+
+    Errors are of the total field at the sensor. The report, DIR/evaluation.html, .md and .json, has Table
+    1 with intervals, and the paper's Figures 2, 5, 6 and 7 of these recordings.
+
+    Parameters
+    ----------
+    weights
+        Weights files of any kind, the released .pth too.
+    out
+        Folder of the report to make.
+    runs
+        Recordings of any kind to judge by; a folder that `magtwin runs` made stands for all of its runs.
+    dataset
+        In place of runs, a data set: the recordings of it that no weights learned from.
+    map
+        Maps that the weights were trained on, each found by its checksum; the first, the paper's trilinear
+        one, is the naive model's, and that of weights which name none. That of the scene unless given.
+    train
+        Data set that the naive mean and the Tolles-Lawson baselines are fitted to, labelled on each map anew.
+        Without it the mean is that of weights trained on the first map, and there are no baselines.
+    case
+        Rows of the table by the path that they are of, as D=lawnmower.csv, beside the paper's A to E.
+    scene
+        Stage of the twin that made the recordings.
+    any_map
+        Take the first map for weights whose own is not at hand.
+    truth
+        Judge by the exact field, which simulated runs know, in place of the reading.
+    seed
+        Seed of the intervals' draws.
+    force
+        Replace the folder if it exists.
+    json
+        Print the figures as JSON.
+    """
+    import numpy as np
+
+    from magtwin.files import check_free
+    from magtwin.io.evaluations import page_of_evaluation, read_curve, write_evaluation
+    from magtwin.learn import evaluate as room
+
+    check_free(out, force=force)
+    charts = _charts(map, scene)
+    names = _short(weights)
+    own = [
+        room.contender(path, charts, any_map=any_map, name=name)
+        for path, name in zip(weights, names, strict=True)
+    ]
+    trials, learned = _trials(runs, dataset, train, own)
+    baselines = [] if train is None else _baselines(charts, *learned[0])
+    first = room.naive(charts[0], dataset=learned[0][0], names=learned[0][1]) if learned else None
+    first = first or room.naive(charts[0], weights=own)
+    with progress("Judging") as advance:
+        found = room.evaluate(
+            [first, *own, *baselines],
+            trials,
+            rng=np.random.default_rng(seed),
+            cases=_cases(case),
+            truth=truth,
+            progress=advance,
+        )
+    curves = {name: read_curve(path) for path, name in zip(weights, names, strict=True)}
+    page = page_of_evaluation(found, curves=curves)
+    write_evaluation(page, out, force=force)
+    if json:
+        from magtwin.io.pages import to_json
+
+        say(to_json(page).rstrip())
+        return
+    _print(found)
+    say(f"Wrote {out}: evaluation.html, evaluation.md, evaluation.json")
+
+
+def _charts(maps: Sequence[Path] | None, scene: Path | None) -> "list[Chart]":
+    """The maps at hand; of a scene its own."""
+    from magtwin.cli.map import _open_map
+    from magtwin.files import existing, sha256
+    from magtwin.learn.evaluate import chart_of
+
+    files = list(maps or ())
+    if not files and scene is not None:
+        from magtwin.usd.scene import read_scene
+
+        files = [read_scene(existing(scene, "scene"), check_network=False).map_layer]
+    if not files:
+        raise RefusedError(
+            "no map: name those that the weights were trained on (--map), or the scene (--scene)"
+        )
+    found = []
+    for path, name in zip(files, _short(files), strict=True):
+        field = _open_map(existing(path, "map"))
+        found.append(chart_of(name, field, *([sha256(path)] if path.is_file() else [])))
+    return found
+
+
+def _short(files: Sequence[Path]) -> list[str]:
+    """What to call files: their stems, or more of their paths where two have one."""
+    for called in (lambda path: path.stem, lambda path: path.name, str):
+        names = [called(path) for path in files]
+        if len(set(names)) == len(names):
+            return names
+    twice = next(path for path in files if list(files).count(path) > 1)
+    raise RefusedError(f"{twice} is named twice; name each file once")
+
+
+def _trials(
+    runs: Sequence[Path] | None, dataset: Path | None, train: Path | None, own: "Sequence[Contender]"
+) -> "tuple[list[Trial], list[tuple[Dataset, tuple[str, ...]]]]":
+    """Recordings to judge by; and the data set that baselines are fitted to, with its recordings for that."""
+    from magtwin.cli.dataset import _files, _sources
+    from magtwin.learn.dataset import open_dataset
+    from magtwin.learn.evaluate import Trial, check_apart, trials_of, unseen
+
+    if (runs is None) == (dataset is None):
+        raise RefusedError("judge by --runs or by a --dataset, one of the two")
+    learning = None if train is None else open_dataset(train)
+    learned = [] if learning is None else [(learning, learning.names)]
+    if dataset is None:
+        sources = _sources(_files(runs or []), "fact", "fact", {})
+        return [Trial(one.name, one.read) for one in sources], learned
+    judged = open_dataset(dataset)
+    names, rest = unseen(judged, own)
+    if learning is not None:
+        if learning.folder.resolve() == judged.folder.resolve():
+            learned = [(learning, tuple(name for name in rest if name not in names))]
+        check_apart(*learned[0], judged, names)
+    return trials_of(judged, names), learned
+
+
+def _baselines(charts: "Sequence[Chart]", dataset: "Dataset", names: Sequence[str]) -> "list[Contender]":
+    """Tolles and Lawson's on each map, without and with the map's gradient."""
+    from magtwin.learn.evaluate import tolles_lawson
+
+    return [
+        tolles_lawson(chart, dataset, names, gradient=gradient)
+        for chart in charts
+        for gradient in (False, True)
+    ]
+
+
+def _cases(given: Sequence[str] | None) -> dict[str, str]:
+    """Rows by name from words such as D=lawnmower.csv."""
+    found: dict[str, str] = {}
+    for word in given or ():
+        name, equals, path = word.partition("=")
+        if not (name and equals and path) or name in found or name in ("all", "mean"):
+            raise RefusedError(f"--case is a row of the table and its path, as D=lawnmower.csv, got {word!r}")
+        found[name] = path
+    return found
+
+
+def _print(found: "Evaluation") -> None:
+    """Table 1 for people: a line a model, its error, and its ratio to the naive one by path."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(highlight=False)
+    shown = [*found.cases[:MOST_CASES], *(case for case in found.cases[MOST_CASES:] if case is found.every)]
+    table = Table(box=None, pad_edge=False)
+    table.add_column("ratio to naive", overflow="fold")
+    for column in (*(case.name for case in shown), "MAE", "90 %"):
+        table.add_column(Text(column), justify="right", overflow="fold", min_width=4)
+    for m, name in enumerate(found.names):
+        score = found.every.scores[m]
+        covered = "" if math.isnan(score.coverage) else f"{score.coverage:.0%}"
+        ratios = [f"{case.scores[m].ratio:.3f}" for case in shown]
+        table.add_row(*map(Text, (name, *ratios, f"{score.mae_nt:.0f} nT", covered)))
+    readings = found.every.scores[0].rows
+    console.print(Text(f"{readings:,} readings of {len(found.judged)} recordings", style="bold"))
+    console.print(table)
+    for why, count in found.left_out.items():
+        console.print(Text(f"left out: {count:,} readings that {why}", style="dim"))
