@@ -377,6 +377,11 @@ class Chassis:
         self._state[10] = 0.0
         loop.drive_on(loop.COMMANDS, self._figures, table, self._fence, self._spans, self._state, k, 1, now)
 
+    @property
+    def last(self) -> Array:
+        """What happened in the last step, shape (loop.RECORD,)."""
+        return np.array([column[-1] for column in self._record])
+
     def motion(self) -> Motion:
         """What it has done so far."""
         return _motion(self._course, np.array([np.frombuffer(column) for column in self._record]))

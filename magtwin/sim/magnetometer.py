@@ -62,8 +62,8 @@ def sense_magnetometer(
     """
     noise, vector_noise, latch, drop = rng.spawn(4)
     true, vector = np.asarray(b_total_nt, float), np.asarray(b_vector_nt, float)
-    along = _along_axis(vector) if feels_direction(spec) else np.full(len(true), np.nan)
-    lost = np.broadcast_to(np.asarray(steep, bool), true.shape) | _in_dead_zone(spec, along)
+    along = along_axis(vector) if feels_direction(spec) else np.full(len(true), np.nan)
+    lost = np.broadcast_to(np.asarray(steep, bool), true.shape) | in_dead_zone(spec, along)
     known = np.isfinite(true)
     b = true
     if spec.heading_error_nt:
@@ -100,8 +100,8 @@ def sense_axes(
     """
     _, noise, _, drop = copy.deepcopy(rng).spawn(4)
     vector = np.asarray(b_vector_nt, float)
-    along = _along_axis(vector) if feels_direction(spec) else np.full(len(vector), np.nan)
-    lost = np.broadcast_to(np.asarray(steep, bool), along.shape) | _in_dead_zone(spec, along)
+    along = along_axis(vector) if feels_direction(spec) else np.full(len(vector), np.nan)
+    lost = np.broadcast_to(np.asarray(steep, bool), along.shape) | in_dead_zone(spec, along)
     read = sense_vector(spec, vector, noise, rate_hz=rate_hz, lost=lost)
     if spec.dropout_share:
         read[drop.random(len(read)) < spec.dropout_share] = np.nan
@@ -230,13 +230,13 @@ def feels_direction(spec: MagnetometerSpec) -> bool:
     return bool(spec.heading_error_nt or spec.dead_zone_axis or spec.dead_zone_plane)
 
 
-def _along_axis(b_vector_nt: Array) -> Array:
+def along_axis(b_vector_nt: Array) -> Array:
     """Cosine of the angle between the field and the sensor's own z, its optical axis, shape (N,)."""
     size = np.sqrt(np.sum(b_vector_nt * b_vector_nt, axis=1))
     return np.divide(b_vector_nt[:, 2], size, out=np.full(len(size), np.nan), where=size > 0)
 
 
-def _in_dead_zone(spec: MagnetometerSpec, along: Array) -> Flags:
+def in_dead_zone(spec: MagnetometerSpec, along: Array) -> Flags:
     """Whether the field is too near to the optical axis, or to the plane across it."""
     off_plane = np.arcsin(np.abs(np.clip(along, -1, 1)))  # nan is in none
     return (np.pi / 2 - off_plane < spec.dead_zone_axis) | (off_plane < spec.dead_zone_plane)

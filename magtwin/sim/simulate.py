@@ -317,7 +317,7 @@ def sense(
     _check_readings(end, rate_hz)
     t = np.arange(max(1, math.ceil(end * rate_hz - 1e-9))) / rate_hz
     true = motion.at(t)
-    columns, beside = _truth(true, t, robot.base_height_m), np.zeros(len(t))
+    columns, beside = truth(true, t, robot.base_height_m), np.zeros(len(t))
     if needed & _ODOMETRY:
         columns |= sense_odometry(robot.drive, motion, t, draws["odometry"])
     if needed & _IMU:
@@ -326,7 +326,7 @@ def sense(
         columns |= sense_mocap(robot.mocap, robot.base_height_m, motion, t, draws["mocap"])
     columns["lidar_on"] = lidar_on(robot.lidar, t, lidar)
     sloped = "b_map_gradient_nt_m" in needed
-    columns |= _map(anomaly_map, true.pose[:, :2], columns["yaw"], outside, gradient=sloped)
+    columns |= mapped(anomaly_map, true.pose[:, :2], columns["yaw"], outside, gradient=sloped)
     if exact or needed & _BATTERY:
         pack = discharge(robot.battery, robot.drive, motion, partial(lidar_on, robot.lidar, mode=lidar), end)
         columns |= sense_battery(robot.battery, pack, t, draws["battery"])
@@ -343,7 +343,7 @@ def sense(
         columns["b_vector_measured_nt"] = sense_axes(
             robot.magnetometer, columns["b_vector_nt"], draws["magnetometer"], rate_hz=rate_hz, steep=steep
         )
-    columns |= _flags(scene, true)
+    columns |= flags(scene, true)
     if companions:
         columns["flag_bump"] = columns["flag_bump"] | touching(t, motion, robot, companions)
     columns["b_sd_nt"] = np.full(len(t), np.nan)
@@ -395,7 +395,7 @@ def _check_readings(duration_s: float, rate_hz: float) -> None:
         )
 
 
-def _truth(true: Moment, t: Array, height_m: float) -> dict[str, NDArray[Any]]:
+def truth(true: Moment, t: Array, height_m: float) -> dict[str, NDArray[Any]]:
     """The columns of what the robot did and was told."""
     zero, yaw = np.zeros(len(t)), wrap_angle(true.pose[:, 2])
     return {
@@ -411,7 +411,7 @@ def _truth(true: Moment, t: Array, height_m: float) -> dict[str, NDArray[Any]]:
     }
 
 
-def _map(
+def mapped(
     anomaly_map: AnomalyMap,
     xy: Array,
     yaw: Array,
@@ -468,7 +468,7 @@ def _steep(scene: Scene, anomaly_map: AnomalyMap, motion: Moving, t: Array) -> N
     return lost_in(spec, gradient)[seen]
 
 
-def _flags(scene: Scene, true: Moment) -> dict[str, NDArray[Any]]:
+def flags(scene: Scene, true: Moment) -> dict[str, NDArray[Any]]:
     """Touching an obstacle, or the floor's border; and what only a caller with a network knows."""
     x, y = np.abs(true.pose[:, 0]), np.abs(true.pose[:, 1])
     most_x, most_y = np.array(scene.lab.floor_m) / 2 + 1e-9
