@@ -6,6 +6,7 @@ from magtwin.cli import (  # noqa: F401 - each registers its commands
     dataset,
     drive,
     evaluate,
+    export,
     file,
     map,  # noqa: A004
     net,

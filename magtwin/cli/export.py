@@ -1,0 +1,96 @@
+"""`magtwin export`: a stage with all that it needs, for other programs."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, Json, announcer, print_report, say
+
+if TYPE_CHECKING:
+    from magtwin.run import Run
+
+
+@app.command
+def export(
+    scene: Path,
+    *,
+    out: Path,
+    profile: Literal["omniverse", "isaac", "newton", "viewer"] | None = None,
+    run: Path | None = None,
+    convert_units: bool = False,
+    thumbnail: bool = True,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Write a stage with all that it needs, so that other programs open it wherever it lies.
+
+    Parameters
+    ----------
+    scene
+        A scene, or any other stage: .usd, .usda, .usdc or .usdz; or the name of one that ships with
+        magtwin: lab.
+    out
+        What to make: a folder, a package .usdz, a single layer .usd or .usdc, or a .glb for the web.
+    profile
+        For whom: omniverse; isaac, with an Action Graph for ROS 2; newton; or viewer, one layer that simple
+        viewers show. omniverse for folders and packages, viewer for the others, unless given.
+    run
+        A run, in any format that magtwin reads, to play over the stage.
+    convert_units
+        Convert a stage that is not in metres with Z up; it is refused otherwise.
+    thumbnail
+        Draw a picture of a folder's stage where asset browsers look for one.
+    force
+        Replace what exists.
+    json
+        Print the summary as JSON.
+    """
+    from magtwin.export.package import export_scene
+    from magtwin.files import check_free
+
+    check_free(out, force=force)
+    played = None if run is None else _read(run)
+    made = export_scene(
+        _stage(scene),
+        out,
+        profile=profile,
+        animation=played,
+        thumbnail=_draw if thumbnail and profile != "viewer" else None,
+        convert_units=convert_units,
+        force=force,
+        progress=announcer(quiet=json),
+    )
+    print_report(made.report(), json)
+    if not json:
+        say(f"Wrote {', '.join(map(str, made.files))}")
+
+
+def _stage(scene: Path) -> Path:
+    """A stage's file, or that of one that ships with magtwin."""
+    if scene.suffix or scene.exists():
+        return scene
+    from magtwin.files import shipped
+    from magtwin.names import find
+
+    return find(
+        "scene",
+        str(scene),
+        {
+            file.stem: file
+            for file in sorted(shipped("scenes").glob("*/*.usda"))
+            if file.stem == file.parent.name
+        },
+    )
+
+
+def _read(run: Path) -> "Run":
+    from magtwin.files import existing
+    from magtwin.io.formats import read_run
+
+    return read_run(existing(run, "run"))
+
+
+def _draw(stage: Path, out: Path) -> None:
+    from magtwin.io.pictures import picture_of_stage
+
+    picture_of_stage(stage, out, size=(256, 256))

@@ -1,0 +1,154 @@
+"""Attached: files that no package may hold, a network above all, as bytes in a layer, and back.
+
+A .usdz holds layers, pictures and sounds. What else a stage names goes into it as a prim a file, below the
+scope `Files` of the default prim: the bytes as one array, the checksum, and the properties that named the
+file, which name nothing meanwhile. A program with usd-core alone gets it back:
+
+    Path("net.safetensors").write_bytes(bytes(prim.GetAttribute("magtwin:file:bytes").Get()))
+"""
+
+import hashlib
+import re
+from pathlib import Path
+
+import numpy as np
+from pxr import Sdf, Usd, UsdUtils, Vt
+
+from magtwin.export.contents import assets_of, kind_of
+from magtwin.files import sha256
+from magtwin.names import RefusedError
+from magtwin.usd.layers import open_stage, relative_asset
+from magtwin.usd.schema import place
+
+SCOPE = "Files"
+"""Name of the scope, below the default prim."""
+
+KINDS = ("weights", "paths")
+"""Files that are attached, by `contents.KINDS`."""
+
+NAME, BYTES, SHA256, OF = (f"magtwin:file:{name}" for name in ("name", "bytes", "sha256", "of"))
+
+
+def attach(root: Path, *more: Path) -> None:
+    """Take files of a stage's folder into a layer of it, `files.usdc`, a sublayer of the root layer.
+
+    Args:
+        root: Root layer; a folder of layers below which all that is named lies.
+        more: Files below that folder to attach though no property names them.
+
+    Raises:
+        RefusedError: The stage has no default prim for them to stand below.
+    """
+    stage = open_stage(root)
+    named = {file.resolve(): list[Sdf.Path]() for file in more}
+    for prim in stage.TraverseAll():
+        for attribute in prim.GetAuthoredAttributes():
+            value = attribute.Get() if attribute.GetTypeName() == Sdf.ValueTypeNames.Asset else None
+            if value and value.resolvedPath and kind_of(value.path) in KINDS:
+                named.setdefault(Path(value.resolvedPath).resolve(), []).append(attribute.GetPath())
+    if not named:
+        return
+    default = stage.GetDefaultPrim()
+    if not default:
+        raise RefusedError(f"{root}: has no default prim to attach files below; set one")
+    scope, meta = default.GetPath().AppendChild(SCOPE), stage.GetRootLayer()
+    layers = [layer for layer in stage.GetUsedLayers() if layer.realPath]
+    for layer in layers:
+        if any(kind_of(asset) in KINDS for _, asset in assets_of(layer)):
+            UsdUtils.ModifyAssetPaths(layer, lambda asset: "" if kind_of(asset) in KINDS else asset)
+            layer.Save()
+    files = Sdf.Layer.CreateNew(str(root.with_name("files.usdc")))
+    files.documentation = "Files that no package may hold, as bytes"
+    files.customLayerData = {"creator": "magtwin"}
+    for key in ("metersPerUnit", "upAxis", "kilogramsPerUnit"):
+        if meta.pseudoRoot.HasInfo(key):
+            files.pseudoRoot.SetInfo(key, meta.pseudoRoot.GetInfo(key))
+    files.defaultPrim = scope.GetParentPath().name
+    _define(files, scope, named)
+    files.Save()
+    meta.subLayerPaths.append("./files.usdc")
+    meta.Save()
+    for file in named:
+        file.unlink()
+        if not any(file.parent.iterdir()):
+            file.parent.rmdir()
+
+
+def _define(layer: Sdf.Layer, scope: Sdf.Path, named: dict[Path, list[Sdf.Path]]) -> None:
+    """Author a prim for each file."""
+    Sdf.CreatePrimInLayer(layer, scope.GetParentPath())
+    top = Sdf.CreatePrimInLayer(layer, scope)
+    top.specifier, top.typeName = Sdf.SpecifierDef, "Scope"
+    taken: set[str] = set()
+    kinds = Sdf.ValueTypeNames
+    for file in sorted(named):
+        plain = re.sub(r"\W", "_", file.name, flags=re.ASCII)
+        names = (f"file_{plain}" if plain[0].isdigit() else plain, *(f"file_{i}_{plain}" for i in range(99)))
+        name = next(n for n in names if n not in taken)
+        taken.add(name)
+        prim = Sdf.CreatePrimInLayer(layer, scope.AppendChild(name))
+        prim.specifier, prim.typeName = Sdf.SpecifierDef, "Scope"
+        given = (
+            (NAME, kinds.String, file.name),
+            (SHA256, kinds.String, sha256(file)),
+            (BYTES, kinds.UCharArray, Vt.UCharArray.FromNumpy(np.fromfile(file, np.uint8))),
+        )
+        for key, kind, value in given:
+            Sdf.AttributeSpec(prim, key, kind, Sdf.VariabilityUniform, declaresCustom=True).default = value
+        of = Sdf.RelationshipSpec(prim, OF, custom=True)
+        for path in named[file]:
+            of.targetPathList.explicitItems.append(path)
+
+
+def detach(root: Path) -> None:
+    """Write the files that are attached to a stage beside its root layer, and name them as they were named.
+
+    Raises:
+        RefusedError: A file is damaged, or its name or kind is none that magtwin attaches.
+    """
+    stage = open_stage(root)
+    default = stage.GetDefaultPrim()
+    scope = default.GetChild(SCOPE) if default else Usd.Prim()
+    found = [prim for prim in scope.GetChildren() if prim.HasAttribute(BYTES)] if scope else []
+    for prim in found:
+        name = str(prim.GetAttribute(NAME).Get() or "")
+        value = prim.GetAttribute(BYTES).Get()
+        data = bytes(np.array(value, np.uint8)) if isinstance(value, Vt.UCharArray) else b""
+        if Path(name).name != name or "\\" in name or kind_of(name) not in KINDS:
+            raise RefusedError(f"{place(prim)}: {NAME} {name!r} is no name of a file that is attached")
+        if hashlib.sha256(data).hexdigest() != prim.GetAttribute(SHA256).Get():
+            raise RefusedError(
+                f"{place(prim)}: the bytes of {name} are not those that its checksum was taken of"
+            )
+        file = root.parent / kind_of(name) / name
+        if file.exists():
+            raise RefusedError(f"{place(prim)}: a second file {name}; rename one")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(data)
+        for path in prim.GetRelationship(OF).GetTargets():
+            attribute = stage.GetAttributeAtPath(path)
+            if not attribute or attribute.GetTypeName() != Sdf.ValueTypeNames.Asset:
+                raise RefusedError(f"{place(prim)}: {OF} names {path}, which names no file")
+            attribute.Set(Sdf.AssetPath(relative_asset(stage.GetRootLayer(), file)))
+    if not found:
+        return
+    path, layers = scope.GetPath(), stage.GetLayerStack(includeSessionLayers=False)
+
+    for layer in layers:
+        if not layer.GetPrimAtPath(path):
+            continue
+        edit = Sdf.BatchNamespaceEdit()
+        edit.Add(path, Sdf.Path.emptyPath)
+        layer.Apply(edit)
+        if layer != layers[0] and _is_empty(layer):
+            file = Path(layer.realPath)  # the layer goes with its last user
+            layers[0].subLayerPaths.remove(relative_asset(layers[0], file))
+            file.unlink()
+        else:
+            layer.Save()
+    layers[0].Save()
+
+
+def _is_empty(layer: Sdf.Layer) -> bool:
+    """Whether nothing is left in a layer but its default prim, unsaid."""
+    return not layer.subLayerPaths and not any(p.nameChildren or p.properties for p in layer.rootPrims)

@@ -1,0 +1,202 @@
+"""Contents: every file that a stage is made of, brought into one folder, each named relative to it."""
+
+import os
+import re
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+from pxr import Sdf, UsdUtils
+
+from magtwin.names import RefusedError
+from magtwin.usd.layers import SUFFIXES, open_stage
+
+KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "textures": (".png", ".jpg", ".jpeg", ".exr", ".avif", ".hdr", ".tif", ".tiff", ".tga", ".bmp"),
+        "weights": (".safetensors", ".pth", ".onnx"),
+        "paths": (".csv",),
+        "materials": (".mdl", ".mtlx"),
+        "lights": (".ies",),
+        "sounds": (".m4a", ".mp3", ".wav"),
+    }
+)
+"""What a stage names beside layers, by the folder that it comes to lie in. Nothing else is carried: a stage
+of a stranger's could otherwise put any file of this machine into what is handed on."""
+
+THUMBNAIL = Path(".thumbs", "256x256")
+"""Where the picture of a layer lies beside it."""
+
+
+def kind_of(file: str | os.PathLike[str]) -> str:
+    """What a file is by its suffix: a key of `KINDS`, or "" for none."""
+    suffix = Path(file).suffix.lower()
+    return next((kind for kind, suffixes in KINDS.items() if suffix in suffixes), "")
+
+
+def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> Path:
+    """Copy a stage and every file that it names, in any variant, into a folder.
+
+    What lies below the stage's own folder stays as it was arranged. Other layers come into a folder called as
+    theirs was, other files into one by their kind. A layer whose names stay right keeps its bytes, and so
+    its checksum.
+
+    Args:
+        root: The stage's root layer.
+        folder: Folder that exists and is empty.
+        within: Folder that the stage may not reach out of; anywhere unless given.
+
+    Returns:
+        The root layer's copy.
+
+    Raises:
+        RefusedError: A file that is named is not there, is of no kind that is carried or lies outside of
+            `within`; or the stage cannot be opened. Says the layer and the prim.
+    """
+    open_stage(root)  # refuses
+    root = root.resolve()
+    heard = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        layers, assets, lost = UsdUtils.ComputeAllDependencies(str(root))
+    finally:
+        heard.TakeUncoalescedDiagnostics()
+    files = {Path(layer.realPath).resolve(): layer for layer in layers}
+    others = [Path(asset).resolve() for asset in assets]
+    for name in lost:
+        if not _is_library(name):
+            raise RefusedError(
+                f"{_namer(layers, name)}: names {name}, which is not there; put it there, or take the name "
+                "out"
+            )
+    for file in (*files, *others):
+        _check_carried(file, layers, within)
+    places = _places(root, files, others)
+    for file, layer in files.items():
+        _copy_layer(file, layer, folder, places)
+    for file in others:
+        _copied(file, folder / places[file])
+    return folder / places[root]
+
+
+def assets_of(layer: Sdf.Layer) -> Iterator[tuple[Sdf.Path, str]]:
+    """Every asset that a layer's properties name, in any variant, with the path of the property."""
+    found: list[tuple[Sdf.Path, str]] = []
+
+    def visit(path: Sdf.Path) -> None:
+        spec = layer.GetObjectAtPath(path) if path.IsPropertyPath() else None
+        if not isinstance(spec, Sdf.AttributeSpec) or spec.typeName not in _ASSETS:
+            return
+        values = [spec.default, *(layer.QueryTimeSample(path, t) for t in layer.ListTimeSamplesForPath(path))]
+        for value in values:
+            named = [value] if isinstance(value, Sdf.AssetPath) else list(value or ())
+            found.extend((path, asset.path) for asset in named if asset.path)
+
+    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+    return iter(found)
+
+
+_ASSETS = (Sdf.ValueTypeNames.Asset, Sdf.ValueTypeNames.AssetArray)
+
+
+def _is_library(name: str) -> bool:
+    """Whether a name is of a material that Omniverse itself brings, such as OmniPBR.mdl."""
+    return Path(name).suffix == ".mdl" and "/" not in name
+
+
+def _check_carried(file: Path, layers: Iterable[Sdf.Layer], within: Path | None) -> None:
+    """Refuse a file that must not be handed on."""
+    if "[" in file.as_posix() or file.suffix == ".usdz":
+        raise RefusedError(
+            f"{_namer(layers, str(file))}: names {file}, a part of a package; unpack that with "
+            "`magtwin export FILE.usdz --out DIR`, and name a layer in it"
+        )
+    if within is not None and not file.is_relative_to(within.resolve()):
+        raise RefusedError(
+            f"{_namer(layers, str(file))}: names {file}, outside of its package; it must bring all it names"
+        )
+    if file.suffix not in SUFFIXES and not kind_of(file):
+        raise RefusedError(
+            f"{_namer(layers, str(file))}: names {file}, which is no layer, texture, network or path, so it "
+            "is not handed on; take the name out"
+        )
+
+
+def _namer(layers: Iterable[Sdf.Layer], name: str) -> str:
+    """Which layer, and which property of it, names a file."""
+    layers = list(layers)
+    for layer in layers:
+        for path, asset in assets_of(layer):
+            if name in (asset, layer.ComputeAbsolutePath(asset), str(_resolved(layer, asset))):
+                return f"{layer.realPath} <{path}>"
+    for layer in layers:
+        for asset in layer.GetExternalReferences():
+            if name in (asset, layer.ComputeAbsolutePath(asset), str(_resolved(layer, asset))):
+                return str(layer.realPath)
+    return str(layers[0].realPath)
+
+
+def _resolved(layer: Sdf.Layer, asset: str) -> Path:
+    return Path(layer.ComputeAbsolutePath(asset)).resolve()
+
+
+def _places(root: Path, layers: Iterable[Path], others: Iterable[Path]) -> dict[Path, Path]:
+    """Where in the folder each file comes to lie."""
+    everything = sorted({*layers, *others}, key=lambda file: (len(file.parts), file))
+    inside = {file.relative_to(root.parent).parts[0] for file in everything if root.parent in file.parents}
+    groups = {root.parent: Path()}
+    taken = {name.lower() for name in inside}
+    places = {}
+    for file in everything:
+        group = next((folder for folder in file.parents if folder in groups), None)
+        if group is None:
+            group = file.parent
+            name = kind_of(file) or re.sub(r"[^\w.-]", "_", group.name) or "layers"
+            free = (name, *(f"{name}_{i}" for i in range(2, len(everything) + 3)))
+            groups[group] = Path(next(n for n in free if n.lower() not in taken))
+            taken.add(groups[group].name.lower())
+        places[file] = groups[group] / file.relative_to(group)
+    return places
+
+
+def _copy_layer(file: Path, layer: Sdf.Layer, folder: Path, places: Mapping[Path, Path]) -> None:
+    """Copy a layer, with what it names as it lies now."""
+    place = places[file]
+    changed = False
+
+    def moved(asset: str) -> str:
+        nonlocal changed
+        target = places.get(_resolved(layer, asset)) if asset else None
+        if target is None and "<UDIM>" in asset:  # stands for several files of one folder
+            target = _udim(_resolved(layer, asset), places)
+        if target is None:
+            return asset
+        relative = Path(os.path.relpath(target, place.parent)).as_posix()
+        relative = relative if relative.startswith("../") else f"./{relative}"
+        changed |= relative != asset
+        return relative
+
+    copy = Sdf.Layer.OpenAsAnonymous(str(file))
+    UsdUtils.ModifyAssetPaths(copy, moved)
+    if changed:
+        (folder / place).parent.mkdir(parents=True, exist_ok=True)
+        copy.Export(str(folder / place))
+    else:
+        _copied(file, folder / place)
+    picture = THUMBNAIL / f"{file.name}.png"
+    if (file.parent / picture).is_file():
+        _copied(file.parent / picture, folder / place.parent / picture)
+
+
+def _udim(pattern: Path, places: Mapping[Path, Path]) -> Path | None:
+    """Where the tiles of a texture come to lie, as a pattern."""
+    begin, end = pattern.name.split("<UDIM>")
+    for file, place in places.items():
+        if file.parent == pattern.parent and file.name.startswith(begin) and file.name.endswith(end):
+            return place.with_name(pattern.name)
+    return None
+
+
+def _copied(file: Path, place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(file, place)

@@ -1,0 +1,43 @@
+"""Flatten: a stage as one layer without references, variants or instances, for viewers that know none."""
+
+from pathlib import Path
+
+from pxr import Sdf, Usd, UsdUtils
+
+from magtwin.export.contents import kind_of
+from magtwin.usd.layers import open_stage, relative_asset
+
+
+def flatten(root: Path, out: Path) -> None:
+    """Write a stage as a single layer; textures are named where they lie.
+
+    Variants come as they are selected. Instances become plain prims, for readers that do not show
+    prototypes. Time samples, and every attribute of magtwin's, stay.
+
+    Args:
+        root: Root layer of the stage.
+        out: Layer to write, below the folder of `root`, so that what it names stays right.
+
+    Raises:
+        RefusedError: The stage cannot be opened.
+    """
+    stage = open_stage(root)
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        instances = [prim for prim in stage.TraverseAll() if prim.IsInstance()]
+        while instances:  # an instance can hold others, which show once it is none
+            for prim in instances:
+                prim.SetInstanceable(False)
+            instances = [prim for prim in stage.TraverseAll() if prim.IsInstance()]
+    flat = stage.Flatten(addSourceFileComment=False)
+    source = stage.GetRootLayer()
+    flat.documentation, flat.customLayerData = source.documentation, source.customLayerData
+    made = Sdf.Layer.CreateNew(str(out))
+    made.TransferContent(flat)
+    UsdUtils.ModifyAssetPaths(made, lambda asset: _beside(made, asset))
+    made.Save()
+
+
+def _beside(layer: Sdf.Layer, asset: str) -> str:
+    """An asset path that flattening made absolute, relative again."""
+    path = Path(asset)
+    return relative_asset(layer, path) if kind_of(asset) and path.is_absolute() else asset

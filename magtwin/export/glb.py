@@ -1,0 +1,347 @@
+"""GLB: a stage as binary glTF 2.0 (Khronos Group), metres and Y up, for web pages and whatever shows no USD.
+
+A node a body and a place between it and the root, with the stage's own names; what stands still is gathered
+below the child of the default prim that it belongs to. Sensors are nodes without a mesh, their attributes in
+`extras`; the map's values are an accessor that its node's `extras` name. A stage that moves brings an
+animation.
+"""
+
+import json
+import struct
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
+
+from magtwin.names import RefusedError
+from magtwin.usd.geometry import Shape, read_shapes
+from magtwin.usd.layers import open_stage
+from magtwin.usd.schema import NOUNS, attribute_name, prims_with
+from magtwin.version import __version__
+
+CREASE = np.deg2rad(40.0)
+"""Faces that meet at a smaller angle are shaded as one surface; ours."""
+
+Y_UP = (-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
+"""Turn (xyzw) that takes Z up to Y up: (x, y, z) to (x, z, -y)."""
+
+UNLIT = "KHR_materials_unlit"
+"""Extension for the floor's colours, which mean nT and not how they are lit."""
+
+TOLD = ("magnetometer", "imu", "lidar", "battery", "robot", "anomalyMap", "earth", "lab")
+"""Nouns whose prims become nodes even where they show nothing."""
+
+MOST_NUMBERS = 64
+"""Numbers of an attribute that go into `extras`."""
+
+_TYPES = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4"}
+_COMPONENTS = {"f4": 5126, "u4": 5125, "u1": 5121}
+_VERTICES, _INDICES = 34962, 34963
+
+
+def write_glb(stage_file: Path, out: Path) -> None:
+    """Write what a stage shows.
+
+    Surfaces have the colour, roughness and metalness of their material, or their own colours; textures stay
+    behind. Variants come as they are selected.
+
+    Args:
+        stage_file: Root layer, in metres with Z up.
+        out: The .glb file to make.
+
+    Raises:
+        RefusedError: The stage cannot be opened, or shows nothing.
+    """
+    stage = open_stage(stage_file)
+    shapes = [shape for shape in read_shapes(stage) if len(shape.faces)]
+    if not shapes:
+        raise RefusedError(f"{stage_file}: shows no surface, so there is nothing to write")
+    scene = _Scene(stage)
+    for home, own in _gathered(stage, shapes).items():
+        scene.show(home, own)
+    for noun in TOLD:
+        for prim in prims_with(stage.GetPseudoRoot(), noun):
+            scene.tell(prim)
+    scene.animate()
+    out.write_bytes(scene.glb())
+
+
+def _gathered(stage: Usd.Stage, shapes: Iterable[Shape]) -> dict[Sdf.Path, list[Shape]]:
+    """Shapes by the prim whose node has them: the body that carries them, or a part of what stands still."""
+    homes: dict[Sdf.Path, list[Shape]] = {}
+    for shape in shapes:
+        prim = stage.GetPrimAtPath(shape.prim)
+        body = prim
+        while body and not body.HasAPI(UsdPhysics.RigidBodyAPI):
+            body = body.GetParent()
+        home = body.GetPath() if body else prim.GetPath().GetPrefixes()[:2][-1]
+        homes.setdefault(home, []).append(shape)
+    return homes
+
+
+class _Scene:
+    """A glTF in the making."""
+
+    def __init__(self, stage: Usd.Stage) -> None:
+        self.stage, self.rest = stage, UsdGeom.XformCache()
+        self.data = bytearray()
+        root = {"name": _root_name(stage), "rotation": _plain(Y_UP), "children": []}
+        self.nodes: list[dict[str, Any]] = [root]
+        self.index: dict[Sdf.Path, int] = {Sdf.Path.absoluteRootPath: 0}
+        self.parts: dict[str, list[Any]] = {
+            name: [] for name in ("meshes", "materials", "accessors", "bufferViews", "animations")
+        }
+        self.materials: dict[str, int] = {}
+
+    def node(self, path: Sdf.Path) -> int:
+        """The node of a prim, below those of its parents."""
+        if path not in self.index:
+            above = self.node(path.GetParentPath())
+            p, q = self._pose(path, self.rest)
+            node = {"name": path.name, "children": []}
+            if np.any(p):
+                node["translation"] = _plain(p)
+            if not np.allclose(q, (0, 0, 0, 1), atol=1e-12):
+                node["rotation"] = _plain(q)
+            self.index[path] = len(self.nodes)
+            self.nodes.append(node)
+            self.nodes[above]["children"].append(self.index[path])
+        return self.index[path]
+
+    def _pose(self, path: Sdf.Path, cache: UsdGeom.XformCache) -> tuple[NDArray, NDArray]:
+        """Place [m] and turn (xyzw) of a prim's frame in that of its parent, scales left out."""
+        here, above = (self._frame(p, cache) for p in (path, path.GetParentPath()))
+        local = here * above.GetInverse()
+        q = local.ExtractRotationQuat().GetNormalized()
+        return np.array(local.ExtractTranslation()), np.array([*q.GetImaginary(), q.GetReal()])
+
+    def _frame(self, path: Sdf.Path, cache: UsdGeom.XformCache) -> Gf.Matrix4d:
+        prim = self.stage.GetPrimAtPath(path)
+        if path == Sdf.Path.absoluteRootPath or not prim:
+            return Gf.Matrix4d(1)
+        return cache.GetLocalToWorldTransform(prim).RemoveScaleShear()
+
+    def show(self, home: Sdf.Path, shapes: list[Shape]) -> None:
+        """Give a node its mesh: a primitive a material, in the node's own frame."""
+        groups: dict[int, list[Shape]] = {}
+        for shape in shapes:
+            groups.setdefault(self._material(shape), []).append(shape)
+        stands = not self.stage.GetPrimAtPath(home).HasAPI(UsdPhysics.RigidBodyAPI)
+        to_home = np.array(self._frame(home, self.rest).GetInverse()) if stands else np.eye(4)
+        primitives = [self._primitive(group, to_home, m) for m, group in groups.items()]
+        self.nodes[self.node(home)]["mesh"] = len(self.parts["meshes"])
+        self.parts["meshes"].append({"name": home.name, "primitives": primitives})
+
+    def _primitive(self, shapes: list[Shape], to_home: NDArray, material: int) -> dict[str, Any]:
+        corners, normals, colours = [], [], []
+        for shape in shapes:
+            points = np.column_stack([shape.vertices, np.ones(len(shape.vertices))]) @ to_home[:, :3]
+            corners.append(points[shape.faces].reshape(-1, 3))
+            normals.append(corner_normals(points, shape.faces))
+            if shape.vertex_colours is not None:
+                colours.append(shape.vertex_colours[shape.faces].reshape(-1, 3))
+        rows = np.hstack([np.vstack(a) for a in (corners, normals, colours) if a]).astype("<f4")
+        rows, index = np.unique(rows, axis=0, return_inverse=True)
+        attributes = {"POSITION": rows[:, :3], "NORMAL": rows[:, 3:6]}
+        if colours:
+            attributes["COLOR_0"] = rows[:, 6:9]
+        return {
+            "attributes": {name: self._accessor(a, _VERTICES) for name, a in attributes.items()},
+            "indices": self._accessor(index.reshape(-1).astype("<u4"), _INDICES),
+            "material": material,
+        }
+
+    def _material(self, shape: Shape) -> int:
+        rough, metal = _surface(self.stage.GetPrimAtPath(shape.prim))
+        r, g, b, a = (1.0, 1.0, 1.0, 1.0) if shape.vertex_colours is not None else shape.colour
+        said: dict[str, Any] = {
+            "pbrMetallicRoughness": {
+                "baseColorFactor": _plain((r, g, b, a)),
+                "metallicFactor": metal,
+                "roughnessFactor": rough,
+            },
+            "doubleSided": True,
+        }
+        if a < 1:
+            said["alphaMode"] = "BLEND"
+        if shape.vertex_colours is not None:
+            said["extensions"] = {UNLIT: {}}
+        key = json.dumps(said, sort_keys=True)
+        if key not in self.materials:
+            self.materials[key] = len(self.parts["materials"])
+            self.parts["materials"].append(said)
+        return self.materials[key]
+
+    def tell(self, prim: Usd.Prim) -> None:
+        """Write what magtwin says of a prim into its node."""
+        extras = self.nodes[self.node(prim.GetPath())].setdefault("extras", {})
+        for attribute in prim.GetAuthoredAttributes():
+            if attribute.GetNamespace().startswith("magtwin:"):
+                value = _said(attribute.Get())
+                if value is not None:
+                    extras[attribute.GetName()] = value
+        if prim.HasAPI(NOUNS["anomalyMap"]):
+            values = np.array(prim.GetAttribute(attribute_name("anomalyMap", "values")).Get(), "<f4")
+            valid = np.array(prim.GetAttribute(attribute_name("anomalyMap", "valid")).Get(), "u1")
+            valid &= np.isfinite(values)
+            numbers = {"values": np.where(valid, values, 0).astype("<f4"), "valid": valid}
+            for name, array in numbers.items():
+                extras[attribute_name("anomalyMap", name)] = {"accessor": self._accessor(array)}
+            for child in prim.GetChildren():
+                if colours := _said_of_colours(child):
+                    extras["colours"] = colours
+
+    def animate(self) -> None:
+        """Move the nodes of prims that move, as their time samples say."""
+        moving = [
+            prim
+            for prim in self.stage.Traverse()
+            if UsdGeom.Xformable(prim) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying()
+        ]
+        rate, start = self.stage.GetTimeCodesPerSecond(), self.stage.GetStartTimeCode()
+        channels: list[dict[str, Any]] = []
+        samplers: list[dict[str, Any]] = []
+        clocks: dict[bytes, int] = {}
+        for prim in moving:
+            times = np.array(UsdGeom.Xformable(prim).GetTimeSamples())
+            cache, poses = UsdGeom.XformCache(), []
+            for time in times.tolist():
+                cache.SetTime(time)
+                poses.append(self._pose(prim.GetPath(), cache))
+            clock = ((times - start) / rate).astype("<f4")
+            if clock.tobytes() not in clocks:
+                clocks[clock.tobytes()] = self._accessor(clock, limits=True)
+            q = np.array([q for _, q in poses])
+            flips = np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0))
+            q[1:] *= flips[:, None]  # the shorter way from one to the next
+            node = self.node(prim.GetPath())
+            for path, values in (("translation", np.array([p for p, _ in poses])), ("rotation", q)):
+                if np.ptp(values, axis=0).max() > 1e-9:
+                    sampler = {"input": clocks[clock.tobytes()], "interpolation": "LINEAR"}
+                    samplers.append({**sampler, "output": self._accessor(values.astype("<f4"))})
+                    target = {"node": node, "path": path}
+                    channels.append({"sampler": len(samplers) - 1, "target": target})
+        if channels:
+            self.parts["animations"].append({"name": "run", "channels": channels, "samplers": samplers})
+
+    def _accessor(self, array: NDArray, target: int | None = None, *, limits: bool = False) -> int:
+        """An array in the buffer; returns the index of its accessor."""
+        self.data += bytes(-len(self.data) % 4)
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes}
+        if target is not None:
+            view["target"] = target
+        self.data += np.ascontiguousarray(array).tobytes()
+        said: dict[str, Any] = {
+            "bufferView": len(self.parts["bufferViews"]),
+            "componentType": _COMPONENTS[array.dtype.str[1:]],
+            "count": len(array),
+            "type": _TYPES[array.shape[1:]],
+        }
+        if limits or (target == _VERTICES and array.shape[1:] == (3,)):
+            said["min"], said["max"] = (np.atleast_1d(f(array, axis=0)).tolist() for f in (np.min, np.max))
+        self.parts["bufferViews"].append(view)
+        self.parts["accessors"].append(said)
+        return len(self.parts["accessors"]) - 1
+
+    def glb(self) -> bytes:
+        """The file: a header, JSON, and the buffer."""
+        facts = self.stage.GetRootLayer().customLayerData.get("magtwin", {}).get("export", {})
+        asset = {"version": "2.0", "generator": f"magtwin {__version__}", "extras": dict(facts)}
+        self.data += bytes(-len(self.data) % 4)
+        nodes = [{k: v for k, v in node.items() if v != []} for node in self.nodes]
+        said = {
+            "asset": asset,
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": nodes,
+            "buffers": [{"byteLength": len(self.data)}],
+            **{name: part for name, part in self.parts.items() if part},
+        }
+        if any("extensions" in material for material in self.parts["materials"]):
+            said["extensionsUsed"] = [UNLIT]
+        text = json.dumps(said, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        size = 12 + 8 + len(text) + 8 + len(self.data)
+        head = struct.pack("<4sII", b"glTF", 2, size)
+        return b"".join(
+            (
+                head,
+                struct.pack("<I4s", len(text), b"JSON") + text,
+                struct.pack("<I4s", len(self.data), b"BIN\0") + bytes(self.data),
+            )
+        )
+
+
+def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
+    """Unit normals of the corners of triangles: the mean, by area, of the faces that meet there smoothly.
+
+    Args:
+        points: Vertices, shape (V, 3); those in one place count as one.
+        faces: Corners of the triangles, counter-clockwise seen from outside, shape (F, 3).
+
+    Returns:
+        Normals, shape (3 F, 3), in order of the faces; an edge of more than `CREASE` stays sharp.
+    """
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    by_area = np.cross(b - a, c - a)
+    length = np.linalg.norm(by_area, axis=1, keepdims=True)
+    unit = np.divide(by_area, length, out=np.zeros_like(by_area), where=length > 0)
+    _, place = np.unique(np.round(points, 7), axis=0, return_inverse=True)
+    corner = place.reshape(-1)[faces].reshape(-1)
+    order = np.argsort(corner, kind="stable")
+    counts = np.bincount(corner)
+    sizes, begins = counts[corner], (np.cumsum(counts) - counts)[corner]
+    one = np.repeat(np.arange(len(corner)), sizes)  # every corner with every corner of the same place
+    step = np.arange(len(one)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    other = order[np.repeat(begins, sizes) + step]
+    smooth = np.sum(unit[one // 3] * unit[other // 3], axis=1) >= np.cos(CREASE)
+    total = np.zeros((len(corner), 3))
+    np.add.at(total, one[smooth], by_area[other[smooth] // 3])
+    size = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(size > 0, total / np.where(size > 0, size, 1), (0.0, 0.0, 1.0))
+
+
+def _surface(prim: Usd.Prim) -> tuple[float, float]:
+    """Roughness and metalness of the material that a prim wears; UsdPreviewSurface's own without."""
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    shader = material.ComputeSurfaceSource()[0] if material else None
+    values = [shader.GetInput(name).Get() if shader and shader.GetInput(name) else None for name in _SHEEN]
+    return tuple(d if v is None else round(float(v), 6) for v, d in zip(values, (0.5, 0.0), strict=True))  # type: ignore[return-value]
+
+
+_SHEEN = ("roughness", "metallic")
+
+
+def _said_of_colours(prim: Usd.Prim) -> dict[str, Any]:
+    facts: Mapping[str, Any] = prim.GetCustomDataByKey("magtwin") or {}
+    return {key: _said(value) for key, value in facts.items()} if "colourMap" in facts else {}
+
+
+def _said(value: Any) -> Any:
+    """A value as JSON has it; None for what is no number, text or short list of them."""
+    if isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, Sdf.AssetPath):
+        return value.path or None
+    try:
+        array = np.array(value)
+    except (TypeError, ValueError):
+        return None
+    if array.dtype.kind == "U" or array.dtype.kind == "O":
+        return [str(v) for v in value] if array.size <= MOST_NUMBERS and array.ndim else None
+    finite = array.dtype.kind in "biuf" and array.size <= MOST_NUMBERS and np.isfinite(array).all()
+    return array.tolist() if finite else None
+
+
+def _plain(numbers: Iterable[float]) -> list[float]:
+    """Numbers for JSON, to nine digits, which is what single precision holds."""
+    return [float(f"{float(x):.9g}") + 0.0 for x in numbers]
+
+
+def _root_name(stage: Usd.Stage) -> str:
+    return Path(stage.GetRootLayer().realPath).stem

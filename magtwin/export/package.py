@@ -1,0 +1,430 @@
+"""Package: a stage with all that it needs, as other programs take it: a folder, a .usdz, a layer, a .glb."""
+
+import json
+import os
+import shutil
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal
+
+from pxr import Sdf, Usd, UsdGeom
+
+from magtwin.export.attached import attach, detach
+from magtwin.export.contents import THUMBNAIL, bring_together
+from magtwin.export.flatten import flatten
+from magtwin.export.glb import write_glb
+from magtwin.export.howto import howto
+from magtwin.export.isaac import GRAPHS, author_graph
+from magtwin.export.structure import structure
+from magtwin.export.units import to_metres_z_up
+from magtwin.export.usdz import pack, unpack
+from magtwin.files import check_free, existing, output, sha256
+from magtwin.names import RefusedError, find
+from magtwin.report import Figure, Report
+from magtwin.run import Run
+from magtwin.usd.animation import write_animation
+from magtwin.usd.layers import open_stage, stage_sha256
+from magtwin.usd.maps import read_map
+from magtwin.usd.scene import read_scene
+from magtwin.usd.schema import FOLDER as SCHEMA
+from magtwin.usd.schema import attribute_name, place, prims_with
+from magtwin.usd.sensors import MAP_CHECKSUM
+from magtwin.version import __version__
+
+Profile = Literal["omniverse", "isaac", "newton", "viewer"]
+PROFILES: dict[str, str] = {
+    "omniverse": "the stage with its layers, variants and instances",
+    "isaac": "that, robots in Isaac Sim's asset structure 3.0, an Action Graph a robot for ROS 2",
+    "newton": "that of omniverse, with the network as ONNX for whoever steps Newton",
+    "viewer": "one layer, nothing in it that a simple viewer may not know",
+}
+"""What each profile makes."""
+
+KINDS = {"": "folder", ".usdz": "package", ".usd": "layer", ".usdc": "layer", ".glb": "web"}
+"""What is made, by the suffix of where to."""
+
+NETWORK, NETWORK_SHA256 = (attribute_name("magnetometer", name) for name in ("network", "network_sha256"))
+PLUGIN = Path("plugin", "magtwin")
+GENERATED = ("plugInfo.json", "generatedSchema.usda")
+"""What a program needs to know magtwin's schemas, and where it lies."""
+
+HOWTO = "HOWTO.md"
+
+HEADER_MAX = 10_000_000
+"""Bytes of the header of a safetensors file that are read for a licence."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What an export made."""
+
+    files: tuple[Path, ...]
+    """What was asked for, then the folder that lies beside it, if any."""
+
+    root: Path
+    """What to open: a layer, a package or a .glb."""
+
+    profile: str
+    licences: dict[str, str]
+    """By file, as it is called in the export."""
+
+    notes: tuple[str, ...] = ()
+    """What may need a look."""
+
+    def report(self) -> Report:
+        """The files with their sizes, profile, licences and notes."""
+        figures = [Figure("profile", self.profile), Figure("opens with", str(self.root))]
+        for file in self.files:
+            inside = [f for f in file.rglob("*") if f.is_file()] if file.is_dir() else [file]
+            size = sum(f.stat().st_size for f in inside) / 1e6
+            figures.append(
+                Figure(str(file), size, "MB", note=f"{len(inside)} files" if file.is_dir() else "")
+            )
+        facts = {"licences": self.licences, "notes": list(self.notes)}
+        return Report(str(self.files[0]), tuple(figures), {k: v for k, v in facts.items() if v})
+
+
+def export_scene(
+    scene_file: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    profile: Profile | None = None,
+    animation: Run | None = None,
+    network_onnx: Path | None = None,
+    thumbnail: Callable[[Path, Path], object] | None = None,
+    convert_units: bool = False,
+    force: bool = False,
+    progress: Callable[[str], object] = lambda step: None,
+) -> Exported:
+    """Write a stage with all that it needs, so that it can be moved anywhere.
+
+    Args:
+        scene_file: Root layer of a scene or of any other stage, or a .usdz.
+        out: What to make: a folder (no suffix), a package .usdz, one layer .usd or .usdc, or a .glb. Beside
+            a package lies a folder `<name>_magtwin` with the schema plugin, the how-to and the network.
+        profile: For whom, see `PROFILES`; omniverse for folders and packages, viewer for the others, unless
+            given.
+        animation: A run that plays over the stage; in a folder as a layer of its own, `<name>_run.usdc`.
+        network_onnx: The scene's one network as ONNX, to lie beside its weights.
+        thumbnail: Draws a folder's stage: called with its root layer and the PNG to make, 256 pixels square.
+        convert_units: Whether a stage that is not in metres with Z up is converted, see `to_metres_z_up`.
+        force: Whether what exists is replaced.
+        progress: Called with what is done next.
+
+    Raises:
+        RefusedError: The stage cannot be opened, names what is not there, is not what its checksums say, or
+            is not in metres with Z up and `convert_units` was not given; or `out` exists, or cannot hold what
+            the stage has. Nothing is written.
+    """
+    scene_file, out = Path(scene_file), Path(out)
+    kind = find("kind of export", out.suffix, KINDS) if out.suffix in KINDS else _no_kind(out)
+    name: str = profile or ("omniverse" if kind in ("folder", "package") else "viewer")
+    find("profile", name, PROFILES)
+    if kind in ("layer", "web") and name != "viewer":
+        raise RefusedError(
+            f"{out}: {out.suffix} is for viewers; give a folder or a .usdz for --profile {name}"
+        )
+    beside = out.with_name(f"{out.stem}_magtwin") if kind == "package" and name != "viewer" else None
+    for target in filter(None, (out, beside)):
+        check_free(target, force=force)
+    existing(scene_file, "stage")
+    with TemporaryDirectory() as scratch, _told_of(Path(scratch, "stage"), scene_file):
+        work = _Work(Path(scratch, "stage"), scene_file, name, progress)
+        work.gather(convert_units=convert_units)
+        work.check()
+        work.network(network_onnx)
+        if name == "isaac":
+            work.for_isaac()
+        work.tell_origin()
+        if animation is not None:
+            work.animate(animation)
+        with ExitStack() as outputs:
+            aside = outputs.enter_context(output(out, force=force))
+            folder = None if beside is None else outputs.enter_context(output(beside, force=force))
+            progress(f"Writing the {kind}")
+            if kind == "folder":
+                work.whole(aside, thumbnail)
+            elif kind == "package":
+                work.package(aside, folder)
+            elif kind == "layer":
+                work.layer(aside)
+            else:
+                write_glb(work.run or work.root, aside)
+        shown = work.run or work.root
+    root = out / shown.name if kind == "folder" else out
+    return Exported((out, *([beside] if beside else [])), root, name, work.licences, tuple(work.notes))
+
+
+def _no_kind(out: Path) -> str:
+    raise RefusedError(f"{out}: an export is a folder (no suffix), or ends in .usdz, .usd, .usdc or .glb")
+
+
+@contextmanager
+def _told_of(copy: Path, scene_file: Path) -> Iterator[None]:
+    """Refusals of the copy that is worked on name the stage that was given."""
+    try:
+        yield
+    except RefusedError as error:
+        there = scene_file if scene_file.suffix == ".usdz" else scene_file.parent
+        text = str(error)
+        for folder in (copy.with_name("package"), copy):
+            for path in (folder.resolve(), folder):
+                text = text.replace(f"{path}{os.sep}", f"{there}{os.sep}")
+        raise RefusedError(text) from error
+
+
+class _Work:
+    """A copy of a stage, made ready step by step."""
+
+    def __init__(
+        self, folder: Path, scene_file: Path, profile: str, progress: Callable[[str], object]
+    ) -> None:
+        self.folder, self.source, self.profile, self.progress = folder, scene_file, profile, progress
+        self.notes: list[str] = []
+        self.licences: dict[str, str] = {}
+        self.run: Path | None = None
+        self.checksum = ""
+
+    def gather(self, *, convert_units: bool) -> None:
+        """Bring the stage together, in metres with Z up."""
+        self.progress("Gathering what the stage names")
+        self.folder.mkdir()
+        if self.source.suffix == ".usdz":
+            package = self.folder.with_name("package")
+            package.mkdir()
+            root = unpack(self.source, package)
+            detach(root)
+            self.checksum = sha256(self.source)
+            self.root = bring_together(root, self.folder, within=package)
+        else:
+            self.root = bring_together(self.source, self.folder)
+            self.checksum = stage_sha256(self.source)
+        stage = open_stage(self.root)
+        metres, up = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)
+        if UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters) and up == UsdGeom.Tokens.z:
+            return
+        if not convert_units:
+            said = stage.HasAuthoredMetadata("metersPerUnit") and stage.HasAuthoredMetadata("upAxis")
+            raise RefusedError(
+                f"{self.source}: has {metres:g} m a unit and {up} up{'' if said else ', as it says none'}; "
+                "magtwin hands on metres with Z up: give --convert-units to convert its points and transforms"
+            )
+        self.progress("Converting to metres with Z up")
+        stale = self._map_stamps(stage)
+        del stage
+        self.notes += to_metres_z_up(self.root)
+        self._stamp(stale)
+
+    def _map_stamps(self, stage: Usd.Stage) -> list[tuple[Sdf.Path, Path]]:
+        """The attributes that hold the checksum of a map's file, where it fits."""
+        fits = []
+        maps = prims_with(stage.GetPseudoRoot(), "anomalyMap")
+        for prim in prims_with(stage.GetPseudoRoot(), "magnetometer"):
+            stamp = prim.GetAttribute(MAP_CHECKSUM)
+            fits += [
+                (stamp.GetPath(), file) for file in map(_values_layer, maps) if stamp.Get() == sha256(file)
+            ]
+        return fits
+
+    def _stamp(self, stamps: list[tuple[Sdf.Path, Path]]) -> None:
+        if not stamps:
+            return
+        stage = open_stage(self.root)
+        for path, layer in stamps:
+            stage.GetAttributeAtPath(path).Set(sha256(layer))
+        stage.GetRootLayer().Save()
+
+    def check(self) -> None:
+        """Refuse a scene, map or network that is not what its checksums say."""
+        self.progress("Checking map and network")
+        stage = open_stage(self.root)
+        world = stage.GetPseudoRoot()
+        self.map = ""
+        for prim in prims_with(world, "anomalyMap"):
+            read_map(prim)
+            self.map = self.map or str(prim.GetPath())
+            if licence := prim.GetAttribute(attribute_name("anomalyMap", "licence")).Get():
+                self.licences[self._said(_values_layer(prim))] = licence
+        magnetometers = prims_with(world, "magnetometer")
+        self.magnetometer = str(magnetometers[0].GetPath()) if magnetometers else ""
+        self.networks: list[Path] = []
+        for prim in magnetometers:
+            named = prim.GetAttribute(NETWORK).Get()
+            if not named or not named.path:
+                continue
+            file = Path(named.resolvedPath)
+            checksum, seen = prim.GetAttribute(NETWORK_SHA256).Get(), sha256(file)
+            if checksum and checksum.lower() != seen:
+                raise RefusedError(
+                    f"{place(prim)}: its network {named.path} has SHA-256 {seen}, the stage was made with "
+                    f"{checksum}; put that network back, or make the scene anew"
+                )
+            if file not in self.networks:
+                self.networks.append(file)
+                if licence := _licence_of(file):
+                    self.licences[self._said(file)] = licence
+        for layer in stage.GetUsedLayers():
+            facts = layer.customLayerData.get("SimReady_Metadata", {})
+            if layer.realPath and facts.get("asset_license"):
+                self.licences[self._said(Path(layer.realPath))] = facts["asset_license"]
+        self.licences = dict(sorted(self.licences.items()))
+        self.scene = read_scene(self.root) if magnetometers and prims_with(world, "robot") else None
+
+    def _said(self, file: Path) -> str:
+        return file.resolve().relative_to(self.folder.resolve()).as_posix()
+
+    def network(self, onnx: Path | None) -> None:
+        """Lay the ONNX file beside the weights that it was made from."""
+        self.onnx: Path | None = None
+        if onnx is None:
+            return
+        if len(self.networks) != 1:
+            raise RefusedError(
+                f"{self.source}: has {len(self.networks)} networks, so {onnx} cannot be that of the scene"
+            )
+        self.onnx = self.networks[0].with_suffix(".onnx")
+        if self.onnx.exists():
+            raise RefusedError(f"{self.source}: names {self._said(self.onnx)} already; leave the ONNX out")
+        shutil.copyfile(existing(onnx, "ONNX file"), self.onnx)
+
+    def for_isaac(self) -> None:
+        """Give robots Isaac Sim's asset structure, and the scene its Action Graphs."""
+        if self.scene is None:
+            raise RefusedError(
+                f"{self.source}: has no robot with a magnetometer of magtwin's, which --profile isaac is "
+                "for; take --profile omniverse"
+            )
+        self.progress("Authoring what Isaac Sim needs")
+        for asset in {placed.robot.asset for placed in self.scene.robots}:
+            structure(asset)
+        stage = open_stage(self.root)
+        author_graph(stage, self.scene)
+        stage.GetRootLayer().Save()
+
+    def tell_origin(self) -> None:
+        """Write into the root layer what it was made from, by what, and under which licences."""
+        layer = Sdf.Layer.FindOrOpen(str(self.root))
+        said = {
+            "version": __version__,
+            "profile": self.profile,
+            "source": self.source.name,
+            "sourceSha256": self.checksum,
+            "licences": self.licences,
+        }
+        facts = dict(layer.customLayerData)
+        facts["creator"] = facts.get("creator", "magtwin")
+        facts["magtwin"] = {**dict(facts.get("magtwin", {})), "export": said}
+        layer.customLayerData = facts
+        layer.Save()
+
+    def animate(self, run: Run) -> None:
+        """Lay a run over the stage."""
+        self.progress("Writing the run")
+        self.run = self.root.with_name(f"{self.root.stem}_run.usdc")
+        write_animation(run, self.run, self.root)
+        layer, below = Sdf.Layer.FindOrOpen(str(self.run)), Sdf.Layer.FindOrOpen(str(self.root))
+        layer.customLayerData = {**dict(layer.customLayerData), "magtwin": below.customLayerData["magtwin"]}
+        layer.Save()
+
+    def flat(self) -> None:
+        """Become one layer, with the textures that it names."""
+        self.progress("Flattening the stage")
+        flat = self.folder.with_name("flat") / f"{self.source.stem}.usdc"
+        flat.parent.mkdir()
+        flatten(self.run or self.root, flat)
+        self.folder = self.folder.with_name("viewer")
+        self.folder.mkdir()
+        self.root, self.run = bring_together(flat, self.folder), None
+
+    def layer(self, out: Path) -> None:
+        """Write one layer."""
+        attach(self.root)
+        self.flat()
+        for file in self.folder.rglob("*"):
+            if file.is_file() and file != self.root:
+                raise RefusedError(
+                    f"{self.source}: {self._said(file)} cannot lie in a layer; give a folder or a .usdz"
+                )
+        if out.suffix == ".usd":
+            self.root = self.root.rename(self.root.with_suffix(".usd"))
+        shutil.move(self.root, out)
+
+    def package(self, out: Path, beside: Path | None) -> None:
+        """Write a package, and the folder beside it."""
+        if beside is not None:
+            beside.mkdir()
+            for file in self.networks + ([self.onnx] if self.onnx else []):
+                _copied(file, beside / "weights" / file.name)
+            self._explain(beside, out.name, attached=True)
+        attach(self.root, *([self.onnx] if self.onnx else []))
+        if self.profile == "viewer":
+            self.flat()
+        pack(self.run or self.root, out)
+
+    def whole(self, out: Path, thumbnail: Callable[[Path, Path], object] | None) -> None:
+        """Write a folder."""
+        if self.profile == "viewer":
+            self.flat()
+        self._explain(self.folder, self.root.name, attached=False)
+        shutil.move(self.folder, out)
+        if thumbnail is not None:
+            self.progress("Drawing its thumbnail")
+            picture = out / THUMBNAIL / f"{self.root.name}.png"
+            picture.parent.mkdir(parents=True, exist_ok=True)
+            thumbnail(out / self.root.name, picture)
+
+    def _explain(self, folder: Path, root: str, *, attached: bool) -> None:
+        """Lay the how-to into a folder, and the schema plugin where programs can use it."""
+        viewer = self.profile == "viewer"
+        if not viewer:
+            for name in GENERATED:
+                _copied(SCHEMA / name, folder / PLUGIN / name)
+        page = howto(
+            name=self.source.stem,
+            version=__version__,
+            root=root,
+            run=self.run.name if self.run and not attached else "",
+            flat=viewer,
+            plugin=not viewer,
+            map_prim=self.map,
+            magnetometer=self.magnetometer if self.networks else "",
+            attached=attached,
+            graphs=str(GRAPHS) if self.profile == "isaac" else "",
+            source=self.source.name,
+            checksum=self.checksum,
+            licences=self.licences,
+            notes=self.notes,
+        )
+        (folder / HOWTO).write_text(page, encoding="utf-8")
+
+
+def _values_layer(prim: Usd.Prim) -> Path:
+    """The file that holds a map's values."""
+    specs = prim.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()
+    return Path(specs[0].layer.realPath)
+
+
+def _licence_of(network: Path) -> str:
+    """The licence that weights say, "" where they say none."""
+    if network.suffix != ".safetensors":
+        return ""
+    with open(network, "rb") as file:
+        head = file.read(8)
+        size = struct.unpack("<Q", head)[0] if len(head) == 8 else 0
+        if not 0 < size <= HEADER_MAX:
+            return ""
+        text = file.read(size)
+    try:
+        facts = json.loads(json.loads(text)["__metadata__"]["magtwin"])["facts"]
+        return str(facts.get("licence", ""))
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return ""
+
+
+def _copied(file: Path, place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(file, place)

@@ -1,0 +1,63 @@
+"""Structure: a robot's single layer taken apart into the layers of Isaac Sim's asset structure 3.0."""
+
+import os
+from pathlib import Path
+
+from pxr import Sdf, UsdUtils
+
+from magtwin.names import RefusedError
+from magtwin.usd.layers import open_stage
+from magtwin.usd.urdf.layout import GEOMETRIES, PAYLOADS, write_layers
+
+
+def structure(asset: Path) -> None:
+    """Take a robot's asset apart in place, as `magtwin robot` lays one out; one that is stays as it is.
+
+    The asset composes to the same stage. Its triangles move to `payloads/geometries.usdc`.
+
+    Args:
+        asset: Root layer of the robot, text, in a folder that may be changed.
+
+    Raises:
+        RefusedError: The asset has no default prim, or names several layers.
+    """
+    folder = asset.parent / PAYLOADS
+    layer = Sdf.Layer.FindOrOpen(str(asset))
+    named = sorted(layer.GetCompositionAssetDependencies())
+    if f"./{PAYLOADS}/base.usda" in named:
+        return
+    if not layer.defaultPrim or len(named) > 1 or folder.exists() or asset.suffix != ".usda":
+        raise RefusedError(
+            f"{asset}: is no robot in one text layer and one of meshes, which Isaac Sim's structure is made "
+            "from; convert its URDF with `magtwin robot`"
+        )
+    folder.mkdir()
+    if named:
+        meshes = Path(layer.ComputeAbsolutePath(named[0]))
+        _move(meshes, folder / GEOMETRIES)
+        here = f"./{PAYLOADS}/{GEOMETRIES}"
+        UsdUtils.ModifyAssetPaths(layer, lambda name: here if name == named[0] else name)
+        layer.Save()
+    made = asset.with_name(f"{asset.stem}_interface.usda")
+    write_layers(layer, made, folder, asset)
+    made.replace(asset)
+    layer.Reload(force=True)
+    open_stage(asset)
+
+
+def _move(layer: Path, place: Path) -> None:
+    """Move a layer; what it names stays where it lies."""
+
+    def moved(name: str) -> str:
+        if not name.startswith(("./", "../")):
+            return name
+        target = os.path.relpath(layer.parent / name, place.parent)
+        return Path(target).as_posix() if target.startswith("..") else f"./{Path(target).as_posix()}"
+
+    copy = Sdf.Layer.OpenAsAnonymous(str(layer))
+    if copy.GetExternalReferences():
+        UsdUtils.ModifyAssetPaths(copy, moved)
+        copy.Export(str(place))
+        layer.unlink()
+    else:
+        layer.rename(place)

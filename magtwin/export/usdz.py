@@ -1,0 +1,122 @@
+"""USDZ: one file of a folder of layers and textures, by OpenUSD's "Usdz File Format Specification", and back.
+
+A package is a ZIP archive, nothing in it compressed, the data of each entry at a multiple of 64 bytes, the
+first entry the layer to open. It may hold layers, pictures and sounds, no other kind of file.
+"""
+
+import shutil
+import struct
+import zipfile
+from pathlib import Path, PurePosixPath
+
+from magtwin.names import RefusedError
+from magtwin.usd.layers import SUFFIXES
+
+ALLOWED = (*SUFFIXES, ".png", ".jpg", ".jpeg", ".exr", ".avif", ".m4a", ".mp3", ".wav")
+"""Suffixes of what a package may hold."""
+
+ALIGNMENT = 64
+"""Bytes; so that USD maps a layer's arrays into memory without a copy."""
+
+MOST_BYTES = 2**32 - 1
+"""Size of a ZIP archive without the extension of 64 bits, which a package must not have."""
+
+_HEADER = 30
+_PADDING = 0x1986
+"""Bytes of an entry's header before its name; what the extra field that pads it is called."""
+
+_DAY = (1980, 1, 1, 0, 0, 0)
+"""The first day that ZIP knows: the same folder makes the same bytes on any other."""
+
+
+def pack(root: Path, out: Path) -> None:
+    """Write the folder of a stage as a package.
+
+    Args:
+        root: The layer to open first; everything below its folder goes in, hidden files left out.
+        out: The .usdz file to make.
+
+    Raises:
+        RefusedError: A file is of no kind that a package may hold, or it would be too large.
+    """
+    folder = root.parent
+    files = sorted(f for f in folder.rglob("*") if f.is_file() and not _is_hidden(f.relative_to(folder)))
+    for file in files:
+        if file.suffix.lower() not in ALLOWED:
+            raise RefusedError(
+                f"{file.relative_to(folder)}: a .usdz may hold {', '.join(ALLOWED)}, and no other file; "
+                "export to a folder, or convert it"
+            )
+    if sum(file.stat().st_size + 1024 for file in files) > MOST_BYTES:
+        raise RefusedError(f"{out}: a .usdz holds at most 4 GiB; export to a folder")
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_STORED, allowZip64=False) as archive:
+        for file in (root, *(f for f in files if f != root)):
+            entry = zipfile.ZipInfo(file.relative_to(folder).as_posix(), _DAY)
+            entry.create_system, entry.external_attr = 3, 0o644 << 16
+            assert archive.fp is not None
+            begin = archive.fp.tell() + _HEADER + len(entry.filename.encode())
+            fill = -(begin + 4) % ALIGNMENT
+            entry.extra = struct.pack("<HH", _PADDING, fill) + bytes(fill)
+            archive.writestr(entry, file.read_bytes())
+
+
+def unpack(package: Path, folder: Path) -> Path:
+    """Write what a package holds into a folder.
+
+    Args:
+        package: The .usdz file.
+        folder: Folder that exists and is empty.
+
+    Returns:
+        The layer to open.
+
+    Raises:
+        RefusedError: The file is no such package or is damaged, or an entry would lie outside of the folder
+            or is of no kind that a package may hold.
+    """
+    try:
+        with zipfile.ZipFile(package) as archive:
+            entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+            _check(package, entries)
+            for entry in entries:
+                place = folder / entry.filename
+                place.parent.mkdir(parents=True, exist_ok=True)
+                with archive.open(entry) as source, open(place, "xb") as file:
+                    shutil.copyfileobj(source, file)  # refuses what is not as its checksum says
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, struct.error, OSError) as error:
+        said = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise RefusedError(f"{package}: damaged, or no .usdz: {said}; copy or write it again") from error
+    return folder / entries[0].filename
+
+
+def _check(package: Path, entries: list[zipfile.ZipInfo]) -> None:
+    """Refuse a package before anything of it is written."""
+    if not entries or PurePosixPath(entries[0].filename).suffix.lower() not in SUFFIXES:
+        raise RefusedError(f"{package}: no .usdz: its first entry is no layer; write it again")
+    seen: set[str] = set()
+    for entry in entries:
+        name = entry.filename
+        path = PurePosixPath(name)
+        climbs = path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name or "\0" in name
+        if climbs or entry.orig_filename != name:
+            raise RefusedError(
+                f"{package}: its entry {entry.orig_filename!r} would lie outside of it; do not open it, it "
+                "was made to write elsewhere"
+            )
+        if path.as_posix().lower() in seen:
+            raise RefusedError(f"{package}: holds {name!r} twice; write it again")
+        seen.add(path.as_posix().lower())
+        if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
+            raise RefusedError(
+                f"{package}: its entry {name!r} is compressed or encrypted, which a .usdz must not be; pack "
+                "it again with `magtwin export`"
+            )
+        if path.suffix.lower() not in ALLOWED:
+            raise RefusedError(f"{package}: holds {name!r}, which a .usdz must not; pack it again without")
+    size = package.stat().st_size
+    if sum(entry.file_size for entry in entries) > size:
+        raise RefusedError(f"{package}: its entries say that they are larger than it is; it is damaged")
+
+
+def _is_hidden(path: Path) -> bool:
+    return any(part.startswith(".") for part in path.parts)
