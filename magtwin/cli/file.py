@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from magtwin.twin import Twin
 
 _STAGES = (".usd", ".usda", ".usdc", ".usdz")
-_NETS = (".safetensors", ".pth")
+_NETS = (".safetensors", ".pth", ".onnx")
 
 
 @app.command
@@ -27,7 +27,7 @@ def info(file: Path, *, json: Json = False) -> None:
     file
         A run (.parquet, .rrd, .mcap, .db3, .csv, .npz, .usd, a .json of the released node, or the folder of a
         bag, of Parquet parts, or of magtwin run), a stage (.usd, .usda, .usdc, .usdz), or a network
-        (.safetensors, .pth).
+        (.safetensors, .pth, .onnx).
     json
         Print it as JSON.
     """
@@ -209,6 +209,10 @@ def _info_of_run(file: Path) -> Any:
 
 
 def _info_of_net(file: Path) -> Any:
+    if file.suffix == ".onnx":
+        from magtwin.learn.onnx import report_onnx
+
+        return report_onnx(file)
     from magtwin.learn.predictor import load_predictor
 
     return load_predictor(file).report(str(file))

@@ -5,7 +5,7 @@ from pathlib import Path
 from cyclopts import App
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, check_suffix, print_report, say
+from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say
 
 net_app = App(name="net", help="Work with networks.")
 app.command(net_app)
@@ -30,3 +30,31 @@ def net_convert(pth: Path, *, out: Path, force: Force = False) -> None:
     net = convert(pth, out, force=force)
     print_report(net.report(str(out)), as_json=False)
     say(f"Wrote {out}")
+
+
+@net_app.command(name="export")
+def net_export(weights: Path, *, onnx: Path, force: Force = False, json: Json = False) -> None:
+    """Export a network as ONNX, which runs in onnxruntime without torch and without magtwin.
+
+    Its input is float64 features in their units, as magtwin info lists them; its outputs are the disturbance
+    and the standard deviation of its error [nT]. Scalers are inside. What onnxruntime gives is held against
+    torch before the file is written. Needs the extra onnx.
+
+    Parameters
+    ----------
+    weights
+        Weights, .safetensors or .pth.
+    onnx
+        File to write, .onnx.
+    force
+        Replace the file if it exists.
+    json
+        Print what it holds as JSON.
+    """
+    from magtwin.learn.onnx import export_onnx
+
+    check_suffix(onnx, (".onnx",), "an ONNX file")
+    report = export_onnx(weights, onnx, force=force)
+    print_report(report, json)
+    if not json:
+        say(f"Wrote {onnx}")

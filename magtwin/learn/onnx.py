@@ -1,0 +1,274 @@
+"""ONNX: a predictor as one graph that runs wherever onnxruntime does, without torch and without magtwin.
+
+In go features in their units and in float64, as `magtwin.learn.features` gives them; out come the disturbance
+and the standard deviation of its error [nT], each (rows,). Scalers are inside and work in float64, because in
+float32 they would err by 0.1 nT; products are float32, as in torch. A file's metadata tell what it holds.
+"""
+
+import json
+import math
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.files import check_free, existing, output, sha256
+from magtwin.learn.features import FEATURES
+from magtwin.learn.inputs import Inputs
+from magtwin.learn.model import FieldNet
+from magtwin.learn.predictor import Predictor, load_predictor
+from magtwin.names import RefusedError
+from magtwin.report import Figure, Report
+from magtwin.version import __version__
+
+if TYPE_CHECKING:
+    import onnx
+
+OPSET = 17
+"""Version of ONNX's operators; runtimes of 2022 and later have them."""
+
+IR_VERSION = 8
+"""Version of the file's own form, as old as the operators."""
+
+INPUT = "features"
+MEAN = "disturbance_nt"
+SD = "sd_nt"
+
+AGREES_NT = 1e-3
+"""How far from torch what onnxruntime gives may be [nT], beside its rounding."""
+
+ROUNDING = 1e-6
+"""What float32 may be off in a sum of products, of its size: 0.001 nT of 1,000 nT."""
+
+PROBE = 512
+"""Rows on which that is checked before a file is written."""
+
+EXTRA = "onnx and onnxruntime are not both installed: pip install 'magtwin[onnx]'"
+
+
+def export_onnx(
+    weights: str | os.PathLike[str], out: str | os.PathLike[str], *, force: bool = False
+) -> Report:
+    """Write the predictor of a weights file as ONNX, if onnxruntime then gives what torch gives.
+
+    The same weights give the same bytes.
+
+    Args:
+        weights: Weights file of any kind but "tcn", .safetensors or .pth.
+        out: The file to write.
+        force: Whether one that exists is replaced.
+
+    Returns:
+        What the file holds, and the largest difference from torch that was seen.
+
+    Raises:
+        RefusedError: No such weights, a kind that has no graph, packages that are missing, or `out` exists.
+    """
+    check_free(out, force=force)
+    predictor = load_predictor(weights)
+    model = model_of(predictor, weights_sha256=sha256(weights))
+    data = model.SerializeToString(deterministic=True)
+    worst = _difference_nt(predictor, data, weights)
+    with output(out, force=force) as aside:
+        aside.write_bytes(data)
+    found = _report(model, str(out))
+    difference = Figure("largest difference", worst, "nT", note=f"from torch, of {PROBE} rows")
+    return Report(found.title, (*found.figures, difference), found.facts)
+
+
+def report_onnx(path: str | os.PathLike[str]) -> Report:
+    """What an ONNX file of magtwin's holds; nothing of it is run, nor is a file that it names opened.
+
+    Raises:
+        RefusedError: No such file, damaged, not of magtwin's, or onnx is not installed.
+    """
+    path = existing(path, "ONNX file")
+    if path.is_dir():
+        raise RefusedError(f"{path}: a folder; give an ONNX file")
+    onnx = _onnx()
+    try:
+        model = onnx.ModelProto.FromString(path.read_bytes())
+    except Exception as error:  # protobuf's own, of a package that is not ours
+        raise RefusedError(f"{path}: no ONNX file, or damaged; export it again") from error
+    try:
+        return _report(model, str(path))
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise RefusedError(
+            f"{path}: ONNX, but no network of magtwin's: its metadata do not tell features and units"
+        ) from error
+
+
+def model_of(predictor: Predictor, *, weights_sha256: str = "") -> "onnx.ModelProto":
+    """The graph of a predictor, with its metadata.
+
+    Args:
+        predictor: Of any kind but "tcn".
+        weights_sha256: Checksum of its weights file, for the metadata.
+
+    Raises:
+        RefusedError: A kind that has no graph, or onnx is not installed.
+    """
+    onnx = _onnx()
+    graph = _Graph(onnx)
+    mean, sd = graph.predictor(predictor)
+    graph.add("Identity", mean, out=MEAN)
+    graph.add("Identity", sd, out=SD)
+    double = onnx.TensorProto.DOUBLE
+    of = inputs_of(predictor)
+    model = onnx.helper.make_model(
+        onnx.helper.make_graph(
+            graph.nodes,
+            "magtwin",
+            [onnx.helper.make_tensor_value_info(INPUT, double, ["rows", len(of.features)])],
+            [onnx.helper.make_tensor_value_info(name, double, ["rows"]) for name in (MEAN, SD)],
+            graph.constants,
+        ),
+        opset_imports=[onnx.helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+        producer_name="magtwin",
+        producer_version=__version__,
+        doc_string="Disturbance of the field's magnitude at a robot's magnetometer [nT]",
+    )
+    sd_nt = predictor.residual_sd_nt
+    told: dict[str, Any] = {
+        "kind": predictor.kind,
+        "layers": predictor.layers_text,
+        "parameters": predictor.parameters_count,
+        "features": of.features,
+        "units": [FEATURES[name].unit for name in of.features],
+        "training_min": _known(of.low),
+        "training_max": _known(of.high),
+        "output_unit": "nT",
+        "residual_sd_nt": None if math.isnan(sd_nt) else sd_nt,
+        "weights_sha256": weights_sha256,
+        "facts": predictor.facts,
+    }
+    for key, value in told.items():
+        text = value if isinstance(value, str) else json.dumps(value, sort_keys=True, allow_nan=False)
+        model.metadata_props.add(key=key, value=text)
+    return model
+
+
+def inputs_of(predictor: Predictor) -> Inputs:
+    """Scaler and training ranges of a predictor's inputs.
+
+    Raises:
+        RefusedError: A kind that has no graph.
+    """
+    if isinstance(predictor, FieldNet):
+        return predictor.inputs
+    raise RefusedError(f"a {predictor.kind} has no ONNX graph; export a mlp")
+
+
+class _Graph:
+    """Nodes and constants of a graph on their way; values go by their names."""
+
+    def __init__(self, onnx: Any) -> None:
+        self._onnx = onnx
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def constant(self, values: Any) -> str:
+        """The name of an array."""
+        name = f"c{len(self.constants)}"
+        self.constants.append(self._onnx.numpy_helper.from_array(np.array(values, order="C"), name))
+        return name
+
+    def add(self, operator: str, *inputs: str, out: str = "", **attributes: Any) -> str:
+        """The name of what an operator gives."""
+        out = out or f"v{len(self.nodes)}"
+        self.nodes.append(self._onnx.helper.make_node(operator, inputs, [out], **attributes))
+        return out
+
+    def predictor(self, predictor: Predictor) -> tuple[str, str]:
+        """Disturbance and standard deviation [nT], each (rows,)."""
+        if isinstance(predictor, FieldNet):
+            mean = self.net(predictor, INPUT)
+            sd = self.constant([predictor.residual_sd_nt])
+            return mean, self.add("Expand", sd, self.add("Shape", mean))
+        raise RefusedError(f"a {predictor.kind} has no ONNX graph; export a mlp")
+
+    def scaled(self, inputs: Inputs, x: str) -> str:
+        """Scaled inputs (rows, F), float64."""
+        centred = self.add("Sub", x, self.constant(inputs.mean))
+        return self.add("Div", centred, self.constant(inputs.scale))
+
+    def net(self, net: FieldNet, x: str) -> str:
+        """Disturbance of a multilayer perceptron (rows,); nan where an input is."""
+        z = self.scaled(net.inputs, x)
+        h = self.layers([(a.weight.detach().numpy(), a.bias.detach().numpy()) for a in net.linears], z)
+        column = self.add("Squeeze", self.float64(h), self.constant(np.array([1])))
+        scaled = self.add("Mul", column, self.constant(float(net.y_scale)))
+        y = self.add("Add", scaled, self.constant(float(net.y_mean)))
+        # ReLU of a runtime may make 0 of nan, which z - z then brings back
+        none = self.add("ReduceSum", self.add("Sub", z, z), self.constant(np.array([1])), keepdims=0)
+        return self.add("Add", y, none)
+
+    def layers(self, layers: list[tuple[NDArray[np.float32], NDArray[np.float32]]], z: str) -> str:
+        """What layers with ReLU between them give (rows, K), float32."""
+        h = self.add("Cast", z, to=self._onnx.TensorProto.FLOAT)
+        for i, (weight, bias) in enumerate(layers):
+            h = self.add("Gemm", h, self.constant(weight), self.constant(bias), transB=1)
+            h = self.add("Relu", h) if i < len(layers) - 1 else h
+        return h
+
+    def float64(self, value: str) -> str:
+        return self.add("Cast", value, to=self._onnx.TensorProto.DOUBLE)
+
+
+def _report(model: Any, title: str) -> Report:
+    told = {one.key: one.value for one in model.metadata_props}
+    names, units, facts, low, high = (
+        json.loads(told[key]) for key in ("features", "units", "facts", "training_min", "training_max")
+    )
+    ranges = {}
+    for name, unit, least, most in zip(names, units, low, high, strict=True):
+        known = "" if least is None or most is None else f"  trained from {least:g} to {most:g}"
+        ranges[name] = f"{unit or '-'}{known}"
+    figures = [
+        Figure("kind", told["kind"]),
+        Figure("layers", told["layers"]),
+        Figure("parameters", int(told["parameters"])),
+        Figure("opset", max(one.version for one in model.opset_import)),
+        Figure("input", f"{INPUT} (rows, {len(names)}), float64"),
+        Figure("outputs", f"{MEAN} and {SD} (rows,), float64, nT"),
+    ]
+    if (sd := json.loads(told["residual_sd_nt"])) is not None:
+        figures.append(Figure("residual sd", float(sd), "nT", note="on held-out runs"))
+    return Report(
+        title, tuple(figures), {"weights_sha256": told["weights_sha256"], **facts, "features": ranges}
+    )
+
+
+def _known(values: NDArray[np.float64]) -> list[float | None]:
+    return [None if math.isnan(value) else value for value in values.tolist()]
+
+
+def _difference_nt(predictor: Predictor, data: bytes, weights: str | os.PathLike[str]) -> float:
+    """Largest difference between onnxruntime and the predictor itself [nT], on rows about the training's."""
+    try:
+        import onnxruntime
+    except ImportError:
+        raise RefusedError(EXTRA) from None
+    of = inputs_of(predictor)
+    wave = np.sin(np.arange(PROBE * len(of.features), dtype=float)).reshape(PROBE, -1)
+    x = of.mean + 2 * of.scale * wave
+    session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
+    found = np.nan_to_num(session.run([MEAN, SD], {INPUT: x}))
+    wanted = np.nan_to_num(predictor.predict(x))
+    difference = np.abs(found - wanted)
+    worst = float(difference.max())
+    if not np.all(difference <= AGREES_NT + ROUNDING * np.abs(wanted)):
+        raise RefusedError(
+            f"{weights}: onnxruntime here differs from torch by {worst:.2g} nT; install another version of it"
+        )
+    return worst
+
+
+def _onnx() -> Any:
+    try:
+        import onnx
+    except ImportError:
+        raise RefusedError(EXTRA) from None
+    return onnx
