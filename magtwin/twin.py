@@ -141,6 +141,40 @@ def twin_of(
 _CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_sha256": "the scene"}
 
 
+def on_its_day(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> Twin:
+    """The twin with its robot as it was on a run's day, where `magtwin runs` dealt the run to one.
+
+    Args:
+        twin: The twin of the run.
+        facts: Those of the run.
+    """
+    from magtwin.sim.session import session_of
+
+    if "session_seed" not in facts:
+        return twin
+    robot = session_of(twin.scene.robot, int(facts["session_seed"]), int(facts["session"]))
+    return dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot))
+
+
+def check_figures(scene: Scene, facts: Mapping[str, str | int | float | bool], name: str) -> None:
+    """Refuse a scene that is not, figure by figure, the one that a run came from.
+
+    Args:
+        scene: The scene, its robot as it was on the run's day.
+        facts: Those of the run.
+        name: What to call the run.
+
+    Raises:
+        RefusedError: Its figures have another checksum, or the run tells none.
+    """
+    found, said = _config_sha256(scene), facts.get("config_sha256", "none")
+    if found != said:
+        raise RefusedError(
+            f"{name}: came from a scene whose figures have the sha256 {said}, those of {scene.name!r} on its "
+            f"day have {found}; name the scene that it was made in"
+        )
+
+
 def scene_of(
     run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None
 ) -> FilePath:

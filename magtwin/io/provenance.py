@@ -13,7 +13,7 @@ from magtwin.names import RefusedError
 from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
 from magtwin.report import Figure, Report
 from magtwin.run import COLUMNS, Run
-from magtwin.twin import Twin, locate, path_facts, scene_of, simulate, simulate_robots, twin_of
+from magtwin.twin import locate, on_its_day, path_facts, scene_of, simulate, simulate_robots, twin_of
 
 CAUSES: Mapping[str, str] = {
     "magtwin": "another version of magtwin",
@@ -105,7 +105,7 @@ def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePat
             "the run does not say its seed, so it cannot be repeated; was it recorded elsewhere?"
         )
     twin = twin_of(run, scene, near=near, check=False)
-    twin = _on_its_day(twin, facts)
+    twin = on_its_day(twin, facts)
     what = _driven(run, near)
     try:
         seed, rate = int(facts["seed"]), float(facts["rate_hz"])
@@ -264,13 +264,3 @@ def _read_run(file: FilePath) -> Run:
     from magtwin.io.formats import read_run
 
     return read_run(file)
-
-
-def _on_its_day(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> Twin:
-    """The twin with its robot as it was on the run's day, where `magtwin runs` dealt it to one."""
-    from magtwin.sim.session import session_of
-
-    if "session_seed" not in facts:
-        return twin
-    robot = session_of(twin.scene.robot, int(facts["session_seed"]), int(facts["session"]))
-    return replace(twin, scene=replace(twin.scene, robot=robot))

@@ -121,7 +121,7 @@ def labels(run: Run, field: AnomalyMap, alignment: Alignment | None = None) -> L
         RefusedError: The run lacks a column.
     """
     alignment = alignment or Alignment()
-    p, yaw, rates = _placed(run, alignment)
+    p, yaw, rates = placed(run, alignment)
     value, gradient = field.lookup_with_gradient(p, yaw)
     variance = np.zeros(run.rows)
     if field.variance_nt2 is not None:
@@ -292,7 +292,7 @@ class _Fit:
         alignment = Alignment((float(place[0]), float(place[1])), float(place[2]))
         parts_x, parts_y, parts_block, blocks = [], [], [], 0
         for run, rows in self.runs:
-            p, yaw, rates = (values[rows] for values in _placed(run, alignment))
+            p, yaw, rates = (values[rows] for values in placed(run, alignment))
             value, gradient = self.field.lookup_with_gradient(p, yaw)
             usable = np.isfinite(value) & np.isfinite(gradient).all(axis=1)
             for flag in UNUSABLE:
@@ -351,7 +351,7 @@ class _Fit:
         return _Linearised(place, wanted, (covariance + covariance.T) / 2, cost, promised, max(alike, 1.0))
 
 
-def _placed(run: Run, alignment: Alignment) -> tuple[Array, Array, Array]:
+def placed(run: Run, alignment: Alignment) -> tuple[Array, Array, Array]:
     """Sensor's place (N, 2), heading (N,) and rates of x, y, yaw (N, 3) at the time of each reading."""
     if {"mocap_p", "mocap_q_xyzw"} <= set(run):
         p, yaw = run["mocap_p"][:, :2], np.unwrap(_unbroken(yaw_from_quat(run["mocap_q_xyzw"])))
