@@ -275,7 +275,9 @@ def test_nvidias_imu_and_lidar_carry_what_they_can():
     assert imu_sensor.GetTypeName() == "IsaacImuSensor"
     assert imu_sensor.GetAttribute("sensorPeriod").Get() == pytest.approx(0.02)
     assert omni.GetTypeName() == "OmniLidar"
-    assert omni.GetMetadata("apiSchemas").GetAppliedItems() == ["OmniSensorGenericLidarCoreAPI"]
+    assert omni.GetMetadata("apiSchemas").GetAppliedItems() == [sensors.LIDAR_API, sensors.EMITTER_API]
+    assert omni.GetAttribute("omni:sensor:Core:numberOfEmitters").Get() == 1
+    assert omni.GetAttribute("omni:sensor:Core:patternFiringRateHz").Get() == 720 * 8
     assert omni.GetAttribute("omni:sensor:Core:scanRateBaseHz").Get() == 8
     assert omni.GetAttribute("omni:sensor:Core:farRangeM").Get() == 8.0
 

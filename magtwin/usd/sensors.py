@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from magtwin.frames import IDENTITY_XYZW, canonical, xyzw_from_wxyz
 from magtwin.names import RefusedError, hint
@@ -51,9 +51,14 @@ PARALLEL = 1e-12
 IMU_TYPE = "IsaacImuSensor"
 LIDAR_TYPE = "OmniLidar"
 LIDAR_API = "OmniSensorGenericLidarCoreAPI"
+EMITTER_API = "OmniSensorGenericLidarCoreEmitterStateAPI:s001"
 """NVIDIA's types, by name: their plugins live in Omniverse, not here."""
 
+CORE = "omni:sensor:Core:"
+"""How the LiDAR's attributes begin."""
+
 SINGLE_MAX = float(np.finfo(np.float32).max)
+UINT_MAX = 2**32 - 1
 
 FOOTPRINT = attribute_name("robot", "footprint_radius_m")
 
@@ -122,7 +127,8 @@ def define_lidar(stage: Usd.Stage, path: str | Sdf.Path, spec: LidarSpec) -> Usd
     """
     prim = _define_mounted(stage, path, spec)
     write_figures(apply_api(prim, "lidar"), "lidar", spec, skip=POSE_FIELDS)
-    define_omni_lidar(prim, spec.scan_rate_hz, (spec.range_min_m, spec.range_max_m))
+    sensor = define_omni_lidar(prim, spec.scan_rate_hz, (spec.range_min_m, spec.range_max_m))
+    _define_beam(sensor, spec.rays)
     return prim
 
 
@@ -140,13 +146,36 @@ def define_omni_lidar(
     sensor = mount.GetStage().DefinePrim(mount.GetPath().AppendChild("omni_lidar"), LIDAR_TYPE)
     if LIDAR_API not in sensor.GetPrimTypeInfo().GetAppliedAPISchemas():
         sensor.AddAppliedSchema(LIDAR_API)
-    names, core = Sdf.ValueTypeNames, "omni:sensor:Core:"
+    names, core = Sdf.ValueTypeNames, CORE
     turns = round(np.clip(scan_rate_hz, 1, 1e6))
     _write_foreign(sensor, core + "scanType", names.Token, "ROTARY" if rotary else "SOLID_STATE")
     _write_foreign(sensor, core + "scanRateBaseHz", names.UInt, turns)
     _write_foreign(sensor, core + "nearRangeM", names.Float, ranges_m[0])
     _write_foreign(sensor, core + "farRangeM", names.Float, ranges_m[1])
     return sensor
+
+
+def _define_beam(sensor: Usd.Prim, rays: int) -> None:
+    """One emitter that fires `rays` times a turn; without it Isaac Sim's default has 128, one above another.
+
+    A sensor that has the emitters of a URDF's tags is left as it is.
+    """
+    if sensor.GetAttribute(f"{CORE}numberOfEmitters") and not sensor.GetAttribute(f"{CORE}reportRateBaseHz"):
+        return
+    if EMITTER_API not in sensor.GetPrimTypeInfo().GetAppliedAPISchemas():
+        sensor.AddAppliedSchema(EMITTER_API)
+    names = Sdf.ValueTypeNames
+    firings = min(rays * int(sensor.GetAttribute(f"{CORE}scanRateBaseHz").Get()), UINT_MAX)
+    # Isaac Sim 6.0.1 reads the first of these names, the sensor's own documentation has the second.
+    for name in ("patternFiringRateHz", "reportRateBaseHz"):
+        _write_foreign(sensor, CORE + name, names.UInt, firings)
+    for name in ("numberOfEmitters", "numberOfChannels"):
+        _write_foreign(sensor, CORE + name, names.UInt, 1)
+    state = f"{CORE}emitterState:s001:"
+    for name in ("azimuthDeg", "elevationDeg"):
+        _write_foreign(sensor, state + name, names.FloatArray, Vt.FloatArray([0.0]))
+    for name, value in (("fireTimeNs", 0), ("channelId", 1)):
+        _write_foreign(sensor, state + name, names.UIntArray, Vt.UIntArray([value]))
 
 
 def read_lidar(prim: Usd.Prim) -> LidarSpec:

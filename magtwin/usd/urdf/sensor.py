@@ -18,6 +18,7 @@ from magtwin.names import RefusedError, hint
 from magtwin.spec import ZERO3, ImuSpec, LidarSpec, MagnetometerSpec
 from magtwin.usd.schema import prims_with
 from magtwin.usd.sensors import (
+    EMITTER_API,
     define_imu,
     define_isaac_imu,
     define_lidar,
@@ -33,8 +34,6 @@ FACTS = "magtwin:sensor"
 
 CONTACT_TYPE, CONTACT_API = "IsaacContactSensor", "PhysxContactReportAPI"
 """NVIDIA's types, by name: their plugins live in Omniverse, not here."""
-
-EMITTER_API = "OmniSensorGenericLidarCoreEmitterStateAPI:s001"
 
 SCANNER = np.pi
 """View from which on a LiDAR is one that spins [rad]; below, it is a range finder."""
