@@ -45,8 +45,9 @@ _VERTICES, _INDICES = 34962, 34963
 def write_glb(stage_file: Path, out: Path) -> None:
     """Write what a stage shows.
 
-    Surfaces have the colour, roughness and metalness of their material, or their own colours; textures stay
-    behind. Variants come as they are selected.
+    Surfaces have the colour and roughness of their material, or their own colours; textures stay behind, and
+    metals are painted: a page with nothing around for them to mirror would show them black. Variants come as
+    they are selected.
 
     Args:
         stage_file: Root layer, in metres with Z up.
@@ -155,13 +156,12 @@ class _Scene:
         }
 
     def _material(self, shape: Shape) -> int:
-        rough, metal = _surface(self.stage.GetPrimAtPath(shape.prim))
         r, g, b, a = (1.0, 1.0, 1.0, 1.0) if shape.vertex_colours is not None else shape.colour
         said: dict[str, Any] = {
             "pbrMetallicRoughness": {
                 "baseColorFactor": _plain((r, g, b, a)),
-                "metallicFactor": metal,
-                "roughnessFactor": rough,
+                "metallicFactor": 0.0,
+                "roughnessFactor": _roughness(self.stage.GetPrimAtPath(shape.prim)),
             },
             "doubleSided": True,
         }
@@ -304,15 +304,12 @@ def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
     return np.where(size > 0, total / np.where(size > 0, size, 1), (0.0, 0.0, 1.0))
 
 
-def _surface(prim: Usd.Prim) -> tuple[float, float]:
-    """Roughness and metalness of the material that a prim wears; UsdPreviewSurface's own without."""
+def _roughness(prim: Usd.Prim) -> float:
+    """Roughness of the material that a prim wears; UsdPreviewSurface's own without."""
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
     shader = material.ComputeSurfaceSource()[0] if material else None
-    values = [shader.GetInput(name).Get() if shader and shader.GetInput(name) else None for name in _SHEEN]
-    return tuple(d if v is None else round(float(v), 6) for v, d in zip(values, (0.5, 0.0), strict=True))  # type: ignore[return-value]
-
-
-_SHEEN = ("roughness", "metallic")
+    value = shader.GetInput("roughness").Get() if shader and shader.GetInput("roughness") else None
+    return 0.5 if value is None else round(float(value), 6)
 
 
 def _said_of_colours(prim: Usd.Prim) -> dict[str, Any]:
