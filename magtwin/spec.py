@@ -407,9 +407,23 @@ class MocapSpec(Spec):
     dropout_s: float = 0.2
     """Mean length of a dropout [s]; 0 for no dropouts."""
 
+    offset_m: tuple[float, float] = (0.0, 0.0)
+    """Where base_link lies forward and left of where it is taken to be [m]: markers are put on by hand."""
+
+    offset_drift_m: tuple[float, float] = (0.0, 0.0)
+    """What `offset_m` has changed by since the survey [m]: the markers were put on anew."""
+
+    latency_drift_s: float = 0.0
+    """What `latency_s` has changed by since the survey [s]."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         self._above_zero("rate_hz")
+        if self.latency_s + self.latency_drift_s < 0:
+            raise RefusedError(
+                f"latency_drift_s of motion capture takes its latency of {self.latency_s} s below 0, "
+                f"got {self.latency_drift_s}"
+            )
         self._not_negative("latency_s", "jitter_s", "p_noise_std_m", "angle_noise_std")
         self._not_negative("dropout_every_s", "dropout_s")
 

@@ -70,6 +70,24 @@ def test_every_feature_of_a_set_is_known_and_comes_from_a_column_of_a_run():
     assert {column for f in FEATURES.values() for column in f.columns} <= set(COLUMNS)
 
 
+def test_what_is_fixed_to_the_robot_turns_with_it():
+    run = a_run()
+    v = run["v_cmd"] - run["odom_v"][:, 0]
+    w = run["w_cmd"] - run["odom_w"][:, 2]
+    names = [
+        "lag_v",
+        "lag_w",
+        "turning",
+        "lidar_on_yaw_sin",
+        "battery_a_yaw_cos",
+        "turning_yaw_cos",
+        "lag_w_yaw_sin",
+    ]
+    sin, cos, turning = np.sin(run["yaw"]), np.cos(run["yaw"]), np.abs(run["odom_w"][:, 2])
+    wanted = [v, w, turning, run["lidar_on"] * sin, run["battery_a"] * cos, turning * cos, w * sin]
+    assert_allclose(features(run, names), np.column_stack(wanted))
+
+
 @pytest.mark.parametrize(
     ("names", "text"),
     [

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from magtwin.frames import canonical, quat_conjugate, quat_from_yaw, quat_multiply
+from magtwin.frames import canonical, quat_conjugate, quat_from_yaw, quat_multiply, rotate
+from magtwin.names import RefusedError
 from magtwin.sim.drive import Motion
 from magtwin.sim.mocap import dropouts, sense_mocap
 from magtwin.sim.sensors import held
@@ -26,6 +27,21 @@ def test_without_noise_it_is_the_true_pose_at_its_rate():
     assert_allclose(read["mocap_p"], np.column_stack([pose[:, :2], np.full(len(T), 0.04)]), atol=1e-12)
     assert_allclose(read["mocap_q_xyzw"], canonical(quat_from_yaw(pose[:, 2])), atol=1e-12)
     assert not read["flag_pose_lost"].any()
+
+
+def test_a_body_that_is_taken_to_be_elsewhere_is_seen_there_whatever_its_heading():
+    spec = MocapSpec(**QUIET, offset_m=(0.05, -0.02))
+    read = sense_mocap(spec, 0.04, CIRCLE, T, generator())
+    turn, seen = read["mocap_q_xyzw"], read["mocap_p"]
+    base = seen + rotate(turn, np.tile([0.05, -0.02, 0.0], (len(T), 1)))
+    assert_allclose(
+        base, sense_mocap(MocapSpec(**QUIET), 0.04, CIRCLE, T, generator())["mocap_p"], atol=1e-12
+    )
+
+
+def test_a_latency_that_drifts_below_0_is_refused():
+    with pytest.raises(RefusedError, match=r"takes its latency of 0.01 s below 0, got -0.02"):
+        MocapSpec(latency_drift_s=-0.02)
 
 
 def test_its_noise_has_the_spread_of_its_spec():

@@ -57,6 +57,41 @@ def carried(gradient_nt_m: NDArray[Any], odom_v: NDArray[Any]) -> Array:
     return gradient_nt_m * odom_v[:, :1]
 
 
+def lags(v_cmd: NDArray[Any], w_cmd: NDArray[Any], odom_v: NDArray[Any], odom_w: NDArray[Any]) -> Array:
+    """What is commanded beyond what is driven, forward [m/s] and turning [rad/s], shape (N, 2).
+
+    The motors' torque, and so their current, goes with it while the robot gains speed or loses it.
+    """
+    return np.column_stack([v_cmd - odom_v[:, 0], w_cmd - odom_w[:, 2]])
+
+
+def turned(yaw: NDArray[Any], *signals: NDArray[Any]) -> Array:
+    """Signals (N,) or (N, width) times sin and cos of the heading, shape (N, 2 x their numbers).
+
+    A current's field is fixed to the robot, beside which the Earth's turns: of its level part
+    the magnitude sees what lies along the Earth's.
+    """
+    each = np.column_stack(signals)
+    return np.column_stack([w * s for s in each.T for w in (np.sin(yaw), np.cos(yaw))])
+
+
+def turned_motion(yaw: NDArray[Any], odom_v: NDArray[Any], odom_w: NDArray[Any]) -> Array:
+    """Speed and turning, signed and by size, times sin and cos of the heading, shape (N, 6)."""
+    return turned(yaw, odom_v[:, 0], odom_w[:, 2], np.abs(odom_w[:, 2]))
+
+
+def turned_lags(
+    yaw: NDArray[Any], v_cmd: NDArray[Any], w_cmd: NDArray[Any], odom_v: NDArray[Any], odom_w: NDArray[Any]
+) -> Array:
+    """`lags` times sin and cos of the heading, shape (N, 4)."""
+    return turned(yaw, lags(v_cmd, w_cmd, odom_v, odom_w))
+
+
+def turning_size(odom_w: NDArray[Any]) -> Array:
+    """How fast a robot turns, to either side [rad/s], shape (N,): friction does not know the side."""
+    return np.abs(odom_w[:, 2])
+
+
 def direction_cosines(b_vector_nt: NDArray[Any]) -> Array:
     """Unit vectors along fields, shape (N, 3); nan for a field of 0.
 
@@ -109,6 +144,12 @@ GRADIENT = ("map_gradient_forward", "map_gradient_left")
 CARRIED = ("speed_map_gradient_forward", "speed_map_gradient_left")
 COSINES = ("cosine_x", "cosine_y", "cosine_z")
 INDUCED = ("induced_xx", "induced_xy", "induced_xz", "induced_yy", "induced_yz")
+LAGS = ("lag_v", "lag_w")
+TURNED = tuple(f"{signal}_yaw_{part}" for signal in ("lidar_on", "battery_a") for part in ("sin", "cos"))
+TURNED_MOTION = tuple(
+    f"{signal}_yaw_{part}" for signal in ("odom_v_x", "odom_w_z", "turning") for part in ("sin", "cos")
+)
+TURNED_LAGS = tuple(f"{signal}_yaw_{part}" for signal in LAGS for part in ("sin", "cos"))
 EDDY = ("eddy_xdx", "eddy_xdy", "eddy_ydx", "eddy_ydy", "eddy_zdx", "eddy_zdy")
 
 FEATURES: Mapping[str, Feature] = MappingProxyType(
@@ -126,6 +167,25 @@ FEATURES: Mapping[str, Feature] = MappingProxyType(
         "battery_a": Feature(("battery_a",), None, "A"),
         **_named(dict.fromkeys(GRADIENT, "nT/m"), None, "b_map_gradient_nt_m"),
         **_named(dict.fromkeys(CARRIED, "nT/s"), carried, "b_map_gradient_nt_m", "odom_v"),
+        **_named({"lag_v": "m/s", "lag_w": "rad/s"}, lags, "v_cmd", "w_cmd", "odom_v", "odom_w"),
+        "turning": Feature(("odom_w",), None, "rad/s", turning_size),
+        **_named(
+            dict(zip(TURNED, ("0 or 1", "0 or 1", "A", "A"), strict=True)),
+            turned,
+            "yaw",
+            "lidar_on",
+            "battery_a",
+        ),
+        **_named(
+            dict(zip(TURNED_MOTION, ("m/s",) * 2 + ("rad/s",) * 4, strict=True)),
+            turned_motion,
+            *("yaw", "odom_v", "odom_w"),
+        ),
+        **_named(
+            dict(zip(TURNED_LAGS, ("m/s",) * 2 + ("rad/s",) * 2, strict=True)),
+            turned_lags,
+            *("yaw", "v_cmd", "w_cmd", "odom_v", "odom_w"),
+        ),
         **_named(dict.fromkeys(COSINES, ""), direction_cosines, _B),
         **_named(dict.fromkeys(INDUCED, ""), induced_products, _B),
         **_named(dict.fromkeys(EDDY, "1/s"), eddy_products, _B, "imu_w"),
@@ -161,12 +221,14 @@ SETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "correlated": ("yaw_deg", "odom_v_x", "imu_q_x", "imu_q_y", "imu_q_z", "imu_q_w"),
         "circular": CIRCULAR,
         "gradient": (*CIRCULAR, *GRADIENT, *CARRIED),
+        "platform": (*CIRCULAR, *GRADIENT, *CARRIED, *LAGS, "turning", *TURNED, *TURNED_MOTION, *TURNED_LAGS),
         "vector": (*CIRCULAR, *GRADIENT, *CARRIED, *COSINES, *INDUCED, *EDDY),
     }
 )
 """Features by the name of a set. "correlated" holds those whose Spearman correlation with the
 disturbance exceeds 0.04 in the paper's Figure 2; "gradient" adds to "circular" what a lever arm and a
-latency make of the map; "vector" what the vector axes tell of the platform's attitude in the field."""
+latency make of the map; "platform" what a field that is fixed to the robot makes of currents, torques and the
+LiDAR as the robot turns; "vector" what the vector axes tell of the platform's attitude in the field."""
 
 
 def feature_names(names: str | Sequence[str]) -> tuple[str, ...]:

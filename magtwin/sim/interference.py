@@ -376,8 +376,8 @@ def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> Plat
     one standard normal N each for motors, LiDAR and battery; wheels, caster and LiDAR begin at any angle.
 
     So a map that was surveyed on one day errs on another by a constant and by a wave over heading. Of the
-    TurtleBot 4 in Florida, where the field dips by 58 deg, the drift makes 460 nT and a wave of 180 nT, and
-    the 180 nT that days differ by each way another 154 nT and a wave of 141 nT (root mean squares).
+    TurtleBot 4 in Florida, where the field dips by 58 deg, the drift makes 690 nT and a wave of 130 nT, and
+    the 90 nT that days differ by each way another 77 nT and a wave of 70 nT (root mean squares).
 
     Args:
         platform: The platform as its asset has it: that of the mean day, and of the survey.

@@ -14,10 +14,11 @@ _ROUND = 64
 def sense_mocap(
     spec: MocapSpec, height_m: float, motion: Moving, t: ArrayLike, rng: np.random.Generator
 ) -> dict[str, NDArray]:
-    """Pose of base_link in world, with white noise, and dropouts in which the last pose is held.
+    """Pose of base_link in world, off by where it is taken to be, with white noise, and dropouts in which
+    the last pose is held.
 
     Args:
-        spec: Rate, delays, noise, and how often and how long the markers are not seen.
+        spec: Rate, delays, offset, noise, and how often and how long the markers are not seen.
         height_m: Height of base_link above the floor [m].
         motion: What the robot did.
         t: Times of the readings [s], shape (N,).
@@ -30,7 +31,10 @@ def sense_mocap(
     delays, noise, gaps = rng.spawn(3)
     stamps, latest = held(t, spec.rate_hz, latency_s=spec.latency_s, jitter_s=spec.jitter_s, rng=delays)
     pose = moment_at(motion, stamps).pose
-    p = np.column_stack([pose[:, :2], np.full(len(stamps), height_m)])
+    forward, left = spec.offset_m
+    cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    x, y = pose[:, 0] - forward * cos + left * sin, pose[:, 1] - forward * sin - left * cos
+    p = np.column_stack([x, y, np.full(len(stamps), height_m)])
     white = noise.standard_normal((len(stamps), 6))
     q = quat_multiply(quat_from_yaw(pose[:, 2]), quat_from_rpy(spec.angle_noise_std * white[:, 3:]))
     lost = dropouts(spec, stamps, gaps)

@@ -49,9 +49,10 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
     Returns:
         The robot with `initial_fraction`, `yaw_zero`, `gyro_bias`, `phase_s`, `wheel_errors` and
         `odometry_scale` drawn, and its platform by `magtwin.sim.interference.draw_platform`. What a run
-        draws of wheels and odometry otherwise, it no longer does: their standard deviations are 0.
+        draws of wheels and odometry otherwise, it no longer does: their standard deviations are 0. Motion
+        capture is as it has become since the survey.
     """
-    drive, imu, lidar = robot.drive, robot.imu, robot.lidar
+    drive, imu, lidar, mocap = robot.drive, robot.imu, robot.lidar, robot.mocap
     draws = dict(zip(_STREAMS, rng.spawn(len(_STREAMS)), strict=True))
     missing = float(draws["battery"].exponential(CHARGE_SPENT))
     yaw_zero = float(draws["imu"].normal(*YAW_ZERO))
@@ -60,12 +61,20 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
     errors = draw_wheel_errors(drive, draws["drive"])
     scale = 1.0 + drive.odometry_noise_std * draws["drive"].standard_normal(2)
     left, right = np.array(drive.odometry_scale) * scale
+    forward, leftward = np.add(mocap.offset_m, mocap.offset_drift_m).tolist()
     return replace(
         robot,
         battery=replace(robot.battery, initial_fraction=max(1.0 - missing, LEAST_CHARGE)),
         imu=replace(imu, yaw_zero=yaw_zero, gyro_bias=tuple(bias.tolist())),
         lidar=replace(lidar, phase_s=phase),
         platform=draw_platform(robot.platform, draws["platform"]),
+        mocap=replace(
+            mocap,
+            offset_m=(forward, leftward),
+            latency_s=mocap.latency_s + mocap.latency_drift_s,
+            offset_drift_m=(0.0, 0.0),
+            latency_drift_s=0.0,
+        ),
         drive=replace(
             drive,
             wheel_errors=errors,
