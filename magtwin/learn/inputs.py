@@ -1,15 +1,20 @@
 """Inputs: what a predictor reads in a row, how it is scaled, and what it was trained within."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.learn.features import FEATURES, feature_names
+from magtwin.learn.features import feature_names
 from magtwin.names import RefusedError
 
 Array = NDArray[np.float64]
+
+SCALERS = ("x_mean", "x_scale", "x_min", "x_max")
+"""Tensors of a weights file that hold scaler and ranges."""
 
 FAR = 5.0
 """Scales from the mean beyond which an input is outside, where the training range is unknown."""
@@ -37,10 +42,24 @@ class Inputs:
     high: Array
     """Largest training inputs, shape (F,); nan where unknown."""
 
-    @property
-    def columns(self) -> frozenset[str]:
-        """Columns of a Run that the features are made of."""
-        return frozenset(column for name in self.features for column in FEATURES[name].columns)
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """What a weights file holds of them, by name, float64."""
+        values = (self.mean, self.scale, self.low, self.high)
+        return {name: torch.as_tensor(value) for name, value in zip(SCALERS, values, strict=True)}
+
+    def grown(self, of: "Inputs") -> "Inputs":
+        """The same scaler, with ranges that hold those of other rows too, or stay unknown.
+
+        Raises:
+            RefusedError: The others are of other features.
+        """
+        if of.features != self.features:
+            raise RefusedError(
+                f"the model to go on from has inputs {', '.join(self.features)}, this training "
+                f"{', '.join(of.features)}; give it the same features"
+            )
+        low, high = np.minimum(self.low, of.low), np.maximum(self.high, of.high)
+        return Inputs(self.features, self.mean, self.scale, low, high)
 
     def checked(self, x: ArrayLike) -> Array:
         """`x` as rows of float64, if they are as wide as the features are many.
@@ -89,3 +108,25 @@ def inputs_of(x: ArrayLike, features: str | Sequence[str]) -> Inputs:
     scale = x.std(axis=0)
     scale[scale < 1e-12 * np.maximum(1.0, np.abs(x).max(axis=0))] = 1.0
     return Inputs(feature_names(features), x.mean(axis=0), scale, x.min(axis=0), x.max(axis=0))
+
+
+def scaler_tensors(count: int) -> dict[str, torch.Tensor]:
+    """Tensors of the names, shapes and types in which a weights file holds so many inputs."""
+    return dict.fromkeys(SCALERS, torch.ones(count, dtype=torch.float64))
+
+
+def inputs_from(features: Sequence[str], tensors: Mapping[str, torch.Tensor], path: Path) -> Inputs:
+    """Scaler and ranges of a weights file.
+
+    Args:
+        features: Names of the inputs.
+        tensors: Those of `scaler_tensors`, and others.
+        path: The file, for refusals.
+
+    Raises:
+        RefusedError: A scale is not above 0.
+    """
+    mean, scale, low, high = (tensors[name].numpy() for name in SCALERS)
+    if not (scale > 0).all():
+        raise RefusedError(f"{path}: a scale of its scalers is not above 0")
+    return Inputs(tuple(features), mean, scale, low, high)

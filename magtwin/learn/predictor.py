@@ -1,13 +1,19 @@
 """Predictor: whatever tells a robot's disturbance from features, and how sure it is."""
 
 import os
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.learn.ensemble import ensemble_of
+from magtwin.learn.hybrid import hybrid_of
+from magtwin.learn.linear import linear_of
 from magtwin.learn.model import net_of, net_of_checkpoint
-from magtwin.learn.weights import Fact, is_checkpoint, read_weights
+from magtwin.learn.temporal import temporal_of
+from magtwin.learn.weights import Fact, Weights, is_checkpoint, read_weights
 from magtwin.report import Report
 
 Array = NDArray[np.float64]
@@ -16,14 +22,15 @@ Array = NDArray[np.float64]
 class Predictor(Protocol):
     """A disturbance with its standard deviation, row by row; of which kind is its own business."""
 
-    features: tuple[str, ...]
-    """Names of the inputs, in order."""
-
     facts: dict[str, Fact]
     """Provenance: on what it was trained."""
 
     residual_sd_nt: float
     """Root mean square error on recordings it never saw [nT]; nan where unknown."""
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Names of the inputs, in order."""
 
     @property
     def kind(self) -> str:
@@ -67,4 +74,16 @@ def load_predictor(path: str | os.PathLike[str]) -> Predictor:
     """
     if is_checkpoint(path):
         return net_of_checkpoint(path)
-    return net_of(read_weights(path))
+    weights = read_weights(path)
+    return _KINDS[weights.kind](weights)
+
+
+_KINDS: Mapping[str, Callable[[Weights], Predictor]] = MappingProxyType(
+    {
+        "mlp": net_of,
+        "linear": linear_of,
+        "hybrid": hybrid_of,
+        "ensemble": ensemble_of,
+        "tcn": temporal_of,
+    }
+)

@@ -4,12 +4,15 @@ A safetensors file: tensors by name, and JSON of the settings that they belong t
 went. Nothing of it is executed, and every tensor is held against the one that it is to replace.
 """
 
+import hashlib
 import json
 import os
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
@@ -20,6 +23,14 @@ FORMAT_VERSION = 1
 """Version of the file; a reader refuses another."""
 
 Tensors = Mapping[str, torch.Tensor]
+
+
+def digest(*arrays: NDArray[Any] | torch.Tensor) -> str:
+    """SHA-256 of the numbers of arrays, by which a checkpoint knows what it was trained on."""
+    found = hashlib.sha256()
+    for array in arrays:
+        found.update(np.ascontiguousarray(array).data)
+    return found.hexdigest()
 
 
 def save_state(

@@ -4,7 +4,7 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from magtwin.files import existing, output
-from magtwin.learn.features import FEATURES
+from magtwin.learn.features import FEATURES, feature_names
 from magtwin.names import RefusedError
 
 Fact = str | int | float | bool
@@ -49,6 +49,10 @@ class Weights:
         sd = self.about["residual_sd_nt"]
         return math.nan if sd is None else sd
 
+    def with_tensors(self, tensors: Mapping[str, torch.Tensor]) -> "Weights":
+        """The same file with a part of its tensors alone, under names of their own."""
+        return replace(self, tensors=tensors)
+
     def expect(self, key: str, kind: Any) -> Any:
         """What the file says of itself under a key, if it is of a type.
 
@@ -59,6 +63,42 @@ class Weights:
         if key not in self.about or not isinstance(value, kind):
             raise RefusedError(f"{self.path}: {key!r} of its metadata is missing or of the wrong type")
         return value
+
+    def number(self, key: str, *, above: float = -math.inf) -> float:
+        """A finite number that the file says of itself, above another.
+
+        Raises:
+            RefusedError: It is not there, no number, or not above.
+        """
+        value = self.expect(key, int | float)
+        if isinstance(value, bool) or not above < value < math.inf:
+            wanted = f"above {above:g} and finite" if above > -math.inf else "a finite number"
+            raise RefusedError(f"{self.path}: {key!r} of its metadata must be {wanted}, got {value}")
+        return float(value)
+
+    def widths(self, key: str) -> tuple[int, ...]:
+        """Whole numbers above 0 that the file says of itself, no more of them than its tensors hold numbers.
+
+        Raises:
+            RefusedError: They are not there, or none such.
+        """
+        values = self.expect(key, list)
+        held = sum(tensor.numel() for tensor in self.tensors.values())
+        if not values or not all(type(value) is int and 0 < value <= held for value in values):
+            raise RefusedError(f"{self.path}: {key!r} of its metadata must be widths of layers, got {values}")
+        return tuple(values)
+
+    def check_size(self, count: int) -> None:
+        """Refuse a file whose metadata ask for more numbers than its tensors hold, before room is made.
+
+        Raises:
+            RefusedError: They do.
+        """
+        held = sum(tensor.numel() for tensor in self.tensors.values())
+        if count > held:
+            raise RefusedError(
+                f"{self.path}: its metadata ask for {count:,} weights, its tensors hold {held:,} numbers"
+            )
 
     def fit(
         self, like: Mapping[str, torch.Tensor], *, unknown: Sequence[str] = ("x_min", "x_max")
@@ -203,6 +243,10 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
             raise RefusedError(
                 f"{path}: reads {name} in {unit!r}, magtwin gives it in {FEATURES[name].unit!r}"
             )
+    try:
+        feature_names(about["features"])
+    except RefusedError as error:
+        raise RefusedError(f"{path}: {error}") from error
     return about
 
 
