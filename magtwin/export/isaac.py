@@ -17,7 +17,6 @@ from magtwin.spec import ZERO3, MountSpec, RobotSpec, Scene
 from magtwin.usd.layers import WORLD
 from magtwin.usd.schema import only_prim_with, place, prims_with
 from magtwin.usd.sensors import BASE, IMU_TYPE, LIDAR_TYPE
-from magtwin.usd.urdf.sensor import EMITTER_API
 
 GRAPHS = WORLD.AppendChild("Graphs")
 """Scope of the graphs, each called as its robot."""
@@ -31,8 +30,6 @@ BRIDGE = "isaacsim.ros2.bridge."
 CORE = "isaacsim.core.nodes."
 SENSORS = "isaacsim.sensors.physics."
 BREAK = "omni.graph.nodes.BreakVector"
-
-UINT_MAX = 2**32 - 1
 
 DEFAULT_QOS, SENSOR_QOS, CLOCK_QOS = "qos", "sensor_qos", "clock_qos"
 """Nodes that say how topics are offered."""
@@ -49,13 +46,13 @@ class _Parts:
 
 
 def author_graph(stage: Usd.Stage, scene: Scene) -> list[Usd.Prim]:
-    """Author an Action Graph for each robot of a scene, and what its LiDAR lacks to scan in Isaac Sim.
+    """Author an Action Graph for each robot of a scene.
 
     The topics of a robot that is alone are /robot/odom and so on; of several, each has its own name there.
 
     Args:
         stage: The scene's stage; written to in its edit target.
-        scene: Its robots' drives, LiDARs and names.
+        scene: Its robots, by their names in the stage.
 
     Returns:
         The graphs' prims.
@@ -70,7 +67,6 @@ def author_graph(stage: Usd.Stage, scene: Scene) -> list[Usd.Prim]:
         if robot.name not in robots:
             raise RefusedError(f"the stage has no robot {robot.name!r}; it has {', '.join(robots) or 'none'}")
         parts = _parts(robots[robot.name])
-        _complete_lidar(stage.GetPrimAtPath(parts.lidar), robot.lidar.rays)
         if not stage.GetPrimAtPath(GRAPHS):
             stage.DefinePrim(GRAPHS, "Scope")
         graph = Graph(stage, GRAPHS.AppendChild(robot.name))
@@ -132,7 +128,7 @@ def _odometry(graph: Graph, parts: _Parts, topic: str) -> None:
 
 
 def _imu(graph: Graph, parts: _Parts, topic: str, frame: str) -> None:
-    graph.node("imu", f"{SENSORS}IsaacReadIMU", imuPrim=parts.imu, readGravity=True)
+    graph.node("imu", f"{SENSORS}IsaacReadIMU", imuPrim=parts.imu, readGravity=False)  # as imu_a is
     graph.node("publish_imu", f"{BRIDGE}ROS2PublishImu", topicName=topic, frameId=frame)
     graph.connect("tick.tick", "imu.execIn")
     _published(graph, "publish_imu", SENSOR_QOS, "imu.execOut")
@@ -257,30 +253,3 @@ def _child(mount: Usd.Prim, kind: str) -> Usd.Prim:
     if len(found) != 1:
         raise RefusedError(f"{place(mount)}: has {len(found)} children of type {kind}; it needs one")
     return found[0]
-
-
-def _complete_lidar(lidar: Usd.Prim, rays: int) -> None:
-    """One emitter that fires `rays` times a turn; without it Isaac Sim's default has 128, one above another.
-
-    A sensor whose emitters are said already is left alone.
-    """
-    core, names = "omni:sensor:Core:", Sdf.ValueTypeNames
-    if lidar.GetAttribute(f"{core}numberOfEmitters"):
-        return
-    turns = lidar.GetAttribute(f"{core}scanRateBaseHz").Get()
-    firings = min(rays * turns, UINT_MAX)
-    if EMITTER_API not in lidar.GetMetadata("apiSchemas").GetAppliedItems():
-        lidar.AddAppliedSchema(EMITTER_API)
-    state = f"{core}emitterState:s001:"
-    for name, kind, value in (
-        # Isaac Sim 6.0.1 reads the first of these names, the sensor's own documentation has the second.
-        (f"{core}patternFiringRateHz", names.UInt, firings),
-        (f"{core}reportRateBaseHz", names.UInt, firings),
-        (f"{core}numberOfEmitters", names.UInt, 1),
-        (f"{core}numberOfChannels", names.UInt, 1),
-        (f"{state}azimuthDeg", names.FloatArray, [0.0]),
-        (f"{state}elevationDeg", names.FloatArray, [0.0]),
-        (f"{state}fireTimeNs", names.UIntArray, [0]),
-        (f"{state}channelId", names.UIntArray, [1]),
-    ):
-        lidar.CreateAttribute(name, kind, custom=False).Set(value)
