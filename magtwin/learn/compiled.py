@@ -17,6 +17,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
+Figures = NDArray[np.float64]
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 
@@ -127,8 +128,9 @@ def _layer(
 
 _ROWS = types.Array(types.float32, 2, "C")
 _FLAT = types.Array(types.float32, 1, "C", readonly=True)
+_ROW = types.Array(types.float32, 1, "C")
 _FIGURES = types.Array(types.float64, 1, "C")
-_NUMBERS = types.Array(types.int64, 1, "C", readonly=True)
+_RANGES = types.Array(types.float64, 2, "C", readonly=True)
 
 
 @compiled(_ROWS, _FLAT, _FLAT, types.int64, _ROWS)
@@ -151,19 +153,46 @@ def forward(h: Floats, weight: Floats, bias: Floats, chunk: int, out: Floats) ->
             row[j] = _NONE if row[j] < _NONE else row[j]  # nan stays
 
 
-@compiled(_FIGURES, _NUMBERS, _FLAT, types.Array(types.float32, 1, "C"), _FIGURES)
-def reading(
-    z: NDArray[np.float64], widths: NDArray[np.int64], table: Floats, work: Floats, out: NDArray[np.float64]
-) -> None:
-    """A whole perceptron for one row.
+@compiled(_FIGURES, _RANGES, _FIGURES)
+def scaled(x: Figures, ranges: Figures, z: Figures) -> bool:
+    """Scale a row, z = (x held within bounds - mean) / scale; gives whether one left the training's range.
 
     Args:
-        z: Scaled inputs, shape (F,).
+        x: Features, shape (F,); nan stays nan, and is outside.
+        ranges: Means, scales, bounds that inputs are held within, and training ranges: shape (6, F).
+        z: Takes the scaled row, shape (F,).
+    """
+    outside = False
+    for i in range(x.shape[0]):
+        value = x[i]
+        outside |= not (ranges[4, i] <= value <= ranges[5, i])
+        value = ranges[2, i] if value < ranges[2, i] else ranges[3, i] if value > ranges[3, i] else value
+        z[i] = (value - ranges[0, i]) / ranges[1, i]
+    return outside
+
+
+@compiled(_FIGURES, _RANGES, types.Array(types.int64, 1, "C", readonly=True), _FLAT, _FIGURES, _ROW, _FIGURES)
+def perceptron(
+    x: Figures,
+    ranges: Figures,
+    widths: NDArray[np.int64],
+    table: Floats,
+    z: Figures,
+    work: Floats,
+    out: Figures,
+) -> bool:
+    """Scale a row and take it through all layers of a perceptron; gives what `scaled` gives.
+
+    Args:
+        x: As for `scaled`, and so the next one.
+        ranges: Of the inputs.
         widths: Numbers of inputs, of each hidden layer's units, and of what comes out, shape (L + 1,).
         table: Weights, those of a unit together, and biases of each layer, one layer after the other.
+        z: Takes the scaled row, shape (F,).
         work: Memory for two of the widest rows.
         out: Takes the scaled outputs, shape (O,).
     """
+    outside: bool = scaled(x, ranges, z)
     most = work.shape[0] // 2
     units, values = np.empty(most + AT_ONCE, np.uint64), np.empty(most + AT_ONCE, np.float32)
     sums = np.empty(most, np.float32)
@@ -183,3 +212,4 @@ def reading(
         row, other = other, row
     for j in range(out.shape[0]):
         out[j] = row[j]
+    return outside
