@@ -7,6 +7,8 @@ from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, announcer, print_report, say
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from magtwin.run import Run
 
 
@@ -55,6 +57,7 @@ def export(
         out,
         profile=profile,
         animation=played,
+        to_onnx=_to_onnx(),
         thumbnail=_draw if thumbnail and profile != "viewer" else None,
         convert_units=convert_units,
         force=force,
@@ -88,6 +91,17 @@ def _read(run: Path) -> "Run":
     from magtwin.io.formats import read_run
 
     return read_run(existing(run, "run"))
+
+
+def _to_onnx() -> "Callable[[Path, Path], object] | None":
+    """What writes a network as ONNX, where the extra is installed."""
+    from importlib.util import find_spec
+
+    if not (find_spec("onnx") and find_spec("onnxruntime")):
+        return None
+    from magtwin.learn.onnx import export_onnx
+
+    return export_onnx
 
 
 def _draw(stage: Path, out: Path) -> None:

@@ -100,8 +100,11 @@ def _define(layer: Sdf.Layer, scope: Sdf.Path, named: dict[Path, list[Sdf.Path]]
             of.targetPathList.explicitItems.append(path)
 
 
-def detach(root: Path) -> None:
+def detach(root: Path) -> tuple[Path, ...]:
     """Write the files that are attached to a stage beside its root layer, and name them as they were named.
+
+    Returns:
+        Those that nothing named.
 
     Raises:
         RefusedError: A file is damaged, or its name or kind is none that magtwin attaches.
@@ -110,6 +113,7 @@ def detach(root: Path) -> None:
     default = stage.GetDefaultPrim()
     scope = default.GetChild(SCOPE) if default else Usd.Prim()
     found = [prim for prim in scope.GetChildren() if prim.HasAttribute(BYTES)] if scope else []
+    unnamed = []
     for prim in found:
         name = str(prim.GetAttribute(NAME).Get() or "")
         value = prim.GetAttribute(BYTES).Get()
@@ -125,13 +129,16 @@ def detach(root: Path) -> None:
             raise RefusedError(f"{place(prim)}: a second file {name}; rename one")
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(data)
-        for path in prim.GetRelationship(OF).GetTargets():
+        targets = prim.GetRelationship(OF).GetTargets()
+        if not targets:
+            unnamed.append(file)
+        for path in targets:
             attribute = stage.GetAttributeAtPath(path)
             if not attribute or attribute.GetTypeName() != Sdf.ValueTypeNames.Asset:
                 raise RefusedError(f"{place(prim)}: {OF} names {path}, which names no file")
             attribute.Set(Sdf.AssetPath(relative_asset(stage.GetRootLayer(), file)))
     if not found:
-        return
+        return ()
     path, layers = scope.GetPath(), stage.GetLayerStack(includeSessionLayers=False)
 
     for layer in layers:
@@ -147,6 +154,7 @@ def detach(root: Path) -> None:
         else:
             layer.Save()
     layers[0].Save()
+    return tuple(unnamed)
 
 
 def _is_empty(layer: Sdf.Layer) -> bool:

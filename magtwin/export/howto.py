@@ -77,6 +77,13 @@ below `{graphs}` publish `/clock`, odometry, inertial unit, pose, joint states a
 chooses the engine.
 """
 
+_SCRIPT = """
+`{script}` drives the robot along a figure of eight and reads the magnetometer at every step, without
+magtwin; its first lines say what it needs.
+
+    python {script} {root} {onnx} readings.csv
+"""
+
 _LICENCES = """
 ## Where it comes from
 
@@ -98,6 +105,8 @@ def howto(
     magnetometer: str = "",
     attached: bool = False,
     graphs: str = "",
+    scripts: Sequence[str] = (),
+    onnx: str = "",
     source: str,
     checksum: str,
     licences: Mapping[str, str],
@@ -110,6 +119,8 @@ def howto(
     parts.append(_OPEN.format(root=root))
     if graphs:
         parts.append(_ISAAC.format(graphs=graphs))
+    stage = f"../{root}" if attached else root
+    parts += [_SCRIPT.format(script=s, root=stage, onnx=onnx or "NETWORK.onnx") for s in scripts]
     if plugin:
         parts.append(_PLUGIN)
     if map_prim:

@@ -18,6 +18,7 @@ from magtwin.export.contents import THUMBNAIL, bring_together
 from magtwin.export.flatten import flatten
 from magtwin.export.glb import write_glb
 from magtwin.export.howto import howto
+from magtwin.export.inspection import inspect
 from magtwin.export.isaac import GRAPHS, author_graph
 from magtwin.export.structure import structure
 from magtwin.export.units import to_metres_z_up
@@ -53,6 +54,9 @@ GENERATED = ("plugInfo.json", "generatedSchema.usda")
 """What a program needs to know magtwin's schemas, and where it lies."""
 
 HOWTO = "HOWTO.md"
+
+SCRIPTS = Path(__file__).resolve().parent / "scripts"
+"""Examples of what to do with an export, which need no magtwin; those called as a profile go with it."""
 
 HEADER_MAX = 10_000_000
 """Bytes of the header of a safetensors file that are read for a licence."""
@@ -94,9 +98,10 @@ def export_scene(
     *,
     profile: Profile | None = None,
     animation: Run | None = None,
-    network_onnx: Path | None = None,
+    to_onnx: Callable[[Path, Path], object] | None = None,
     thumbnail: Callable[[Path, Path], object] | None = None,
     convert_units: bool = False,
+    trusted: bool = False,
     force: bool = False,
     progress: Callable[[str], object] = lambda step: None,
 ) -> Exported:
@@ -109,9 +114,12 @@ def export_scene(
         profile: For whom, see `PROFILES`; omniverse for folders and packages, viewer for the others, unless
             given.
         animation: A run that plays over the stage; in a folder as a layer of its own, `<name>_run.usdc`.
-        network_onnx: The scene's one network as ONNX, to lie beside its weights.
+        to_onnx: Writes a network as ONNX, which then lies beside its weights: called with the weights and the
+            file to make. What it refuses becomes a note.
         thumbnail: Draws a folder's stage: called with its root layer and the PNG to make, 256 pixels square.
         convert_units: Whether a stage that is not in metres with Z up is converted, see `to_metres_z_up`.
+        trusted: Whether the stage was made here. Otherwise it is first read in a process of its own, as a
+            damaged layer can end its reader; that takes a second.
         force: Whether what exists is replaced.
         progress: Called with what is done next.
 
@@ -131,12 +139,14 @@ def export_scene(
     beside = out.with_name(f"{out.stem}_magtwin") if kind == "package" and name != "viewer" else None
     for target in filter(None, (out, beside)):
         check_free(target, force=force)
-    existing(scene_file, "stage")
+    if existing(scene_file, "stage").is_dir():
+        raise RefusedError(f"{scene_file}: a folder; give a USD file in it")
     with TemporaryDirectory() as scratch, _told_of(Path(scratch, "stage"), scene_file):
         work = _Work(Path(scratch, "stage"), scene_file, name, progress)
-        work.gather(convert_units=convert_units)
+        work.gather(convert_units=convert_units, trusted=trusted)
         work.check()
-        work.network(network_onnx)
+        if to_onnx is not None and name != "viewer":
+            work.onnx_of(to_onnx)
         if name == "isaac":
             work.for_isaac()
         work.tell_origin()
@@ -187,9 +197,11 @@ class _Work:
         self.notes: list[str] = []
         self.licences: dict[str, str] = {}
         self.run: Path | None = None
+        self.onnx: list[Path] = []
+        self.scripts = sorted(SCRIPTS.glob(f"{profile}_*.py"))
         self.checksum = ""
 
-    def gather(self, *, convert_units: bool) -> None:
+    def gather(self, *, convert_units: bool, trusted: bool) -> None:
         """Bring the stage together, in metres with Z up."""
         self.progress("Gathering what the stage names")
         self.folder.mkdir()
@@ -197,10 +209,16 @@ class _Work:
             package = self.folder.with_name("package")
             package.mkdir()
             root = unpack(self.source, package)
-            detach(root)
+            if not trusted:
+                inspect(root, ())
+            unnamed = detach(root)
             self.checksum = sha256(self.source)
             self.root = bring_together(root, self.folder, within=package)
+            for file in unnamed:
+                _copied(file, self.folder / file.relative_to(root.parent))
         else:
+            if not trusted:
+                inspect(self.source, ())
             self.root = bring_together(self.source, self.folder)
             self.checksum = stage_sha256(self.source)
         stage = open_stage(self.root)
@@ -277,19 +295,17 @@ class _Work:
     def _said(self, file: Path) -> str:
         return file.resolve().relative_to(self.folder.resolve()).as_posix()
 
-    def network(self, onnx: Path | None) -> None:
-        """Lay the ONNX file beside the weights that it was made from."""
-        self.onnx: Path | None = None
-        if onnx is None:
-            return
-        if len(self.networks) != 1:
-            raise RefusedError(
-                f"{self.source}: has {len(self.networks)} networks, so {onnx} cannot be that of the scene"
-            )
-        self.onnx = self.networks[0].with_suffix(".onnx")
-        if self.onnx.exists():
-            raise RefusedError(f"{self.source}: names {self._said(self.onnx)} already; leave the ONNX out")
-        shutil.copyfile(existing(onnx, "ONNX file"), self.onnx)
+    def onnx_of(self, write: Callable[[Path, Path], object]) -> None:
+        """Lay networks as ONNX beside their weights."""
+        for weights in self.networks:
+            out = weights.with_suffix(".onnx")
+            try:
+                if not out.exists():  # of a package that was unpacked
+                    self.progress(f"Writing {weights.stem} as ONNX")
+                    write(weights, out)
+                self.onnx.append(out)
+            except RefusedError as error:
+                self.notes.append(f"{self._said(weights)} has no ONNX beside it: {error}")
 
     def for_isaac(self) -> None:
         """Give robots Isaac Sim's asset structure, and the scene its Action Graphs."""
@@ -331,7 +347,7 @@ class _Work:
         layer.Save()
 
     def flat(self) -> None:
-        """Become one layer, with the textures that it names."""
+        """Become one layer, with the files that it names."""
         self.progress("Flattening the stage")
         flat = self.folder.with_name("flat") / f"{self.source.stem}.usdc"
         flat.parent.mkdir()
@@ -357,10 +373,10 @@ class _Work:
         """Write a package, and the folder beside it."""
         if beside is not None:
             beside.mkdir()
-            for file in self.networks + ([self.onnx] if self.onnx else []):
+            for file in [*self.networks, *self.onnx]:
                 _copied(file, beside / "weights" / file.name)
             self._explain(beside, out.name, attached=True)
-        attach(self.root, *([self.onnx] if self.onnx else []))
+        attach(self.root, *self.onnx)
         if self.profile == "viewer":
             self.flat()
         pack(self.run or self.root, out)
@@ -397,9 +413,13 @@ class _Work:
             source=self.source.name,
             checksum=self.checksum,
             licences=self.licences,
+            scripts=[script.name for script in self.scripts],
+            onnx=self._said(self.onnx[0]) if self.onnx else "",
             notes=self.notes,
         )
         (folder / HOWTO).write_text(page, encoding="utf-8")
+        for script in self.scripts:
+            _copied(script, folder / script.name)
 
 
 def _values_layer(prim: Usd.Prim) -> Path:
