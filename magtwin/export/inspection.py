@@ -89,13 +89,21 @@ def inspect(
             raise RuntimeError(f"the inspection of {file} ended with {done.returncode}: {last}")
         said = json.loads(answer.read_text(encoding="utf-8"))
     if said.get("refused"):
-        raise RefusedError(said["refused"])
+        raise RefusedError(_as_named(said["refused"], root, file))
+    checks = json.loads(_as_named(json.dumps(said["checks"], ensure_ascii=False), root, file))
     return Inspection(
-        tuple(check_from(check) for check in said["checks"]),
+        tuple(check_from(check) for check in checks),
         {prim: None if asset is None else Path(asset) for prim, asset in said["robots"].items()},
         said["bodies"],
         tuple(said["mended"]),
     )
+
+
+def _as_named(text: str, root: Path | None, file: Path) -> str:
+    """What was said of the folder that a package was unpacked to, said of the package."""
+    for folder in () if root is None else (root.parent.resolve(), root.parent):
+        text = text.replace(folder.as_posix(), file.as_posix())
+    return text
 
 
 def _look(job: dict[str, Any]) -> dict[str, Any]:
@@ -113,8 +121,12 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     heard = UsdUtils.CoalescingDiagnosticDelegate()  # keeps what USD says off the terminal
     checks: list[Check] = []
     try:
+        lost: list[Finding] = []
         if job["packed"]:
-            detach(root)
+            try:
+                detach(root)
+            except RefusedError as error:
+                lost.append(Finding("attached", str(error), advice="export the package anew"))
         mended = mend(root, job["fix"]) if job["fix"] else []
         stage = Usd.Stage.Open(str(root))
         if stage is None:
@@ -128,6 +140,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
         for name, rules in (("isaac", ISAAC_RULES), ("magtwin", RULES)):
             if name in job["against"]:
                 found = [finding for rule in rules.values() for finding in rule.findings(subject)]
+                found += lost if name == "magtwin" else []
                 checks.append(Check(name, tuple(found), scope=f"{len(rules)} rules"))
         assets = robot_assets(subject)
         bodies = sum(prim.HasAPI(UsdPhysics.RigidBodyAPI) for prim in subject.prims)

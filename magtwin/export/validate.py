@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from magtwin.export.findings import Findings
-from magtwin.export.inspection import inspect
+from magtwin.export.inspection import Inspection, inspect
 from magtwin.export.usdz import unpack
 from magtwin.export.validators import newton, nvidia, simready
 from magtwin.files import existing
@@ -63,8 +63,10 @@ def validate(
     say = progress or (lambda name: None)
     with tempfile.TemporaryDirectory() as folder:
         root = unpack(file, Path(folder)) if file.suffix == ".usdz" else None
-        say("core, isaac and magtwin")
-        seen = inspect(file, wanted, root=root, inputs=inputs, fix=fix)
+        seen = Inspection(())
+        if fix or set(wanted) - {"nvidia"}:
+            say("core, isaac and magtwin")
+            seen = inspect(file, wanted, root=root, inputs=inputs, fix=fix)
         checks = {check.validator: [check] for check in seen.checks}
         for name, look in (
             ("nvidia", lambda: [nvidia(file)]),
