@@ -44,7 +44,7 @@ lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies
 
 physics: $(VENV)/.dev  ## Drive converted robots in Newton (extra physics, 600 MB)
 	$(PIP) -e '.[dev,physics]'
-	$(BIN)/python -m pytest -m physics tests/test_newton.py tests/test_engine.py
+	$(BIN)/python -m pytest -m physics tests/test_newton.py tests/test_engine.py tests/test_engine_scripts.py
 
 bench: $(VENV)/.dev  ## Compare with peers; prints ratios
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
