@@ -119,6 +119,11 @@ def read_scene(path: str | os.PathLike[str], *, check_network: bool = True) -> S
             is out of range, or the map is not what its checksum was taken of, or is another than the
             scene was made with; names the prim.
     """
+    if Path(path).suffix == ".usdz":
+        raise RefusedError(
+            f"{path}: a package, in which no file can be read by itself; unpack it with `magtwin export "
+            f"{Path(path).name} --out DIR` and give the layer in DIR"
+        )
     stage = open_stage(path)
     _check_axes(stage, path)
     world = stage.GetPseudoRoot()
