@@ -1,7 +1,6 @@
 """`magtwin train`: a neural magnetometer from a data set."""
 
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -25,9 +24,13 @@ def train(
     *,
     out: Path,
     config: Path | None = None,
-    model: Literal["paper", "released"] | None = None,
+    model: Literal["paper", "released", "linear", "hybrid", "ensemble", "tcn"] | None = None,
     layers: str | None = None,
     features: str | None = None,
+    members: Whole | None = None,
+    kernel: Whole | None = None,
+    penalty: float | None = None,
+    weighting: Literal["auto", "label_sd", "none"] | None = None,
     dropout: float | None = None,
     epochs: Whole | None = None,
     batch: Whole | None = None,
@@ -37,16 +40,18 @@ def train(
     split: Literal["session", "run", "path", "row"] | None = None,
     hold_out: Names = None,
     threads: Whole | None = None,
+    device: Literal["cpu", "cuda", "auto"] | None = None,
     init: Path | None = None,
     freeze: Names = None,
     resume: Flag = False,
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Train a network on a data set and judge it on recordings that it never saw.
+    """Train a model on a data set and judge it on recordings that it never saw.
 
-    Beside F.safetensors it writes F.md, the model card, and the learning curve as F.png and F.csv. After each
-    epoch the state goes to F.checkpoint, which is removed at the end.
+    Beside F.safetensors it writes F.md, the model card, and, of what is trained in epochs, the learning
+    curve as F.png and F.csv. After each epoch the state goes to F.checkpoint, which is removed at the end.
+    An option that the model does not read is refused.
 
     Parameters
     ----------
@@ -57,13 +62,26 @@ def train(
     config
         TOML of the options below, with _ for -; options given here go first.
     model
-        paper: 20-512-512-512-512-1, the default; released: 20-512-512-512-128-1.
+        paper: 20-512-512-512-512-1, the default; released: 20-512-512-512-128-1; linear: Tolles-Lawson terms
+        by ridge regression; hybrid: a linear base and a small network for what it leaves, kept only where it
+        does better on validation; ensemble: small networks with a mean and a variance each; tcn: a small
+        temporal network that looks back over rows.
     layers
         Widths of the hidden layers in place of the model's, as 256,256.
     features
-        Set of inputs, or names with commas between; full, the paper's 20, unless given.
+        Set of inputs, or names with commas between; full, the paper's 20, unless given, circular of a linear
+        model, gradient of a hybrid, an ensemble and a tcn.
+    members
+        Networks of an ensemble; 5 unless given.
+    kernel
+        Rows that each layer of a tcn looks at, each twice as far apart as in the one before; 3 unless given.
+    penalty
+        Of the ridge of a linear model or a hybrid; chosen by cross-validation over recordings unless given.
+    weighting
+        Whether the ridge weighs rows by how well the map is known there: label_sd, none, or auto, unless
+        given: what does better on recordings left out.
     dropout
-        Share of units dropped in training; 0.3 unless given.
+        Share of units dropped in training; 0.3 unless given, 0.1 of a hybrid.
     epochs
         Passes over the training rows; 20 unless given.
     batch
@@ -81,10 +99,12 @@ def train(
         Sessions, runs or paths that are all in the test.
     threads
         Threads to train with; another number gives other bits.
+    device
+        Where to train: cpu, cuda, or auto, unless given: a GPU where torch sees one.
     init
-        Weights to go on from, .safetensors or a released .pth, of the same inputs and layers.
+        Weights to go on from, .safetensors or a released .pth, of the same kind, inputs and layers.
     freeze
-        Layers that stay as they are: layers.0 is the first.
+        Layers that stay as they are: layers.0 is the first; base that of a hybrid.
     resume
         Go on from F.checkpoint, which a training that was killed left; the weights are those of one that
         was not.
@@ -106,7 +126,7 @@ def train(
     card, picture, table, checkpoint = (
         out.with_suffix(end) for end in (".md", ".png", ".csv", ".checkpoint")
     )
-    for path in (out, card, picture, table):
+    for path in (out, card):
         check_free(path, force=force)
     if checkpoint.exists() and not (resume or force):
         raise RefusedError(
@@ -116,6 +136,10 @@ def train(
         "model": model,
         "layers": None if layers is None else _widths(layers),
         "features": features,
+        "members": members,
+        "kernel": kernel,
+        "penalty": penalty,
+        "weighting": weighting,
         "dropout": dropout,
         "epochs": epochs,
         "batch": batch,
@@ -125,10 +149,14 @@ def train(
         "split": split,
         "hold_out": None if hold_out is None else tuple(hold_out),
         "threads": threads,
+        "device": device,
         "init": init,
         "freeze": None if freeze is None else tuple(freeze),
     }
     options = _given(TrainConfig() if config is None else read_config(config), given)
+    curves = () if options.model == "linear" else (picture, table)
+    for path in curves:
+        check_free(path, force=force)
     found = open_dataset(dataset)
     deals, draws = np.random.default_rng(options.seed).spawn(2)
     parts = split_of(found.recordings, options.split, hold_out=options.hold_out, rng=deals)
@@ -144,16 +172,17 @@ def train(
             progress=pace.epoch,
             advance=pace.rows,
         )
-    naive = trained.parts[0].naive_rmse_nt
-    plot_learning_curve(trained.history, picture, naive_rmse_nt=naive, title=out.name, force=force)
-    write_learning_curve(trained.history, table, force=force)
+    if trained.history:
+        naive = trained.parts[0].naive_rmse_nt
+        plot_learning_curve(trained.history, picture, naive_rmse_nt=naive, title=out.name, force=force)
+        write_learning_curve(trained.history, table, force=force)
     trained.net.save(out, force=force)
     with output(card, force=force) as aside:
         aside.write_text(trained.card(out.name, sha256(out)), encoding="utf-8")
     checkpoint.unlink(missing_ok=True)
     print_report(trained.report(str(out)), json)
     if not json:
-        say(f"Wrote {out}, {card.name}, {picture.name} and {table.name}")
+        say(f"Wrote {', '.join([str(out), card.name, *(path.name for path in curves if trained.history)])}")
 
 
 class _Pace:
@@ -188,8 +217,6 @@ def _widths(text: str) -> tuple[int, ...]:
 def _given(config: "TrainConfig", options: dict[str, Any]) -> "TrainConfig":
     """A configuration with the options that were given in place of its own."""
     found = {name: value for name, value in options.items() if value is not None}
-    if "model" in found and "layers" not in found:
-        found["layers"] = ()  # the file's layers are those of another model
-    elif {"model", "layers"} <= set(found):
+    if {"model", "layers"} <= set(found) and found["model"] in ("paper", "released"):
         raise RefusedError("--model and --layers both say the widths; give one of them")
-    return replace(config, **found)
+    return config.with_options(**found)

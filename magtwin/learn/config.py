@@ -7,45 +7,93 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 from magtwin.files import from_table, read_toml
 from magtwin.learn.features import feature_names
+from magtwin.learn.linear import Weighting
 from magtwin.learn.split import By
 from magtwin.names import RefusedError
 
-MODELS: Mapping[str, tuple[int, ...]] = MappingProxyType(
-    {"paper": (512, 512, 512, 512), "released": (512, 512, 512, 128)}
+Model = Literal["paper", "released", "linear", "hybrid", "ensemble", "tcn"]
+Device = Literal["cpu", "cuda", "auto"]
+
+_DESCENT: Mapping[str, Any] = MappingProxyType({"epochs": 20, "batch": 1024, "lr": 1e-3, "patience": None})
+_TORCH: Mapping[str, Any] = MappingProxyType({"threads": None, "device": "auto", "freeze": ()})
+_PAPER: Mapping[str, Any] = MappingProxyType({"features": "full", "dropout": 0.3, **_DESCENT, **_TORCH})
+_RIDGE: Mapping[str, Any] = MappingProxyType({"penalty": None, "weighting": "auto"})
+
+MODELS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        "paper": {"layers": (512, 512, 512, 512), **_PAPER},
+        "released": {"layers": (512, 512, 512, 128), **_PAPER},
+        "linear": {"features": "circular", **_RIDGE},
+        "hybrid": {
+            "features": "gradient",
+            **_RIDGE,
+            "layers": (64, 64),
+            "dropout": 0.1,
+            **_DESCENT,
+            **_TORCH,
+        },
+        "ensemble": {"features": "gradient", "members": 5, "layers": (64, 64), **_DESCENT, **_TORCH},
+        "tcn": {
+            "features": "gradient",
+            "layers": (32, 32, 32, 32),
+            "kernel": 3,
+            **_DESCENT,
+            "threads": None,
+            "device": "auto",
+        },
+    }
 )
-"""Widths of the hidden layers by the name of a model: as the paper has them, and as its weights have."""
+"""Models by name: the options that each reads beside those that all do, and what they are unless given."""
+
+ALL_READ = ("model", "seed", "split", "hold_out", "init")
+"""Options that every model reads."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """What a training does; the paper's network, loss and dropout unless said otherwise.
+    """What a training does: a model and its options, those that are not given as `MODELS` has them.
 
-    The paper does not tell its epochs, batch, step size or split; those are magtwin's own.
+    An option that the model does not read is refused; it is None here. The paper does not tell its epochs,
+    batch, step size or split; those are magtwin's own.
     """
 
-    model: Literal["paper", "released"] = "paper"
-    """Whose layers; see `MODELS`. Says nothing where `layers` are given."""
+    model: Model = "paper"
+    """Which model: the multilayer perceptron as the paper has it ("paper") or as its weights have
+    ("released"), "linear" (Tolles-Lawson by ridge regression), "hybrid", "ensemble" or "tcn"."""
 
     layers: tuple[int, ...] = ()
-    """Widths of the hidden layers; the model's where empty."""
+    """Widths of the hidden layers; of a tcn, of its convolutions."""
 
-    features: str = "full"
+    features: str = ""
     """A set of `magtwin.learn.features.SETS`, or names of features with commas between."""
 
-    dropout: float = 0.3
+    dropout: float | None = None
     """Share of units dropped in training."""
 
-    epochs: int = 20
+    members: int | None = None
+    """Networks of an ensemble."""
+
+    kernel: int | None = None
+    """Rows that each convolution of a tcn looks at."""
+
+    penalty: float | None = None
+    """Of the ridge, as a share of the rows' own curvature; None chooses it by cross-validation."""
+
+    weighting: Weighting | None = None
+    """Whether a ridge weighs rows by how well the map is known there: "label_sd", "none", or "auto",
+    whichever does better on recordings left out."""
+
+    epochs: int | None = None
     """Passes over the training rows."""
 
-    batch: int = 1024
+    batch: int | None = None
     """Rows a step."""
 
-    lr: float = 1e-3
+    lr: float | None = None
     """Largest step size of Adam."""
 
     patience: int | None = None
@@ -63,21 +111,45 @@ class TrainConfig:
     threads: int | None = None
     """Threads of torch; as many as it takes unless given. Another number gives other bits."""
 
+    device: Device | None = None
+    """Where torch trains: "cpu", "cuda", or "auto", a GPU where torch sees one."""
+
     init: Path | None = None
-    """Weights file that training goes on from, .safetensors or .pth."""
+    """Weights file that training goes on from, .safetensors or .pth, of the same kind and features."""
 
     freeze: tuple[str, ...] = ()
-    """Layers that stay as `init` has them: "layers.0" is the first."""
+    """Layers that stay as `init` has them: "layers.0" is the first; of a hybrid, "base" too."""
 
     def __post_init__(self) -> None:
+        known = MODELS[self.model]
+        for field in fields(self):
+            given = getattr(self, field.name)
+            if field.name in ALL_READ or given is None or given in ((), ""):
+                continue
+            if field.name not in known:
+                raise RefusedError(
+                    f"{field.name} is nothing to the model {self.model!r}, which reads "
+                    f"{', '.join([*known, *ALL_READ])}; leave it out"
+                )
+        for name, usual in known.items():
+            if getattr(self, name) in (None, (), ""):
+                object.__setattr__(self, name, usual)
+        self._check()
+
+    def _check(self) -> None:
         inputs = self.inputs  # refuses what is no feature
-        for name, value in (("epochs", self.epochs), ("batch", self.batch), ("lr", self.lr)):
-            if not 0 < value < math.inf:
+        for name in ("epochs", "batch", "lr", "members"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
                 raise RefusedError(f"{name} must be above 0, got {value!r}")
         for name, count in (("patience", self.patience), ("threads", self.threads)):
             if count is not None and count < 1:
                 raise RefusedError(f"{name} must be 1 at least, got {count!r}; leave it out for none")
-        if not 0 <= self.dropout < 1:
+        if self.kernel is not None and self.kernel < 2:
+            raise RefusedError(f"kernel must be 2 rows at least, got {self.kernel!r}")
+        if self.penalty is not None and not 0 <= self.penalty < math.inf:
+            raise RefusedError(f"penalty must be from 0 up and finite, got {self.penalty!r}")
+        if self.dropout is not None and not 0 <= self.dropout < 1:
             raise RefusedError(f"dropout must lie in 0..1, 1 left out, got {self.dropout!r}")
         if self.seed < 0:
             raise RefusedError(f"seed must be 0 or more, got {self.seed!r}")
@@ -87,9 +159,14 @@ class TrainConfig:
             raise RefusedError("freeze keeps layers of trained weights: give init too")
 
     @property
+    def kind(self) -> str:
+        """Kind of the predictor: "mlp", "linear", "hybrid", "ensemble" or "tcn"."""
+        return "mlp" if self.model in ("paper", "released") else self.model
+
+    @property
     def hidden(self) -> tuple[int, ...]:
-        """Widths of the hidden layers."""
-        return self.layers or MODELS[self.model]
+        """Widths of the hidden layers; none of a linear model."""
+        return self.layers
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -100,12 +177,28 @@ class TrainConfig:
         """
         return feature_names(self.features)
 
+    def options(self, *names: str) -> dict[str, Any]:
+        """Some of the options by name, such as a model's fit takes them."""
+        return {name: getattr(self, name) for name in names}
+
+    def with_options(self, **options: Any) -> "TrainConfig":
+        """With other options; those of another model are left behind where `model` is one of them."""
+        keep = {field.name: getattr(self, field.name) for field in fields(self)}
+        if options.get("model", self.model) != self.model:
+            usual, known = MODELS[self.model], MODELS[options["model"]]
+            keep = {
+                name: value
+                for name, value in keep.items()
+                if name in ALL_READ or (name in known and name != "layers" and value != usual.get(name))
+            }
+        return TrainConfig(**{**keep, **options})
+
     def to_toml(self) -> str:
         """The file that `read_config` reads this from; what is not set is left out."""
         lines = []
         for field in fields(self):
             value = getattr(self, field.name)
-            if value is None or value == () or (field.name == "model" and self.layers):
+            if value is None or value == ():
                 continue
             value = value.as_posix() if isinstance(value, Path) else value
             text = json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
@@ -114,10 +207,10 @@ class TrainConfig:
 
 
 def read_config(path: str | os.PathLike[str]) -> TrainConfig:
-    """A configuration from a TOML file; what it does not say is as `TrainConfig` has it.
+    """A configuration from a TOML file; what it does not say is as `MODELS` has it.
 
     Raises:
-        RefusedError: No such file, not TOML, an unknown key (the near one is named), or a value that
-            cannot be, each with its line.
+        RefusedError: No such file, not TOML, an unknown key (the near one is named), an option that the model
+            does not read, or a value that cannot be, each with its line.
     """
     return from_table(TrainConfig, read_toml(path), path)

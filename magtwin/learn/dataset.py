@@ -145,6 +145,7 @@ class Dataset:
         *,
         split: Split | None = None,
         part: Part = "train",
+        beside: Sequence[str] = (),
     ) -> Rows:
         """Inputs and labels of recordings; rows without a label, or with an input that is nan, are left out.
 
@@ -153,22 +154,24 @@ class Dataset:
             names: Recordings; all unless given.
             split: In place of names: the recordings, and for a split by row the rows, of a part of it.
             part: Which.
+            beside: Names of features that are read along; a row is not left out where one of them is nan.
 
         Raises:
             RefusedError: No such recording or feature, the recordings lack a column that a feature is made
                 of, or no row is left.
         """
         wanted = feature_names(features)
-        self._check_features(wanted)
+        self._check_features((*wanted, *beside))
         if split is not None:
             names = split.names(part)
         chosen = self._named(names)
         room = sum(one.labelled for one in chosen)
         x, y, sd = np.empty((room, len(wanted))), np.empty(room), np.empty(room)
-        recording = np.empty(room, np.intp)
+        recording, row = np.empty(room, np.intp), np.empty(room, np.intp)
+        along = np.empty((room, len(beside)))
         number = {one.name: i for i, one in enumerate(chosen)}
         end, unlabelled, unknown = 0, 0, 0
-        columns = [*columns_of(wanted), "label_nt", "label_sd_nt"]
+        columns = [*columns_of(wanted), *columns_of(beside), "label_nt", "label_sd_nt"]
         for one, first, run in self.blocks(columns, number):
             label, values = run["label_nt"], features_of(run, wanted)
             known = np.isfinite(label)
@@ -186,7 +189,9 @@ class Dataset:
                     f"{self.folder}: {one.name!r} has more labels than {MANIFEST} says; build it anew"
                 )
             x[end:stop], y[end:stop], sd[end:stop] = values[kept], label[kept], run["label_sd_nt"][kept]
-            recording[end:stop] = number[one.name]
+            recording[end:stop], row[end:stop] = number[one.name], first + np.flatnonzero(kept)
+            if beside:
+                along[end:stop] = features_of(run, beside)[kept]
             end = stop
         if not end:
             said = f"{unlabelled:,} rows have no label and {unknown:,} lack an input"
@@ -201,6 +206,8 @@ class Dataset:
             tuple(number),
             wanted,
             MappingProxyType({"without a label": unlabelled, "without an input": unknown}),
+            row[:end],
+            along[:end],
         )
 
     def check(self) -> None:

@@ -109,6 +109,12 @@ class Rows:
     left_out: Mapping[str, int]
     """How many rows there were without a label, and how many labelled ones with an input that is nan."""
 
+    row: NDArray[np.intp]
+    """Which row of its recording each is, shape (N,)."""
+
+    beside: Array
+    """Other features that were asked for on the same rows, shape (N, K); nan where unknown."""
+
 
 def sources_of(recordings: Mapping[str, Run] | Sequence[Source]) -> list[Source]:
     """Sources of runs by name, or as given, each with a name of its own.

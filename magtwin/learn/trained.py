@@ -1,23 +1,25 @@
 """Trained: a network from a data set, how it does on recordings that it never saw, and what repeats it."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from magtwin.files import sha256
+from magtwin.learn.calibration import coverage
 from magtwin.learn.config import TrainConfig
 from magtwin.learn.dataset import MANIFEST, Dataset
-from magtwin.learn.magnetometer import NeuralMagnetometer
-from magtwin.learn.model import Fact, FieldNet, load_net
-from magtwin.learn.recording import Rows
-from magtwin.learn.split import PARTS, Split
-from magtwin.learn.train import Epoch, train
-from magtwin.names import RefusedError
+from magtwin.learn.material import Material, material
+from magtwin.learn.predictor import Predictor, load_predictor
+from magtwin.learn.recipe import Choice, device_of, make
+from magtwin.learn.split import PARTS, Part, Split
+from magtwin.learn.train import Epoch
+from magtwin.learn.weights import Fact
 from magtwin.report import Figure, Report
 from magtwin.version import __version__
 
@@ -25,6 +27,17 @@ Array = NDArray[np.float64]
 
 MOST_PATHS = 40
 """Paths that a card tells of one by one."""
+
+NOUNS: Mapping[str, str] = MappingProxyType(
+    {
+        "mlp": "A multilayer perceptron, float32",
+        "linear": "A linear model by ridge regression",
+        "hybrid": "A linear base by ridge regression and a small network for what it leaves",
+        "ensemble": "An ensemble of perceptrons with a mean and a variance each, float32",
+        "tcn": "A temporal network of causal convolutions with a mean and a variance, float32",
+    }
+)
+"""What a card calls each kind."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +54,14 @@ class Judged:
     naive_mae_nt: float
     naive_rmse_nt: float
 
+    ridge_mae_nt: float
+    """Of Tolles and Lawson's terms by ridge regression, on the same rows."""
+
+    ridge_rmse_nt: float
+
+    coverage: float
+    """Share of rows within the predicted interval of 90 %."""
+
     before_mae_nt: float
     """Of the network that was gone on from; nan where there was none."""
 
@@ -54,11 +75,16 @@ class Judged:
 class Trained:
     """A network with all that its card tells."""
 
-    net: FieldNet
-    """In evaluation mode; `residual_sd_nt` is its error on the test, `facts` repeat it."""
+    net: Predictor
+    """`residual_sd_nt` is its error on the test, `facts` repeat it."""
 
     config: TrainConfig
     history: tuple[Epoch, ...]
+    """Its epochs; none of a model that is fitted at once."""
+
+    choice: Choice | None
+    """Whether a hybrid keeps its network."""
+
     split: Split
 
     parts: tuple[Judged, ...]
@@ -77,26 +103,38 @@ class Trained:
     """Training rows."""
 
     @property
-    def best(self) -> Epoch:
-        """The epoch whose weights were kept."""
-        return next(epoch for epoch in reversed(self.history) if epoch.best)
+    def best(self) -> Epoch | None:
+        """The epoch whose weights were kept; none where there was no epoch."""
+        return next((epoch for epoch in reversed(self.history) if epoch.best), None)
 
     def report(self, title: str) -> Report:
         """Rows, epochs, and errors against the naive ones."""
         figures = [
-            Figure("layers", "-".join(str(n) for n in (len(self.net.features), *self.net.hidden, 1))),
+            Figure("kind", self.net.kind),
+            Figure("layers", self.net.layers_text),
             Figure("parameters", self.net.parameters_count),
             Figure("training rows", self.rows),
-            Figure("epochs", self.history[-1].number, note=f"kept {self.best.number}"),
-            Figure("training RMSE", self.best.train_rmse_nt, "nT", note=f"in epoch {self.best.number}"),
         ]
+        if (best := self.best) is not None:
+            figures += [
+                Figure("epochs", self.history[-1].number, note=f"kept {best.number}"),
+                Figure("training RMSE", best.train_rmse_nt, "nT", note=f"in epoch {best.number}"),
+            ]
+        if self.choice:
+            figures += [
+                Figure("base alone MAE", self.choice.base_mae_nt, "nT", note="on validation"),
+                Figure("with network MAE", self.choice.whole_mae_nt, "nT", note="on validation"),
+                Figure("network", "kept" if self.choice.kept else "left out: the base alone does better"),
+            ]
         for one in self.parts:
             figures += [
                 Figure(f"{one.name} rows", one.rows, note=f"{one.recordings} recordings"),
                 Figure(f"{one.name} MAE", one.mae_nt, "nT"),
                 Figure(f"{one.name} RMSE", one.rmse_nt, "nT"),
                 Figure(f"{one.name} naive MAE", one.naive_mae_nt, "nT", note="the mean training label"),
+                Figure(f"{one.name} ridge MAE", one.ridge_mae_nt, "nT", note="Tolles-Lawson terms"),
                 Figure(f"{one.name} ratio", one.ratio, note="MAE by naive MAE"),
+                Figure(f"{one.name} coverage", one.coverage, note="share within intervals of 90 %"),
             ]
             if not math.isnan(one.before_mae_nt):
                 figures.append(Figure(f"{one.name} MAE before", one.before_mae_nt, "nT"))
@@ -111,18 +149,18 @@ class Trained:
             checksum: Its SHA-256.
         """
         facts = self.net.facts
-        layers = "-".join(str(n) for n in (len(self.net.features), *self.net.hidden, 1))
         before = self.config.init is not None
         heads = ["rows of", "recordings", "rows", "MAE", "RMSE", "naive MAE", "naive RMSE", "MAE / naive"]
+        heads += ["ridge MAE", "ridge RMSE", "within 90 %"]
         heads += ["MAE before"] if before else []
         table = [_line(heads), _line(["---"] * len(heads))]
         shown = self.paths[:MOST_PATHS] if len(self.paths) > 1 else ()
         for one in (*self.parts, *shown):
             errors = (one.mae_nt, one.rmse_nt, one.naive_mae_nt, one.naive_rmse_nt)
             cells = [one.name, f"{one.recordings:,}", f"{one.rows:,}", *(f"{e:.1f}" for e in errors)]
-            table.append(
-                _line([*cells, f"{one.ratio:.3f}", *([f"{one.before_mae_nt:.1f}"] if before else [])])
-            )
+            cells += [f"{one.ratio:.3f}", f"{one.ridge_mae_nt:.1f}", f"{one.ridge_rmse_nt:.1f}"]
+            cells += ["-" if math.isnan(one.coverage) else f"{one.coverage:.3f}"]
+            table.append(_line([*cells, *([f"{one.before_mae_nt:.1f}"] if before else [])]))
         if len(self.paths) > MOST_PATHS:
             table.append(f"\nThe first {MOST_PATHS} of {len(self.paths)} paths are shown.")
         counts = ", ".join(f"{len(self.split.names(part))} in {part}" for part in PARTS)
@@ -135,10 +173,19 @@ class Trained:
             gone_on = (
                 f"\nIt goes on from `{facts['init']}` (SHA-256 `{facts['init_sha256']}`), {kept} frozen."
             )
+        best, chosen = self.best, ""
+        if best is not None:
+            chosen = f"Validation chose the epoch that was kept, {best.number} of {self.history[-1].number}; "
+        if self.choice:
+            chosen += f"{self.choice.text()}; "
+        chosen = chosen[:1].upper() + chosen[1:] if chosen else "Validation calibrated the intervals; "
+        torch_with = ""
+        if self.config.kind != "linear":
+            torch_with = f", torch {facts['torch']}, with --threads {facts['threads']} on {facts['device']}"
         return f"""# {name}
 
-Predicts what a robot adds to a map of the magnetic field at its magnetometer [nT]. A multilayer perceptron
-{layers}, {self.net.parameters_count:,} parameters, float32. SHA-256 `{checksum}`.{gone_on}
+Predicts what a robot adds to a map of the magnetic field at its magnetometer [nT]. {NOUNS[self.net.kind]},
+{self.net.layers_text}, {self.net.parameters_count:,} parameters. SHA-256 `{checksum}`.{gone_on}
 Inputs: {", ".join(self.net.features)}.
 {warning}
 ## Data
@@ -152,23 +199,37 @@ Inputs: {", ".join(self.net.features)}.
 
 ## Errors
 
-Of the total field at the sensor [nT]. Naive: the mean training label on every row. Validation chose the
-epoch that was kept, {self.best.number} of {self.history[-1].number}; the test was looked at once.
+Of the total field at the sensor [nT]. Naive: the mean training label on every row. Ridge: Tolles and
+Lawson's terms (heading harmonics, speed, turning, current, LiDAR) by ridge regression on the same training
+rows. Within 90 %: the share of rows inside the predicted interval of 90 %. {chosen}the test was looked at
+once.
 
 {chr(10).join(table)}
 
-The file keeps the RMSE of the test as `residual_sd_nt`; it is the `b_sd_nt` of a Run. Rows of a recording are
-alike: the spread of these errors is that between recordings, not between rows.
+{self._spread()} The file keeps the RMSE of the test as `residual_sd_nt`. Rows of a recording are alike: the
+spread of these errors is that between recordings, not between rows.
 
 ## To repeat it
 
-magtwin {facts["magtwin"]}, torch {facts["torch"]}, with --threads {facts["threads"]}, and as `F.toml` in
+magtwin {facts["magtwin"]}{torch_with}, and as `F.toml` in
 `magtwin train {_plain(str(facts["dataset"]))} --config F.toml --out {name}`:
 
 ```toml
 {str(facts["config"]).rstrip()}
 ```
 """
+
+    def _spread(self) -> str:
+        """How wide its intervals are and why, for the card."""
+        if self.net.kind == "mlp":
+            return (
+                "Intervals above are those of the RMSE on validation; in the file the standard deviation of "
+                "every prediction, the `b_sd_nt` of a Run, is the RMSE of the test."
+            )
+        return (
+            "The standard deviation of a prediction is its own, row by row, and the `b_sd_nt` of a Run; it "
+            "was scaled so that intervals of 90 % hold 90 % on recordings left out, none of them the test's."
+        )
 
 
 def fit(
@@ -182,7 +243,7 @@ def fit(
     progress: Callable[[Epoch], None] | None = None,
     advance: Callable[[int, int], None] | None = None,
 ) -> Trained:
-    """Train a network on a part of a data set, stop by another, judge by the third.
+    """Train a model on a part of a data set, stop and calibrate by another, judge by the third.
 
     Args:
         config: What to do.
@@ -196,66 +257,61 @@ def fit(
 
     Raises:
         RefusedError: A part without rows, a data set without a column that a feature is made of, or what
-            `train` refuses.
+            the fit of the model refuses.
     """
-    for part in PARTS:
-        if not split.names(part):
-            raise RefusedError(f"no recording is in {part}; record more, or hold out fewer")
-    init = None if config.init is None else load_net(config.init)
-    of = {part: dataset.rows(config.inputs, split=split, part=part) for part in PARTS}
-    learned, stops = of["train"], of["validation"]
+    of = material(dataset, split, config.inputs)
+    init = None if config.init is None else load_predictor(config.init)
+    device = device_of(config)
+    going = {"checkpoint": checkpoint, "resume": resume, "progress": progress, "advance": advance}
     before = torch.get_num_threads()
     if config.threads is not None:
         torch.set_num_threads(config.threads)
     try:
-        net, history = train(
-            learned.x,
-            learned.y,
-            stops.x,
-            stops.y,
-            rng=rng,
-            features=config.inputs,
-            layers=config.hidden,
-            dropout=config.dropout,
-            epochs=config.epochs,
-            batch=config.batch,
-            lr=config.lr,
-            patience=config.patience,
-            facts=_facts(config, dataset, split, len(learned.y)),
-            init=init,
-            freeze=config.freeze,
-            checkpoint=checkpoint,
-            resume=resume,
-            progress=progress,
-            advance=advance,
-        )
+        made = make(config, of, init, going, rng)
     finally:
         torch.set_num_threads(before)
-    mean = float(learned.y.mean())
-    models = [NeuralMagnetometer(one) for one in (net, init) if one is not None]
-    parts = tuple(_judged(part, of[part], models, mean)[0] for part in PARTS[1:])
+    net, learned = made.model, of.rows["train"]
+    mean, sd = float(learned.y.mean()), float(learned.y.std())
+    models = [net] if init is None else [net, init]
+    parts = tuple(_judged(of, part, models, mean)[0] for part in PARTS[1:])
     path_of = {one.name: one.path for one in dataset.recordings}
-    _, *paths = _judged("test", of["test"], models, mean, [path_of[name] for name in of["test"].names])
+    _, *paths = _judged(of, "test", models, mean, [path_of[name] for name in of.rows["test"].names])
     net.residual_sd_nt = parts[-1].rmse_nt
-    kept = next(epoch for epoch in reversed(history) if epoch.best)
-    net.facts |= {"epochs_run": history[-1].number, "epoch_kept": kept.number}
+    net.facts.update(_facts(config, dataset, split, len(learned.y), device))
+    net.facts.update(label_mean_nt=mean, label_sd_nt=sd)
+    if made.history:
+        kept = next(epoch for epoch in reversed(made.history) if epoch.best)
+        net.facts.update(epochs_run=made.history[-1].number, epoch_kept=kept.number)
+    if made.choice:
+        net.facts.update(
+            network="kept" if made.choice.kept else "left out",
+            base_validation_mae_nt=made.choice.base_mae_nt,
+            whole_validation_mae_nt=made.choice.whole_mae_nt,
+        )
     for one in parts:
-        net.facts |= {f"{one.name}_mae_nt": one.mae_nt, f"{one.name}_naive_mae_nt": one.naive_mae_nt}
-    sd = float(learned.y.std())
-    return Trained(net, config, history, split, parts, tuple(paths), mean, sd, len(learned.y))
+        told = {"mae_nt": one.mae_nt, "naive_mae_nt": one.naive_mae_nt, "ridge_mae_nt": one.ridge_mae_nt}
+        net.facts.update({f"{one.name}_{key}": value for key, value in told.items()})
+        if math.isfinite(one.coverage):
+            net.facts[f"{one.name}_coverage_90"] = one.coverage
+    return Trained(
+        net, config, made.history, made.choice, split, parts, tuple(paths), mean, sd, len(learned.y)
+    )
 
 
 def _judged(
-    name: str, rows: Rows, models: Sequence[NeuralMagnetometer], mean: float, paths: Sequence[str] = ()
+    of: Material, part: Part, models: Sequence[Predictor], mean: float, paths: Sequence[str] = ()
 ) -> list[Judged]:
-    """Errors on all rows, and on those of each path: `paths` of the recordings of `rows`."""
+    """Errors on all rows of a part, and on those of each path: `paths` of its recordings."""
+    rows = of.rows[part]
     naive = mean - rows.y
-    errors = [model.predict(rows.x) - rows.y for model in models]
-    masks = {name: np.ones(len(rows.y), bool)}
+    ridge = of.ridge_of(part)[0] - rows.y
+    told = [of.told(model, part) for model in models]
+    errors = [found - rows.y for found, _ in told]
+    masks = {str(part): np.ones(len(rows.y), bool)}
     for path in dict.fromkeys(paths):
         on_it = np.array([one == path for one in paths])[rows.recording]
         if on_it.any():
-            masks[f"{name}, path {path}"] = on_it
+            masks[f"{part}, path {path}"] = on_it
     return [
         Judged(
             what,
@@ -265,13 +321,16 @@ def _judged(
             _rmse(errors[0][mask]),
             _mae(naive[mask]),
             _rmse(naive[mask]),
+            _mae(ridge[mask]),
+            _rmse(ridge[mask]),
+            coverage(errors[0][mask], told[0][1][mask]),
             _mae(errors[1][mask]) if len(errors) > 1 else math.nan,
         )
         for what, mask in masks.items()
     ]
 
 
-def _facts(config: TrainConfig, dataset: Dataset, split: Split, rows: int) -> dict[str, Fact]:
+def _facts(config: TrainConfig, dataset: Dataset, split: Split, rows: int, device: str) -> dict[str, Fact]:
     """What repeats a training, for the weights file."""
     lever = dataset.alignment
     told = config if config.init is None else replace(config, init=Path(config.init.name))
@@ -287,10 +346,11 @@ def _facts(config: TrainConfig, dataset: Dataset, split: Split, rows: int) -> di
         "seed": config.seed,
         "split": split.by,
         "training_rows": rows,
-        "threads": config.threads or torch.get_num_threads(),
-        "torch": str(torch.__version__),
         "magtwin": __version__,
     }
+    if config.kind != "linear":
+        threads = config.threads or torch.get_num_threads()
+        facts |= {"threads": threads, "torch": str(torch.__version__), "device": device}
     if config.init is not None:
         facts |= {"init": config.init.name, "init_sha256": sha256(config.init)}
     return facts
