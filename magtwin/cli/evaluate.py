@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -12,8 +12,11 @@ from magtwin.cli.terminal import Force, Json, Seed, progress, say
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
+    from magtwin.io.pages import Section
     from magtwin.learn.dataset import Dataset
     from magtwin.learn.evaluate import Chart, Contender, Evaluation, Trial
+    from magtwin.run import Run
+    from magtwin.spec import Scene
 
 Flag = Annotated[bool, Parameter(negative="")]
 Files = Annotated[list[Path] | None, Parameter(negative="", consume_multiple=True)]
@@ -63,7 +66,8 @@ def evaluate(
     case
         Rows of the table by the path that they are of, as D=lawnmower.csv, beside the paper's A to E.
     scene
-        Stage of the twin that made the recordings.
+        Stage of the twin that made the recordings, training's too: adds an error budget, how much of the
+        error is map, lever arm, latency, sessions, platform and sensor. Needs train.
     any_map
         Take the first map for weights whose own is not at hand.
     truth
@@ -101,8 +105,14 @@ def evaluate(
             truth=truth,
             progress=advance,
         )
+    sections, data = [], {}
+    if scene is not None and train is not None:
+        with progress("Budgets") as advance:
+            section, told = _budget(found, scene, *learned[0], advance)
+        sections.append(section)
+        data["budget"] = told
     curves = {name: read_curve(path) for path, name in zip(weights, names, strict=True)}
-    page = page_of_evaluation(found, curves=curves)
+    page = page_of_evaluation(found, curves=curves, more=sections, data=data)
     write_evaluation(page, out, force=force)
     if json:
         from magtwin.io.pages import to_json
@@ -178,6 +188,38 @@ def _baselines(charts: "Sequence[Chart]", dataset: "Dataset", names: Sequence[st
         for chart in charts
         for gradient in (False, True)
     ]
+
+
+def _budget(
+    found: "Evaluation", scene: Path, train: "Dataset", names: Sequence[str], advance: Any
+) -> "tuple[Section, dict[str, Any]]":
+    """The error budget of a twin, as a section and in figures."""
+    from magtwin.io.budgets import section_of_budget
+    from magtwin.learn.budget import Truth, budgets, steps, true_errors
+    from magtwin.twin import Twin, check_figures, on_its_day, open_twin
+
+    twins: dict[Any, Twin] = {}
+
+    def opened(kind: Any) -> Twin:
+        if kind not in twins:
+            twins[kind] = open_twin(scene, magnetometer=kind)
+        return twins[kind]
+
+    def day_of(name: str, run: "Run") -> "Scene":
+        day = on_its_day(opened(run.facts.get("magnetometer")), run.facts).scene
+        check_figures(day, run.facts, name)
+        return day
+
+    truth = Truth(opened("physical").scene, day_of)
+    order = steps(found)
+    made = budgets(found, order, truth, train, names, progress=advance)
+    missed = true_errors(found, truth)
+    told = {
+        "models": [one.summary() for one in made],
+        "maps": {one.chart: {k: v for k, v in vars(one).items() if k != "chart"} for one in missed},
+        "steps": [found.names[m] for m in order],
+    }
+    return section_of_budget(found, made, missed, order), told
 
 
 def _cases(given: Sequence[str] | None) -> dict[str, str]:

@@ -74,9 +74,9 @@ def page_of_evaluation(
     sections = [
         Section("Table 1", _lead_of_table(found), (), (_table(found), _intervals(found))),
         Section("Models and maps", "", (), (_models(found), _maps(found), _left_out(found))),
-        Section("Inputs and the disturbance", "", _pictured([_ranks(found)])),
-        Section("A run", "", _pictured([_band(found), _floor_plan(found)])),
-        Section("Errors by path", "", _pictured([_bars(found), _curves(found, curves or {})])),
+        Section("Inputs and the disturbance", "", pictured([_ranks(found)])),
+        Section("A run", "", pictured([_band(found), _floor_plan(found)])),
+        Section("Errors by path", "", pictured([_bars(found), _curves(found, curves or {})])),
         *more,
     ]
     kept = tuple(one for one in sections if one.tables or one.pictures)
@@ -139,7 +139,8 @@ class Drawing:
     tall: bool = False
 
 
-def _pictured(drawings: Sequence[Drawing | None]) -> tuple[Picture, ...]:
+def pictured(drawings: Sequence[Drawing | None]) -> tuple[Picture, ...]:
+    """Figures as pictures of a page, without those that there was nothing to draw of."""
     made = []
     for one in drawings:
         if one is None:
@@ -285,7 +286,7 @@ def _every(one: Judged, rate_hz: float) -> int:
     return max(1, round(1 / (step * rate_hz)))
 
 
-def _weights(found: Evaluation) -> list[int]:
+def of_weights(found: Evaluation) -> list[int]:
     """The models that came from weights files, or all but the naive one where none did."""
     own = [i for i, one in enumerate(found.contenders) if "sha256" in one.facts]
     return (own or list(range(1, len(found.contenders))) or [0])[:MOST_PANELS]
@@ -293,14 +294,14 @@ def _weights(found: Evaluation) -> list[int]:
 
 def _middle(found: Evaluation) -> Judged:
     """The recording in which the last of the models errs as much as in most."""
-    last = _weights(found)[-1]
+    last = of_weights(found)[-1]
     size = [float(np.mean(np.abs(one.errors().error_nt[last]))) for one in found.judged]
     return found.judged[int(np.argsort(size, kind="stable")[(len(size) - 1) // 2])]
 
 
 def _band(found: Evaluation) -> Drawing:
     """The paper's Figure 5: what was measured, the map alone, and each model; below, errors in its band."""
-    one, shown = _middle(found), _weights(found)
+    one, shown = _middle(found), of_weights(found)
     t = one.run["t"] - one.run["t"][0]
     seen = t <= SHOWN_S
     t, kept = t[seen], one.kept[seen]
@@ -315,13 +316,13 @@ def _band(found: Evaluation) -> Drawing:
         half = HALF_WIDTH * one.sd_nt[m, seen]
         _line(field_ax, t, measured / 1000, color=INK, lw=1.8, label="measured")
         _line(field_ax, t, alone / 1000, color="0.55", lw=1.0, label="map alone")
-        _line(field_ax, t, total / 1000, color=_ink(m), lw=1.0, label="map and model")
+        _line(field_ax, t, total / 1000, color=ink(m), lw=1.0, label="map and model")
         error = total - measured
         if np.isfinite(half).any():
-            band = {"color": _ink(m), "alpha": 0.18, "lw": 0, "label": f"its {COVERED:.0%} interval"}
+            band = {"color": ink(m), "alpha": 0.18, "lw": 0, "label": f"its {COVERED:.0%} interval"}
             error_ax.fill_between(t[rows], -half[rows], half[rows], **band)
         _line(error_ax, t, alone - measured, color="0.55", lw=0.8)
-        _line(error_ax, t, error, color=_ink(m), lw=0.9)
+        _line(error_ax, t, error, color=ink(m), lw=0.9)
         error_ax.axhline(0, color=INK, lw=0.6)
         mae = np.nanmean(np.abs(error)) if np.isfinite(error).any() else np.nan
         field_ax.set_title(f"{found.names[m]}: MAE {mae:.0f} nT in what is shown", fontsize=9, loc="left")
@@ -343,7 +344,7 @@ def _floor_plan(found: Evaluation) -> Drawing | None:
 
     cases = list(dict.fromkeys(one.case for one in found.judged))[:MOST_PANELS]
     shown = [next(one for one in found.judged if one.case == case) for case in cases]
-    last = _weights(found)[-1]
+    last = of_weights(found)[-1]
     chart = found.contenders[last].chart.field
     known = np.where(chart.valid.all(axis=0), chart.values_nt.mean(axis=0), np.nan) / 1000
     x0, x1, y0, y1 = chart.extent
@@ -403,7 +404,7 @@ def _bars(found: Evaluation) -> Drawing:
         at = np.arange(len(cases)) + (m - (count - 1) / 2) * width
         mae = np.array([case.scores[m].mae_nt for case in cases])
         low, high = np.array([case.scores[m].mae_interval_nt for case in cases]).T
-        ax.bar(at, mae, 0.92 * width, color=_ink(m), label=name)
+        ax.bar(at, mae, 0.92 * width, color=ink(m), label=name)
         spread = np.nan_to_num(np.stack([mae - low, high - mae]).clip(0))
         ax.errorbar(at, mae, yerr=spread, fmt="none", ecolor=INK, elinewidth=0.8, capsize=1.5)
     ax.set_xticks(np.arange(len(cases)), [case.name for case in cases], fontsize=9)
@@ -432,7 +433,7 @@ def _curves(found: Evaluation, curves: Mapping[str, Sequence[Mapping[str, float]
             if points:
                 mark = "." if len(points) < 40 else ""
                 label = f"{found.names[m]}, {what}"
-                ax.plot(*zip(*points, strict=True), ls=style, marker=mark, color=_ink(m), label=label)
+                ax.plot(*zip(*points, strict=True), ls=style, marker=mark, color=ink(m), label=label)
     ax.set_ylim(bottom=0)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("epoch", fontsize=9)
@@ -444,7 +445,8 @@ def _curves(found: Evaluation, curves: Mapping[str, Sequence[Mapping[str, float]
     return Drawing("figure_6c", title, title, figure)
 
 
-def _ink(m: int) -> str:
+def ink(m: int) -> str:
+    """Colour of a model by its number."""
     return INKS[m % len(INKS)]
 
 

@@ -573,9 +573,18 @@ def training_rows(
     return rows
 
 
-def aligned_runs(dataset: Dataset, names: Sequence[str] | None, chart: Chart) -> Iterator[tuple[str, Run]]:
-    """Training recordings, thinned and labelled on a map, with their names."""
-    alignment = _alignment(dataset, chart)
+def aligned_runs(
+    dataset: Dataset, names: Sequence[str] | None, chart: Chart, alignment: Alignment | None = None
+) -> Iterator[tuple[str, Run]]:
+    """Training recordings, thinned and labelled on a map, with their names.
+
+    Args:
+        dataset: The recordings.
+        names: Which of them; all unless given.
+        chart: The map.
+        alignment: Lever arm and latency; the data set's own where it was labelled on this map, else none.
+    """
+    alignment = alignment or _alignment(dataset, chart)
     for one, run in dataset.runs(names):
         try:
             yield one.name, labelled(thinned(run, TRAINED_AT_HZ), chart.field, alignment)

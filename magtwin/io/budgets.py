@@ -1,0 +1,117 @@
+"""Budgets: what makes a model's error on a twin, as a section of an evaluation's report."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from magtwin.io.evaluations import MOST_PANELS, Drawing, ink, of_weights, pictured
+from magtwin.io.pages import Section, Table
+from magtwin.io.plots import INK, new_figure
+from magtwin.learn.budget import CLOSED, TERMS, Budget, TrueError
+from magtwin.learn.evaluate import Evaluation
+
+SAVED, LOST = "#40916c", "#c92a2a"
+"""Colours of what a step takes from an error, and of what it adds to it."""
+
+
+def section_of_budget(
+    found: Evaluation, made: Sequence[Budget], missed: Sequence[TrueError], order: Sequence[int]
+) -> Section:
+    """The error budget of a twin, for `page_of_evaluation`.
+
+    Args:
+        found: The evaluation.
+        made: Budgets of some of its models.
+        missed: What its maps miss.
+        order: Its models, step by step from the paper's configuration on.
+    """
+    lead = (
+        "On a twin every error has an address. To close a term is to take away its part of the error: what "
+        "is left of it beside what the model has learned of it in training. In turn: with those to its left "
+        "closed too. Sessions: the robot is neither as it was when the map was surveyed nor as on the mean day "
+        "of training. Platform: what moving, motors, LiDAR and battery add, and what the model makes of them."
+    )
+    drawings = [_waterfall(found, made), _ladder(found, order)]
+    tables = (_budget_table(made), _rms_table(made), _true_table(missed))
+    return Section("Error budget", lead, pictured(drawings), tables)
+
+
+def _budget_table(made: Sequence[Budget]) -> Table:
+    rows = []
+    for one in made:
+        rows.append((one.name, "MAE closed in turn", one.mae_nt, *(term.after_nt for term in one.terms)))
+        ratios = (term.after_nt / one.naive_mae_nt for term in one.terms)
+        rows.append((one.name, "by naive MAE", one.mae_nt / one.naive_mae_nt, *ratios))
+        rows.append((one.name, "bought", "", *one.bought))
+        rows.append((one.name, "MAE closed alone", "", *(term.alone_nt for term in one.terms)))
+    note = "[nT]. Closed: " + "; ".join(f"{term}, {what}" for term, what in CLOSED.items()) + "."
+    return Table("Closing each term", ("model", "", "as it is", *TERMS), tuple(rows), note)
+
+
+def _rms_table(made: Sequence[Budget]) -> Table:
+    rows = tuple((one.name, *(term.rms_nt for term in one.terms)) for one in made)
+    note = (
+        "Root mean square of each part of the error [nT]; the parts themselves add up to it at each reading."
+    )
+    return Table("How large each part is", ("model", *TERMS), rows, note)
+
+
+def _true_table(missed: Sequence[TrueError]) -> Table:
+    rows = tuple((one.chart, one.mae_nt, one.rms_nt, one.bias_nt) for one in missed)
+    note = "Map less the exact field of the robot that surveyed, at rest, where the robot was seen."
+    return Table("What the maps miss", ("map", "MAE [nT]", "RMS [nT]", "mean [nT]"), rows, note)
+
+
+def _waterfall(found: Evaluation, made: Sequence[Budget]) -> Drawing:
+    """Each model's error, and what closing one term after the other takes from it."""
+    shown = [one for one in made if found.names.index(one.name) in (0, *of_weights(found))][:MOST_PANELS]
+    shown = shown or list(made[:MOST_PANELS])
+    figure = new_figure(7.4, 0.5 + 2.0 * len(shown))
+    axes = figure.subplots(len(shown), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    most = max(one.mae_nt for one in shown)
+    for ax, one in zip(axes, shown, strict=True):
+        colour = ink(found.names.index(one.name))
+        before = [one.mae_nt, *(term.after_nt for term in one.terms)]
+        ax.bar(0, one.mae_nt, 0.7, color=colour)
+        ax.text(0, one.mae_nt + 0.02 * most, f"{one.mae_nt:.0f}", ha="center", va="bottom", fontsize=8)
+        for k, bought in enumerate(one.bought, start=1):
+            now, then = before[k], before[k - 1]
+            ax.bar(k, abs(bought), 0.7, bottom=min(now, then), color=SAVED if bought >= 0 else LOST)
+            ax.plot([k - 1.35, k + 0.35], [then, then], color="0.6", lw=0.7)
+            ax.text(k, max(now, then) + 0.02 * most, f"{-bought:+.0f}", ha="center", va="bottom", fontsize=8)
+        ax.set_title(f"{one.name}: {one.mae_nt / one.naive_mae_nt:.3f} of naive", fontsize=9, loc="left")
+        ax.set_ylabel("MAE [nT]", fontsize=9)
+        ax.set_ylim(0, 1.18 * most)
+        ax.tick_params(labelsize=8)
+        for side in ("top", "right"):
+            ax.spines[side].set_visible(False)
+    axes[-1].set_xticks(range(len(TERMS) + 1), ["as it is", *TERMS], fontsize=9)
+    title = "Error budget: what closing each term, one after the other, takes from the mean absolute error"
+    return Drawing("budget", title, title, figure, tall=True)
+
+
+def _ladder(found: Evaluation, order: Sequence[int]) -> Drawing:
+    """Errors of all models, step by step from the paper's configuration on."""
+    scores = found.every.scores
+    figure = new_figure(6.4, 1.0 + 0.36 * len(order))
+    ax = figure.subplots()
+    for k, m in enumerate(order):
+        low, high = scores[m].mae_interval_nt
+        mae = scores[m].mae_nt
+        ax.barh(k, mae, 0.66, color=ink(m))
+        if np.isfinite(low + high):
+            spread = [[max(mae - low, 0.0)], [max(high - mae, 0.0)]]
+            ax.errorbar(mae, k, xerr=spread, fmt="none", ecolor=INK, elinewidth=0.8, capsize=2)
+        step = "" if not k else f", {mae - scores[order[k - 1]].mae_nt:+.0f}"
+        words = f"{mae:.0f} nT ({scores[m].ratio:.3f}{step})"
+        at = high if np.isfinite(high) else mae
+        ax.text(max(at, mae), k, f"  {words}", va="center", fontsize=8)
+    ax.set_yticks(range(len(order)), [found.names[m] for m in order], fontsize=8)
+    ax.invert_yaxis()
+    ax.set_xlim(0, 1.45 * max(max(scores[m].mae_interval_nt[1], scores[m].mae_nt) for m in order))
+    ax.set_xlabel("mean absolute error [nT]", fontsize=9)
+    ax.tick_params(axis="x", labelsize=8)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    title = "Steps: each model's error (ratio to naive, change from the line above)"
+    return Drawing("steps", title, title, figure)
