@@ -93,7 +93,7 @@ def evaluate(
         for path, name in zip(weights, names, strict=True)
     ]
     trials, learned = _trials(runs, dataset, train, own)
-    baselines = [] if train is None else _baselines(charts, *learned[0])
+    baselines = [] if train is None else _baselines(charts, own, *learned[0])
     first = room.naive(charts[0], dataset=learned[0][0], names=learned[0][1]) if learned else None
     first = first or room.naive(charts[0], weights=own)
     with progress("Judging") as advance:
@@ -179,15 +179,24 @@ def _trials(
     return trials_of(judged, names), learned
 
 
-def _baselines(charts: "Sequence[Chart]", dataset: "Dataset", names: Sequence[str]) -> "list[Contender]":
-    """Tolles and Lawson's on each map, without and with the map's gradient."""
+def _baselines(
+    charts: "Sequence[Chart]", own: "Sequence[Contender]", dataset: "Dataset", names: Sequence[str]
+) -> "list[Contender]":
+    """Tolles and Lawson's on each map: as it stands, with the weights' lever arm and latency, and with terms
+    of the map's gradient.
+    """
     from magtwin.learn.evaluate import tolles_lawson
+    from magtwin.learn.labels import Alignment
 
-    return [
-        tolles_lawson(chart, dataset, names, gradient=gradient)
-        for chart in charts
-        for gradient in (False, True)
-    ]
+    found = []
+    for chart in charts:
+        fitted = [one.alignment for one in own if one.chart is chart and one.alignment != Alignment()]
+        found.append(tolles_lawson(chart, dataset, names))
+        if fitted and found[-1].alignment == Alignment():
+            found.append(tolles_lawson(chart, dataset, names, alignment=fitted[0]))
+        aligned = found[-1].alignment if found[-1].alignment in fitted else None
+        found.append(tolles_lawson(chart, dataset, names, gradient=True, alignment=aligned))
+    return found
 
 
 def _budget(

@@ -28,8 +28,8 @@ def section_of_budget(
     lead = (
         "On a twin every error has an address. To close a term is to take away its part of the error: what "
         "is left of it beside what the model has learned of it in training. In turn: with those to its left "
-        "closed too. Sessions: the robot is neither as it was when the map was surveyed nor as on the mean day "
-        "of training. Platform: what moving, motors, LiDAR and battery add, and what the model makes of them."
+        "closed too. Sessions: the robot is neither as it was when the map was surveyed nor as on the mean "
+        "day of training. Platform: what moving, motors, LiDAR and battery add, and what the model makes of them."
     )
     drawings = [_waterfall(found, made), _ladder(found, order)]
     tables = (_budget_table(made), _rms_table(made), _true_table(missed))
@@ -39,11 +39,11 @@ def section_of_budget(
 def _budget_table(made: Sequence[Budget]) -> Table:
     rows = []
     for one in made:
-        rows.append((one.name, "MAE closed in turn", one.mae_nt, *(term.after_nt for term in one.terms)))
-        ratios = (term.after_nt / one.naive_mae_nt for term in one.terms)
-        rows.append((one.name, "by naive MAE", one.mae_nt / one.naive_mae_nt, *ratios))
-        rows.append((one.name, "bought", "", *one.bought))
-        rows.append((one.name, "MAE closed alone", "", *(term.alone_nt for term in one.terms)))
+        turn = [one.mae_nt, *(term.after_nt for term in one.terms)]
+        rows.append((one.name, "MAE closed in turn", *(round(nt, 1) for nt in turn)))
+        rows.append((one.name, "by naive MAE", *(round(nt / one.naive_mae_nt, 3) for nt in turn)))
+        rows.append((one.name, "bought", "", *(round(nt, 1) for nt in one.bought)))
+        rows.append((one.name, "MAE closed alone", "", *(round(term.alone_nt, 1) for term in one.terms)))
     note = "[nT]. Closed: " + "; ".join(f"{term}, {what}" for term, what in CLOSED.items()) + "."
     return Table("Closing each term", ("model", "", "as it is", *TERMS), tuple(rows), note)
 
@@ -105,7 +105,8 @@ def _ladder(found: Evaluation, order: Sequence[int]) -> Drawing:
         step = "" if not k else f", {mae - scores[order[k - 1]].mae_nt:+.0f}"
         words = f"{mae:.0f} nT ({scores[m].ratio:.3f}{step})"
         at = high if np.isfinite(high) else mae
-        ax.text(max(at, mae), k, f"  {words}", va="center", fontsize=8)
+        place = {"xytext": (6, 0), "textcoords": "offset points", "va": "center", "fontsize": 8}
+        ax.annotate(words, (max(at, mae), k), **place)
     ax.set_yticks(range(len(order)), [found.names[m] for m in order], fontsize=8)
     ax.invert_yaxis()
     ax.set_xlim(0, 1.45 * max(max(scores[m].mae_interval_nt[1], scores[m].mae_nt) for m in order))

@@ -337,7 +337,8 @@ def steps(found: Evaluation) -> list[int]:
         chart = found.charts.index(one.chart)
         own = "sha256" in one.facts
         gradient = bool(set(one.model.features) & set(GRADIENT))
-        return (chart, int(own) if chart else int(not own), int(gradient), m)
+        aligned = one.alignment != Alignment()
+        return (chart, int(own) if chart else int(not own), int(gradient), int(aligned), m)
 
     return [0, *sorted(range(1, len(found.contenders)), key=rank)]
 

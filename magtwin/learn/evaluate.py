@@ -521,7 +521,12 @@ def naive(
 
 
 def tolles_lawson(
-    chart: Chart, dataset: Dataset, names: Sequence[str] | None = None, *, gradient: bool = False
+    chart: Chart,
+    dataset: Dataset,
+    names: Sequence[str] | None = None,
+    *,
+    gradient: bool = False,
+    alignment: Alignment | None = None,
 ) -> Contender:
     """A ridge in Tolles and Lawson's manner on a map: heading, motion, currents; and the map's gradient.
 
@@ -530,18 +535,22 @@ def tolles_lawson(
         dataset: Training recordings, which are labelled on it.
         names: Which of them; all unless given.
         gradient: Whether the terms of a lever arm and a latency are among the inputs.
+        alignment: Lever arm and latency; the data set's own where it was labelled on this map, else none.
 
     Raises:
         RefusedError: A recording has no label on the map.
     """
+    given = alignment is not None
+    alignment = alignment or _alignment(dataset, chart)
     wanted = (*CIRCULAR, *GRADIENT, *CARRIED) if gradient else CIRCULAR
     able = set(dataset.columns) | {"yaw", "b_map_gradient_nt_m"}
     inputs = tuple(name for name in wanted if set(FEATURES[name].columns) <= able)
-    rows = training_rows(dataset, names, chart, inputs)
+    rows = training_rows(dataset, names, chart, inputs, alignment)
     model = fit_ridge(rows.x, rows.y, rows.recording, inputs)
     what = "Tolles-Lawson and gradient" if gradient else "Tolles-Lawson"
     told = {"fitted to": dataset.folder.name, "penalty": model.penalty, "training rows": len(rows.y)}
-    return Contender(f"{what}, {chart.name}", model, chart, _alignment(dataset, chart), told)
+    name = f"{what}, {chart.name}{' aligned' * given}"
+    return Contender(name, model, chart, alignment, told)
 
 
 @dataclass(frozen=True, eq=False)
@@ -554,14 +563,18 @@ class TrainingRows:
 
 
 def training_rows(
-    dataset: Dataset, names: Sequence[str] | None, chart: Chart, inputs: Sequence[str]
+    dataset: Dataset,
+    names: Sequence[str] | None,
+    chart: Chart,
+    inputs: Sequence[str],
+    alignment: Alignment | None = None,
 ) -> TrainingRows:
     """Inputs (N, F) and labels (N,) of training recordings on a map, at most `TRAINED_AT_HZ` rows a second.
 
-    The alignment is the data set's own where it was labelled on this map, else none.
+    The arguments are those of `aligned_runs`.
     """
     xs, ys, recording = [], [], []
-    for k, (_, run) in enumerate(aligned_runs(dataset, names, chart)):
+    for k, (_, run) in enumerate(aligned_runs(dataset, names, chart, alignment)):
         x, y = features(run, inputs), run["label_nt"]
         known = np.isfinite(y) & np.isfinite(x).all(axis=1)
         xs.append(x[known])
