@@ -81,6 +81,7 @@ class Ensemble:
 
     kind = "ensemble"
     context = 0
+    step_s = 0.0
 
     @property
     def features(self) -> tuple[str, ...]:

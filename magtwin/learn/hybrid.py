@@ -37,6 +37,7 @@ class Hybrid:
 
     kind = "hybrid"
     context = 0
+    step_s = 0.0
 
     @property
     def features(self) -> tuple[str, ...]:

@@ -58,6 +58,7 @@ class Linear:
 
     kind = "linear"
     context = 0
+    step_s = 0.0
 
     @property
     def features(self) -> tuple[str, ...]:

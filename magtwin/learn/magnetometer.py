@@ -16,6 +16,9 @@ from magtwin.run import Run
 
 Array = NDArray[np.float64]
 
+STEPS_ALIKE = 0.1
+"""By what share times between rows may differ, for a network that looks back over them."""
+
 
 @dataclass(frozen=True)
 class Read:
@@ -108,17 +111,37 @@ class NeuralMagnetometer:
             outside: Whether `Read.outside` is wanted.
 
         Raises:
-            RefusedError: A run lacks a column that the network reads.
+            RefusedError: A run lacks a column that the network reads, or has its rows at another rate than
+                those that a network which looks back was trained on.
         """
         parts = [features(run, self.features) for run in runs]
         if self.net.context:
-            told = [(*self.net.predict(x), self.net.outside(x) if outside else None) for x in parts]
-            return [Read(*one) for one in told]
+            told = [self._looking_back(run, x) for run, x in zip(runs, parts, strict=True)]
+            left = [self.net.outside(x) if outside else None for x in parts]
+            return [Read(*one, which) for one, which in zip(told, left, strict=True)]
         x = parts[0] if len(parts) == 1 else np.concatenate(parts)
         ends = np.cumsum([run.rows for run in runs])[:-1]
         mean, sd = (np.split(values, ends) for values in self.net.predict(x))
-        left = np.split(self.net.outside(x), ends) if outside else [None] * len(runs)
-        return [Read(*one) for one in zip(mean, sd, left, strict=True)]
+        flags = np.split(self.net.outside(x), ends) if outside else [None] * len(runs)
+        return [Read(*one) for one in zip(mean, sd, flags, strict=True)]
+
+    def _looking_back(self, run: Run, x: Array) -> tuple[Array, Array]:
+        """As `predict_with_sd`, of a run whose rows may lie closer than those that were trained on.
+
+        Of rows k times as close each k-th is a run of its own, so that a look back is as long as it was.
+        """
+        step = float(np.median(np.diff(run["t"]))) if run.rows > 1 else self.net.step_s
+        every = round(self.net.step_s / step) if step > 0 else 0
+        if every < 1 or abs(every * step / self.net.step_s - 1) > STEPS_ALIKE:
+            raise RefusedError(
+                f"{self.name or 'the network'}: looks back over rows {self.net.step_s:g} s apart, the "
+                f"run has them {step:g} s apart; take a rate of {1 / self.net.step_s:g} Hz, or a whole "
+                "number of times that"
+            )
+        mean, sd = np.empty(run.rows), np.empty(run.rows)
+        for first in range(every):
+            mean[first::every], sd[first::every] = self.net.predict(x[first::every])
+        return mean, sd
 
     def outside_training(self, run: Run) -> NDArray[np.bool_]:
         """Whether an input of a reading left the range of the training rows, shape (N,)."""

@@ -13,14 +13,12 @@ from magtwin.learn.dataset import Dataset
 from magtwin.learn.features import CIRCULAR, FEATURES, features
 from magtwin.learn.inputs import Array
 from magtwin.learn.linear import Fitted, fit_linear
+from magtwin.learn.magnetometer import STEPS_ALIKE
 from magtwin.learn.predictor import Predictor
 from magtwin.learn.recording import Recording, Rows
 from magtwin.learn.split import PARTS, Part, Split
 from magtwin.learn.temporal import Track
 from magtwin.names import RefusedError
-
-STEPS_ALIKE = 0.1
-"""How much the times between rows of recordings may differ, as a share, for a network that looks back."""
 
 
 @dataclass(frozen=True)

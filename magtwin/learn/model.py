@@ -41,6 +41,7 @@ class FieldNet(torch.nn.Module):
 
     context = 0
     """A row's prediction looks at no earlier one."""
+    step_s = 0.0
 
     x_mean: torch.Tensor
     """Means of the training inputs, in the units of the features, shape (F,), float64."""

@@ -41,6 +41,10 @@ class Predictor(Protocol):
         """How many earlier rows of a run a row's prediction looks at."""
 
     @property
+    def step_s(self) -> float:
+        """Time between the rows that it looks back over [s]; 0 where `context` is 0."""
+
+    @property
     def layers_text(self) -> str:
         """Its shape in words, as 20-512-1."""
 
