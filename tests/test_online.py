@@ -18,7 +18,7 @@ from magtwin.spec import MagnetometerSpec
 from magtwin.twin import Twin, open_twin
 
 SEED = 3
-DURATION_S = 21.0  # the LiDAR is switched on at 40 s; with a mode of "on" it spins throughout
+DURATION_S = 8.0
 
 
 @pytest.fixture(scope="module", params=["physical", "neural"])

@@ -1,14 +1,14 @@
 """The bus: what one node says another hears, over DDS and in rclpy, on this machine only."""
 
-import itertools
 import os
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from nodes import DOMAINS, spin
 
 from magtwin.io.messages import LATCHED, ODOMETRY, SENSOR_DATA, TOPICS, TYPES, Qos
 from magtwin.names import RefusedError
@@ -20,9 +20,6 @@ pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 ROOT = Path(__file__).resolve().parents[1]
 JAZZY = ROOT / "build" / "ros-jazzy" / "bin" / "python"
 FIELD = "sensor_msgs/msg/MagneticField"
-SLOWEST_S = 10.0
-
-_domains = itertools.count(1 + os.getpid() % 100)
 
 
 @pytest.fixture
@@ -30,7 +27,7 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> int:
     """A domain of a test's own, on loopback only."""
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-    return next(_domains)
+    return next(DOMAINS)
 
 
 @pytest.fixture
@@ -40,15 +37,6 @@ def pair(domain: int) -> Iterator[tuple[Bus, Bus]]:
     yield nodes  # type: ignore[misc]
     for node in nodes:
         node.close()
-
-
-def spin(until: Callable[[], object], *nodes: Bus) -> None:
-    """Spin nodes until something holds, or too long."""
-    last = time.monotonic() + SLOWEST_S
-    while not until():
-        assert time.monotonic() < last, "it never came"
-        for node in nodes:
-            node.spin_once(0.005)
 
 
 def test_every_type_of_the_table_crosses_unchanged(pair: tuple[Bus, Bus]) -> None:

@@ -14,6 +14,7 @@ from magtwin.cli import (  # noqa: F401 - each registers its commands
     report,
     rerun_of,
     robot,
+    ros,
     run,
     runs,
     scene,

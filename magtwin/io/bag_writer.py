@@ -93,10 +93,10 @@ def write_bag(
             time does not rise, or a column cannot stand in a bag.
     """
     path = Path(path)
-    storage = _storage(path, storage)
+    storage = storage_of(path, storage)
     check_free(path, force=force)
-    who = _sender(twin, units, run)
-    with output(path, force=force) as aside, _refused(path):
+    who = sender_for(twin, units, run.facts.get("rate_hz"))
+    with output(path, force=force) as aside, refused(path):
         sink = _Sink(aside, storage, who, scans, live=False)
         try:
             for first in range(0, max(run.rows, 1), BLOCK):
@@ -147,7 +147,7 @@ class BagWriter:
     ) -> None:
         self._path, self._twin, self._units, self._force = Path(path), twin, units, force
         self._scans = scans
-        self._storage = _storage(self._path, storage)
+        self._storage = storage_of(self._path, storage)
         _check_units(units)
         check_free(self._path, force=force)
         self.partial = partial_of(self._path)
@@ -167,7 +167,7 @@ class BagWriter:
         Raises:
             RefusedError: As `write_bag`.
         """
-        with _refused(self._path):
+        with refused(self._path):
             if self._sink is None:
                 self._sink = self._open(run)
             self._sink.append(run)
@@ -177,7 +177,7 @@ class BagWriter:
         """End the bag and give it its name; of a bag to which nothing was appended there is none."""
         if self._sink is None:
             return
-        with _refused(self._path):
+        with refused(self._path):
             self._sink.close()
             check_free(self._path, force=self._force)
             with output(self._path, force=self._force) as aside:
@@ -198,7 +198,7 @@ class BagWriter:
             self.abort()
 
     def _open(self, run: Run) -> "_Sink":
-        who = _sender(self._twin, self._units, run)
+        who = sender_for(self._twin, self._units, run.facts.get("rate_hz"))
         if self.partial.is_dir():
             for file in self.partial.iterdir():
                 file.unlink()
@@ -210,7 +210,7 @@ class BagWriter:
         return _Sink(self.partial, self._storage, who, self._scans, live=True)
 
 
-def _storage(path: Path, storage: str | None) -> Storage:
+def storage_of(path: Path, storage: str | None) -> Storage:
     """The storage of a bag that is to be written to a path."""
     if storage is not None and storage not in STORAGES:
         raise RefusedError(f"no storage {storage!r} of bags; {hint(storage, STORAGES)}")
@@ -230,7 +230,7 @@ def _check_units(units: str) -> None:
 
 
 @contextlib.contextmanager
-def _refused(path: Path) -> Iterator[None]:
+def refused(path: Path) -> Iterator[None]:
     """Faults of the disk in a line."""
     try:
         yield
@@ -239,8 +239,8 @@ def _refused(path: Path) -> Iterator[None]:
         raise RefusedError(f"{path}: cannot be written ({reason})") from error
 
 
-def _sender(twin: "Twin | None", units: Unit, run: Run) -> Sender:
-    """What messages tell of the robot."""
+def sender_for(twin: "Twin | None", units: Unit, rate_hz: Any = None) -> Sender:
+    """What messages tell of a twin's robot, whose magnetometer reads at a rate [Hz]."""
     _check_units(units)
     if twin is None:
         return Sender(unit=units)
@@ -259,11 +259,10 @@ def _sender(twin: "Twin | None", units: Unit, run: Run) -> Sender:
             turning[link.joint] = frame
         else:
             fixed.append(frame)
-    rate = run.facts.get("rate_hz")
     return sender_of(
         robot,
         unit=units,
-        rate_hz=float(rate) if isinstance(rate, int | float) and rate > 0 else None,
+        rate_hz=float(rate_hz) if isinstance(rate_hz, int | float) and rate_hz > 0 else None,
         links=tuple(fixed),
         wheels=(turning[joints[0]], turning[joints[1]]) if len(turning) == 2 else None,
         description=read_description(robot.asset),
@@ -299,12 +298,12 @@ class _Sink:
         self._facts: dict[str, str] | None = None
         self._connections: dict[str, Connection] = {}
         self._tally = Tally({})
-        self._stream: _Stream | None = None
+        self._stream: Stream | None = None
 
     def append(self, run: Run) -> None:
         """Write rows, and the scans that arrived by the last of them."""
         if self._stream is None:
-            self._stream = _Stream(run, self._who, self._scans)
+            self._stream = Stream(run, self._who, self._scans)
             self._connect(self._stream.topics)
         facts = {name: json.dumps(value) for name, value in json.loads(facts_to_json(run)).items()}
         if facts != self._facts:
@@ -334,7 +333,7 @@ class _Sink:
         with contextlib.suppress(OSError, sqlite3.Error):
             self._store.abort()
 
-    def _write(self, said: Iterable["_Said"]) -> None:
+    def _write(self, said: Iterable["Said"]) -> None:
         batches = [
             Batch(self._connections[topic.name], t, encode(leaves(form), fields, len(t), room=ROOM))
             for topic, t, form, fields in said
@@ -344,7 +343,7 @@ class _Sink:
 
     def _connect(self, topics: Sequence[Topic]) -> None:
         for topic in topics:
-            definition, digest = _definition(topic.kind)
+            definition, digest = definition_of(topic.kind)
             number = len(self._connections) + 1
             self._connections[topic.name] = Connection(
                 number, topic.name, topic.kind, definition, digest, topic.qos
@@ -370,7 +369,7 @@ class _Sink:
 
 
 @cache
-def _definition(kind: str) -> tuple[str, str]:
+def definition_of(kind: str) -> tuple[str, str]:
     """A type of messages in text, and its hash."""
     from rosbags.typesys import Stores, get_typestore
 
@@ -392,20 +391,38 @@ class _Last:
     """How often they have been sent again since."""
 
 
-_Said = tuple[Topic, Index, str, dict[str, Any]]
+Said = tuple[Topic, Index, str, dict[str, Any]]
 """A topic with the times of some messages [ns], the leaves of their type, and their fields."""
 
 
-class _Stream:
+class Stream:
     """What a robot says as a run goes on; it remembers what it said last."""
 
-    def __init__(self, run: Run, who: Sender, scans: "Scans | None") -> None:
+    def __init__(
+        self,
+        run: Run,
+        who: Sender,
+        scans: "Scans | None",
+        *,
+        topics: Iterable[Topic] = tuple(TOPICS.values()),
+        whole: bool = False,
+    ) -> None:
+        """Begin.
+
+        Args:
+            run: Rows of it, which tell the columns.
+            who: The robot.
+            scans: What its LiDAR will have seen; none says nothing of it.
+            topics: Those that are said, as far as the run has their columns.
+            whole: Whether /magtwin/reading tells every column, and not only those that no other topic does.
+        """
         self._who, self._scans = who, scans
         self._t = -np.inf
         self._last: dict[str, _Last] = {}
         columns = set(run)
-        sent = [t for t in TOPICS.values() if t.needs and columns.issuperset(t.needs)]
-        self._carried = {column: topic for topic in sent for column in topic.carries}
+        sent = [t for t in topics if t.needs and columns.issuperset(t.needs)]
+        carried = {} if whole else {column: topic for topic in sent for column in topic.carries}
+        self._carried: dict[str, Topic] = carried
         self._rest = [name for name in run if name not in self._carried]
         self._columns = {name: (values.dtype, values.shape[1:]) for name, values in run.items()}
         self._table = self._told(run)
@@ -424,7 +441,7 @@ class _Stream:
         self.topics = [*once, *sent, *([] if scans is None else [SCAN]), READING]
         """Topics that there are."""
 
-    def messages(self, run: Run) -> Iterator["_Said"]:
+    def messages(self, run: Run) -> Iterator["Said"]:
         """What is said in the time of some rows."""
         if {name: (values.dtype, values.shape[1:]) for name, values in run.items()} != self._columns:
             raise RefusedError(f"rows of a bag must have the same columns, {', '.join(self._columns)}")
@@ -434,7 +451,7 @@ class _Stream:
         for topic in once:
             first = stamps[:1] if len(stamps) else np.zeros(1, np.int64)
             fields = {"data": self._table} if topic is NAMES else topic.write({}, first, self._who)
-            yield topic, first, _form(topic, fields), fields
+            yield topic, first, form_of(topic, fields), fields
         for topic in self.topics:
             if topic.needs:
                 rows = self._rows(topic, run, t)
@@ -444,18 +461,18 @@ class _Stream:
                     else {name: run[name][rows] for name in self._wanted(topic, run)}
                 )
                 fields = topic.write(chosen, stamps[rows], self._who)
-                yield topic, stamps[rows], _form(topic, fields), fields
+                yield topic, stamps[rows], form_of(topic, fields), fields
         data = np.column_stack([np.asarray(run[name], float) for name in self._rest])
         yield READING, stamps, TYPES[READING.kind], {"data": data}
         if len(t):
             self._t = float(t[-1])
             yield from self._scanned(self._t)
 
-    def last(self) -> Iterator["_Said"]:
+    def last(self) -> Iterator["Said"]:
         """What is said after the last row: scans that were on their way."""
         yield from self._scanned(np.inf)
 
-    def _scanned(self, until_s: float) -> Iterator["_Said"]:
+    def _scanned(self, until_s: float) -> Iterator["Said"]:
         """The scans that arrived by a time and have not been told yet."""
         if self._scans is None:
             return
@@ -532,7 +549,7 @@ class _Stream:
         return json.dumps({"unit": self._who.unit, "columns": columns}, ensure_ascii=False, indent=1)
 
 
-def _form(topic: Topic, fields: Mapping[str, Any]) -> str:
+def form_of(topic: Topic, fields: Mapping[str, Any]) -> str:
     """The leaves of a topic's type."""
     return transforms(fields["count"]) if topic.kind.startswith("tf2_msgs") else TYPES[topic.kind]
 

@@ -8,7 +8,7 @@ A Run holds slower signals causally on the magnetometer's clock, so a message sa
 readings: at the first of them that saw it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal
@@ -58,18 +58,32 @@ TYPES: Mapping[str, str] = MappingProxyType(
         "f4 range_max, f4[] ranges, f4[] intensities",
         "sensor_msgs/msg/JointState": _STAMPED + "text[] name, f8[] position, f8[] velocity, f8[] effort",
         "rosgraph_msgs/msg/Clock": "time clock",
+        "std_msgs/msg/Empty": "u1 structure_needs_at_least_one_member",
         "std_msgs/msg/String": "text data",
         "std_msgs/msg/Float64": "f8 data",
         "std_msgs/msg/Float32": "f4 data",
         "std_msgs/msg/Float64MultiArray": "none layout.dim, u4 layout.data_offset, f8[] data",
     }
 )
-"""Leaves of each type of message, as `magtwin.io.cdr.leaves` reads them; of tf2_msgs `transforms` does."""
+"""Leaves of each type of message, as `magtwin.io.cdr.leaves` reads them; those with parts that have parts of
+their own, tf2_msgs and diagnostic_msgs, are told by `transforms` and `diagnostics`."""
 
 
 def transforms(count: int) -> str:
     """Leaves of a tf2_msgs/msg/TFMessage of `count` transforms, `0.header.stamp` to begin with."""
     return ", ".join(["u4 count", *(_TRANSFORM.format(f"{k}.") for k in range(count))])
+
+
+def diagnostics(values: Sequence[int]) -> str:
+    """Leaves of a diagnostic_msgs/msg/DiagnosticArray of a status for each of `values`, with as many values.
+
+    Status 0 begins with `0.level` (0 OK, 1 WARN, 2 ERROR, 3 STALE), its value 0 is `0.0.key`, `0.0.value`.
+    """
+    form = [_STAMPED + "u4 count"]
+    for k, count in enumerate(values):
+        form.append(f"u1 {k}.level, text {k}.name, text {k}.message, text {k}.hardware_id, u4 {k}.values")
+        form += [f"text {k}.{n}.key, text {k}.{n}.value" for n in range(count)]
+    return ", ".join(form)
 
 
 @dataclass(frozen=True)
@@ -569,6 +583,15 @@ READING = Topic(
     sent="each",
     write=lambda c, stamp, who: {"data": c["data"]},
 )
+
+TOTAL_FIELD = Topic(
+    name="/robot/qtfm/total_field_nt",
+    kind="std_msgs/msg/Float64",
+    needs=("b_measured_nt",),
+    sent="each",
+    write=lambda c, stamp, who: {"data": c["b_measured_nt"]},
+)
+"""The magnitude in nT, whatever the unit of the others; of live robots only, as bags have it in MAGNITUDE."""
 
 TOPICS: Mapping[str, Topic] = MappingProxyType(
     {

@@ -8,6 +8,7 @@ it be asked for parameters: those are rclpy's own doing.
 import os
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
@@ -36,6 +37,9 @@ NS = 10**9
 
 MOST_TAKEN = 256
 """Messages of a topic that are taken at a time."""
+
+CLOCK_DEPTH = 1000
+"""Messages of /clock that may wait, so that each other message is dated by the one before it."""
 
 _COMMON = (
     "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"  # Kilted's is other
@@ -119,7 +123,7 @@ class DdsBus:
         self._offered: dict[str, set[str]] = {}
         self.clock = Clock(sim_time=sim_time)
         if sim_time:
-            self.subscribe(CLOCK.name, CLOCK.kind, self._told, CLOCK.qos)
+            self.subscribe(CLOCK.name, CLOCK.kind, self._told, replace(CLOCK.qos, depth=CLOCK_DEPTH))
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> DdsPublisher:
         """As for `Bus`."""
@@ -190,7 +194,7 @@ class DdsBus:
     def _take(self) -> None:
         """Hand on all messages that have come, in the order in which they were sent."""
         come: list[tuple[int, int, DdsSubscription, bytes]] = []
-        for subscription in self._subscriptions:
+        for subscription in reversed(self._subscriptions):  # /clock, the first one, last: it dates the others
             while taken := subscription.reader.take(N=MOST_TAKEN):
                 for sample in taken:
                     if sample.sample_info.valid_data:

@@ -24,7 +24,7 @@ from magtwin.sim.interference import field_at_sensor_nt, level_gradient_nt_m, se
 from magtwin.sim.lidar import Scans, lidar_on, scan
 from magtwin.sim.magnetometer import LOCK_RATE_HZ
 from magtwin.sim.manual import at_start
-from magtwin.sim.online_sensors import Battery, Imu, Magnetometer, Mocap, Odometry
+from magtwin.sim.online_sensors import Battery, Imu, Magnetometer, Mocap, Odometry, Samples
 from magtwin.sim.sensors import into_sensor
 from magtwin.sim.simulate import check_run, flags, mapped, streams, truth
 from magtwin.spec import DriveSpec, Scene
@@ -181,6 +181,19 @@ class Online:
     def scans(self) -> Scans:
         """What the LiDAR saw in the last step, as it will arrive: scans whose moment lay in it."""
         return self._scanner.until(self._track)
+
+    def samples(self) -> dict[str, list[Samples]]:
+        """What odometry, IMU, motion capture and battery read since the last time, by those names."""
+        sensors = {
+            "odometry": self._odometry,
+            "imu": self._imu,
+            "mocap": self._mocap,
+            "battery": self._battery,
+        }
+        taken = {}
+        for name, sensor in sensors.items():
+            taken[name], sensor.held.fresh = sensor.held.fresh, []
+        return taken
 
     def _read(self) -> Run:
         until = self._track.end_s

@@ -7,6 +7,7 @@ order (1e-12 of the values; a reading that is rounded to the sensor's resolution
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,20 @@ _ROUND = 64
 """Dropouts drawn at a time, as `magtwin.sim.mocap.dropouts` draws them."""
 
 
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """What a sensor read, sample by sample."""
+
+    t: Array
+    """When each was taken [s], shape (M,)."""
+
+    arrival: Array
+    """When each arrives [s], shape (M,)."""
+
+    columns: Columns
+    """What was read, columns of a Run, (M, ...)."""
+
+
 class Held:
     """Samples as they are taken and arrive: `magtwin.sim.sensors.held`, step by step."""
 
@@ -45,6 +60,8 @@ class Held:
         self._arrivals = np.zeros(0)
         self._last = -math.inf
         self._columns: Columns = {}
+        self.fresh: list[Samples] = []
+        """Samples that were taken since somebody last emptied this."""
 
     def due(self, until_s: float) -> Array:
         """Times of the samples that have not been taken yet and lie before a time [s], shape (M,)."""
@@ -62,6 +79,7 @@ class Held:
             return
         arrivals = np.maximum.accumulate(np.concatenate([[self._last], arrivals]))[1:]
         self._last = float(arrivals[-1])
+        self.fresh.append(Samples(stamps, arrivals, columns))
         self._arrivals = np.concatenate([self._arrivals, arrivals])
         for name, values in columns.items():
             self._columns[name] = (
@@ -105,13 +123,13 @@ class Odometry:
         self._drive = drive
         factors = np.array(drive.odometry_scale)
         self._factors = factors * (1.0 + drive.odometry_noise_std * rng.standard_normal(2))
-        self._held = Held(drive.odometry_rate_hz, drive.odometry_latency_s, drive.odometry_jitter_s, delays)
+        self.held = Held(drive.odometry_rate_hz, drive.odometry_latency_s, drive.odometry_jitter_s, delays)
         self._angle: Array | None = None
         self._yaw, self._x, self._y = 0.0, 0.0, 0.0
 
     def sense(self, motion: Moving, t: Array, until_s: float) -> Columns:
         """Readings at times [s], shape (N,), of a motion that is known until `until_s`."""
-        drive, stamps = self._drive, self._held.due(until_s)
+        drive, stamps = self._drive, self.held.due(until_s)
         if len(stamps):
             rate = drive.odometry_rate_hz
             if self._angle is None:
@@ -129,7 +147,7 @@ class Odometry:
             twist *= (*drive.odometry_v_noise_std, *drive.odometry_w_noise_std)
             twist[:, 0] += way * rate
             twist[:, 5] += turn * rate
-            self._held.add(
+            self.held.add(
                 stamps,
                 {
                     "odom_p": np.column_stack([x, y, np.zeros(len(x))]),
@@ -138,7 +156,7 @@ class Odometry:
                     "odom_w": twist[:, 3:],
                 },
             )
-        return self._held.at(t)
+        return self.held.at(t)
 
 
 class Imu:
@@ -147,17 +165,17 @@ class Imu:
     def __init__(self, spec: ImuSpec, q_base_imu_xyzw: Quat, rng: np.random.Generator) -> None:
         delays, self._fast, self._slow = rng.spawn(3)
         self._spec, self._q_base = spec, q_base_imu_xyzw
-        self._held = Held(spec.rate_hz, spec.latency_s, spec.jitter_s, delays)
+        self.held = Held(spec.rate_hz, spec.latency_s, spec.jitter_s, delays)
         self._tilt = Markov(spec.tilt_time_s, spec.rate_hz)
         self._walk: Array | None = None
         self._ran, self._zero = 0.0, 0.0
 
     def sense(self, motion: Moving, t: Array, until_s: float) -> Columns:
         """As for `Odometry`."""
-        stamps = self._held.due(until_s)
+        stamps = self.held.due(until_s)
         if len(stamps):
-            self._held.add(stamps, self._samples(motion, stamps))
-        return self._held.at(t)
+            self.held.add(stamps, self._samples(motion, stamps))
+        return self.held.at(t)
 
     def _samples(self, motion: Moving, stamps: Array) -> Columns:
         spec, q_base, count = self._spec, self._q_base, len(stamps)
@@ -196,13 +214,13 @@ class Mocap:
     def __init__(self, spec: MocapSpec, height_m: float, rng: np.random.Generator) -> None:
         delays, self._noise, self._gaps = rng.spawn(3)
         self._spec, self._height = spec, height_m
-        self._held = Held(spec.rate_hz, spec.latency_s, spec.jitter_s, delays)
+        self.held = Held(spec.rate_hz, spec.latency_s, spec.jitter_s, delays)
         self._edges: Array | None = None
         self._seen: tuple[Array, Array] | None = None
 
     def sense(self, motion: Moving, t: Array, until_s: float) -> Columns:
         """As for `Odometry`."""
-        stamps = self._held.due(until_s)
+        stamps = self.held.due(until_s)
         if len(stamps):
             pose = moment_at(motion, stamps).pose
             white = self._noise.standard_normal((len(stamps), 6))
@@ -215,8 +233,8 @@ class Mocap:
             for k in np.flatnonzero(lost):
                 p[k], q[k] = self._seen if k == 0 and self._seen is not None else (p[k - 1], q[k - 1])
             self._seen = p[-1].copy(), q[-1].copy()
-            self._held.add(stamps, {"mocap_p": p, "mocap_q_xyzw": q, "flag_pose_lost": lost})
-        return self._held.at(t)
+            self.held.add(stamps, {"mocap_p": p, "mocap_q_xyzw": q, "flag_pose_lost": lost})
+        return self.held.at(t)
 
     def _lost(self, stamps: Array) -> NDArray[np.bool_]:
         """As `magtwin.sim.mocap.dropouts`."""
@@ -250,7 +268,7 @@ class Battery:
     ) -> None:
         delays, self._noise = rng.spawn(2)
         self._spec, self._drive, self._lidar_on = spec, drive, lidar_on
-        self._held = Held(spec.rate_hz, spec.latency_s, spec.jitter_s, delays)
+        self.held = Held(spec.rate_hz, spec.latency_s, spec.jitter_s, delays)
         self._spent, self._done, self._first = 0.0, 0, 0
         rest = self._step(0.0, at_s=0.0)
         self._states = np.array([[spec.initial_fraction, *rest]])
@@ -266,15 +284,15 @@ class Battery:
             voltage, current = self._step(energy, at_s=float(times[0]), spend=True)
             self._done += 1
             self._states = np.vstack([self._states, [self._fraction(), voltage, current]])
-        stamps = self._held.due(until_s)
+        stamps = self.held.due(until_s)
         if len(stamps):
             state = self._states[self._index(stamps)]
             noise = spec.voltage_noise_std_v * self._noise.standard_normal(len(stamps))
-            self._held.add(
+            self.held.add(
                 stamps,
                 {"battery_v": state[:, 1] + noise, "battery_a": state[:, 2], "battery_fraction": state[:, 0]},
             )
-        seen = self._held.at(t) | {"supply_a": self._states[self._index(t)][:, 2]}
+        seen = self.held.at(t) | {"supply_a": self._states[self._index(t)][:, 2]}
         if len(self._states) > 64:
             self._first, self._states = self._first + 32, self._states[32:]
         return seen

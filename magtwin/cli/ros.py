@@ -1,0 +1,222 @@
+"""`magtwin ros`: the twin and its sensors as nodes of ROS 2."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import App, Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Force, Seed, Whole, announcer, say
+from magtwin.names import RefusedError
+
+if TYPE_CHECKING:
+    from magtwin.ros.bus import Bus
+
+ros_app = App(name="ros", help="The twin and its sensors as nodes of ROS 2.")
+app.command(ros_app)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Node:
+    """Where a node stands."""
+
+    namespace: str = "robot"
+    """Namespace of its topics; "" is the root."""
+
+    remap: tuple[str, ...] = ()
+    """A name that it has on the network instead, as odom:=/wheel/odom; may be given several times."""
+
+    domain: Whole | None = None
+    """ROS domain, 0 to 232; ROS_DOMAIN_ID unless given."""
+
+    backend: Literal["auto", "rclpy", "cyclonedds"] = "auto"
+    """What carries it: rclpy where it can be imported, else cyclonedds."""
+
+    @contextmanager
+    def bus(self, name: str, *, sim_time: bool = False, parameters: Any = None) -> "Iterator[Bus]":
+        """The node, until the end or Ctrl-C."""
+        from magtwin.ros.bus import names_of, open_bus
+
+        bus = open_bus(
+            name,
+            names=names_of(self.namespace, self.remap),
+            sim_time=sim_time,
+            backend=self.backend,
+            domain=self.domain,
+            parameters=parameters,
+        )
+        try:
+            with suppress(KeyboardInterrupt):
+                yield bus
+        finally:
+            bus.close()
+
+
+Where = Annotated[Node, Parameter(name="*")]
+HERE = Node()
+
+
+@ros_app.command(name="sim")
+def sim(
+    scene: Path,
+    *,
+    where: Where = HERE,
+    speed: float = 1.0,
+    duration: float | None = None,
+    seed: Seed = 0,
+    net: Path | None = None,
+    rate_hz: float | None = None,
+    units: Literal["T", "nT"] = "T",
+    lidar: Literal["schedule", "on", "off"] = "schedule",
+    stamps: Literal["sim", "wall"] = "sim",
+    stamped_commands: bool = False,
+) -> None:
+    """Simulate a scene's robot in real time: the topics of the real one, and /clock.
+
+    It is driven by cmd_vel, and stops where none has come for half a second. A message on reset
+    (std_msgs/Empty) puts it back to its start. Ctrl-C ends.
+
+    Parameters
+    ----------
+    scene
+        USD stage to simulate.
+    where
+        Where the node stands.
+    speed
+        Sim time for each wall time.
+    duration
+        How long, in sim time [s]; without an end unless given.
+    seed
+        Seed of all noise.
+    net
+        Weights to use in place of the scene's; "none" for a physical magnetometer.
+    rate_hz
+        Readings of the magnetometer a second [Hz]; the scene's unless given.
+    units
+        Unit of fields: T, as ROS has them, or nT, as APRILab's robot publishes them.
+    lidar
+        Whether the LiDAR follows its schedule, or stays on or off.
+    stamps
+        Whether messages are stamped by sim time, from 0 on, or by the wall's.
+    stamped_commands
+        Take cmd_vel as TwistStamped, and not as Twist.
+    """
+    from magtwin.ros.simulate import Simulator
+    from magtwin.twin import open_twin
+
+    tell = announcer(quiet=False)
+    tell(f"opening {scene}")
+    twin = open_twin(scene, net=net)
+    with where.bus("magtwin_sim") as bus:
+        node = Simulator(
+            twin,
+            bus,
+            seed=seed,
+            speed=speed,
+            rate_hz=rate_hz,
+            units=units,
+            lidar=lidar,
+            stamps=stamps,
+            stamped_commands=stamped_commands,
+            say=tell,
+        )
+        tell(f"simulating by {bus.backend} at {speed:g} x real time; Ctrl-C ends")
+        node.run(duration_s=duration)
+
+
+@ros_app.command(name="record")
+def record(
+    out: Path,
+    *,
+    topic: tuple[str, ...] = (),
+    where: Where = HERE,
+    duration: float | None = None,
+    sim_time: bool = False,
+    force: Force = False,
+) -> None:
+    """Record a robot's topics as a rosbag2, which is a run: magtwin convert, info, report and train take it.
+
+    Topics may come and go; Ctrl-C ends.
+
+    Parameters
+    ----------
+    out
+        Folder to make, or a file that ends in .mcap or .db3.
+    topic
+        A topic to record; may be given several times. All of the robot's unless given.
+    where
+        Where the node stands.
+    duration
+        How long, by the wall [s]; without an end unless given.
+    sim_time
+        Date messages by /clock, as when the robot is simulated.
+    force
+        Replace what exists.
+    """
+    from magtwin.io.bag_raw import RawBagWriter
+    from magtwin.ros.record import Recorder
+
+    writer = RawBagWriter(out, force=force)
+    try:
+        with where.bus("magtwin_record", sim_time=sim_time) as bus:
+            announcer(quiet=False)(f"recording by {bus.backend}; Ctrl-C ends")
+            Recorder(bus, writer, topic, say=_warn).run(duration_s=duration)
+    finally:
+        counts = dict(writer.counts)
+        writer.close()
+    if not sum(counts.values()):
+        raise RefusedError("nothing was recorded: nobody offered a topic; look at --domain and --namespace")
+    for name, count in counts.items():
+        say(f"{count:8d}  {name}")
+    say(f"Wrote {out}; magtwin info {out}")
+
+
+@ros_app.command(name="replay")
+def replay(
+    run: Path,
+    *,
+    topic: tuple[str, ...] = (),
+    scene: Path | None = None,
+    where: Where = HERE,
+    speed: float = 1.0,
+    units: Literal["T", "nT"] = "T",
+) -> None:
+    """Say a run again on the topics of its robot, in real time.
+
+    Parameters
+    ----------
+    run
+        A run of any format.
+    topic
+        A topic to say; may be given several times. All unless given.
+    scene
+        Scene that the run came from: gives frames, covariances, /tf_static and the robot's description.
+    where
+        Where the node stands.
+    speed
+        Sim time for each wall time.
+    units
+        Unit of fields: T, as ROS has them, or nT, as APRILab's robot publishes them.
+    """
+    from magtwin.io.formats import read_run
+    from magtwin.ros.record import Player
+    from magtwin.twin import open_twin
+
+    if not speed > 0:
+        raise RefusedError(f"speed must be above 0, got {speed!r}")
+    whole = read_run(run)
+    twin = None if scene is None else open_twin(scene)
+    with where.bus("magtwin_replay") as bus:
+        player = Player(whole, bus, twin, units=units, topics=topic)
+        announcer(quiet=False)(
+            f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends"
+        )
+        count = player.run(speed=speed)
+    say(f"{count} messages")
+
+
+def _warn(text: str) -> None:
+    announcer(quiet=False)(f"warning: {text}")

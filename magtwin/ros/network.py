@@ -1,0 +1,38 @@
+"""A network that reads rows as they come, a few at a time."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.run import Run
+
+if TYPE_CHECKING:
+    from magtwin.learn.magnetometer import NeuralMagnetometer
+
+
+class Following:
+    """A neural magnetometer that remembers the rows that its predictor looks back at."""
+
+    def __init__(self, magnetometer: "NeuralMagnetometer") -> None:
+        """Begin without any."""
+        self._magnetometer = magnetometer
+        self._before: Run | None = None
+
+    def __call__(self, run: Run) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_] | None]:
+        """Disturbances, their standard deviations [nT] and what is out of the training's range.
+
+        Args:
+            run: The next rows, later than those before.
+        """
+        context = self._magnetometer.net.context
+        if not run.rows:
+            return np.zeros(0), np.zeros(0), np.zeros(0, bool)
+        columns = run.select("t", *sorted(self._magnetometer.columns - {"t"}))
+        whole = columns if self._before is None else Run.concat([self._before, columns])
+        (read,) = self._magnetometer.read([whole])
+        if context:
+            self._before = whole.take(slice(max(whole.rows - context, 0), whole.rows))
+        new = slice(whole.rows - run.rows, whole.rows)
+        outside = None if read.outside is None else read.outside[new]
+        return read.disturbance_nt[new], read.sd_nt[new], outside

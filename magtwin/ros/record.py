@@ -1,0 +1,162 @@
+"""Record and replay: topics to a bag, which is a run; and a run to topics."""
+
+import heapq
+import time
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+
+import numpy as np
+
+from magtwin.io.bag_raw import RawBagWriter
+from magtwin.io.bag_writer import Stream, sender_for
+from magtwin.io.cdr import encode, leaves
+from magtwin.io.messages import TYPES, Qos, Unit
+from magtwin.names import RefusedError
+from magtwin.ros.bus import NS, Bus, Message, Publisher
+from magtwin.ros.topics import READ, RECORDED, SAMPLED
+from magtwin.run import Run
+from magtwin.twin import Twin
+
+FLUSH_S = 1.0
+"""Time between flushes, by the wall [s]."""
+
+LOOK_S = 0.5
+"""Time between looks for topics that were not offered before [s]."""
+
+DEPTH = 1000
+"""Messages of a topic that may wait to be taken in: none is lost while a file is written."""
+
+AT_A_TIME = 1024
+"""Rows of a run that are turned into messages at a time."""
+
+
+class Recorder:
+    """What records topics, each as soon as somebody offers it."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        writer: RawBagWriter,
+        topics: Iterable[str] = (),
+        *,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        """Begin to listen.
+
+        Args:
+            bus: The node; its clock dates the messages.
+            writer: Where they go.
+            topics: Names of those to record; none takes all of the robot's.
+            say: Takes lines for people.
+        """
+        self._bus, self._writer, self._say = bus, writer, say
+        known = {topic.name: topic for topic in RECORDED}
+        names = list(topics) or list(known)
+        self._waited = {name: known.get(name) for name in names}
+        self._last_ns = -1
+
+    def run(self, until: Callable[[], bool] = lambda: False, *, duration_s: float | None = None) -> None:
+        """Record until that says so, or for a time by the wall [s]."""
+        begin = flushed = time.monotonic()
+        looked = 0.0
+        while not until():
+            now = time.monotonic()
+            if duration_s is not None and now - begin > duration_s:
+                break
+            if now - looked > LOOK_S:
+                looked = now
+                self._look()
+            if now - flushed > FLUSH_S:
+                flushed = now
+                self._writer.flush()
+            self._bus.spin_once(0.05)
+
+    def _look(self) -> None:
+        """Listen to what is offered now and was not before."""
+        for name, topic in list(self._waited.items()):
+            kinds = [kind for kind in self._bus.types(name) if kind in TYPES or _parted(kind)]
+            if not kinds:
+                continue
+            del self._waited[name]
+            kind = topic.kind if topic is not None and topic.kind in kinds else kinds[0]
+            if len(kinds) > 1:
+                self._say(f"{name} is offered as {' and as '.join(kinds)}; {kind} is recorded")
+            latched = topic is not None and topic.qos.latched
+            qos = Qos(
+                depth=DEPTH, reliable=latched or (topic is not None and topic.qos.reliable), latched=latched
+            )
+            self._writer.add(name, kind, qos)
+            self._bus.subscribe(name, kind, partial(self._heard, name), qos)
+
+    def _heard(self, name: str, message: Message) -> None:
+        now = self._bus.now_ns()
+        if now < self._last_ns:
+            raise RefusedError(
+                f"time jumped back from {self._last_ns / NS:.3f} to {now / NS:.3f} s, as after a reset: the "
+                "recording ends here; record anew"
+            )
+        self._last_ns = now
+        self._writer.write(name, now, message.data)
+
+
+def _parted(kind: str) -> bool:
+    return kind in ("tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticArray")
+
+
+class Player:
+    """What says a run again, as its robot would have."""
+
+    def __init__(
+        self,
+        run: Run,
+        bus: Bus,
+        twin: Twin | None = None,
+        *,
+        units: Unit = "T",
+        topics: Sequence[str] = (),
+    ) -> None:
+        """Offer its topics.
+
+        Args:
+            run: What happened.
+            bus: The node.
+            twin: What it happened in: gives frames, covariances, /tf_static and the robot's description.
+            units: Unit of fields.
+            topics: Names of those to say; none says all.
+
+        Raises:
+            RefusedError: The run has none of them.
+        """
+        self._run = run
+        who = sender_for(twin, units, run.facts.get("rate_hz"))
+        self._stream = Stream(run, who, None, topics=(*READ, *SAMPLED.values()), whole=True)
+        said = [t for t in self._stream.topics if not topics or t.name in topics]
+        if not said:
+            raise RefusedError(f"the run has no columns of {', '.join(topics) or 'any topic'}")
+        self._publishers: dict[str, Publisher] = {t.name: bus.publisher(t.name, t.kind, t.qos) for t in said}
+        self._bus = bus
+
+    def run(self, until: Callable[[], bool] = lambda: False, *, speed: float = 1.0) -> int:
+        """Say it in real time, `speed` times as fast; how many messages that were."""
+        first = float(self._run["t"][0])
+        begin = time.monotonic()
+        count = 0
+        for row in range(0, self._run.rows, AT_A_TIME):
+            rows = self._run.take(slice(row, row + AT_A_TIME))
+            for t, publisher, data in self._messages(rows):
+                while (left := begin + (t / NS - first) / speed - time.monotonic()) > 0:
+                    self._bus.spin_once(left)
+                if until():
+                    return count
+                publisher.publish(data)
+                count += 1
+        return count
+
+    def _messages(self, rows: Run) -> list[tuple[int, Publisher, bytes]]:
+        events: list[tuple[int, int, Publisher, bytes]] = []
+        for topic, times, form, fields in self._stream.messages(rows):
+            if topic.name in self._publishers and len(times):
+                encoded = encode(leaves(form), fields, len(times))
+                for t, data in zip(np.asarray(times).tolist(), encoded, strict=True):
+                    heapq.heappush(events, (t, len(events), self._publishers[topic.name], data.tobytes()))
+        return [(t, publisher, data) for t, _, publisher, data in sorted(events, key=lambda e: e[:2])]

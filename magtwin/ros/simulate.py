@@ -1,0 +1,274 @@
+"""The simulator as a node: a twin's robot in real time, that says and takes what the real one does."""
+
+import heapq
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.io.bag_writer import Said, Stream, sender_for
+from magtwin.io.cdr import encode, leaves
+from magtwin.io.messages import COMMAND, IMU, SCAN, TYPES, Qos, Topic, Unit
+from magtwin.names import RefusedError
+from magtwin.ros.bus import NS, Bus, Message, Publisher
+from magtwin.ros.diagnostics import Reporter, Status
+from magtwin.ros.network import Following
+from magtwin.ros.topics import READ, SAMPLED
+from magtwin.run import Run
+from magtwin.sim.online import Online
+from magtwin.sim.online_sensors import Samples
+from magtwin.twin import Twin
+
+RESET = "/robot/reset"
+"""Topic (std_msgs/Empty) that puts the robot back to its start, and the time to 0."""
+
+LEAD_S = 0.006
+"""How long before its begin a control step is computed, so that its first message is not late [s]."""
+
+SLIP_S = 0.1
+"""Delay after which a machine that is too slow gives up real time [s]."""
+
+WARM = 5
+"""Steps of another robot that are made beforehand: they open libraries, and tell which topics there are."""
+
+REPORT_S = 1.0
+"""Time between diagnostics, by the wall [s]."""
+
+Say = Callable[[str], None]
+
+
+@dataclass
+class Pace:
+    """How sim time goes with the wall's."""
+
+    speed: float
+    """Sim time for each wall time."""
+
+    begin_s: float
+    """Wall time at which sim time was 0 [s]."""
+
+    def due_s(self, t: float) -> float:
+        """Wall time of a sim time [s]."""
+        return self.begin_s + t / self.speed
+
+    def slip(self, t: float, now_s: float) -> bool:
+        """Give up time that was lost, if that is much; whether it was."""
+        behind = now_s - self.due_s(t)
+        if behind < SLIP_S:
+            return False
+        self.begin_s += behind
+        return True
+
+
+class Simulator:
+    """A robot that is simulated in real time; the same commands in the same steps give the same messages."""
+
+    def __init__(
+        self,
+        twin: Twin,
+        bus: Bus,
+        *,
+        seed: int = 0,
+        speed: float = 1.0,
+        rate_hz: float | None = None,
+        units: Unit = "T",
+        lidar: Literal["schedule", "on", "off"] = "schedule",
+        stamps: Literal["sim", "wall"] = "sim",
+        stamped_commands: bool = False,
+        say: Say = lambda text: None,
+    ) -> None:
+        """Offer its topics; `run` begins.
+
+        Args:
+            twin: What is simulated.
+            bus: The node; its own clock is not used.
+            seed: Seed of all noise.
+            speed: Sim time for each wall time.
+            rate_hz: Readings of the magnetometer a second [Hz]; None takes the scene's.
+            units: Unit of fields: "T", as ROS has them, or "nT", as APRILab's robot publishes them.
+            lidar: Whether the LiDAR follows its schedule, or stays on or off.
+            stamps: Whether messages are stamped by sim time, from 0 on, or by the wall's.
+            stamped_commands: Whether cmd_vel is a TwistStamped, and not a Twist.
+            say: Takes lines for people.
+
+        Raises:
+            RefusedError: The robot would begin in an obstacle, or an option is out of range.
+        """
+        if not 0 < speed <= 100:
+            raise RefusedError(f"speed must be above 0 and at most 100 times real time, got {speed!r}")
+        self._twin, self._bus, self._seed, self._rate, self._lidar = twin, bus, seed, rate_hz, lidar
+        self._speed, self._wall, self._say = speed, stamps == "wall", say
+        self._units: Unit = units
+        self.online = self._online()
+        self._who = sender_for(twin, units, self.online.rate_hz)
+        self._publishers: dict[str, Publisher] = {}
+        self._events: list[tuple[int, int, Publisher, bytes]] = []
+        self._count = 0
+        self._command: tuple[float, float] | None = None
+        self._commands, self._refused, self._resets, self._slips = 0, 0, 0, 0
+        self._kind = "geometry_msgs/msg/TwistStamped" if stamped_commands else COMMAND.kind
+        self._input = bus.subscribe(COMMAND.name, self._kind, self._commanded, COMMAND.qos)
+        bus.subscribe(RESET, "std_msgs/msg/Empty", lambda message: self.reset(), Qos())
+        self._reporter = Reporter(bus)
+        self._stream: Stream | None = None
+        self._moved: NDArray[np.float64] | None = None
+        warm = self._online()
+        rows = [warm.step() for _ in range(WARM)]
+        for topic in (*self._streamed(rows[0]).topics, *SAMPLED.values(), SCAN):
+            self._publisher(topic)
+        self._begin_ns = 0
+        self._reset = False
+        if units == "nT":
+            say("fields are published in nT, as APRILab's robot does; ROS means tesla")
+
+    def reset(self) -> None:
+        """Put the robot back to its start and time to 0, before the next step."""
+        self._reset = True
+
+    def run(self, until: Callable[[], bool] = lambda: False, *, duration_s: float | None = None) -> None:
+        """Simulate.
+
+        Args:
+            until: Asked at each step; an end where it says so.
+            duration_s: How long, in sim time [s]; None goes on.
+        """
+        pace = self._begun()
+        reported, factor_from = time.monotonic(), (time.monotonic(), 0.0)
+        while not until() and (duration_s is None or self.online.t < duration_s - 1e-9):
+            if self._reset:
+                self._reset, self._resets = False, self._resets + 1
+                self.online = self._online()
+                pace, self._stream = self._begun(), None
+                factor_from = (time.monotonic(), 0.0)
+                self._say("reset: the robot is at its start, time is 0")
+            self._publish_until(pace, pace.due_s(self.online.t) - LEAD_S)
+            if pace.slip(self.online.t, time.monotonic()):
+                self._slips += 1
+            command, self._command = self._command, None
+            self._tell(self.online.step(command))
+            now = time.monotonic()
+            if now - reported > REPORT_S:
+                factor = (self.online.t - factor_from[1]) / max(now - factor_from[0], 1e-9)
+                reported, factor_from = now, (now, self.online.t)
+                self._report(factor)
+        self._publish_until(pace, pace.due_s(self.online.t))
+
+    def _online(self) -> Online:
+        twin = self._twin
+        return Online(
+            twin.scene,
+            anomaly_map=twin.field,
+            rng=np.random.default_rng(self._seed),
+            obstacles=twin.obstacles,
+            rate_hz=self._rate,
+            network=Following(twin.magnetometer) if twin.magnetometer else None,
+            lidar=self._lidar,
+        )
+
+    def _begun(self) -> Pace:
+        self._events.clear()
+        self._begin_ns = time.time_ns() if self._wall else 0
+        return Pace(self._speed, time.monotonic() + LEAD_S)
+
+    def _tell(self, rows: Run) -> None:
+        """Have what was read in a step published when its time comes."""
+        if self._stream is None:
+            self._stream = self._streamed(rows)
+        for said in self._stream.messages(rows):
+            self._queue(said)
+        if rows.rows:
+            self._moved = rows["odom_v"][-1:]
+        for name, parts in self.online.samples().items():
+            for part in parts:
+                self._sampled(SAMPLED[name], part)
+        scans = self.online.scans()
+        if len(scans.t):
+            moments, came = (np.rint(t * NS).astype(np.int64) for t in (scans.t, scans.arrival))
+            fields = SCAN.write({"ranges_m": scans.ranges_m}, moments, self._who)
+            self._queue((SCAN, came, TYPES[SCAN.kind], fields))
+
+    def _streamed(self, rows: Run) -> Stream:
+        return Stream(rows, self._who, None, topics=READ, whole=True)
+
+    def _sampled(self, topic: Topic, samples: Samples) -> None:
+        """Have samples published when they arrive; those of before the beginning are known to nobody."""
+        taken = samples.t >= 0
+        if topic.lost:
+            taken &= ~samples.columns[topic.lost]
+        columns = {name: values[taken] for name, values in samples.columns.items()}
+        if topic is IMU and self._moved is not None:  # it shakes with the speed, and tells how much
+            columns["odom_v"] = np.repeat(self._moved, taken.sum(), axis=0)
+        stamps, arrivals = (np.rint(t[taken] * NS).astype(np.int64) for t in (samples.t, samples.arrival))
+        self._queue((topic, arrivals, TYPES[topic.kind], topic.write(columns, stamps, self._who)))
+
+    def _queue(self, said: Said) -> None:
+        topic, times, form, fields = said
+        if not len(times):
+            return
+        if self._begin_ns:
+            fields = {
+                name: value + self._begin_ns if name.endswith("stamp") or name == "clock" else value
+                for name, value in fields.items()
+            }
+        publisher = self._publisher(topic)
+        for t, data in zip(times.tolist(), encode(leaves(form), fields, len(times)), strict=True):
+            self._count += 1
+            heapq.heappush(self._events, (t, self._count, publisher, data.tobytes()))
+
+    def _publisher(self, topic: Topic) -> Publisher:
+        if topic.name not in self._publishers:
+            self._publishers[topic.name] = self._bus.publisher(topic.name, topic.kind, topic.qos)
+        return self._publishers[topic.name]
+
+    def _publish_until(self, pace: Pace, due_s: float) -> None:
+        """Publish what falls due before a wall time, each message in its time, and hear what comes."""
+        while True:
+            next_s = pace.due_s(self._events[0][0] / NS) if self._events else math.inf
+            left = min(next_s, due_s) - time.monotonic()
+            if left > 0:
+                self._bus.spin_once(left)
+            elif next_s <= due_s:
+                _, _, publisher, data = heapq.heappop(self._events)
+                publisher.publish(data)
+            else:
+                self._bus.spin_once(0.0)
+                return
+
+    def _commanded(self, message: Message) -> None:
+        linear, angular = COMMAND.leaves[self._kind]
+        read = message.read([linear, angular])
+        v, w = float(read[linear][0]), float(read[angular][2])
+        if not (math.isfinite(v) and math.isfinite(w)):
+            self._refused += 1
+            return
+        self._command = (v, w)
+        self._commands += 1
+
+    def _report(self, factor: float) -> None:
+        senders = self._input.publishers()
+        level: Any = "ok"
+        words = []
+        if self._slips:
+            level = "warn"
+            words.append(f"slower than {self._speed:g} x real time")
+        if senders > 1:
+            level = "warn"
+            words.append(f"{senders} publishers on {self._input.topic}: the last command wins")
+        if self._refused:
+            level = "warn"
+            words.append(f"{self._refused} commands were not finite")
+        values = {
+            "sim time [s]": f"{self.online.t:.2f}",
+            "real-time factor": f"{factor:.3f}",
+            "commands": str(self._commands),
+            "commands refused": str(self._refused),
+            "publishers of commands": str(senders),
+            "resets": str(self._resets),
+        }
+        stamp = self._begin_ns + round(self.online.t * NS)
+        self._reporter.report([Status("simulator", level, "; ".join(words) or "running", values)], stamp)
+        self._slips = self._refused = 0
