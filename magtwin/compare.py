@@ -211,6 +211,48 @@ def compare(a: Run, b: Run, *, align: Align = "time") -> Comparison:
 
 
 @dataclass(frozen=True, eq=False)
+class Traversals:
+    """One path driven twice, as in Figure 8 of the paper: with the clocks as they stand, and laid over."""
+
+    a: Run
+    b: Run
+    """Both with their own start at 0 s."""
+
+    recorded: Comparison
+    """Second by second from each run's own start."""
+
+    timed: Comparison
+    """With B's clock moved to where the positions lie closest."""
+
+    placed: Comparison
+    """Place by place, whatever the speeds."""
+
+    def summary(self) -> dict[str, Any]:
+        """The three comparisons in plain figures, for JSON."""
+        return {name: getattr(self, name).summary() for name in ("recorded", "timed", "placed")}
+
+
+def traversals(a: Run, b: Run) -> Traversals:
+    """Lay two drives of one path over each other, with and without alignment.
+
+    Two robots that drive one path at speeds of their own drift apart, so that fields compared second by
+    second differ though each may be right where it is; place by place they are compared as fields.
+
+    Args:
+        a: The run whose readings differences are given at.
+        b: Another: by another engine, with another seed, or recorded.
+
+    Raises:
+        RefusedError: As for `compare`.
+    """
+    a, b = (run.with_columns(t=run["t"] - run["t"][0]) if run.rows else run for run in (a, b))
+    return Traversals(a, b, *(compare(a, b, align=how) for how in _HOW))
+
+
+_HOW: tuple[Align, ...] = ("none", "time", "path")
+
+
+@dataclass(frozen=True, eq=False)
 class _Track:
     """The readings of a run that can be laid over another's, in order of where they were taken."""
 

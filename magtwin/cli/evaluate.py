@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -36,6 +36,8 @@ def evaluate(
     train: Path | None = None,
     case: Names = None,
     scene: Path | None = None,
+    against: Path | None = None,
+    engine: Literal["kinematic", "newton"] | None = None,
     any_map: Flag = False,
     truth: Flag = False,
     seed: Seed = 0,
@@ -68,6 +70,11 @@ def evaluate(
     scene
         Stage of the twin that made the recordings, training's too: adds an error budget, how much of the
         error is map, lever arm, latency, sessions, platform and sensor. Needs train.
+    against
+        Another recording of a path that is judged by, laid over that one: the paper's Figure 8.
+    engine
+        Drive the first recording's path once more in the scene, moved by this engine and with another seed,
+        and lay it over that one: the paper's Figure 8.
     any_map
         Take the first map for weights whose own is not at hand.
     truth
@@ -111,6 +118,10 @@ def evaluate(
             section, told = _budget(found, scene, *learned[0], advance)
         sections.append(section)
         data["budget"] = told
+    if against is not None or engine is not None:
+        section, told = _traversals(found, scene, against, engine, quiet=json)
+        sections.append(section)
+        data["traversals"] = told
     curves = {name: read_curve(path) for path, name in zip(weights, names, strict=True)}
     page = page_of_evaluation(found, curves=curves, more=sections, data=data)
     write_evaluation(page, out, force=force)
@@ -229,6 +240,31 @@ def _budget(
         "steps": [found.names[m] for m in order],
     }
     return section_of_budget(found, made, missed, order), told
+
+
+def _traversals(
+    found: "Evaluation", scene: Path | None, against: Path | None, engine: str | None, *, quiet: bool
+) -> "tuple[Section, dict[str, Any]]":
+    """One path driven twice, as a section and in figures."""
+    from magtwin.cli.terminal import announcer
+    from magtwin.compare import traversals
+    from magtwin.io.formats import read_run
+    from magtwin.io.provenance import made_again
+    from magtwin.io.traversals import section_of_traversals
+
+    if against is not None and engine is not None:
+        raise RefusedError("--against and --engine both say what to lay over a recording; give one of them")
+    first = found.judged[0]
+    if against is not None:
+        other, name = read_run(against), against.stem
+        path = str(other.facts.get("path", ""))
+        first = next((one for one in found.judged if one.path == path), first)
+    else:
+        announcer(quiet=quiet)(f"Driving {first.path} by {engine}")
+        other = made_again(first.run, scene, engine=engine, seed=int(first.run.facts.get("seed", 0)) + 1)
+        name = f"{first.path} by {engine}"
+    both = traversals(first.run, other)
+    return section_of_traversals(both, (first.name, name)), both.summary()
 
 
 def _cases(given: Sequence[str] | None) -> dict[str, str]:

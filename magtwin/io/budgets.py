@@ -29,7 +29,8 @@ def section_of_budget(
         "On a twin every error has an address. To close a term is to take away its part of the error: what "
         "is left of it beside what the model has learned of it in training. In turn: with those to its left "
         "closed too. Sessions: the robot is neither as it was when the map was surveyed nor as on the mean "
-        "day of training. Platform: what moving, motors, LiDAR and battery add, and what the model makes of them."
+        "day of training. Platform: what moving, motors, LiDAR and battery add, and what the model makes of "
+        "them."
     )
     drawings = [_waterfall(found, made), _ladder(found, order)]
     tables = (_budget_table(made), _rms_table(made), _true_table(missed))
@@ -105,8 +106,8 @@ def _ladder(found: Evaluation, order: Sequence[int]) -> Drawing:
         step = "" if not k else f", {mae - scores[order[k - 1]].mae_nt:+.0f}"
         words = f"{mae:.0f} nT ({scores[m].ratio:.3f}{step})"
         at = high if np.isfinite(high) else mae
-        place = {"xytext": (6, 0), "textcoords": "offset points", "va": "center", "fontsize": 8}
-        ax.annotate(words, (max(at, mae), k), **place)
+        end = (max(at, mae), k)
+        ax.annotate(words, end, xytext=(6, 0), textcoords="offset points", va="center", fontsize=8)
     ax.set_yticks(range(len(order)), [found.names[m] for m in order], fontsize=8)
     ax.invert_yaxis()
     ax.set_xlim(0, 1.45 * max(max(scores[m].mae_interval_nt[1], scores[m].mae_nt) for m in order))

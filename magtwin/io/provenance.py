@@ -1,6 +1,6 @@
 """Provenance: a run made once more from what its facts say, and whether it is the same."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any
@@ -99,8 +99,33 @@ def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePat
         RefusedError: The facts do not say enough, a file is not there, or the run is of something that was
             made in Python and is no longer at hand.
     """
+    return _compared(run, made_again(run, scene, near=near))
+
+
+def made_again(
+    run: Run,
+    scene: str | FilePath | None = None,
+    *,
+    near: str | FilePath | None = None,
+    engine: str | None = None,
+    seed: int | None = None,
+    progress: Callable[[int, int, str], Any] | None = None,
+) -> Run:
+    """A run made once more, from what its facts say; or what it drove, driven by another engine.
+
+    Args:
+        run: As for `repeat`.
+        scene: As for `repeat`.
+        near: As for `repeat`.
+        engine: "kinematic" or "newton", in place of the run's own.
+        seed: Of all noise, in place of the run's own.
+        progress: As for `magtwin.twin.engine_named`.
+
+    Raises:
+        RefusedError: As for `repeat`; or the engine is not known or not installed.
+    """
     facts = run.facts
-    if "seed" not in facts:
+    if "seed" not in facts and seed is None:
         raise RefusedError(
             "the run does not say its seed, so it cannot be repeated; was it recorded elsewhere?"
         )
@@ -108,25 +133,25 @@ def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePat
     twin = on_its_day(twin, facts)
     what = _driven(run, near)
     try:
-        seed, rate = int(facts["seed"]), float(facts["rate_hz"])
+        seed, rate = int(facts["seed"]) if seed is None else seed, float(facts["rate_hz"])
         asked = float(facts["asked_duration_s"]) if "asked_duration_s" in facts else None
         speed = float(facts.get("speed_m_s", 0.2))
     except (KeyError, ValueError) as error:
         raise RefusedError(f"the facts of the run do not say how it was made: {error}") from error
-    engine: Any = facts.get("engine", "kinematic")
+    moved_by: Any = engine or facts.get("engine", "kinematic")
     options: dict[str, Any] = {
         "lidar": facts.get("lidar", "schedule"),
         "outside": facts.get("outside", "nan"),
     }
     if isinstance(what, Path):
         options["controller"] = facts.get("controller", "follower")
-    if engine not in ("kinematic", "newton", "replay"):
+    if engine is None and moved_by not in ("kinematic", "newton", "replay"):
         raise RefusedError(
-            f"the run was moved by an engine of its maker's own, {engine!r}, which is not here"
+            f"the run was moved by an engine of its maker's own, {moved_by!r}, which is not here"
         )
     name = str(facts.get("robot", ""))
-    if name and twin.scene.others:  # beside others, which drive what the scene says
-        again = simulate_robots(
+    if engine is None and name and twin.scene.others:  # beside others, which drive what the scene says
+        return simulate_robots(
             twin,
             {name: what},
             robots=[name],
@@ -137,18 +162,17 @@ def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePat
             rate_hz=rate,
             **options,
         )[name]
-        return _compared(run, again)
-    again = simulate(
+    return simulate(
         twin,
         what,
         seed=seed,
         speed=speed,
         duration_s=asked,
         rate_hz=rate,
-        engine="kinematic" if engine == "replay" else engine,
+        engine="kinematic" if moved_by == "replay" else moved_by,
+        progress=progress,
         **options,
     )
-    return _compared(run, again)
 
 
 def _compared(run: Run, again: Run) -> Repeat:
