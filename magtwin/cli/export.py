@@ -7,8 +7,6 @@ from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, announcer, print_report, say
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from magtwin.run import Run
 
 
@@ -20,6 +18,7 @@ def export(
     profile: Literal["omniverse", "isaac", "newton", "viewer"] | None = None,
     run: Path | None = None,
     convert_units: bool = False,
+    onnx: bool = True,
     thumbnail: bool = True,
     force: Force = False,
     json: Json = False,
@@ -40,6 +39,8 @@ def export(
         A run, in any format that magtwin reads, to play over the stage.
     convert_units
         Convert a stage that is not in metres with Z up; it is refused otherwise.
+    onnx
+        Write networks as ONNX too, beside their weights, where the extra onnx is installed.
     thumbnail
         Draw a picture of a folder's stage where asset browsers look for one.
     force
@@ -57,7 +58,7 @@ def export(
         out,
         profile=profile,
         animation=played,
-        to_onnx=_to_onnx(),
+        to_onnx=_write_onnx if onnx and _has_onnx() else None,
         thumbnail=_draw if thumbnail and profile != "viewer" else None,
         convert_units=convert_units,
         force=force,
@@ -93,15 +94,17 @@ def _read(run: Path) -> "Run":
     return read_run(existing(run, "run"))
 
 
-def _to_onnx() -> "Callable[[Path, Path], object] | None":
-    """What writes a network as ONNX, where the extra is installed."""
-    from importlib.util import find_spec
-
-    if not (find_spec("onnx") and find_spec("onnxruntime")):
-        return None
+def _write_onnx(weights: Path, out: Path) -> None:
     from magtwin.learn.onnx import export_onnx
 
-    return export_onnx
+    export_onnx(weights, out)
+
+
+def _has_onnx() -> bool:
+    """Whether the extra is installed that networks are written as ONNX with."""
+    from importlib.util import find_spec
+
+    return bool(find_spec("onnx") and find_spec("onnxruntime"))
 
 
 def _draw(stage: Path, out: Path) -> None:

@@ -136,25 +136,36 @@ def detach(root: Path) -> tuple[Path, ...]:
             attribute = stage.GetAttributeAtPath(path)
             if not attribute or attribute.GetTypeName() != Sdf.ValueTypeNames.Asset:
                 raise RefusedError(f"{place(prim)}: {OF} names {path}, which names no file")
-            attribute.Set(Sdf.AssetPath(relative_asset(stage.GetRootLayer(), file)))
+            layer = next((spec.layer for spec in attribute.GetPropertyStack()), stage.GetRootLayer())
+            with Usd.EditContext(stage, layer):
+                attribute.Set(Sdf.AssetPath(relative_asset(layer, file)))
     if not found:
         return ()
-    path, layers = scope.GetPath(), stage.GetLayerStack(includeSessionLayers=False)
-
+    handles = stage.GetLayerStack(includeSessionLayers=False)
+    layers = [Sdf.Layer.FindOrOpen(layer.identifier) for layer in handles]  # which keeps them
+    _remove(layers, scope.GetPath())
     for layer in layers:
-        if not layer.GetPrimAtPath(path):
+        if layer.dirty:
+            layer.Save()
+    return tuple(unnamed)
+
+
+def _remove(layers: list[Sdf.Layer], scope: Sdf.Path) -> None:
+    """Take a scope out of the layers that have it, and the layers that had nothing else off the disk."""
+    for layer in layers:
+        if not layer.GetPrimAtPath(scope):
             continue
         edit = Sdf.BatchNamespaceEdit()
-        edit.Add(path, Sdf.Path.emptyPath)
+        edit.Add(scope, Sdf.Path.emptyPath)
         layer.Apply(edit)
-        if layer != layers[0] and _is_empty(layer):
-            file = Path(layer.realPath)  # the layer goes with its last user
-            layers[0].subLayerPaths.remove(relative_asset(layers[0], file))
-            file.unlink()
-        else:
+        users = [
+            (u, n) for u in layers for n in u.subLayerPaths if u.ComputeAbsolutePath(n) == layer.realPath
+        ]
+        if users and _is_empty(layer):
+            for user, name in users:
+                user.subLayerPaths.remove(name)
             layer.Save()
-    layers[0].Save()
-    return tuple(unnamed)
+            Path(layer.realPath).unlink()
 
 
 def _is_empty(layer: Sdf.Layer) -> bool:
