@@ -1,13 +1,16 @@
 """Isaac Sim: the Action Graph has what its nodes' definitions have, and what magtwin's ROS 2 topics are."""
 
+import json
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from pxr import Sdf, Usd, UsdPhysics, UsdShade
 
 from magtwin.export.isaac import GRAPHS, author_graph
 from magtwin.export.ogn import Graph, fits, message_fields, node_types
-from magtwin.io.messages import TOPICS, sender_of
+from magtwin.io.messages import TOPICS, TYPES, sender_of
 from magtwin.names import RefusedError
 from magtwin.spec import PlacedRobot
 from magtwin.usd.layers import open_stage
@@ -120,20 +123,55 @@ def test_topics_messages_and_qos_are_those_of_magtwins_own_robot(authored):
         seen[name] = short
     assert set(seen) == {
         *("/clock", "/robot/odom", "/robot/imu", "/robot/enu/pose"),
-        *("/robot/joint_states", "/robot/scan", "/robot/cmd_vel"),
+        *("/robot/battery_state", "/robot/joint_states", "/robot/scan", "/robot/cmd_vel"),
     }
     assert seen["/robot/cmd_vel"].startswith("Subscribe")
 
 
-def test_a_message_has_every_field_that_its_publisher_makes_so_that_isaac_keeps_the_connections(authored):
+@pytest.mark.parametrize("node", ["publish_pose", "publish_battery"])
+def test_a_message_has_every_field_that_its_publisher_makes_so_that_isaac_keeps_the_connections(
+    authored, node
+):
     _, _, graph = authored
-    node = graph.GetChild("publish_pose")
+    prim = graph.GetChild(node)
+    package, folder, short = (
+        prim.GetAttribute(f"inputs:message{part}").Get() for part in ("Package", "Subfolder", "Name")
+    )
     own = set(node_types()["isaacsim.ros2.bridge.ROS2Publisher"].inputs)
-    made = {prop.GetName().removeprefix("inputs:") for prop in ports(node)} - own
-    assert made == set(message_fields("geometry_msgs/msg/PoseStamped"))
-    for axis in "xyz":
-        (path,) = node.GetAttribute(f"inputs:pose:position:{axis}").GetConnections()
-        assert path.name == f"outputs:{axis}"
+    made = {prop.GetName().removeprefix("inputs:") for prop in ports(prim)} - own
+    assert made == set(message_fields(f"{package}/{folder}/{short}"))
+
+
+@pytest.mark.parametrize("message", ["geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/BatteryState"])
+def test_fields_of_messages_are_the_leaves_that_magtwin_itself_writes(message):
+    basic = {"text": "token", "f8": "double", "f4": "float", "u1": "uint", "f4[]": "float[]"}
+    parts = {"f8[3]": "xyz", "f8[4]": "xyzw"}
+    want = {}
+    for leaf in TYPES[message].split(", "):
+        kind, name = leaf.split()
+        name = name.replace(".", ":")
+        if kind == "time":
+            want |= {f"{name}:sec": "int", f"{name}:nanosec": "uint"}
+        elif kind in parts:
+            want |= {f"{name}:{part}": "double" for part in parts[kind]}
+        else:
+            want[name] = "bool" if name == "present" else basic[kind]
+    assert message_fields(message) == want
+
+
+def test_pose_and_battery_are_put_together_as_the_robot_has_them(authored):
+    _, scene, graph = authored
+    pose, battery = graph.GetChild("publish_pose"), graph.GetChild("publish_battery")
+    for group, parts in (("position", "xyz"), ("orientation", "xyzw")):
+        for axis in parts:
+            (path,) = pose.GetAttribute(f"inputs:pose:{group}:{axis}").GetConnections()
+            assert path.name == f"outputs:{axis}"
+    pack = scene.robot.battery
+    volts, amperes = (battery.GetAttribute(f"inputs:{name}").Get() for name in ("voltage", "current"))
+    assert volts * -amperes == pytest.approx(pack.load_w, rel=1e-5)
+    assert pack.voltage_empty_v < volts < pack.voltage_full_v
+    assert battery.GetAttribute("inputs:percentage").Get() == pack.initial_fraction
+    assert graph.GetChild("seldom").GetAttribute("inputs:step").Get() == 60 / pack.rate_hz
 
 
 def test_frames_of_messages_are_those_that_a_bag_of_the_robot_names(authored):
@@ -142,6 +180,7 @@ def test_frames_of_messages_are_those_that_a_bag_of_the_robot_names(authored):
     assert graph.GetChild("publish_imu").GetAttribute("inputs:frameId").Get() == who.imu_frame
     assert graph.GetChild("publish_scan").GetAttribute("inputs:frameId").Get() == who.lidar_frame
     assert graph.GetChild("publish_pose").GetAttribute("inputs:header:frame_id").Get() == who.map_frame
+    assert graph.GetChild("publish_battery").GetAttribute("inputs:header:frame_id").Get() == who.base_frame
     odometry = graph.GetChild("publish_odometry")
     assert odometry.GetAttribute("inputs:odomFrameId").Get() == who.odom_frame
     assert odometry.GetAttribute("inputs:chassisFrameId").Get() == who.base_frame
@@ -239,7 +278,7 @@ def test_robots_that_share_a_lab_have_topics_of_their_own_and_one_clock(lab_scen
         for prim in graph.GetChildren()
         if prim.GetAttribute("inputs:topicName")
     ]
-    assert len(topics) == len(set(topics)) == 13
+    assert len(topics) == len(set(topics)) == 15
     assert {"/clock", "/second/odom", f"/{scene.robot.name}/odom"} <= set(topics)
 
 
@@ -276,6 +315,27 @@ def test_what_is_no_robot_to_isaac_is_refused_with_what_to_do(lab_scene):
 )
 def test_types_go_together_where_base_tuple_and_array_are_the_same(given, taken, yes):
     assert fits(given, taken) is yes
+
+
+@pytest.mark.skipif(
+    "MAGTWIN_ISAACSIM" not in os.environ, reason="MAGTWIN_ISAACSIM names no checkout of isaac-sim/IsaacSim"
+)
+def test_the_table_is_what_a_checkout_of_isaac_sim_says():
+    count = 0
+    for known in node_types().values():
+        file = Path(os.environ["MAGTWIN_ISAACSIM"], known.source.split(": ")[-1])
+        if file.suffix != ".ogn":
+            continue
+        ((name, said),) = json.loads(file.read_text()).items()
+        assert known.name in (name, f"{file.parts[file.parts.index('extensions') + 1]}.{name}")
+        assert known.version == said["version"]
+        for mine, its in ((known.inputs, said.get("inputs", {})), (known.outputs, said.get("outputs", {}))):
+            kinds = {key: value["type"] for key, value in its.items()}
+            assert mine == {k: v if isinstance(v, str) else tuple(v) for k, v in kinds.items()}, known.name
+        for key, values in known.tokens.items():
+            assert set(values) == set(said["inputs"][key]["metadata"]["allowedTokens"].values())
+        count += 1
+    assert count == 20
 
 
 def test_what_a_definition_does_not_have_is_refused_when_it_is_authored():

@@ -1,19 +1,22 @@
 """Isaac Sim: what a scene needs there beside what every USD has, ROS 2 topics above all.
 
-An Action Graph a robot publishes clock, odometry, inertial unit, pose, joints and scan, and drives the robot
-by the commands that come in, on the topics and in the frames of `magtwin.io.messages`. Isaac Sim has no
-magnetometer: whoever reads these topics has what the network reads, and computes the field. None of this has
-been run in Isaac Sim; the graph is held against the definitions of its nodes, see `magtwin.export.ogn`.
+An Action Graph a robot publishes clock, odometry, inertial unit, pose, battery, joints and scan, and drives
+the robot by the commands that come in, on the topics and in the frames of `magtwin.io.messages`. Isaac Sim
+has no magnetometer: whoever reads these topics has what the network reads, and computes the field. None of
+this has been run in Isaac Sim; the graph is held against its nodes' definitions, see `magtwin.export.ogn`.
 """
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 from pxr import Sdf, Usd, UsdPhysics
 
 from magtwin.export.ogn import Graph
 from magtwin.frames import IDENTITY_XYZW
 from magtwin.names import RefusedError
-from magtwin.spec import ZERO3, MountSpec, RobotSpec, Scene
+from magtwin.sim.battery import current_a, open_voltage
+from magtwin.spec import ZERO3, BatterySpec, MountSpec, RobotSpec, Scene
 from magtwin.usd.layers import WORLD
 from magtwin.usd.schema import only_prim_with, place, prims_with
 from magtwin.usd.sensors import BASE, IMU_TYPE, LIDAR_TYPE
@@ -30,6 +33,12 @@ BRIDGE = "isaacsim.ros2.bridge."
 CORE = "isaacsim.core.nodes."
 SENSORS = "isaacsim.sensors.physics."
 BREAK = "omni.graph.nodes.BreakVector"
+
+FRAMES_HZ = 60.0
+"""Frames a second of Isaac Sim's playback, unless told otherwise."""
+
+DISCHARGING = 2
+"""POWER_SUPPLY_STATUS_DISCHARGING of sensor_msgs/BatteryState."""
 
 DEFAULT_QOS, SENSOR_QOS, CLOCK_QOS = "qos", "sensor_qos", "clock_qos"
 """Nodes that say how topics are offered."""
@@ -79,6 +88,8 @@ def _author(graph: Graph, robot: RobotSpec, parts: _Parts, namespace: str, *, cl
     """The nodes of one robot's graph."""
     graph.node("tick", "omni.graph.action.OnPlaybackTick")
     graph.node("time", f"{CORE}IsaacReadSimulationTime", resetOnStop=True)
+    graph.node("stamp", f"{CORE}IsaacTimeSplitter")
+    graph.connect("time.simulationTime", "stamp.time")
     graph.node("context", f"{BRIDGE}ROS2Context", useDomainIDEnvVar=True)
     _qos(graph)
     if clock:
@@ -87,6 +98,7 @@ def _author(graph: Graph, robot: RobotSpec, parts: _Parts, namespace: str, *, cl
     _odometry(graph, parts, f"/{namespace}/odom")
     _imu(graph, parts, f"/{namespace}/imu", frame_of(robot.imu, "imu"))
     _pose(graph, parts, f"/{namespace}/enu/pose")
+    _battery(graph, robot.battery, f"/{namespace}/battery_state")
     _joints(graph, parts, f"/{namespace}/joint_states")
     _scan(graph, parts, f"/{namespace}/scan", frame_of(robot.lidar, "lidar"))
     _drive(graph, robot, parts, f"/{namespace}/cmd_vel")
@@ -142,24 +154,55 @@ def _pose(graph: Graph, parts: _Parts, topic: str) -> None:
     graph.node("pose", f"{CORE}IsaacReadWorldPose", prim=parts.base)
     graph.node("place", f"{BREAK}3")
     graph.node("turn", f"{BREAK}4")
-    graph.node("stamp", f"{CORE}IsaacTimeSplitter")
-    graph.node(
-        "publish_pose",
-        f"{BRIDGE}ROS2Publisher",
-        message="geometry_msgs/msg/PoseStamped",
-        topicName=topic,
-        **{"header:frame_id": "map"},
-    )
-    _published(graph, "publish_pose", DEFAULT_QOS, stamp=False)
-    graph.connect("time.simulationTime", "stamp.time")
-    graph.connect("stamp.seconds", "publish_pose.header:stamp:sec")
-    graph.connect("stamp.nanoseconds", "publish_pose.header:stamp:nanosec")
+    _message(graph, "publish_pose", "geometry_msgs/msg/PoseStamped", topic, "map", DEFAULT_QOS)
     graph.connect("pose.translation", "place.tuple")
     graph.connect("pose.orientation", "turn.tuple")
     for axis in "xyz":
         graph.connect(f"place.{axis}", f"publish_pose.pose:position:{axis}")
     for axis in "xyzw":
         graph.connect(f"turn.{axis}", f"publish_pose.pose:orientation:{axis}")
+
+
+def _battery(graph: Graph, spec: BatterySpec, topic: str) -> None:
+    """The pack as it is at the start, with the electronics' load on it: Isaac Sim discharges none."""
+    charge = spec.initial_fraction
+    current = float(current_a(spec, spec.load_w, charge))
+    unknown = math.nan
+    graph.node("seldom", f"{CORE}IsaacSimulationGate", step=max(1, round(FRAMES_HZ / spec.rate_hz)))
+    graph.connect("tick.tick", "seldom.execIn")
+    _message(
+        graph,
+        "publish_battery",
+        "sensor_msgs/msg/BatteryState",
+        topic,
+        BASE,
+        SENSOR_QOS,
+        after="seldom.execOut",
+        voltage=float(open_voltage(spec, charge)) - spec.resistance_ohm * current,
+        current=-current,  # ROS counts what flows in
+        percentage=charge,
+        **dict.fromkeys(("temperature", "charge", "capacity", "design_capacity"), unknown),
+        power_supply_status=DISCHARGING,
+        present=True,
+    )
+
+
+def _message(
+    graph: Graph,
+    node: str,
+    message: str,
+    topic: str,
+    frame: str,
+    qos: str,
+    after: str = "tick.tick",
+    **values: Any,
+) -> None:
+    """A node that publishes a message with a header, of which Isaac Sim has no publisher of its own."""
+    values |= {"topicName": topic, "header:frame_id": frame}
+    graph.node(node, f"{BRIDGE}ROS2Publisher", message=message, **values)
+    _published(graph, node, qos, after, stamp=False)
+    graph.connect("stamp.seconds", f"{node}.header:stamp:sec")
+    graph.connect("stamp.nanoseconds", f"{node}.header:stamp:nanosec")
 
 
 def _joints(graph: Graph, parts: _Parts, topic: str) -> None:

@@ -36,6 +36,7 @@ _USD = {
     "uint64": Sdf.ValueTypeNames.UInt64,
     "uchar[]": Sdf.ValueTypeNames.UCharArray,
     "float": Sdf.ValueTypeNames.Float,
+    "float[]": Sdf.ValueTypeNames.FloatArray,
     "double": Sdf.ValueTypeNames.Double,
     "double[]": Sdf.ValueTypeNames.DoubleArray,
     "vectord[3]": Sdf.ValueTypeNames.Vector3d,

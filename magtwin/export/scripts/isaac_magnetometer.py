@@ -66,7 +66,8 @@ if graphs := stage.GetPrimAtPath("/World/Graphs"):
 joints = [robot.GetRelationship(f"magtwin:drive:{side}WheelJoint").GetTargets() for side in ("left", "right")]
 SimulationManager.setup_simulation(dt=DT / STEPS, device="cpu")
 articulation = Articulation(str(robot.GetPath()))
-base = RigidPrim(f"{robot.GetPath()}/base_link")
+links = robot.GetRelationship("isaac:physics:robotLinks").GetTargets()  # the base comes first
+base = RigidPrim(str(links[0]))
 omni.timeline.get_timeline_interface().play()
 app.update()
 wheels = [articulation.get_dof_indices(path.name).list()[0] for (path,) in joints]

@@ -58,7 +58,9 @@ joints = [robot.GetRelationship(f"magtwin:drive:{side}WheelJoint").GetTargets() 
 wheels = [builder.joint_qd_start[builder.joint_label.index(str(path))] for (path,) in joints]
 for dof in wheels:  # inertia of the motors; without it stiff drives answer in one step and throw the robot
     builder.joint_armature[dof] = max(builder.joint_armature[dof], 0.002)
-base = builder.body_label.index(f"{robot.GetPath()}/base_link")
+links = robot.GetRelationship("isaac:physics:robotLinks").GetTargets()  # the base comes first
+base = builder.body_label.index(str(links[0]))
+free = builder.joint_q_start[builder.joint_child.index(base)]  # of its joint: x, y, z, and a quaternion
 model = builder.finalize(device="cpu")
 solver = newton.solvers.SolverMuJoCo(model, use_mujoco_cpu=True)
 now, then, control = model.state(), model.state(), model.control()
@@ -68,8 +70,8 @@ path = np.column_stack([2.4 * np.sin(u), 1.2 * np.sin(2 * u)])
 way = np.append(0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))  # travelled to each point of the path [m]
 course = np.unwrap(np.arctan2(2.4 * np.cos(2 * u), 2.4 * np.cos(u)))
 guide = *path.T, course, np.gradient(course, way)  # x, y, heading and curvature there
-pose = model.joint_q.numpy()  # the free joint comes first: x, y, z, and a quaternion
-pose[:2], pose[3:7] = path[0], (0, 0, math.sin(course[0] / 2), math.cos(course[0] / 2))
+pose, half = model.joint_q.numpy(), course[0] / 2
+pose[free : free + 2], pose[free + 3 : free + 7] = path[0], (0, 0, math.sin(half), math.cos(half))
 now.joint_q.assign(pose)
 newton.eval_fk(model, now.joint_q, now.joint_qd, now)
 
