@@ -17,7 +17,9 @@ from magtwin.export.structure import structure
 from magtwin.export.units import to_metres_z_up
 from magtwin.export.usdz import pack, unpack
 from magtwin.files import sha256, shipped
+from magtwin.io.tables import write_parquet
 from magtwin.names import RefusedError
+from magtwin.run import Run
 from magtwin.usd.scene import read_scene
 
 LAB = shipped("scenes", "lab", "lab.usda")
@@ -483,7 +485,8 @@ def test_the_command_exports_a_scene_by_its_name_and_says_what_it_made_as_json(t
 
 def test_the_command_draws_a_thumbnail_and_plays_a_run(tmp_path, capsys):
     out, run = tmp_path / "lab", tmp_path / "run.parquet"
-    main(["run", str(LAB), "--path", "sine", "--net", "none", "--parquet", str(run), "--json"])
+    poses = {"p_world_base": np.zeros((2, 3)), "q_world_base_xyzw": np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))}
+    write_parquet(Run({"t": np.array([0.0, 1.0]), **poses}), run)
     main(["export", str(LAB), "--out", str(out), "--run", str(run), "--no-onnx"])
     picture = (out / ".thumbs" / "256x256" / "lab.usda.png").read_bytes()
     assert struct.unpack_from(">II", picture, 16) == (256, 256)
