@@ -77,10 +77,30 @@ def outputs(layers: Sequence[Layer], inputs: Inputs, x: Array) -> Array:
     y = np.empty((len(x), len(layers[-1][1])))
     starts = itertools.count(0, CHUNK)  # next() on it is atomic
     threads = min(torch.get_num_threads(), math.ceil(len(x) / CHUNK))
-    transposed = [(weight.t(), bias) for weight, bias in layers]
+    transposed = [(weight.t(), bias) for weight, bias in _widened(layers)]
     skipping = Skipping(transposed)
     in_threads(lambda: _work(transposed, skipping, inputs, x, y, starts), threads)
     return y
+
+
+def _widened(layers: Sequence[Layer]) -> list[Layer]:
+    """Layers whose products give a row the same bytes wherever it stands in a block.
+
+    Of less than a dozen outputs from inputs that are no multiple of 4 the matrix kernels round a row by its
+    place; such a layer gets further outputs, which are 0 and which the next one takes as nothing.
+    """
+    found: list[Layer] = []
+    for weight, bias in layers:
+        if found and (more := len(found[-1][1]) - weight.shape[1]):
+            weight = torch.nn.functional.pad(weight, (0, more))
+        if len(bias) < TILE and weight.shape[1] % 4:
+            more = TILE - len(bias)
+            weight, bias = (
+                torch.nn.functional.pad(weight, (0, 0, 0, more)),
+                torch.cat([bias, bias.new_zeros(more)]),
+            )
+        found.append((weight, bias))
+    return found
 
 
 def _work(
@@ -111,4 +131,4 @@ def _work(
                 torch.addmm(bias, blocks[i], weight, out=blocks[i + 1])
                 if i < len(layers) - 1:
                     blocks[i + 1].relu_()
-            y[start : start + n] = last[:n]
+            y[start : start + n] = last[:n, : y.shape[1]]
