@@ -258,7 +258,8 @@ def _traversals(
     if against is not None:
         other, name = read_run(against), against.stem
         path = str(other.facts.get("path", ""))
-        first = next((one for one in found.judged if one.path == path), first)
+        able = [one for one in found.judged if one.path == path and one.name != name]
+        first = able[0] if able else first
     else:
         announcer(quiet=quiet)(f"Driving {first.path} by {engine}")
         other = made_again(first.run, scene, engine=engine, seed=int(first.run.facts.get("seed", 0)) + 1)

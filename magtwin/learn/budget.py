@@ -29,9 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.frames import into_base
-from magtwin.learn.baselines import Mean, Ridge, fit_ridge
 from magtwin.learn.dataset import Dataset
-from magtwin.learn.evaluate import Contender, Evaluation, aligned_runs
+from magtwin.learn.evaluate import Contender, Evaluation, Mean, aligned_runs
 from magtwin.learn.features import CARRIED, CIRCULAR, FEATURES, GRADIENT, features
 from magtwin.learn.labels import Alignment, labelled, placed
 from magtwin.names import RefusedError
@@ -55,6 +54,9 @@ CLOSED = {
 """What an oracle for each tells."""
 
 _OTHERS = tuple(term for term in TERMS if term != "platform")
+
+PENALTY = 1e-3
+"""Of the ridge that tells what a model can have learned, as a share of the rows' own curvature."""
 
 BUDGET_HZ = 20.0
 """Readings a second that a budget is made of: their exact field takes its time."""
@@ -264,7 +266,7 @@ def _budget(found: Evaluation, m: int, truth: Truth, train: Dataset, names: Sequ
         run = judged.run.take(rows)
         if any(set(FEATURES[name].columns) & {"b_map_gradient_nt_m"} for name in inputs):
             run = labelled(judged.run, one.chart.field, one.alignment).take(rows)
-        expected = learned.figures(features(run, inputs)).T
+        expected = learned(features(run, inputs)).T
         part = dict(zip(TERMS, exact, strict=True))
         for term, expectation in zip(_OTHERS, expected, strict=True):
             part[term] = part[term] - expectation
@@ -284,18 +286,33 @@ def _budget(found: Evaluation, m: int, truth: Truth, train: Dataset, names: Sequ
 
 def _learned(
     one: Contender, inputs: Sequence[str], truth: Truth, train: Dataset, names: Sequence[str] | None
-) -> Ridge:
+) -> "_Expectation":
     """What the inputs tell of each term but the platform's, from training recordings."""
-    xs, ys, recording = [], [], []
-    for k, (name, run) in enumerate(aligned_runs(train, names, one.chart, one.alignment)):
+    xs, ys = [], []
+    for name, run in aligned_runs(train, names, one.chart, one.alignment):
         x, rows = features(run, inputs), np.arange(run.rows)
         called, measured = f"training {name}", run["b_measured_nt"]
         exact = truth.parts(called, run, rows, run["b_map_nt"], one.alignment, measured)
         whole = np.isfinite(run["label_nt"]) & np.isfinite(x).all(axis=1) & np.isfinite(exact).all(axis=0)
         xs.append(x[whole])
         ys.append(exact[[TERMS.index(term) for term in _OTHERS]][:, whole].T)
-        recording.append(np.full(int(whole.sum()), k, np.intp))
-    return fit_ridge(np.concatenate(xs), np.concatenate(ys), np.concatenate(recording), tuple(inputs))
+    return _Expectation(np.concatenate(xs), np.concatenate(ys))
+
+
+class _Expectation:
+    """E[y | x] of several y at once, by ridge regression."""
+
+    def __init__(self, x: Array, y: Array) -> None:
+        """Fit to rows (N, F) and what goes with them, (N, T)."""
+        self.mean, self.scale, self.offset = x.mean(axis=0), x.std(axis=0), y.mean(axis=0)
+        self.scale[self.scale <= 1e-12 * np.maximum(1.0, np.abs(self.mean))] = 1.0
+        z = (x - self.mean) / self.scale
+        held = z.T @ z + PENALTY * len(z) * np.eye(z.shape[1])
+        self.weights = np.linalg.solve(held, z.T @ (y - self.offset))
+
+    def __call__(self, x: Array) -> Array:
+        """At rows (N, F), shape (N, T)."""
+        return np.asarray(self.offset + (x - self.mean) / self.scale @ self.weights)
 
 
 def _inputs(one: Contender, found: Evaluation, train: Dataset) -> tuple[str, ...]:

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from magtwin.field.map import AnomalyMap
 from magtwin.files import sha256
-from magtwin.learn.baselines import Mean, fit_ridge
 from magtwin.learn.dataset import MANIFEST, Dataset, values_sha256
 from magtwin.learn.features import CARRIED, CIRCULAR, FEATURES, GRADIENT, features
 from magtwin.learn.labels import Alignment, labelled
-from magtwin.learn.magnetometer import NeuralMagnetometer
+from magtwin.learn.linear import fit_linear
+from magtwin.learn.magnetometer import NeuralMagnetometer, Read
 from magtwin.learn.recording import thinned
 from magtwin.learn.scores import LEVEL, Errors, Score, scores
 from magtwin.learn.split import split
@@ -57,17 +57,33 @@ GAUSSIAN_MAE = math.sqrt(2 / math.pi)
 
 
 class Model(Protocol):
-    """What predicts a disturbance."""
+    """What predicts a disturbance; a `NeuralMagnetometer` does."""
 
     @property
     def features(self) -> tuple[str, ...]:
         """Names of its inputs."""
 
-    def predict(self, x: Array) -> tuple[Array, Array]:
-        """Means and standard deviations [nT], each (N,), of the rows of a run in order of time (N, F)."""
+    def read(self, runs: Sequence[Run]) -> list[Read]:
+        """Disturbances, their standard deviations, and rows beyond the training ranges, of each run."""
 
-    def outside(self, x: Array) -> NDArray[np.bool_]:
-        """Whether an input of a row is beyond the training ranges, shape (N,)."""
+
+@dataclass(frozen=True)
+class Mean:
+    """The naive model: the mean training label, whatever is read."""
+
+    mean_nt: float
+    """Mean of the training labels [nT]."""
+
+    sd_nt: float
+    """Their standard deviation [nT]; nan where unknown."""
+
+    features: tuple[str, ...] = ()
+    """It reads nothing."""
+
+    def read(self, runs: Sequence[Run]) -> list[Read]:
+        """The mean, its standard deviation, and that nothing is beyond what it knows."""
+        counts = [run.rows for run in runs]
+        return [Read(np.full(n, self.mean_nt), np.full(n, self.sd_nt), np.zeros(n, bool)) for n in counts]
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,12 +389,14 @@ def _judge(
             if key not in on:
                 on[key] = labelled(run, one.chart.field, one.alignment)
             here = on[key]
-            x = features(here, one.model.features)
+            told = one.model.read([here])[0]
         except RefusedError as error:
             raise RefusedError(f"{trial.name}: {one.name}: {error}") from error
-        mean, sd[m] = one.model.predict(x)
-        map_nt[m], map_sd[m], outside[m] = here["b_map_nt"], here["label_sd_nt"], one.model.outside(x)
-        total[m] = map_nt[m] + mean
+        sd[m] = told.sd_nt
+        if told.outside is not None:
+            outside[m] = told.outside
+        map_nt[m], map_sd[m] = here["b_map_nt"], here["label_sd_nt"]
+        total[m] = map_nt[m] + told.disturbance_nt
         for why, known in (
             (f"have no label on {one.chart.name}", np.isfinite(here["label_nt"])),
             (f"lack an input of {one.name}", np.isfinite(total[m])),
@@ -465,7 +483,7 @@ def contender(
         )
     chart = fits[0] if fits else charts[0]
     told = {"sha256": magnetometer.sha256, **facts}
-    return Contender(name or magnetometer.name, magnetometer.net, chart, alignment_of(facts, path), told)
+    return Contender(name or magnetometer.name, magnetometer, chart, alignment_of(facts, path), told)
 
 
 def alignment_of(facts: Mapping[str, Any], where: object = "") -> Alignment:
@@ -546,11 +564,11 @@ def tolles_lawson(
     able = set(dataset.columns) | {"yaw", "b_map_gradient_nt_m"}
     inputs = tuple(name for name in wanted if set(FEATURES[name].columns) <= able)
     rows = training_rows(dataset, names, chart, inputs, alignment)
-    model = fit_ridge(rows.x, rows.y, rows.recording, inputs)
+    model = fit_linear(rows.x, rows.y, rows.session, features=inputs, sd=rows.sd).model
     what = "Tolles-Lawson and gradient" if gradient else "Tolles-Lawson"
     told = {"fitted to": dataset.folder.name, "penalty": model.penalty, "training rows": len(rows.y)}
     name = f"{what}, {chart.name}{' aligned' * given}"
-    return Contender(name, model, chart, alignment, told)
+    return Contender(name, NeuralMagnetometer(model, name=name), chart, alignment, told)
 
 
 @dataclass(frozen=True, eq=False)
@@ -558,8 +576,13 @@ class TrainingRows:
     """Training recordings on a map."""
 
     x: Array
+    """Inputs, shape (N, F)."""
     y: Array
-    recording: NDArray[np.intp]
+    """Labels [nT], shape (N,)."""
+    sd: Array
+    """How well the map is known there [nT], shape (N,)."""
+    session: NDArray[np.intp]
+    """Which session each row is of, shape (N,)."""
 
 
 def training_rows(
@@ -573,14 +596,14 @@ def training_rows(
 
     The arguments are those of `aligned_runs`.
     """
-    xs, ys, recording = [], [], []
-    for k, (_, run) in enumerate(aligned_runs(dataset, names, chart, alignment)):
+    parts = []
+    sessions = [one.session for one in dataset.recordings]
+    for name, run in aligned_runs(dataset, names, chart, alignment):
         x, y = features(run, inputs), run["label_nt"]
         known = np.isfinite(y) & np.isfinite(x).all(axis=1)
-        xs.append(x[known])
-        ys.append(y[known])
-        recording.append(np.full(int(known.sum()), k, np.intp))
-    rows = TrainingRows(np.concatenate(xs), np.concatenate(ys), np.concatenate(recording))
+        session = sessions.index(dataset.recording(name).session)
+        parts.append((x[known], y[known], run["label_sd_nt"][known], np.full(int(known.sum()), session)))
+    rows = TrainingRows(*(np.concatenate(column) for column in zip(*parts, strict=True)))
     if not len(rows.y):
         raise RefusedError(f"{dataset.folder}: no training row has a label on {chart.name} and all inputs")
     return rows
