@@ -1,4 +1,4 @@
-"""Robot: an articulation made from a URDF, for scripts and for `magtwin robot`; and where its links stand."""
+"""Robot: an articulation made from a URDF, and back, for scripts and `magtwin robot`; where links stand."""
 
 import dataclasses
 import os
@@ -14,8 +14,9 @@ from magtwin.usd.urdf.convert import convert_with_report
 from magtwin.usd.urdf.kinematics import link_poses
 from magtwin.usd.urdf.options import DEFAULTS, DriveRule, Options
 from magtwin.usd.urdf.report import ConversionReport
+from magtwin.usd.urdf.write import write_urdf
 
-__all__ = ["DriveRule", "Options", "Robot", "RobotSettings", "from_urdf", "link_poses"]
+__all__ = ["DriveRule", "Options", "Robot", "RobotSettings", "from_urdf", "link_poses", "write_urdf"]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""`magtwin robot`: a description in, a USD articulation out."""
+"""`magtwin robot`: a description in, a USD articulation out, and back."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,7 +14,8 @@ from magtwin.names import RefusedError
 def robot(
     urdf: Path,
     *,
-    out: Path,
+    out: Path | None = None,
+    to_urdf: Path | None = None,
     settings: Path | None = None,
     package: Annotated[list[str] | None, Parameter(negative="")] = None,
     arg: Annotated[list[str] | None, Parameter(negative="")] = None,
@@ -33,14 +34,17 @@ def robot(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Convert a URDF or a xacro to a USD articulation that drives.
+    """Convert a URDF or a xacro to a USD articulation that drives, or such a stage to a URDF.
 
     Parameters
     ----------
     urdf
-        The robot's description, .urdf or .xacro.
+        The robot's description, .urdf or .xacro; with --to-urdf a stage of one robot.
     out
         Folder to make; it will hold NAME.usda and the layers it refers to.
+    to_urdf
+        URDF to make of a stage, in place of --out: the other way about, with equal kinematics and inertia.
+        It takes --force and --json alone.
     settings
         TOML with drive, battery, platform field, sensor mounts and conversion, such as
         robots/turtlebot4/robot.toml; options given here come before its [conversion].
@@ -81,6 +85,19 @@ def robot(
     from magtwin.files import check_free, output
     from magtwin.robot import DriveRule, from_urdf
 
+    if (out is None) == (to_urdf is None):
+        raise RefusedError(
+            "robot makes a stage with --out DIR, or a URDF with --to-urdf FILE; give one of them"
+        )
+    given = (settings, package, arg, missing_meshes, collision, profile, drive, fix_base, merge_fixed)
+    if to_urdf is not None:
+        if any(option is not None for option in (*given, density, mass, single_file, strict, report)):
+            raise RefusedError(
+                "--to-urdf takes a stage as it is, with --force and --json; leave the others out"
+            )
+        _to_urdf(urdf, to_urdf, force=force, json=json)
+        return
+    assert out is not None
     if report is not None:
         check_suffix(report, (".json",), "a report")
         check_free(report, force=force)
@@ -112,6 +129,16 @@ def robot(
     print_report(made.report.summary(), json)
     if not json:
         say(f"Wrote {made.asset}")
+
+
+def _to_urdf(stage: Path, out: Path, *, force: bool, json: bool) -> None:
+    from magtwin.robot import write_urdf
+
+    if stage.suffix in (".urdf", ".xacro"):
+        raise RefusedError(f"{stage}: --to-urdf takes a stage, .usd, .usda, .usdc or .usdz")
+    print_report(write_urdf(stage, out, force=force), json)
+    if not json:
+        say(f"Wrote {out}")
 
 
 def _thumbnail(asset: Path, out: Path) -> None:
