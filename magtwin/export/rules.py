@@ -272,7 +272,14 @@ def network_file(subject: Subject) -> Iterator[Wrong]:
         if spec.kind != "neural":
             continue
         file = network_of(prim)
-        if spec.network is None:
+        if spec.network is None and spec.network_sha256:
+            yield Wrong(
+                f"keeps the checksum {spec.network_sha256[:12]}... of a network that it does not name",
+                where,
+                "a layer for viewers does not bring it; name it again to read this magnetometer",
+                severity="warning",
+            )
+        elif spec.network is None:
             yield Wrong("is neural and names no network", where)
         elif file is None:
             yield Wrong(f"names the network {spec.network.name}, which is not there", where)

@@ -70,7 +70,7 @@ def validate(
         checks = {check.validator: [check] for check in seen.checks}
         for name, look in (
             ("nvidia", lambda: [nvidia(file)]),
-            ("simready", lambda: simready(seen.robots)),
+            ("simready", lambda: simready(seen.robots, packed=root is not None)),
             ("newton", lambda: [newton(root or file, seen.bodies)]),
         ):
             if name in wanted:

@@ -69,8 +69,14 @@ def nvidia(file: Path) -> Check:
     return Check("nvidia", tuple(findings), scope=_version("usd-validation-nvidia"))
 
 
-def simready(robots: Mapping[str, Path | None]) -> list[Check]:
-    """What SimReady's profiles say of the robots of a stage, each by its own asset."""
+def simready(robots: Mapping[str, Path | None], *, packed: bool = False) -> list[Check]:
+    """What SimReady's profiles say of the robots of a stage, each by its own asset.
+
+    Args:
+        robots: File of the asset of each robot by its prim; None where it is no asset of its own.
+        packed: Whether they lie in a package: a profile is of an asset's folder with its picture, which no
+            package may hold.
+    """
     command = os.environ.get(SIMREADY) or shutil.which("simready-validate")
     checks = []
     for profile, version in PROFILES:
@@ -79,6 +85,8 @@ def simready(robots: Mapping[str, Path | None]) -> list[Check]:
             checks.append(Check(name, not_run=GET_SIMREADY))
         elif not robots:
             checks.append(Check(name, not_run="the stage has no robot"))
+        elif packed:
+            checks.append(Check(name, not_run="a package is no folder of an asset, which the profile is for"))
         elif any(asset is None for asset in robots.values()):
             checks.append(Check(name, not_run="a robot is no asset of its own, which the profile is for"))
         else:

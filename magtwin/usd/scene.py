@@ -48,6 +48,7 @@ from magtwin.usd.sensors import (
     read_way,
 )
 from magtwin.usd.sources import LOOKS, SOURCES, define_sources
+from magtwin.usd.urdf.convert import THUMBNAILS
 
 EARTH = WORLD.AppendChild("Earth")
 TAKEN = (LAB.name, PHYSICS_SCENE.name, MAP.name, EARTH.name, SOURCES.name, FURNITURE.name)
@@ -539,7 +540,7 @@ def _copied(file: Path, folder: Path) -> Path:
 
 
 def _copied_asset(asset: Path, folder: Path) -> Path:
-    """A USD file copied with every file that it names, in the same arrangement."""
+    """A USD file copied with every file that it names, in the same arrangement, and its picture."""
     asset = asset.resolve()
     layers, assets, unresolved = UsdUtils.ComputeAllDependencies(str(asset))
     if unresolved:
@@ -549,7 +550,8 @@ def _copied_asset(asset: Path, folder: Path) -> Path:
     if outside:
         raise RefusedError(f"{asset}: names {outside[0]}, outside its folder; copy it into {asset.parent}")
     common = Path(os.path.commonpath([file.parent for file in files]))
-    for file in files:
+    picture = asset.parent / THUMBNAILS / f"{asset.name}.png"
+    for file in (*files, *([picture] if picture.is_file() else [])):
         _copied(file, (folder / file.relative_to(common)).parent)
     return folder / asset.relative_to(common)
 
