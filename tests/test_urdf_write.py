@@ -194,8 +194,8 @@ def edit(tmp_path, change):
     urdf = tmp_path / "two.urdf"
     urdf.write_text(
         f'<robot name="two"><link name="base_link">{BODY}</link><link name="arm">{INERTIAL}</link>'
-        '<joint name="j" type="continuous"><parent link="base_link"/><child link="arm"/><axis xyz="0 0 1"/></joint>'
-        "</robot>"
+        '<joint name="j" type="continuous"><parent link="base_link"/><child link="arm"/>'
+        '<axis xyz="0 0 1"/></joint></robot>'
     )
     asset = convert_urdf(urdf, tmp_path / "two.usda", options=Options(single_file=True))
     stage = Usd.Stage.Open(str(asset))
