@@ -3,7 +3,7 @@ import pytest
 import torch
 from numpy.testing import assert_allclose
 
-from magtwin.learn.train import train
+from magtwin.learn.train import Dropout, train
 from magtwin.names import RefusedError
 
 NAMES = ("yaw_deg", "odom_v_x")
@@ -46,6 +46,31 @@ def test_one_seed_gives_one_network_and_another_seed_another():
     a, b, c = (a_training(seed, n=600, epochs=2, dropout=0.3)[0].state_dict() for seed in (0, 0, 1))
     assert all(torch.equal(a[name], b[name]) for name in a)
     assert not torch.equal(a["layers.0.weight"], c["layers.0.weight"])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.9])
+def test_dropout_drops_its_share_and_scales_the_others_up(share):
+    drop = Dropout(share, torch.Generator().manual_seed(5))
+    out = torch.stack([drop(torch.ones(99, 999)) for _ in range(10)])
+    dropped = (out == 0).double()
+    sd = np.sqrt(share * (1 - share))
+    assert abs(float(dropped.mean()) - share) <= 4 * sd / np.sqrt(out.numel()) + 1e-5
+    assert_allclose(out[out != 0].numpy(), 1 / (1 - share), rtol=2e-4)  # to a 65,536th of 0.1
+    assert_allclose(dropped.mean(dim=(0, 1)).numpy(), share, atol=6 * sd / np.sqrt(990))  # no unit is spared
+    if share:
+        assert not torch.equal(out[0], out[1])
+
+
+def test_dropped_units_pass_no_gradient():
+    h = torch.ones(8, 64, requires_grad=True)
+    out = Dropout(0.5, torch.Generator().manual_seed(0))(h)
+    out.sum().backward()
+    assert torch.equal(h.grad, out.detach())
+
+
+def test_a_device_that_is_not_there_is_refused():
+    with pytest.raises(RefusedError, match="device 'nowhere': this torch has none"):
+        a_training(n=300, epochs=1, device="nowhere")
 
 
 def test_training_leaves_torchs_own_generator_as_it_was():
@@ -245,7 +270,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path, harm):
     changed = {
         "cut": whole[:-100],
         "pickle": b"\x80\x04N.",
-        "tensor": whole.replace(b'"rng"', b'"rnh"'),
+        "tensor": whole.replace(b'"rng.order"', b'"rnh.order"'),
         "epochs": whole.replace(b'\\"number\\": 1', b'\\"number\\": 2'),
         "keys": whole.replace(b'\\"best\\": true', b'\\"bast\\": true'),
     }
