@@ -4,8 +4,8 @@
 
 magtwin's is `magtwin.learn.train.train` as `magtwin train` calls it: 600,000 x 20 float64 rows, 1,024 a step,
 dropout .3, Adam. The bare loop is what one writes with torch alone: the same layers in eager mode with ReLU
-and Dropout, tensors in memory, shuffled indices, mean squared error, fused Adam. The bare products are those of
-the network forward and backward (not for the gradient of the inputs), float32, into memory that is there
+and Dropout, tensors in memory, shuffled indices, mean squared error, fused Adam. The bare products are those
+of the network forward and backward (not for the gradient of the inputs), float32, into memory that is there
 already. They take turns every few steps. On one thread processor time is taken, which other work on the
 machine disturbs least; on more, time by the clock.
 """
