@@ -1,5 +1,7 @@
 """`magtwin train`: from a data set to weights that a simulation runs, with card and curve."""
 
+import contextlib
+import io
 import json
 
 import numpy as np
@@ -12,8 +14,10 @@ from magtwin.files import sha256
 from magtwin.io.formats import read_run
 from magtwin.learn.config import read_config
 from magtwin.learn.dataset import build_dataset, open_dataset
+from magtwin.learn.features import features
 from magtwin.learn.magnetometer import NeuralMagnetometer
 from magtwin.learn.model import load_net
+from magtwin.learn.predictor import load_predictor
 from magtwin.learn.split import LEAK
 from magtwin.learn.train import _Training
 from magtwin.run import COLUMNS, Run
@@ -172,6 +176,157 @@ def test_a_split_by_row_carries_its_warning_everywhere(data, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["facts"]["warning"] == LEAK
     assert load_net(out).facts["warning"] == LEAK
     assert LEAK in out.with_suffix(".md").read_text()
+
+
+# Other kinds than perceptrons
+
+SMALL = {
+    "linear": [],
+    "hybrid": ["--layers", "8", "--epochs", "2"],
+    "ensemble": ["--layers", "8", "--epochs", "4", "--members", "2", "--batch", "64", "--lr", "0.03"],
+    "tcn": ["--layers", "6,6", "--epochs", "4", "--kernel", "2", "--batch", "64", "--lr", "0.03"],
+}
+
+
+@pytest.fixture(scope="module")
+def kinds(data, tmp_path_factory):
+    """A file of each kind, and what its training printed."""
+    folder = tmp_path_factory.mktemp("kinds")
+    found = {}
+    for kind, words in SMALL.items():
+        out = folder / f"{kind}.safetensors"
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            words = ["--model", kind, *words, "--hold-out", "f", "g", "--json"]
+            main(["train", str(data), "--out", str(out), *words])
+        found[kind] = out, json.loads(printed.getvalue())
+    return found
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_what_is_told_of_a_kind_is_its_own_error_beside_the_naive_and_the_ridges(data, kinds, kind):
+    out, printed = kinds[kind]
+    predictor, figures = load_predictor(out), printed["figures"]
+    assert figures["kind"]["value"] == predictor.kind == kind
+    errors, naive, inside, ridge = [], [], [], []
+    peer = load_predictor(kinds["linear"][0])  # on the set "circular", as the baseline
+    for _, run in open_dataset(data).runs(["f", "g"]):
+        mean, sd = predictor.predict(features(run, predictor.features))
+        errors.append(np.abs(mean - run["label_nt"]))
+        inside.append(errors[-1] <= 1.645 * sd)
+        naive.append(np.abs(predictor.facts["label_mean_nt"] - run["label_nt"]))
+        ridge.append(np.abs(peer.predict(features(run, peer.features))[0] - run["label_nt"]))
+    assert figures["test MAE"]["value"] == pytest.approx(np.mean(errors))
+    assert figures["test naive MAE"]["value"] == pytest.approx(np.mean(naive))
+    assert figures["test ridge MAE"]["value"] == pytest.approx(np.mean(ridge))
+    assert figures["test coverage"]["value"] == pytest.approx(np.mean(inside), abs=0.003)
+    assert np.mean(errors) < 0.8 * np.mean(naive)
+    row = f"{np.mean(errors) / np.mean(naive):.3f} | {np.mean(ridge):.1f} |"
+    assert row in out.with_suffix(".md").read_text()
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_the_configuration_of_any_kind_repeats_its_weights_to_the_byte(data, kinds, kind, tmp_path):
+    (tmp_path / "c.toml").write_text(load_predictor(kinds[kind][0]).facts["config"])
+    again = tmp_path / f"{kind}.safetensors"
+    main(["train", str(data), "--out", str(again), "--config", str(tmp_path / "c.toml"), "--json"])
+    assert again.read_bytes() == kinds[kind][0].read_bytes()
+
+
+def test_a_model_that_is_fitted_at_once_has_no_learning_curve(kinds):
+    beside = sorted(path.name for path in kinds["linear"][0].parent.glob("linear.*"))
+    assert beside == ["linear.md", "linear.safetensors"]
+    assert kinds["tcn"][0].with_suffix(".csv").exists()
+
+
+def test_a_hybrid_says_whether_its_network_was_kept_and_both_figures(kinds):
+    out, printed = kinds["hybrid"]
+    hybrid, figures = load_predictor(out), printed["figures"]
+    base, whole = (figures[name]["value"] for name in ("base alone MAE", "with network MAE"))
+    assert (hybrid.net is not None) == (whole < base) == (figures["network"]["value"] == "kept")
+    assert f"the base alone errs by {base:.1f} nT, with the network by {whole:.1f} nT" in (
+        out.with_suffix(".md").read_text()
+    )
+
+
+@pytest.mark.parametrize("bent", [True, False])
+def test_a_hybrid_keeps_its_network_only_where_the_base_leaves_something(tmp_path, bent):
+    runs = {name: a_run(i, "eight") for i, name in enumerate("abcdefg")}
+    for name, run in runs.items():
+        speed = run["odom_v"][:, 0]
+        field = run["b_measured_nt"] + (300 * np.abs(speed) if bent else 0)
+        runs[name] = run.with_columns(b_measured_nt=field)
+    build_dataset(runs, FIELD, tmp_path / "set")
+    words = ["--model", "hybrid", "--features", "odom_v_x,imu_w_z", "--layers", "16", "--epochs", "8"]
+    words += ["--batch", "32", "--lr", "0.02", "--json"]
+    main(["train", str(tmp_path / "set"), "--out", str(tmp_path / "h.safetensors"), *words])
+    facts = load_predictor(tmp_path / "h.safetensors").facts
+    assert facts["network"] == ("kept" if bent else "left out")
+    if bent:
+        assert facts["test_mae_nt"] < 0.5 * facts["test_ridge_mae_nt"]
+
+
+def test_a_hybrid_is_fine_tuned_with_its_base_frozen(data, kinds, tmp_path):
+    begun = kinds["hybrid"][0]
+    words = ["--model", "hybrid", "--layers", "8", "--epochs", "1", "--init", str(begun), "--freeze", "base"]
+    main(["train", str(data), "--out", str(tmp_path / "h.safetensors"), *words, "--json"])
+    before, after = load_predictor(begun), load_predictor(tmp_path / "h.safetensors")
+    assert np.array_equal(before.base.coefficients_nt, after.base.coefficients_nt)
+    assert "base frozen" in (tmp_path / "h.md").read_text()
+
+
+def test_a_linear_model_goes_on_from_another(data, kinds, tmp_path, capsys):
+    words = ["--model", "linear", "--init", str(kinds["linear"][0]), "--penalty", "1e9"]
+    main(["train", str(data), "--out", str(tmp_path / "l.safetensors"), *words, "--json"])
+    before, after = load_predictor(kinds["linear"][0]), load_predictor(tmp_path / "l.safetensors")
+    np.testing.assert_allclose(after.coefficients_nt, before.coefficients_nt, rtol=1e-4)
+    assert "test MAE before" in json.loads(capsys.readouterr().out)["figures"]
+
+
+def test_rows_that_come_at_other_rates_are_nothing_for_a_network_that_looks_back(tmp_path, capsys):
+    runs = {name: a_run(i, "eight") for i, name in enumerate("abc")}
+    runs["c"] = runs["c"].with_columns(t=np.arange(200) / 20)
+    build_dataset(runs, FIELD, tmp_path / "set")
+    said = refused(
+        capsys, "train", tmp_path / "set", "--out", tmp_path / "t.safetensors", "--model", "tcn", *TINY[2:4]
+    )
+    assert "rows of the recordings lie 0.05 to 0.1 s apart, and a tcn looks back over rows" in said
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["set"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this torch sees a GPU")
+def test_a_gpu_that_is_not_there_is_refused_and_auto_takes_the_cpu(data, kinds, tmp_path, capsys):
+    out = tmp_path / "f.safetensors"
+    said = refused(capsys, "train", data, "--out", out, "--device", "cuda", *TINY)
+    assert "device cuda: this torch sees no GPU" in said
+    assert load_predictor(kinds["tcn"][0]).facts["device"] == "cpu"
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--model", "linear", "--epochs", "3"], "epochs is nothing to 'linear'; leave it out, or take"),
+        (["--model", "ensemble", "--dropout", "0.1"], "dropout is nothing to 'ensemble'"),
+        (["--members", "3"], "members is nothing to 'paper'"),
+        (["--model", "tcn", "--kernel", "1"], "kernel must be 2 rows at least, got 1"),
+        (["--model", "linear", "--penalty", "-1"], "penalty must be from 0 up and finite, got -1.0"),
+        (["--model", "linear", "--resume"], "a linear model is fitted at once"),
+        (["--model", "hybrid", "--init", "KINDS/tcn.safetensors"], "holds a tcn, and the training is of a"),
+        (["--model", "linear", "--init", "KINDS/linear.safetensors", "--features", "gradient"],
+         "the model to go on from has inputs yaw_sin,"),
+        (["--model", "hybrid", "--init", "KINDS/hybrid.safetensors", "--freeze", "layers.7"],
+         "no layer 'layers.7'"),
+        (["--model", "linear", "--features", "odom_x"], "no feature set 'odom_x'"),
+    ],
+)  # fmt: skip
+def test_what_a_kind_cannot_do_is_refused_and_writes_nothing(data, kinds, tmp_path, capsys, words, text):
+    folder = kinds["linear"][0].parent
+    words = [word.replace("KINDS", str(folder)) for word in words]
+    assert text in refused(capsys, "train", data, "--out", tmp_path / "f.safetensors", *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+# Refusals
 
 
 @pytest.mark.parametrize(

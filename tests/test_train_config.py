@@ -1,6 +1,6 @@
 import pytest
 
-from magtwin.learn.config import TrainConfig, read_config
+from magtwin.learn.config import MODELS, TrainConfig, read_config
 from magtwin.learn.features import SETS
 from magtwin.names import RefusedError
 
@@ -22,6 +22,24 @@ def test_a_configuration_comes_back_from_its_own_toml(tmp_path):
     assert config.inputs == ("yaw_sin", "lidar_on")
 
 
+@pytest.mark.parametrize("model", list(MODELS))
+def test_every_model_is_complete_without_a_word_and_comes_back_from_its_toml(tmp_path, model):
+    config = TrainConfig(model=model)
+    (tmp_path / "c.toml").write_text(config.to_toml(), encoding="utf-8")
+    assert read_config(tmp_path / "c.toml") == config
+    assert config.inputs
+
+
+def test_another_model_leaves_the_options_of_the_one_before_behind():
+    config = TrainConfig(model="ensemble", members=3, epochs=7, seed=4, features="circular")
+    other = config.with_options(model="hybrid")
+    assert (other.epochs, other.seed, other.features, other.members) == (7, 4, "circular", None)
+    assert other.layers == TrainConfig(model="hybrid").layers
+    assert config.with_options(epochs=9) == TrainConfig(
+        model="ensemble", members=3, epochs=9, seed=4, features="circular"
+    )
+
+
 def test_weights_to_go_on_from_lie_beside_the_file_that_names_them(tmp_path):
     (tmp_path / "c.toml").write_text('init = "a.safetensors"\n')
     assert read_config(tmp_path / "c.toml").init == tmp_path / "a.safetensors"
@@ -40,9 +58,17 @@ def test_weights_to_go_on_from_lie_beside_the_file_that_names_them(tmp_path):
         ('split = "day"', "c.toml:1: split must be one of 'session', 'run', 'path', 'row', got 'day'"),
         ('features = "ful"', "no feature set 'ful'; did you mean 'full'?"),
         ('features = "yaw_sin, lidar"', "no feature 'lidar'; did you mean 'lidar_on'?"),
+        ('model = "linear"\nepochs = 3', "c.toml:2: epochs is nothing to 'linear'; leave it out, or "
+         "take one that reads it: paper, released, hybrid, ensemble, tcn"),
+        ('model = "rigde"', "c.toml:1: model must be one of 'paper', 'released', 'linear', 'hybrid', "
+         "'ensemble', 'tcn', got 'rigde'"),
+        ('model = "hybrid"\npenalty = -1', "c.toml:2: penalty must be from 0 up and finite, got -1.0"),
+        ('model = "tcn"\nkernel = 1', "c.toml:2: kernel must be 2 rows at least, got 1"),
+        ('model = "ensemble"\nmembers = 0', "c.toml:2: members must be above 0, got 0"),
+        ('device = "gpu"', "c.toml:1: device must be one of 'cpu', 'cuda', 'auto', got 'gpu'"),
         ('freeze = ["layers.0"]', "freeze keeps layers of trained weights: give init too"),
     ],
-)
+)  # fmt: skip
 def test_a_file_that_says_what_cannot_be_is_refused(tmp_path, text, said):
     (tmp_path / "c.toml").write_text(text + "\n")
     with pytest.raises(RefusedError) as refused:

@@ -127,9 +127,10 @@ class TrainConfig:
             if field.name in ALL_READ or given is None or given in ((), ""):
                 continue
             if field.name not in known:
+                able = [name for name, options in MODELS.items() if field.name in options]
                 raise RefusedError(
-                    f"{field.name} is nothing to the model {self.model!r}, which reads "
-                    f"{', '.join([*known, *ALL_READ])}; leave it out"
+                    f"{field.name} is nothing to {self.model!r}; leave it out, or take one that reads it: "
+                    f"{', '.join(able)}"
                 )
         for name, usual in known.items():
             if getattr(self, name) in (None, (), ""):
