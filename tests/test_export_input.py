@@ -233,7 +233,7 @@ def test_what_cannot_be_made_is_refused(out, options, text, tmp_path):
 
 def test_a_stage_without_a_robot_has_no_action_graph_to_be_exported_with(tmp_path):
     refuse(
-        "no robot with a magnetometer .* take --profile omniverse",
+        "is no scene of magtwin's, .* take --profile omniverse",
         write(tmp_path, HEAD + CUBE),
         tmp_path,
         profile="isaac",
@@ -250,6 +250,21 @@ def test_what_exists_is_replaced_only_when_asked(lab, tmp_path):
         assert (tmp_path / name).stat().st_mtime_ns == before
         export_scene(stage, tmp_path / name, trusted=True, force=True)
     assert not list(tmp_path.glob(".*"))
+
+
+def test_an_export_does_not_take_the_place_of_the_stage_that_it_is_made_from(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    for out in (own, own.parent):
+        with pytest.raises(RefusedError, match="holds the stage that is exported; name another place"):
+            export_scene(own / "lab.usda", out, trusted=True, force=True)
+    assert (own / "room.usda").is_file()
+
+
+def test_a_robot_alone_can_be_handed_on(tmp_path):
+    robot = shipped("robots", "turtlebot4", "turtlebot4.usda")
+    made = export_scene(robot, tmp_path / "robot.usdz", trusted=True)
+    assert Usd.Stage.Open(str(made.root)).GetPrimAtPath("/turtlebot4/left_wheel")
+    assert made.licences == {"turtlebot4.usda": "Apache-2.0"}
 
 
 # Units

@@ -141,6 +141,9 @@ def export_scene(
         check_free(target, force=force)
     if existing(scene_file, "stage").is_dir():
         raise RefusedError(f"{scene_file}: a folder; give a USD file in it")
+    for target in filter(None, (out, beside)):
+        if target.resolve() in (scene_file.resolve(), *scene_file.resolve().parents):
+            raise RefusedError(f"{target}: is or holds the stage that is exported; name another place")
     with TemporaryDirectory() as scratch, _told_of(Path(scratch, "stage"), scene_file):
         work = _Work(Path(scratch, "stage"), scene_file, name, progress)
         work.gather(convert_units=convert_units, trusted=trusted)
@@ -290,7 +293,8 @@ class _Work:
             if layer.realPath and facts.get("asset_license"):
                 self.licences[self._said(Path(layer.realPath))] = facts["asset_license"]
         self.licences = dict(sorted(self.licences.items()))
-        self.scene = read_scene(self.root) if magnetometers and prims_with(world, "robot") else None
+        is_scene = all(prims_with(world, noun) for noun in ("lab", "robot", "magnetometer"))
+        self.scene = read_scene(self.root) if is_scene else None
 
     def _said(self, file: Path) -> str:
         return file.resolve().relative_to(self.folder.resolve()).as_posix()
@@ -311,8 +315,8 @@ class _Work:
         """Give robots Isaac Sim's asset structure, and the scene its Action Graphs."""
         if self.scene is None:
             raise RefusedError(
-                f"{self.source}: has no robot with a magnetometer of magtwin's, which --profile isaac is "
-                "for; take --profile omniverse"
+                f"{self.source}: is no scene of magtwin's, with lab, robot and magnetometer, which --profile "
+                "isaac is for; take --profile omniverse"
             )
         self.progress("Authoring what Isaac Sim needs")
         for asset in {placed.robot.asset for placed in self.scene.robots}:
