@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from pxr import Sdf, Usd, UsdPhysics, UsdShade
 
 from magtwin.export.isaac import GRAPHS, author_graph
-from magtwin.export.ogn import Graph, fits, message_fields, node_types
+from magtwin.export.ogn import Graph, faults, fits, message_fields, node_types
 from magtwin.io.messages import TOPICS, TYPES, sender_of
 from magtwin.names import RefusedError
 from magtwin.spec import PlacedRobot
@@ -338,6 +339,38 @@ def test_the_table_is_what_a_checkout_of_isaac_sim_says():
     assert count == 20
 
 
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("int node:typeVersion = 7", "is of version 7 of isaacsim.ros2.bridge.ROS2PublishClock, known is 1"),
+        ('string inputs:topic = "/clock"', "has no inputs:topic; did you mean 'inputs:topicName'?"),
+        ("float inputs:timeStamp = 0", "inputs:timeStamp is a float, .* has a double"),
+        ("uint inputs:execIn.connect = </G/tick.outputs:time>", "execIn takes execution, .* is double"),
+        ("uint inputs:execIn.connect = </G/tick.inputs:tick>", "which is no output"),
+        ("uint inputs:execIn.connect = </G/tock.outputs:tick>", "which is no node's"),
+    ],
+)
+def test_a_graph_that_others_edited_is_held_against_the_definitions_too(text, what):
+    version = "" if "typeVersion" in text else "int node:typeVersion = 1"
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.ImportFromString(
+        '#usda 1.0\ndef OmniGraph "G" {\n'
+        'def OmniGraphNode "tick" { token node:type = "omni.graph.action.OnPlaybackTick"\n'
+        "int node:typeVersion = 2\n }\n"
+        'def OmniGraphNode "clock" { token node:type = "isaacsim.ros2.bridge.ROS2PublishClock"\n'
+        f"{version}\n{text}\n }}\n}}\n"
+    )
+    stage = Usd.Stage.Open(layer)
+    assert not faults(stage.GetPrimAtPath("/G/tick"))
+    (said,) = faults(stage.GetPrimAtPath("/G/clock"))
+    assert re.search(what, said)
+
+
+def test_no_node_of_the_authored_graph_has_a_fault(authored):
+    _, _, graph = authored
+    assert not [text for prim in graph.GetChildren() for text in faults(prim)]
+
+
 def test_what_a_definition_does_not_have_is_refused_when_it_is_authored():
     graph = Graph(Usd.Stage.CreateInMemory(), Sdf.Path("/Graph"))
     clock = "isaacsim.ros2.bridge.ROS2PublishClock"
@@ -347,6 +380,8 @@ def test_what_a_definition_does_not_have_is_refused_when_it_is_authored():
         graph.node("a", clock, topic="/clock")
     with pytest.raises(RefusedError, match="type 'laserscan' is none; did you mean 'laser_scan'"):
         graph.node("a", "isaacsim.ros2.bridge.ROS2RtxLidarHelper", type="laserscan")
+    with pytest.raises(RefusedError, match="no message 'geometry_msgs/msg/Pose'"):
+        graph.node("a", "isaacsim.ros2.bridge.ROS2Publisher", message="geometry_msgs/msg/Pose")
     graph.node("tick", "omni.graph.action.OnPlaybackTick")
     graph.node("clock", clock)
     with pytest.raises(RefusedError, match=r"tick\.tick is execution, clock\.timeStamp takes double"):

@@ -57,10 +57,10 @@ class NodeType:
     name: str
     version: int
 
-    inputs: Mapping[str, Kind]
+    inputs: dict[str, Kind]
     """Kind of each input by its name: OmniGraph's name of a type, or several that it takes one of."""
 
-    outputs: Mapping[str, Kind]
+    outputs: dict[str, Kind]
 
     tokens: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Values that an input may have, where it is a choice."""
@@ -88,8 +88,8 @@ def node_types() -> dict[str, NodeType]:
 
 @cache
 def message_fields(message: str) -> dict[str, Kind]:
-    """Inputs that a ROS2Publisher makes for a type of message, such as geometry_msgs/msg/PoseStamped."""
-    return _kinds(_table()["messages"][message])
+    """Inputs that a ROS2Publisher makes for a message, geometry_msgs/msg/PoseStamped; none unless known."""
+    return _kinds(_table()["messages"].get(message, {}))
 
 
 def isaac_version() -> str:
@@ -105,6 +105,75 @@ def fits(given: Kind, taken: Kind) -> bool:
     """
     sides = [{_shape(k) for k in ((kind,) if isinstance(kind, str) else kind)} for kind in (given, taken)]
     return bool(sides[0] & sides[1])
+
+
+def ports(node: Usd.Prim) -> dict[str, Kind] | None:
+    """Kinds of a node's inputs and outputs by name, `inputs:execIn`; None where its type is not known.
+
+    Those that a ROS2Publisher makes for its message are among them, where the message is known.
+    """
+    known = node_types().get(node.GetAttribute("node:type").Get())
+    if known is None:
+        return None
+    inputs = dict(known.inputs)
+    if "messageName" in inputs:
+        parts = (
+            node.GetAttribute(f"inputs:message{part}").Get() for part in ("Package", "Subfolder", "Name")
+        )
+        inputs |= message_fields("/".join(map(str, parts)))
+    named = {"inputs": inputs, "outputs": known.outputs}
+    return {f"{space}:{name}": kind for space, kinds in named.items() for name, kind in kinds.items()}
+
+
+def _fields(node: Usd.Prim) -> dict[str, Kind]:
+    """Inputs that a node has for its message."""
+    parts = (node.GetAttribute(f"inputs:message{part}").Get() for part in ("Package", "Subfolder", "Name"))
+    return message_fields("/".join(map(str, parts)))
+
+
+def faults(node: Usd.Prim) -> list[str]:
+    """What of a node its definition does not have, a sentence each; none of a type that is not known."""
+    kinds = ports(node)
+    if kinds is None:
+        return []
+    known, found = node_types()[node.GetAttribute("node:type").Get()], []
+    version = node.GetAttribute("node:typeVersion").Get()
+    if version != known.version:
+        found.append(f"is of version {version} of {known.name}, known is {known.version}")
+    for prop in node.GetAuthoredProperties():
+        name = prop.GetName()
+        if not name.startswith(("inputs:", "outputs:")):
+            continue
+        if name not in kinds:
+            if "inputs:messageName" in kinds and not _fields(node):
+                continue  # a message of which nothing is known
+            found.append(f"{known.name} has no {name}; {hint(name, kinds)}")
+        elif isinstance(prop, Usd.Attribute):
+            if (
+                isinstance(kinds[name], str)
+                and kinds[name] in _USD
+                and prop.GetTypeName() != _usd_type(kinds[name])
+            ):
+                found.append(f"{name} is a {prop.GetTypeName()}, {known.name} has a {_words(kinds[name])}")
+            found += [text for path in prop.GetConnections() if (text := _unfit(prop, path, kinds[name]))]
+    return found
+
+
+def _unfit(attribute: Usd.Attribute, path: Sdf.Path, taken: Kind) -> str:
+    """What is wrong with one connection of an attribute, "" for nothing."""
+    source = attribute.GetStage().GetPrimAtPath(path.GetPrimPath())
+    if source and source.GetTypeName() == "OmniGraph":
+        return ""  # a variable of the graph
+    if not source or source.GetTypeName() != "OmniGraphNode":
+        return f"{attribute.GetName()} is fed by <{path}>, which is no node's"
+    given = ports(source)
+    if given is None:
+        return ""
+    if not path.name.startswith("outputs:") or path.name not in given:
+        return f"{attribute.GetName()} is fed by <{path}>, which is no output"
+    if not fits(given[path.name], taken):
+        return f"{attribute.GetName()} takes {_words(taken)}, <{path}> is {_words(given[path.name])}"
+    return ""
 
 
 class Graph:
@@ -155,6 +224,8 @@ class Graph:
         prim.CreateAttribute("node:typeVersion", names.Int, custom=False).Set(known.version)
         inputs = dict(known.inputs)
         if message:
+            if not message_fields(message):
+                raise RefusedError(f"no message {message!r}; {hint(message, _table()['messages'])}")
             package, folder, short = message.split("/")
             values |= {"messagePackage": package, "messageSubfolder": folder, "messageName": short}
             inputs |= message_fields(message)
