@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from rerun.chunk import RrdReader
 
 from magtwin.cli import main
 from magtwin.field.map import AnomalyMap
@@ -111,6 +112,23 @@ def test_the_learning_curve_is_drawn_and_tabled(trained):
     assert [line.split(",")[0] for line in table[1:]] == ["1", "2", "3", "4", "5", "6"]
     assert trained.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     assert not trained.with_suffix(".checkpoint").exists()
+
+
+def test_the_learning_curve_is_a_recording_on_a_timeline_of_epochs(data, tmp_path):
+    words = ["--model", "tcn", *SMALL["tcn"], "--rrd", str(tmp_path / "f.rrd"), "--json"]
+    main(["train", str(data), "--out", str(tmp_path / "f.safetensors"), *words])
+    table = np.genfromtxt(tmp_path / "f.csv", delimiter=",", names=True)
+    seen = {}
+    for chunk in RrdReader(tmp_path / "f.rrd").stream():
+        batch = chunk.to_record_batch()
+        if "epoch" in batch.schema.names and "Scalars:scalars" in batch.schema.names:
+            values = [row[0] for row in batch["Scalars:scalars"].to_pylist()]
+            seen[chunk.entity_path] = dict(zip(batch["epoch"].to_pylist(), values, strict=True))
+    assert list(seen["/learning/validation"]) == table["number"].astype(int).tolist()
+    assert list(seen["/learning/validation"].values()) == table["val_rmse_nt"].tolist()
+    assert list(seen["/learning/training"].values()) == table["train_rmse_nt"].tolist()
+    ((number, rmse),) = seen["/learning/kept"].items()
+    assert rmse == table["val_rmse_nt"].min() == seen["/learning/validation"][number]
 
 
 def test_a_simulation_runs_the_trained_network(trained, lab_scene, tmp_path, capsys):
@@ -316,12 +334,14 @@ def test_a_gpu_that_is_not_there_is_refused_and_auto_takes_the_cpu(data, kinds, 
          "the model to go on from has inputs yaw_sin,"),
         (["--model", "hybrid", "--init", "KINDS/hybrid.safetensors", "--freeze", "layers.7"],
          "no layer 'layers.7'"),
+        (["--model", "linear", "--rrd", "OUT/f.rrd"], "--rrd: a linear model is fitted at once and has no"),
+        (["--rrd", "OUT/f.csv"], "f.csv: a Rerun recording ends in .rrd"),
         (["--model", "linear", "--features", "odom_x"], "no feature set 'odom_x'"),
     ],
 )  # fmt: skip
 def test_what_a_kind_cannot_do_is_refused_and_writes_nothing(data, kinds, tmp_path, capsys, words, text):
     folder = kinds["linear"][0].parent
-    words = [word.replace("KINDS", str(folder)) for word in words]
+    words = [word.replace("KINDS", str(folder)).replace("OUT", str(tmp_path)) for word in words]
     assert text in refused(capsys, "train", data, "--out", tmp_path / "f.safetensors", *words)
     assert list(tmp_path.iterdir()) == []
 

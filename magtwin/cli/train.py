@@ -44,6 +44,7 @@ def train(
     init: Path | None = None,
     freeze: Names = None,
     resume: Flag = False,
+    rrd: Path | None = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -108,6 +109,8 @@ def train(
     resume
         Go on from F.checkpoint, which a training that was killed left; the weights are those of one that
         was not.
+    rrd
+        Rerun recording of the learning curve to write, .rrd.
     force
         Replace what exists, an unfinished training too.
     json
@@ -116,7 +119,11 @@ def train(
     import numpy as np
 
     from magtwin.files import check_free, output, sha256
-    from magtwin.io.learning_curves import plot_learning_curve, write_learning_curve
+    from magtwin.io.learning_curves import (
+        plot_learning_curve,
+        record_learning_curve,
+        write_learning_curve,
+    )
     from magtwin.learn.config import TrainConfig, read_config
     from magtwin.learn.dataset import open_dataset
     from magtwin.learn.split import split as split_of
@@ -155,7 +162,11 @@ def train(
     }
     options = _given(TrainConfig() if config is None else read_config(config), given)
     curves = () if options.model == "linear" else (picture, table)
-    for path in curves:
+    if rrd is not None:
+        check_suffix(rrd, (".rrd",), "a Rerun recording")
+        if not curves:
+            raise RefusedError("--rrd: a linear model is fitted at once and has no learning curve")
+    for path in (*curves, *([rrd] if rrd else [])):
         check_free(path, force=force)
     found = open_dataset(dataset)
     deals, draws = np.random.default_rng(options.seed).spawn(2)
@@ -176,6 +187,8 @@ def train(
         naive = trained.parts[0].naive_rmse_nt
         plot_learning_curve(trained.history, picture, naive_rmse_nt=naive, title=out.name, force=force)
         write_learning_curve(trained.history, table, force=force)
+        if rrd is not None:
+            record_learning_curve(trained.history, rrd, naive_rmse_nt=naive, title=out.name, force=force)
     trained.net.save(out, force=force)
     with output(card, force=force) as aside:
         aside.write_text(trained.card(out.name, sha256(out)), encoding="utf-8")

@@ -1,8 +1,10 @@
 """The paper's Figure 6c from a training of one's own: how the error falls with the epochs."""
 
+import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import astuple, fields
+from pathlib import Path
 
 from magtwin.files import output
 from magtwin.io.plots import INK, MAP_INK, new_figure, save
@@ -66,3 +68,60 @@ def write_learning_curve(
     lines += [",".join(repr(int(v) if isinstance(v, bool) else v) for v in astuple(e)) for e in history]
     with output(out, force=force) as aside:
         aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def record_learning_curve(
+    history: Sequence[Epoch],
+    out: str | os.PathLike[str],
+    *,
+    naive_rmse_nt: float | None = None,
+    title: str = "",
+    force: bool = False,
+) -> None:
+    """Write the epochs as a Rerun recording, on a timeline of epochs, that opens as a plot.
+
+    Args:
+        history: What a training gave.
+        out: The .rrd file to make.
+        naive_rmse_nt: Error of the mean training label on the validation rows [nT], a line of its own.
+        title: What the viewer calls the recording; the file's name unless given.
+        force: Whether a file that exists is replaced.
+
+    Raises:
+        RefusedError: `out` exists or cannot be written.
+    """
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    from magtwin.io.recording import stream
+
+    path = Path(out)
+    numbers = [epoch.number for epoch in history]
+    lines = {
+        "training": ([epoch.train_rmse_nt for epoch in history], (25, 113, 194)),
+        "validation": ([epoch.val_rmse_nt for epoch in history], (224, 102, 13)),
+        "validation_mae": ([epoch.val_mae_nt for epoch in history], (130, 130, 130)),
+    }
+    if naive_rmse_nt is not None:
+        lines["validation_naive"] = ([naive_rmse_nt] * len(history), (180, 180, 180))
+    told = repr((numbers, lines)).encode()
+    plot = rrb.TimeSeriesView(
+        origin="/learning",
+        name="RMSE [nT] by epoch",
+        axis_y=rrb.ScalarAxis(range=(0.0, 1.1 * max(max(values) for values, _ in lines.values()))),
+    )
+    views = rrb.Blueprint(plot, rrb.TimePanel(timeline="epoch", state="collapsed"), collapse_panels=True)
+    with (
+        output(path, force=force) as aside,
+        stream(hashlib.sha256(told).hexdigest(), title or path.stem, views, file=aside, said=path) as rec,
+    ):
+        for name, (values, colour) in lines.items():
+            entity = f"learning/{name}"
+            said = name.replace("_", ", ").replace("mae", "MAE")
+            rec.log(entity, rr.SeriesLines(names=[f"{said} [nT]"], colors=[colour]), static=True)
+            columns = rr.Scalars.columns(scalars=values)
+            rec.send_columns(entity, [rr.TimeColumn("epoch", sequence=numbers)], columns)
+        kept = next(epoch for epoch in reversed(history) if epoch.best)
+        rec.log("learning/kept", rr.SeriesPoints(names=[f"kept: epoch {kept.number}"]), static=True)
+        rec.set_time("epoch", sequence=kept.number)
+        rec.log("learning/kept", rr.Scalars(kept.val_rmse_nt))
