@@ -1,5 +1,6 @@
 """`magtwin ros`: the twin and its sensors as nodes of ROS 2."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -73,6 +74,7 @@ def sim(
     lidar: Literal["schedule", "on", "off"] = "schedule",
     stamps: Literal["sim", "wall"] = "sim",
     stamped_commands: bool = False,
+    magnetometer: bool = True,
 ) -> None:
     """Simulate a scene's robot in real time: the topics of the real one, and /clock.
 
@@ -103,6 +105,8 @@ def sim(
         Whether messages are stamped by sim time, from 0 on, or by the wall's.
     stamped_commands
         Take cmd_vel as TwistStamped, and not as Twist.
+    magnetometer
+        Say what its magnetometer reads, or leave that to magtwin ros magnetometer.
     """
     from magtwin.ros.simulate import Simulator
     from magtwin.twin import open_twin
@@ -121,10 +125,54 @@ def sim(
             lidar=lidar,
             stamps=stamps,
             stamped_commands=stamped_commands,
+            magnetometer=magnetometer,
             say=tell,
         )
         tell(f"simulating by {bus.backend} at {speed:g} x real time; Ctrl-C ends")
         node.run(duration_s=duration)
+
+
+@ros_app.command(name="magnetometer")
+def magnetometer(
+    scene: Path,
+    *settings: str,
+    where: Where = HERE,
+    net: Path | None = None,
+    duration: float | None = None,
+) -> None:
+    """Read a robot's sensors through map and network: the magnetometer alone, for any robot or simulator.
+
+    It takes pose (/robot/enu/pose), odometry, IMU, battery and scans, as far as the network reads them, and
+    says qtfm/magnitude and qtfm/total_field_nt wherever they are fresh; /diagnostics says how it fares.
+    Inputs may come and go. Settings are those of ROS, name:=value: rate_hz (135), units (T or nT),
+    use_sim_time, max_age_s (0.5), battery_max_age_s (30), lidar (scan, on or off), outside (silent or clamp).
+
+    Parameters
+    ----------
+    scene
+        USD stage that names the map, the network and the robot.
+    settings
+        Settings, such as units:=nT use_sim_time:=true.
+    where
+        Where the node stands.
+    net
+        Weights to use in place of the scene's.
+    duration
+        How long, by the wall [s]; without an end unless given.
+    """
+    from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
+    from magtwin.ros.parameters import settings as settings_of
+    from magtwin.twin import open_twin
+
+    values = settings_of(PARAMETERS, settings)
+    tell = announcer(quiet=False)
+    tell(f"opening {scene}")
+    twin = open_twin(scene, net=net)
+    sim_time = values["use_sim_time"]
+    with where.bus("magtwin_magnetometer", sim_time=sim_time, parameters=values) as bus:
+        Magnetometer(twin, bus, values, say=tell)
+        tell(f"reading by {bus.backend}; Ctrl-C ends")
+        spin(bus, duration)
 
 
 @ros_app.command(name="record")
@@ -216,6 +264,13 @@ def replay(
         )
         count = player.run(speed=speed)
     say(f"{count} messages")
+
+
+def spin(bus: "Bus", duration_s: float | None) -> None:
+    """Have a node do what it does, without an end or for a time by the wall [s]."""
+    begin = time.monotonic()
+    while duration_s is None or time.monotonic() - begin < duration_s:
+        bus.spin_once(0.1)
 
 
 def _warn(text: str) -> None:

@@ -138,6 +138,9 @@ class Bus(Protocol):
     def now_ns(self) -> int:
         """Time on the bus's clock [ns]: wall time, or /clock's in sim time (0 before the first)."""
 
+    def due_wall_ns(self) -> int:
+        """When the timer that is being called was due, by the wall, as far as that is known [ns]."""
+
     def spin_once(self, timeout_s: float) -> None:
         """Take in what has come, waiting for it at most `timeout_s`; timers that are due are called."""
 

@@ -33,13 +33,16 @@ class Clock:
         self.sim_time = sim_time
         self._now_ns = 0
         self._alarms: list[Alarm] = []
+        self.due_wall_ns = 0
+        """When the timer that is being called was due, by the wall: in sim time, when that was told [ns]."""
 
     def now_ns(self) -> int:
         """Time [ns]."""
         return self._now_ns if self.sim_time else time.time_ns()
 
-    def tell(self, now_ns: int) -> None:
-        """Set sim time [ns]."""
+    def tell(self, now_ns: int, sent_ns: int = 0) -> None:
+        """Set sim time [ns], which was sent at a wall time [ns]."""
+        self.due_wall_ns = sent_ns
         back = now_ns < self._now_ns
         self._now_ns = now_ns
         for alarm in self._alarms:
@@ -48,7 +51,7 @@ class Clock:
 
     def timer(self, period_s: float, due: Callable[[], None]) -> Alarm:
         """Call `due` in steps of `period_s` [s] from now on."""
-        period_ns = max(round(period_s * NS), 1)
+        period_ns = max(int(period_s * NS), 1)  # rounded up it would miss steps of a /clock as fine
         now = self._time_ns()
         alarm = Alarm(period_ns, due, now + period_ns if now else 0)
         self._alarms.append(alarm)
@@ -67,6 +70,8 @@ class Clock:
         now = self._time_ns()
         for alarm in list(self._alarms):
             if alarm.live and alarm.next_ns and alarm.next_ns <= now:
+                if not self.sim_time:
+                    self.due_wall_ns = time.time_ns() - (now - alarm.next_ns)
                 alarm.next_ns += alarm.period_ns * ((now - alarm.next_ns) // alarm.period_ns + 1)
                 alarm.due()
 

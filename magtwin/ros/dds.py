@@ -162,6 +162,10 @@ class DdsBus:
         """As for `Bus`."""
         return self.clock.now_ns()
 
+    def due_wall_ns(self) -> int:
+        """As for `Bus`."""
+        return self.clock.due_wall_ns
+
     def spin_once(self, timeout_s: float) -> None:
         """As for `Bus`."""
         left = self.clock.left_s(timeout_s)
@@ -209,7 +213,7 @@ class DdsBus:
             subscription.heard(Message(subscription.kind, data, sent_ns, now))
 
     def _told(self, message: Message) -> None:
-        self.clock.tell(int(message.read(["clock"])["clock"]))
+        self.clock.tell(int(message.read(["clock"])["clock"]), message.sent_ns)
 
 
 def _deaf(message: Message) -> None:

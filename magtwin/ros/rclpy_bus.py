@@ -91,10 +91,11 @@ class RclpyBus:
             parameter_overrides=[Parameter("use_sim_time", value=sim_time)],
         )
         for key, value in parameters.items():
-            self._node.declare_parameter(key, value)
+            if key != "use_sim_time":  # which every node has
+                self._node.declare_parameter(key, value)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._calls = 0
+        self._calls, self._due_ns = 0, 0
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> RclpyPublisher:
         """As for `Bus`."""
@@ -123,6 +124,7 @@ class RclpyBus:
 
         def call() -> None:
             self._calls += 1
+            self._due_ns = time.time_ns()  # rclpy does not tell when it was due
             due()
 
         return self._node.create_timer(period_s, call)
@@ -130,6 +132,10 @@ class RclpyBus:
     def now_ns(self) -> int:
         """As for `Bus`."""
         return int(self._node.get_clock().now().nanoseconds)
+
+    def due_wall_ns(self) -> int:
+        """As for `Bus`."""
+        return self._due_ns
 
     def spin_once(self, timeout_s: float) -> None:
         """As for `Bus`."""

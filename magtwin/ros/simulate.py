@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magtwin.io.bag_writer import Said, Stream, sender_for
 from magtwin.io.cdr import encode, leaves
-from magtwin.io.messages import COMMAND, IMU, SCAN, TYPES, Qos, Topic, Unit
+from magtwin.io.messages import COMMAND, IMU, MAGNITUDE, SCAN, TOTAL_FIELD, TYPES, VECTOR, Qos, Topic, Unit
 from magtwin.names import RefusedError
 from magtwin.ros.bus import NS, Bus, Message, Publisher
 from magtwin.ros.diagnostics import Reporter, Status
@@ -79,6 +79,7 @@ class Simulator:
         lidar: Literal["schedule", "on", "off"] = "schedule",
         stamps: Literal["sim", "wall"] = "sim",
         stamped_commands: bool = False,
+        magnetometer: bool = True,
         say: Say = lambda text: None,
     ) -> None:
         """Offer its topics; `run` begins.
@@ -93,6 +94,7 @@ class Simulator:
             lidar: Whether the LiDAR follows its schedule, or stays on or off.
             stamps: Whether messages are stamped by sim time, from 0 on, or by the wall's.
             stamped_commands: Whether cmd_vel is a TwistStamped, and not a Twist.
+            magnetometer: Whether it says what its magnetometer reads, or leaves that to another node.
             say: Takes lines for people.
 
         Raises:
@@ -102,6 +104,7 @@ class Simulator:
             raise RefusedError(f"speed must be above 0 and at most 100 times real time, got {speed!r}")
         self._twin, self._bus, self._seed, self._rate, self._lidar = twin, bus, seed, rate_hz, lidar
         self._speed, self._wall, self._say = speed, stamps == "wall", say
+        self._reads = magnetometer
         self._units: Unit = units
         self.online = self._online()
         self._who = sender_for(twin, units, self.online.rate_hz)
@@ -192,7 +195,9 @@ class Simulator:
             self._queue((SCAN, came, TYPES[SCAN.kind], fields))
 
     def _streamed(self, rows: Run) -> Stream:
-        return Stream(rows, self._who, None, topics=READ, whole=True)
+        silent = () if self._reads else (MAGNITUDE, VECTOR, TOTAL_FIELD)
+        topics = [topic for topic in READ if topic not in silent]
+        return Stream(rows, self._who, None, topics=topics, whole=True)
 
     def _sampled(self, topic: Topic, samples: Samples) -> None:
         """Have samples published when they arrive; those of before the beginning are known to nobody."""

@@ -184,15 +184,15 @@ class Online:
 
     def samples(self) -> dict[str, list[Samples]]:
         """What odometry, IMU, motion capture and battery read since the last time, by those names."""
-        sensors = {
-            "odometry": self._odometry,
-            "imu": self._imu,
-            "mocap": self._mocap,
-            "battery": self._battery,
+        queues = {
+            "odometry": self._odometry.held,
+            "imu": self._imu.held,
+            "mocap": self._mocap.held,
+            "battery": self._battery.held,
         }
         taken = {}
-        for name, sensor in sensors.items():
-            taken[name], sensor.held.fresh = sensor.held.fresh, []
+        for name, queue in queues.items():
+            taken[name], queue.fresh = queue.fresh, []
         return taken
 
     def _read(self) -> Run:

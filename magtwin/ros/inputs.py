@@ -1,0 +1,216 @@
+"""Inputs: what a node hears, joined by stamp: of each topic the newest message not from the future."""
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.frames import quat_conjugate, rotate
+from magtwin.io.messages import SENSOR_DATA, TYPES, Topic
+from magtwin.names import RefusedError
+from magtwin.ros.bus import NS, Bus, Message, Subscription
+from magtwin.ros.diagnostics import Status
+
+Columns = dict[str, NDArray[Any]]
+
+KEPT = 64
+"""Messages of a topic that are kept to be joined."""
+
+JUMP_S = 1.0
+"""A stamp that is older than the last one by more begins anew: the robot was started again, or time was."""
+
+AHEAD_S = 0.05
+"""How far stamps may be ahead of the node's clock before that is said [s]."""
+
+GRAVITY = 9.80665
+"""Standard gravity [m/s2]."""
+
+SETTLE = 50
+"""Accelerations after which it is known whether gravity is in them."""
+
+
+class Input:
+    """A topic that is heard as soon as somebody offers it, in any of the types that it can have."""
+
+    def __init__(self, bus: Bus, topic: Topic, *, max_age_s: float) -> None:
+        """Begin to look for it.
+
+        Args:
+            bus: The node.
+            topic: What it is called, and what its messages give.
+            max_age_s: Age at which its newest message is stale [s].
+        """
+        self.topic, self.max_age_s, self._bus = topic, max_age_s, bus
+        self.name = topic.name
+        self._kind = ""
+        self._subscription: Subscription | None = None
+        self._kept: deque[tuple[int, Columns]] = deque(maxlen=KEPT)
+        self.heard, self.broken, self.jumps, self.ahead = 0, 0, 0, 0
+        self.sent_ns = 0
+        self._heard_before, self._reported_ns = 0, 0
+        self._trouble = ""
+        self._gravity: Gravity | None = Gravity() if "imu_a" in topic.carries else None
+
+    def look(self) -> None:
+        """Listen, if it is offered and was not heard yet."""
+        if self._subscription is not None:
+            return
+        kinds = self._bus.types(self.topic.name)
+        known = [kind for kind in (self.topic.kind, *self.topic.read) if kind in kinds]
+        if known:
+            self._kind = known[0]
+            self._subscription = self._bus.subscribe(self.topic.name, self._kind, self._hear, SENSOR_DATA)
+        elif kinds:
+            self._trouble = f"offered as {', '.join(kinds)}; {' or '.join(self.topic.read)} can be read"
+
+    def at(self, now_ns: int) -> tuple[Columns, float] | None:
+        """Columns of the newest message that was taken by a time, one row, and its age [s]; none without."""
+        for stamp, columns in reversed(self._kept):
+            if stamp <= now_ns:
+                return columns, (now_ns - stamp) / NS
+        return None
+
+    def forget(self) -> None:
+        """Forget what was heard: time began anew."""
+        self._kept.clear()
+
+    def fresh(self, now_ns: int) -> Columns | None:
+        """Columns as for `at`, none where they are stale."""
+        found = self.at(now_ns)
+        return None if found is None or found[1] > self.max_age_s else found[0]
+
+    def status(self, now_ns: int) -> Status:
+        """How it fares since this was asked last."""
+        found = self.at(now_ns)
+        span = (now_ns - self._reported_ns) / NS
+        rate = (self.heard - self._heard_before) / span if 0 < span < 60 else 0.0
+        self._heard_before, self._reported_ns = self.heard, now_ns
+        senders = self._subscription.publishers() if self._subscription else 0
+        level: Any = "ok"
+        words = []
+        if self._subscription is None:
+            level, words = "stale", [self._trouble or "nobody offers it"]
+        elif found is None:
+            level = "stale"
+            words.append("nothing heard yet" if not self._kept else "every stamp is ahead of the clock")
+        elif found[1] > self.max_age_s:
+            level = "stale"
+            words.append(f"its newest is {found[1]:.2f} s old, more than {self.max_age_s:g} s")
+        troubles = (
+            (senders > 1, f"{senders} publishers; the newest message counts"),
+            (bool(self.broken), f"{self.broken} messages could not be used"),
+            (bool(self.jumps), f"stamps jumped back {self.jumps} times"),
+            (bool(self.ahead), f"{self.ahead} stamps were ahead of this node's clock"),
+        )
+        for there, text in troubles:
+            if there:
+                level = "warn" if level == "ok" else level
+                words.append(text)
+        values = {
+            "topic": self._subscription.topic if self._subscription else self.topic.name,
+            "type": self._kind,
+            "age [s]": "" if found is None else f"{found[1]:.3f}",
+            "rate [Hz]": f"{rate:.1f}",
+            "publishers": str(senders),
+        }
+        self.broken = self.jumps = self.ahead = 0
+        return Status(f"input {self.topic.name}", level, "; ".join(words) or "fresh", values)
+
+    def _hear(self, message: Message) -> None:
+        self.heard += 1
+        try:
+            stamp, columns = self._read(message)
+        except RefusedError:
+            self.broken += 1
+            return
+        if not all(np.isfinite(values).all() for values in columns.values()):
+            self.broken += 1
+            return
+        now = self._bus.now_ns()
+        if now and stamp > now + AHEAD_S * NS:  # before the first of /clock all are
+            self.ahead += 1
+        if self._kept and stamp < self._kept[-1][0]:
+            if stamp >= self._kept[-1][0] - JUMP_S * NS:
+                return  # late or doubled: what is newer is known
+            self.jumps += 1
+            self._kept.clear()
+        self.sent_ns = message.sent_ns
+        self._kept.append((stamp, columns))
+
+    def _read(self, message: Message) -> tuple[int, Columns]:
+        stamped = "header.stamp" in TYPES[message.kind]
+        wanted = (*self.topic.leaves[message.kind], *(("header.stamp",) if stamped else ()))
+        fields = message.read(wanted)
+        stamp = int(fields.pop("header.stamp")) if stamped else self._bus.now_ns()
+        columns = self.topic.read[message.kind]({name: np.asarray(v)[None] for name, v in fields.items()})
+        if self._gravity is not None:
+            columns = self._gravity.without(columns)
+        return stamp, columns
+
+
+class Gravity:
+    """Accelerations freed of gravity, if it is in them: their mean then is as long as it.
+
+    Before that is known nothing is taken off, and nothing is given.
+    """
+
+    def __init__(self) -> None:
+        self._sum, self._count = np.zeros(3), 0
+        self.inside: bool | None = None
+
+    def without(self, columns: Columns) -> Columns:
+        """The same columns with `imu_a` free of gravity.
+
+        Raises:
+            RefusedError: It is not known yet whether it is.
+        """
+        if self.inside is None:
+            self._sum += columns["imu_a"][0]
+            self._count += 1
+            mean = float(np.linalg.norm(self._sum)) / self._count
+            self.inside = abs(mean - GRAVITY) < GRAVITY / 10
+            if self._count < SETTLE and not self.inside and mean > 1.0:
+                self.inside = None  # in motion; a mean of more tells
+                raise RefusedError("it is not known yet whether gravity is in its accelerations")
+        if not self.inside:
+            return columns
+        up = (0.0, 0.0, GRAVITY)
+        return columns | {"imu_a": columns["imu_a"] - rotate(quat_conjugate(columns["imu_q_xyzw"]), up)}
+
+
+class Scanning:
+    """Whether a LiDAR spins, told by its scans: it does while they come."""
+
+    def __init__(self, bus: Bus, topic: Topic, *, gap_s: float) -> None:
+        """Begin to look for scans; `gap_s` is the longest time between two while it spins [s]."""
+        self._bus, self._topic, self._gap_s = bus, topic, gap_s
+        self._subscription: Subscription | None = None
+        self._last_ns: int | None = None
+        self.heard = 0
+
+    def look(self) -> None:
+        """As for `Input`."""
+        if self._subscription is None and self._topic.kind in self._bus.types(self._topic.name):
+            self._subscription = self._bus.subscribe(
+                self._topic.name, self._topic.kind, self._hear, SENSOR_DATA
+            )
+
+    def on(self, now_ns: int) -> bool:
+        """Whether it spins at a time."""
+        return self._last_ns is not None and abs(now_ns - self._last_ns) < self._gap_s * NS
+
+    def status(self, now_ns: int) -> Status:
+        """As for `Input`; no scans are an answer too, so it is never stale."""
+        told = "spins" if self.on(now_ns) else "no scans: it is taken as off"
+        return Status(f"input {self._topic.name}", "ok", told, {"scans": str(self.heard)})
+
+    def _hear(self, message: Message) -> None:
+        self.heard += 1
+        self._last_ns = self._bus.now_ns()
+
+
+def newest_sent_ns(inputs: Mapping[str, Input]) -> int:
+    """When the newest message of some inputs was sent, by the sender's wall clock [ns]; 0 before any."""
+    return max((one.sent_ns for one in inputs.values()), default=0)

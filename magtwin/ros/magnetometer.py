@@ -1,0 +1,272 @@
+"""The magnetometer as a node: what a robot's sensors say, through map and network, to what it would read.
+
+It runs against any source of its inputs: the real robot, Isaac Sim, magtwin's own simulator. At each step of
+its rate it joins, of every input, the newest message whose stamp is not ahead of its clock, as a Run of
+magtwin does. It gives a reading only where all of them are fresh and the map knows the place; else it says on
+/diagnostics what is missing, and goes on as soon as that is there again.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+
+from magtwin.frames import canonical, into_base, yaw_from_quat
+from magtwin.io.messages import (
+    BATTERY,
+    COMMAND,
+    IMU,
+    MAGNITUDE,
+    ODOMETRY,
+    POSE,
+    SCAN,
+    TOTAL_FIELD,
+    Topic,
+    sender_of,
+)
+from magtwin.names import RefusedError
+from magtwin.ros.bus import NS, Bus, to_bytes
+from magtwin.ros.diagnostics import Reporter, Status
+from magtwin.ros.inputs import Input, Scanning, newest_sent_ns
+from magtwin.ros.network import Following
+from magtwin.ros.parameters import Parameter
+from magtwin.run import Run
+from magtwin.twin import Twin
+
+PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
+    {
+        "rate_hz": Parameter(135.0, "readings a second [Hz]", 1.0, 1000.0),
+        "units": Parameter("T", "unit of the field: T, or nT as APRILab's robot has it", words=("T", "nT")),
+        "use_sim_time": Parameter(False, "whether time is /clock's"),
+        "max_age_s": Parameter(0.5, "age at which pose, odometry and IMU are stale [s]", 0.01, 60.0),
+        "battery_max_age_s": Parameter(30.0, "age at which the battery's state is stale [s]", 0.1, 3600.0),
+        "lidar": Parameter(
+            "scan", "whether the LiDAR spins: as scans come, on or off", words=("scan", "on", "off")
+        ),
+        "outside": Parameter(
+            "silent", "beyond the map: no reading, or the map's border's", words=("silent", "clamp")
+        ),
+    }
+)
+"""What the node can be set to."""
+
+INPUTS: tuple[Topic, ...] = (POSE, ODOMETRY, IMU, BATTERY, COMMAND)
+"""What it can hear, beside scans."""
+
+MADE = frozenset(("t", "yaw", "b_map_nt", "b_map_gradient_nt_m", "lidar_on"))
+"""Columns that it makes of those."""
+
+LOOK_S = 0.5
+"""Time between looks for topics that were not offered before [s]."""
+
+REPORT_S = 1.0
+"""Time between diagnostics [s]."""
+
+BACK_S = 0.2
+"""A clock that went back by more began anew [s]."""
+
+
+class Magnetometer:
+    """The node. It hears and says nothing but when the bus spins."""
+
+    def __init__(
+        self,
+        twin: Twin,
+        bus: Bus,
+        settings: Mapping[str, Any],
+        *,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        """Offer its topics, and look for its inputs.
+
+        Args:
+            twin: Gives map, network and the sensor's frame; whatever else is in the scene is not read.
+            bus: The node, whose clock is that of `use_sim_time`.
+            settings: Values of `PARAMETERS`.
+            say: Takes lines for people.
+
+        Raises:
+            RefusedError: The scene's magnetometer is physical, or its network reads what no input tells.
+        """
+        spec = twin.scene.robot.magnetometer
+        if twin.magnetometer is None and spec.kind != "map-only":
+            raise RefusedError(
+                f"the magnetometer of scene {twin.scene.name!r} is {spec.kind}, which needs the lab itself; "
+                "robots' sensors tell it to a network: name weights, or a scene with a neural magnetometer"
+            )
+        self._twin, self._bus, self._settings, self._say = twin, bus, dict(settings), say
+        self._rate = float(settings["rate_hz"])
+        self._who = sender_of(twin.scene.robot, unit=settings["units"], rate_hz=self._rate)
+        self._noise_nt = spec.noise_density_nt * np.sqrt(self._rate / 2)
+        needed = (twin.magnetometer.columns if twin.magnetometer else frozenset()) - MADE
+        told = {column for topic in INPUTS for column in _columns_of(topic)}
+        if beyond := sorted(needed - told):
+            raise RefusedError(
+                f"the network reads {', '.join(beyond)}, which no topic of this node tells; train it without"
+            )
+        chosen = [topic for topic in INPUTS if topic is POSE or needed & _columns_of(topic)]
+        ages = {BATTERY.name: settings["battery_max_age_s"]}
+        self.inputs = {
+            topic.name: Input(bus, topic, max_age_s=ages.get(topic.name, settings["max_age_s"]))
+            for topic in chosen
+        }
+        self._needed = needed
+        self._scans: Scanning | None = None
+        if settings["lidar"] == "scan" and twin.magnetometer and "lidar_on" in twin.magnetometer.columns:
+            lidar = twin.scene.robot.lidar
+            self._scans = Scanning(bus, SCAN, gap_s=lidar.latency_s + 2.5 / max(lidar.scan_rate_hz, 0.1))
+        self._network = Following(twin.magnetometer) if twin.magnetometer else None
+        self._magnitude = bus.publisher(MAGNITUDE.name, MAGNITUDE.kind, MAGNITUDE.qos)
+        self._total = bus.publisher(TOTAL_FIELD.name, TOTAL_FIELD.kind, TOTAL_FIELD.qos)
+        self._reporter = Reporter(bus)
+        self._last_ns = 0
+        self._published, self._published_before = 0, 0
+        self._skipped, self._outside, self._strange, self._resets = 0, 0, 0, 0
+        self._missing = ""
+        self._reported_ns = 0
+        self.latencies_s: deque[float] = deque(maxlen=10_000)
+        """From when its step was due, or the newest message of an input was sent if that was later, to when a
+        reading went out [s], of the last readings."""
+        if settings["units"] == "nT":
+            say("fields are published in nT, as APRILab's robot does; ROS means tesla")
+        self._look()
+        bus.timer(1 / self._rate, self._read)
+        bus.timer(LOOK_S, self._look)
+        bus.timer(REPORT_S, self._report)
+
+    def _look(self) -> None:
+        for one in self.inputs.values():
+            one.look()
+        if self._scans is not None:
+            self._scans.look()
+
+    def _read(self) -> None:
+        """A step: a reading, if all that it takes is there."""
+        now = self._bus.now_ns()
+        if now < self._last_ns:
+            if now > self._last_ns - BACK_S * NS:
+                return  # a clock that is set back a little: what was said stays said
+            self._restart()
+        if now == self._last_ns or not now:
+            return
+        columns: dict[str, Any] = {}
+        for one in self.inputs.values():
+            fresh = one.fresh(now)
+            if fresh is None and one.topic is COMMAND:
+                fresh = {"v_cmd": np.zeros(1), "w_cmd": np.zeros(1)}  # a robot that is told nothing stands
+            if fresh is None:
+                self._skip(f"no fresh {one.topic.name}")
+                return
+            columns |= fresh
+        rows = self._rows(now, columns)
+        if not np.isfinite(rows["b_map_nt"][0]):
+            self._outside += 1
+            self._skip("the pose is outside the map")
+            return
+        sd, disturbance = self._noise_nt, 0.0
+        if self._network is not None:
+            gave, spread, strange = self._network(rows)
+            disturbance = float(gave[0])
+            sd = float(np.hypot(spread[0], self._noise_nt)) if np.isfinite(spread[0]) else 0.0
+            self._strange += bool(strange is not None and strange[0])
+        total = float(rows["b_map_nt"][0]) + disturbance
+        if not np.isfinite(total):
+            self._skip("the network gave no number")
+            return
+        self._publish(now, total, sd)
+        begun = max(self._bus.due_wall_ns(), newest_sent_ns(self.inputs))
+        self.latencies_s.append((time.time_ns() - begun) / NS)
+        if self._missing:
+            self._say(f"reading again, after: {self._missing}")
+            self._missing = ""
+        self._last_ns = now
+        self._published += 1
+
+    def _rows(self, now: int, columns: dict[str, Any]) -> Run:
+        """One row of a Run, of what the network and the map read."""
+        yaw = yaw_from_quat(columns["mocap_q_xyzw"])
+        xy = columns["mocap_p"][:, :2]
+        outside: Literal["clamp", "nan"] = "clamp" if self._settings["outside"] == "clamp" else "nan"
+        b_map, slopes = self._twin.field.lookup_with_gradient(xy, yaw, outside=outside)
+        spins = self._scans.on(now) if self._scans is not None else self._settings["lidar"] == "on"
+        made = {
+            "t": np.array([now / NS]),
+            "yaw": yaw,
+            "lidar_on": np.array([spins]),
+            "b_map_nt": b_map,
+            "b_map_gradient_nt_m": into_base(slopes[:, :2], yaw),
+        }
+        if "imu_q_xyzw" in columns:
+            columns["imu_q_xyzw"] = canonical(columns["imu_q_xyzw"])
+        return Run(made | {name: columns[name] for name in self._needed}, {"rate_hz": self._rate})
+
+    def _publish(self, now: int, total_nt: float, sd_nt: float) -> None:
+        columns = {"b_measured_nt": np.array([total_nt]), "b_sd_nt": np.array([sd_nt])}
+        stamp = np.array([now])
+        for publisher, topic in ((self._magnitude, MAGNITUDE), (self._total, TOTAL_FIELD)):
+            fields = topic.write(columns, stamp, self._who)
+            publisher.publish(to_bytes(topic.kind, fields))
+
+    def _skip(self, why: str) -> None:
+        self._skipped += 1
+        if why != self._missing and self._published:
+            self._say(f"no reading: {why}")
+        self._missing = why
+
+    def _restart(self) -> None:
+        """Time began anew: nothing that was heard counts any more."""
+        self._resets += 1
+        self._say("time jumped back: what was heard before is forgotten")
+        for one in self.inputs.values():
+            one.forget()
+        if self._twin.magnetometer is not None:
+            self._network = Following(self._twin.magnetometer)
+        self._last_ns = 0
+
+    def _report(self) -> None:
+        now = self._bus.now_ns()
+        span = (now - self._reported_ns) / NS
+        rate = (self._published - self._published_before) / span if 0 < span < 60 else 0.0
+        self._published_before = self._published
+        self._reported_ns = now
+        level: Any = "ok"
+        words = []
+        if self._missing:
+            level = "error"
+            words.append(f"no reading: {self._missing}")
+        elif 0 < span < 60 and rate < 0.9 * self._rate:
+            level = "warn"
+            words.append(f"{rate:.0f} readings a second in place of {self._rate:g}")
+        troubles = (
+            (self._outside, "poses were outside the map"),
+            (self._strange, "readings were beyond what the network was trained on"),
+            (self._resets, "times time jumped back"),
+        )
+        for count, text in troubles:
+            if count:
+                level = "warn" if level == "ok" else level
+                words.append(f"{count} {text}")
+        late = 1e3 * np.percentile(self.latencies_s, 99) if self.latencies_s else np.nan
+        values = {
+            "rate [Hz]": f"{rate:.1f}",
+            "p99 latency [ms]": f"{late:.2f}",
+            "skipped": str(self._skipped),
+            "outside map": str(self._outside),
+            "out of distribution": str(self._strange),
+            "time jumps": str(self._resets),
+            "units": self._who.unit,
+        }
+        statuses = [Status("readings", level, "; ".join(words) or "reading", values)]
+        statuses += [one.status(now) for one in self.inputs.values()]
+        if self._scans is not None:
+            statuses.append(self._scans.status(now))
+        self._reporter.report(statuses, now)
+        self._skipped = self._outside = self._strange = self._resets = 0
+
+
+def _columns_of(topic: Topic) -> frozenset[str]:
+    """Columns that a topic's messages give."""
+    return frozenset(topic.carries or topic.needs)
