@@ -60,6 +60,13 @@ def test_a_sublayer_that_is_not_there_is_refused_by_name(lab, tmp_path):
     refuse(r"lab\.usda: .*room\.usda", own / "lab.usda", tmp_path)
 
 
+def test_a_layer_that_is_no_utf8_is_refused_in_one_line(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    data = (own / "room.usda").read_bytes()
+    (own / "room.usda").write_bytes(data.replace(b"Looks", b"L\xffoks"))
+    refuse(r"lab\.usda: .*room\.usda", own / "lab.usda", tmp_path)
+
+
 def test_a_reference_in_a_variant_that_is_not_chosen_is_refused_too(tmp_path):
     text = (
         'def Xform "World" (variants = {string v = "a"}\nprepend variantSets = "v")\n{\n'

@@ -75,7 +75,7 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
     finally:
         heard.TakeUncoalescedDiagnostics()
     if errors:
-        raise RefusedError(f"{path}: {_one_line(str(errors[0]))}")
+        raise RefusedError(f"{path}: {_one_line(_text(errors[0]))}")
     return stage
 
 
@@ -128,6 +128,14 @@ def _reason(error: Tf.ErrorException) -> str:
     """What USD said first, without where in its sources it said so; what it says later follows from that."""
     said = getattr(error.args[0], "commentary", str(error)) if error.args else str(error)
     return re.sub(r"pxrInternal_\w*?pxrReserved__(::|_)", "", _one_line(said))
+
+
+def _text(error: object) -> str:
+    """What USD says of an error; it quotes a damaged layer as it is, UTF-8 or not."""
+    try:
+        return str(error)
+    except UnicodeDecodeError as undecoded:
+        return undecoded.object.decode(errors="replace")
 
 
 def _one_line(text: str) -> str:
