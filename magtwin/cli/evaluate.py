@@ -93,6 +93,10 @@ def evaluate(
     from magtwin.learn import evaluate as room
 
     check_free(out, force=force)
+    if scene is not None and map and train is None and engine is None:
+        raise RefusedError(
+            "--scene adds an error budget, for which --train is needed too; give it, or no --scene"
+        )
     charts = _charts(map, scene)
     names = _short(weights)
     own = [
