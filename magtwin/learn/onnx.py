@@ -3,21 +3,33 @@
 In go features in their units and in float64, as `magtwin.learn.features` gives them; out come the disturbance
 and the standard deviation of its error [nT], each (rows,). Scalers are inside and work in float64, because in
 float32 they would err by 0.1 nT; products are float32, as in torch. A file's metadata tell what it holds.
+
+A temporal network looks at earlier rows: `context` of them, `step_s` apart as all rows are, stand before the
+first row that is wanted, and outputs are by as many fewer. Before a run's first row it stood as in it; where
+an earlier row holds a nan, the last whole one stands in its place.
 """
 
 import json
 import math
 import os
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from magtwin.files import check_free, existing, output, sha256
+from magtwin.learn import heads
+from magtwin.learn.ensemble import Ensemble
 from magtwin.learn.features import FEATURES
+from magtwin.learn.hybrid import Hybrid
 from magtwin.learn.inputs import Inputs
+from magtwin.learn.linear import Linear
 from magtwin.learn.model import FieldNet
+from magtwin.learn.perceptron import Layer
 from magtwin.learn.predictor import Predictor, load_predictor
+from magtwin.learn.temporal import Temporal
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
 from magtwin.version import __version__
@@ -55,7 +67,7 @@ def export_onnx(
     The same weights give the same bytes.
 
     Args:
-        weights: Weights file of any kind but "tcn", .safetensors or .pth.
+        weights: Weights file of any kind, .safetensors or .pth.
         out: The file to write.
         force: Whether one that exists is replaced.
 
@@ -63,7 +75,7 @@ def export_onnx(
         What the file holds, and the largest difference from torch that was seen.
 
     Raises:
-        RefusedError: No such weights, a kind that has no graph, packages that are missing, or `out` exists.
+        RefusedError: No such weights, packages that are missing, onnxruntime differs, or `out` exists.
     """
     check_free(out, force=force)
     predictor = load_predictor(weights)
@@ -103,24 +115,24 @@ def model_of(predictor: Predictor, *, weights_sha256: str = "") -> "onnx.ModelPr
     """The graph of a predictor, with its metadata.
 
     Args:
-        predictor: Of any kind but "tcn".
+        predictor: Of any kind that a weights file holds.
         weights_sha256: Checksum of its weights file, for the metadata.
 
     Raises:
-        RefusedError: A kind that has no graph, or onnx is not installed.
+        RefusedError: Another kind, or onnx is not installed.
     """
     onnx = _onnx()
     graph = _Graph(onnx)
     mean, sd = graph.predictor(predictor)
     graph.add("Identity", mean, out=MEAN)
     graph.add("Identity", sd, out=SD)
-    double = onnx.TensorProto.DOUBLE
-    of = inputs_of(predictor)
+    double, of = onnx.TensorProto.DOUBLE, inputs_of(predictor)
+    rows = f"rows + {predictor.context}" if predictor.context else "rows"
     model = onnx.helper.make_model(
         onnx.helper.make_graph(
             graph.nodes,
             "magtwin",
-            [onnx.helper.make_tensor_value_info(INPUT, double, ["rows", len(of.features)])],
+            [onnx.helper.make_tensor_value_info(INPUT, double, [rows, len(of.features)])],
             [onnx.helper.make_tensor_value_info(name, double, ["rows"]) for name in (MEAN, SD)],
             graph.constants,
         ),
@@ -141,6 +153,8 @@ def model_of(predictor: Predictor, *, weights_sha256: str = "") -> "onnx.ModelPr
         "training_max": _known(of.high),
         "output_unit": "nT",
         "residual_sd_nt": None if math.isnan(sd_nt) else sd_nt,
+        "context": predictor.context,
+        "step_s": predictor.step_s,
         "weights_sha256": weights_sha256,
         "facts": predictor.facts,
     }
@@ -156,9 +170,11 @@ def inputs_of(predictor: Predictor) -> Inputs:
     Raises:
         RefusedError: A kind that has no graph.
     """
-    if isinstance(predictor, FieldNet):
+    if isinstance(predictor, Hybrid):
+        return predictor.base.inputs
+    if isinstance(predictor, FieldNet | Linear | Ensemble | Temporal):
         return predictor.inputs
-    raise RefusedError(f"a {predictor.kind} has no ONNX graph; export a mlp")
+    raise RefusedError(f"a predictor of the kind {predictor.kind!r} has no ONNX graph")
 
 
 class _Graph:
@@ -187,7 +203,21 @@ class _Graph:
             mean = self.net(predictor, INPUT)
             sd = self.constant([predictor.residual_sd_nt])
             return mean, self.add("Expand", sd, self.add("Shape", mean))
-        raise RefusedError(f"a {predictor.kind} has no ONNX graph; export a mlp")
+        if isinstance(predictor, Linear):
+            return self.linear(predictor)
+        if isinstance(predictor, Hybrid):
+            mean, sd = self.linear(predictor.base)
+            if predictor.net is not None:
+                of = predictor.base.inputs
+                held = self.add("Max", INPUT, self.constant(of.low))
+                held = self.add("Min", held, self.constant(of.high))
+                mean = self.add("Add", mean, self.net(predictor.net, held))
+            return mean, self.add("Mul", sd, self.constant(predictor.sd_factor))
+        if isinstance(predictor, Ensemble):
+            return self.ensemble(predictor)
+        if isinstance(predictor, Temporal):
+            return self.temporal(predictor)
+        raise RefusedError(f"a predictor of the kind {predictor.kind!r} has no ONNX graph")
 
     def scaled(self, inputs: Inputs, x: str) -> str:
         """Scaled inputs (rows, F), float64."""
@@ -195,32 +225,108 @@ class _Graph:
         return self.add("Div", centred, self.constant(inputs.scale))
 
     def net(self, net: FieldNet, x: str) -> str:
-        """Disturbance of a multilayer perceptron (rows,); nan where an input is."""
+        """Disturbance of a multilayer perceptron (rows,)."""
         z = self.scaled(net.inputs, x)
-        h = self.layers([(a.weight.detach().numpy(), a.bias.detach().numpy()) for a in net.linears], z)
-        column = self.add("Squeeze", self.float64(h), self.constant(np.array([1])))
-        scaled = self.add("Mul", column, self.constant(float(net.y_scale)))
-        y = self.add("Add", scaled, self.constant(float(net.y_mean)))
-        # ReLU of a runtime may make 0 of nan, which z - z then brings back
-        none = self.add("ReduceSum", self.add("Sub", z, z), self.constant(np.array([1])), keepdims=0)
-        return self.add("Add", y, none)
+        out = self.column(self.layers([(one.weight, one.bias) for one in net.linears], z), 0)
+        y = self.add("Mul", out, self.constant(float(net.y_scale)))
+        return self.nan_of(z, self.add("Add", y, self.constant(float(net.y_mean))))
 
-    def layers(self, layers: list[tuple[NDArray[np.float32], NDArray[np.float32]]], z: str) -> str:
+    def linear(self, linear: Linear) -> tuple[str, str]:
+        """Disturbance and standard deviation of a linear model, each (rows,)."""
+        z = self.scaled(linear.inputs, INPUT)
+        mean = self.add("MatMul", z, self.constant(linear.coefficients_nt))
+        mean = self.add("Add", mean, self.constant(linear.constant_nt))
+        variance = self.add("MatMul", self.add("Mul", z, z), self.constant(linear.spread.slopes_nt2))
+        variance = self.add("Add", variance, self.constant(linear.spread.floor_nt2))
+        return mean, self.add("Sqrt", variance)
+
+    def ensemble(self, ensemble: Ensemble) -> tuple[str, str]:
+        """Mean of the members, and the standard deviation of what each says and of how they differ."""
+        z = self.scaled(ensemble.inputs, INPUT)
+        means, variances = [], []
+        for i in range(ensemble.net.members):
+            out = self.layers(ensemble.member(i), z)
+            mean, variance = self.moments(out, 0.0, ensemble.y_scale_nt)
+            means.append(mean)
+            variances.append(variance)
+        mean, own = self.average(means), self.average(variances)
+        apart = [self.add("Sub", one, mean) for one in means]
+        between = self.average([self.add("Mul", one, one) for one in apart])
+        sd = self.add("Sqrt", self.add("Add", own, between))
+        mean = self.add("Add", mean, self.constant(ensemble.y_mean_nt))
+        sd = self.add("Mul", sd, self.constant(ensemble.sd_factor))
+        return self.nan_of(z, mean), self.nan_of(z, sd)
+
+    def temporal(self, temporal: Temporal) -> tuple[str, str]:
+        """What causal convolutions give of every row but the first `context`."""
+        of, kernel = self.scaled(temporal.inputs, INPUT), temporal.net.kernel
+        z, width = self.add("Cast", of, to=self._onnx.TensorProto.FLOAT), len(temporal.features)
+        for i, layer in enumerate(temporal.net.layers):
+            assert isinstance(layer, torch.nn.Linear)
+            back = [(kernel - 1 - k) * 2**i for k in range(kernel)]
+            taps = [self.rows(z, back[0] - behind, behind) for behind in back]
+            h = self.gemm(self.add("Concat", *taps, axis=1), (layer.weight, layer.bias))
+            h = self.add("Relu", h)
+            z = self.add("Add", h, taps[-1]) if len(layer.bias) == width else h
+            width = len(layer.bias)
+        last = temporal.net.last
+        mean, variance = self.moments(
+            self.gemm(z, (last.weight, last.bias)), temporal.y_mean_nt, temporal.y_scale_nt
+        )
+        sd = self.add("Mul", self.add("Sqrt", variance), self.constant(temporal.sd_factor))
+        now = self.rows(of, temporal.context, 0)
+        return self.nan_of(now, mean), self.nan_of(now, sd)
+
+    def moments(self, out: str, y_mean: float, y_scale: float) -> tuple[str, str]:
+        """Mean and variance of two heads, each (rows,), as `magtwin.learn.heads.moments`."""
+        mean = self.add("Mul", self.column(out, 0), self.constant(y_scale))
+        mean = self.add("Add", mean, self.constant(y_mean))
+        low, high = self.constant(-heads.LIMIT), self.constant(heads.LIMIT)
+        spread = self.add("Exp", self.add("Clip", self.column(out, 1), low, high))
+        return mean, self.add("Mul", spread, self.constant(y_scale**2))
+
+    def layers(self, layers: Sequence[Layer], z: str) -> str:
         """What layers with ReLU between them give (rows, K), float32."""
         h = self.add("Cast", z, to=self._onnx.TensorProto.FLOAT)
-        for i, (weight, bias) in enumerate(layers):
-            h = self.add("Gemm", h, self.constant(weight), self.constant(bias), transB=1)
+        for i, layer in enumerate(layers):
+            h = self.gemm(h, layer)
             h = self.add("Relu", h) if i < len(layers) - 1 else h
         return h
 
-    def float64(self, value: str) -> str:
-        return self.add("Cast", value, to=self._onnx.TensorProto.DOUBLE)
+    def gemm(self, h: str, layer: Layer) -> str:
+        """A layer without its ReLU."""
+        weight, bias = (self.constant(part.detach().numpy()) for part in layer)
+        return self.add("Gemm", h, weight, bias, transB=1)
+
+    def average(self, values: Sequence[str]) -> str:
+        """The mean of several values; onnxruntime has no operator Mean in float64."""
+        total = values[0]
+        for one in values[1:]:
+            total = self.add("Add", total, one)
+        return self.add("Div", total, self.constant(float(len(values))))
+
+    def column(self, values: str, index: int) -> str:
+        """A column of float32 (rows, K) as float64 (rows,)."""
+        one = self.add("Gather", values, self.constant(np.array(index)), axis=1)
+        return self.add("Cast", one, to=self._onnx.TensorProto.DOUBLE)
+
+    def rows(self, values: str, first: int, left: int) -> str:
+        """Rows from `first` on, without the last `left`."""
+        stop = -left if left else np.iinfo(np.int64).max
+        bounds = (self.constant(np.array([at])) for at in (first, stop, 0))
+        return self.add("Slice", values, *bounds)
+
+    def nan_of(self, z: str, values: str) -> str:
+        """Values (rows,) that are nan where an input (rows, F) is: a runtime's ReLU may make 0 of it."""
+        nothing = self.add("ReduceSum", self.add("Sub", z, z), self.constant(np.array([1])), keepdims=0)
+        return self.add("Add", values, nothing)
 
 
 def _report(model: Any, title: str) -> Report:
     told = {one.key: one.value for one in model.metadata_props}
-    names, units, facts, low, high = (
-        json.loads(told[key]) for key in ("features", "units", "facts", "training_min", "training_max")
+    names, units, facts, low, high, context, step_s = (
+        json.loads(told[key])
+        for key in ("features", "units", "facts", "training_min", "training_max", "context", "step_s")
     )
     ranges = {}
     for name, unit, least, most in zip(names, units, low, high, strict=True):
@@ -231,9 +337,11 @@ def _report(model: Any, title: str) -> Report:
         Figure("layers", told["layers"]),
         Figure("parameters", int(told["parameters"])),
         Figure("opset", max(one.version for one in model.opset_import)),
-        Figure("input", f"{INPUT} (rows, {len(names)}), float64"),
+        Figure("input", f"{INPUT} (rows{f' + {context}' if context else ''}, {len(names)}), float64"),
         Figure("outputs", f"{MEAN} and {SD} (rows,), float64, nT"),
     ]
+    if context:
+        figures.append(Figure("rows back", context, note=f"{step_s:g} s apart"))
     if (sd := json.loads(told["residual_sd_nt"])) is not None:
         figures.append(Figure("residual sd", float(sd), "nT", note="on held-out runs"))
     return Report(
@@ -254,8 +362,9 @@ def _difference_nt(predictor: Predictor, data: bytes, weights: str | os.PathLike
     of = inputs_of(predictor)
     wave = np.sin(np.arange(PROBE * len(of.features), dtype=float)).reshape(PROBE, -1)
     x = of.mean + 2 * of.scale * wave
+    before = np.repeat(x[:1], predictor.context, axis=0)
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
-    found = np.nan_to_num(session.run([MEAN, SD], {INPUT: x}))
+    found = np.nan_to_num(session.run([MEAN, SD], {INPUT: np.concatenate([before, x])}))
     wanted = np.nan_to_num(predictor.predict(x))
     difference = np.abs(found - wanted)
     worst = float(difference.max())
