@@ -244,6 +244,25 @@ def test_exports_pass_the_validators_of_openusd_and_nvidia(what, request, tmp_pa
     assert_valid(out if out.is_file() else out / "lab.usda", tmp_path)
 
 
+def test_what_was_exported_exports_again_with_the_same_graphs_its_thumbnail_drawn_anew(isaac, tmp_path):
+    def draw(root, picture):
+        with open(picture, "xb") as file:
+            file.write(root.name.encode())
+
+    first = shutil.copytree(isaac, tmp_path / "first")
+    (first / ".thumbs" / "256x256").mkdir(parents=True)
+    (first / ".thumbs" / "256x256" / "lab.usda.png").write_bytes(b"old")
+    export_scene(first / "lab.usda", tmp_path / "lab", profile="isaac", trusted=True, thumbnail=draw)
+    assert (tmp_path / "lab" / ".thumbs" / "256x256" / "lab.usda.png").read_bytes() == b"lab.usda"
+    stages = [Usd.Stage.Open(str(file / "lab.usda")) for file in (isaac, tmp_path / "lab")]
+    graphs = [
+        {str(prop.GetPath()): str(prop.Get()) for node in Usd.PrimRange(stage.GetPrimAtPath("/World/Graphs"))
+         for prop in node.GetAuthoredAttributes()}
+        for stage in stages
+    ]  # fmt: skip
+    assert graphs[0] == graphs[1]
+
+
 def test_for_isaac_the_robot_has_isaac_sims_layers_and_composes_to_the_same_stage(isaac):
     asset = isaac / "turtlebot4" / "turtlebot4.usda"
     assert {f.name for f in (asset.parent / "payloads").iterdir()} >= {

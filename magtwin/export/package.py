@@ -395,6 +395,7 @@ class _Work:
             self.progress("Drawing its thumbnail")
             picture = out / THUMBNAIL / f"{self.root.name}.png"
             picture.parent.mkdir(parents=True, exist_ok=True)
+            picture.unlink(missing_ok=True)  # of a folder that was exported before
             thumbnail(out / self.root.name, picture)
 
     def _explain(self, folder: Path, root: str, *, attached: bool) -> None:
