@@ -71,6 +71,11 @@ def trained(data, tmp_path_factory):
     return out
 
 
+def card_of(weights):
+    """The card beside weights, its lines put end to end."""
+    return " ".join(weights.with_suffix(".md").read_text().split())
+
+
 def refused(capsys, *words):
     with pytest.raises(SystemExit) as ended:
         main([str(word) for word in words])
@@ -171,7 +176,7 @@ def test_fine_tuning_tells_the_error_before_and_after(data, trained, tmp_path, c
     net = load_net(out)
     assert net.facts["init_sha256"] == sha256(trained)
     assert net.layers[0].weight.equal(load_net(trained).layers[0].weight)
-    card = out.with_suffix(".md").read_text()
+    card = card_of(out)
     assert (
         f"It goes on from `f.safetensors` (SHA-256 `{sha256(trained)}`), layers.0, layers.1 frozen." in card
     )
@@ -193,7 +198,7 @@ def test_a_split_by_row_carries_its_warning_everywhere(data, tmp_path, capsys):
     main(["train", str(data), "--out", str(out), *TINY[:2], "--epochs", "1", "--split", "row", "--json"])
     assert json.loads(capsys.readouterr().out)["facts"]["warning"] == LEAK
     assert load_net(out).facts["warning"] == LEAK
-    assert LEAK in out.with_suffix(".md").read_text()
+    assert LEAK in card_of(out)
 
 
 # Other kinds than perceptrons
@@ -262,9 +267,7 @@ def test_a_hybrid_says_whether_its_network_was_kept_and_both_figures(kinds):
     hybrid, figures = load_predictor(out), printed["figures"]
     base, whole = (figures[name]["value"] for name in ("base alone MAE", "with network MAE"))
     assert (hybrid.net is not None) == (whole < base) == (figures["network"]["value"] == "kept")
-    assert f"the base alone errs by {base:.1f} nT, with the network by {whole:.1f} nT" in (
-        out.with_suffix(".md").read_text()
-    )
+    assert f"the base alone errs by {base:.1f} nT, with the network by {whole:.1f} nT" in card_of(out)
 
 
 @pytest.mark.parametrize("bent", [True, False])
@@ -290,7 +293,7 @@ def test_a_hybrid_is_fine_tuned_with_its_base_frozen(data, kinds, tmp_path):
     main(["train", str(data), "--out", str(tmp_path / "h.safetensors"), *words, "--json"])
     before, after = load_predictor(begun), load_predictor(tmp_path / "h.safetensors")
     assert np.array_equal(before.base.coefficients_nt, after.base.coefficients_nt)
-    assert "base frozen" in (tmp_path / "h.md").read_text()
+    assert "base frozen" in card_of(tmp_path / "h.safetensors")
 
 
 def test_a_linear_model_goes_on_from_another(data, kinds, tmp_path, capsys):

@@ -1,10 +1,9 @@
 """Trained: a network from a data set, how it does on recordings that it never saw, and what repeats it."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from magtwin.files import sha256
 from magtwin.learn.calibration import coverage
+from magtwin.learn.card import card_of
 from magtwin.learn.config import TrainConfig
 from magtwin.learn.dataset import MANIFEST, Dataset
 from magtwin.learn.material import Material, material
@@ -24,20 +24,6 @@ from magtwin.report import Figure, Report
 from magtwin.version import __version__
 
 Array = NDArray[np.float64]
-
-MOST_PATHS = 40
-"""Paths that a card tells of one by one."""
-
-NOUNS: Mapping[str, str] = MappingProxyType(
-    {
-        "mlp": "A multilayer perceptron, float32",
-        "linear": "A linear model by ridge regression",
-        "hybrid": "A linear base by ridge regression and a small network for what it leaves",
-        "ensemble": "An ensemble of perceptrons with a mean and a variance each, float32",
-        "tcn": "A temporal network of causal convolutions with a mean and a variance, float32",
-    }
-)
-"""What a card calls each kind."""
 
 
 @dataclass(frozen=True)
@@ -142,94 +128,8 @@ class Trained:
         return Report(title, tuple(figures), facts)
 
     def card(self, name: str, checksum: str) -> str:
-        """The model card, in Markdown.
-
-        Args:
-            name: Of the weights file.
-            checksum: Its SHA-256.
-        """
-        facts = self.net.facts
-        before = self.config.init is not None
-        heads = ["rows of", "recordings", "rows", "MAE", "RMSE", "naive MAE", "naive RMSE", "MAE / naive"]
-        heads += ["ridge MAE", "ridge RMSE", "within 90 %"]
-        heads += ["MAE before"] if before else []
-        table = [_line(heads), _line(["---"] * len(heads))]
-        shown = self.paths[:MOST_PATHS] if len(self.paths) > 1 else ()
-        for one in (*self.parts, *shown):
-            errors = (one.mae_nt, one.rmse_nt, one.naive_mae_nt, one.naive_rmse_nt)
-            cells = [one.name, f"{one.recordings:,}", f"{one.rows:,}", *(f"{e:.1f}" for e in errors)]
-            cells += [f"{one.ratio:.3f}", f"{one.ridge_mae_nt:.1f}", f"{one.ridge_rmse_nt:.1f}"]
-            cells += ["-" if math.isnan(one.coverage) else f"{one.coverage:.3f}"]
-            table.append(_line([*cells, *([f"{one.before_mae_nt:.1f}"] if before else [])]))
-        if len(self.paths) > MOST_PATHS:
-            table.append(f"\nThe first {MOST_PATHS} of {len(self.paths)} paths are shown.")
-        counts = ", ".join(f"{len(self.split.names(part))} in {part}" for part in PARTS)
-        names = ", ".join(self.split.test[:MOST_PATHS])
-        names += f" and {len(self.split.test) - MOST_PATHS} more" if len(self.split.test) > MOST_PATHS else ""
-        warning = f"\n**Warning: {self.split.leak}.**\n" if self.split.leak else ""
-        gone_on = ""
-        if before:
-            kept = ", ".join(self.config.freeze) or "no layer"
-            gone_on = (
-                f"\nIt goes on from `{facts['init']}` (SHA-256 `{facts['init_sha256']}`), {kept} frozen."
-            )
-        best, chosen = self.best, ""
-        if best is not None:
-            chosen = f"Validation chose the epoch that was kept, {best.number} of {self.history[-1].number}; "
-        if self.choice:
-            chosen += f"{self.choice.text()}; "
-        chosen = chosen[:1].upper() + chosen[1:] if chosen else "Validation calibrated the intervals; "
-        torch_with = ""
-        if self.config.kind != "linear":
-            torch_with = f", torch {facts['torch']}, with --threads {facts['threads']} on {facts['device']}"
-        return f"""# {name}
-
-Predicts what a robot adds to a map of the magnetic field at its magnetometer [nT]. {NOUNS[self.net.kind]},
-{self.net.layers_text}, {self.net.parameters_count:,} parameters. SHA-256 `{checksum}`.{gone_on}
-Inputs: {", ".join(self.net.features)}.
-{warning}
-## Data
-
-* Data set `{_plain(str(facts["dataset"]))}`, SHA-256 of its manifest `{facts["dataset_sha256"]}`.
-* Labelled on the map `{_plain(str(facts["map"]))}`, SHA-256 `{facts["map_sha256"]}`: what was measured less
-  the map, at a lever arm of {facts["lever_arm_m"]} m and a latency of {facts["latency_s"]:g} s.
-* {self.rows:,} training rows, labels {self.label_mean_nt:.1f} +- {self.label_sd_nt:.1f} nT.
-* Recordings split by {self.split.by}: {counts}.
-* Test: {names}.
-
-## Errors
-
-Of the total field at the sensor [nT]. Naive: the mean training label on every row. Ridge: Tolles and
-Lawson's terms (heading harmonics, speed, turning, current, LiDAR) by ridge regression on the same training
-rows. Within 90 %: the share of rows inside the predicted interval of 90 %. {chosen}the test was looked at
-once.
-
-{chr(10).join(table)}
-
-{self._spread()} The file keeps the RMSE of the test as `residual_sd_nt`. Rows of a recording are alike: the
-spread of these errors is that between recordings, not between rows.
-
-## To repeat it
-
-magtwin {facts["magtwin"]}{torch_with}, and as `F.toml` in
-`magtwin train {_plain(str(facts["dataset"]))} --config F.toml --out {name}`:
-
-```toml
-{str(facts["config"]).rstrip()}
-```
-"""
-
-    def _spread(self) -> str:
-        """How wide its intervals are and why, for the card."""
-        if self.net.kind == "mlp":
-            return (
-                "Intervals above are those of the RMSE on validation; in the file the standard deviation of "
-                "every prediction, the `b_sd_nt` of a Run, is the RMSE of the test."
-            )
-        return (
-            "The standard deviation of a prediction is its own, row by row, and the `b_sd_nt` of a Run; it "
-            "was scaled so that intervals of 90 % hold 90 % on recordings left out, none of them the test's."
-        )
+        """The model card, in Markdown; see `magtwin.learn.card`."""
+        return card_of(self, name, checksum)
 
 
 def fit(
@@ -362,12 +262,3 @@ def _mae(error: Array) -> float:
 
 def _rmse(error: Array) -> float:
     return float(np.sqrt(np.mean(error**2)))
-
-
-def _plain(text: str) -> str:
-    """A name from a data set, without what would end a cell, a line or a code of Markdown."""
-    return "".join(" " if c in "|`<>" or not c.isprintable() else c for c in text)
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(map(_plain, cells))} |"
