@@ -68,8 +68,8 @@ def _data(trained: "Trained") -> str:
     label = f"{trained.label_mean_nt:.1f} +- {trained.label_sd_nt:.1f} nT"
     points = (
         f"Data set `{dataset}`, SHA-256 of its manifest `{facts['dataset_sha256']}`.",
-        f"Labelled on the map `{field}`, SHA-256 `{facts['map_sha256']}`: what was measured less the map, at a "
-        f"lever arm of {facts['lever_arm_m']} m and a latency of {facts['latency_s']:g} s.",
+        f"Labelled on the map `{field}`, SHA-256 `{facts['map_sha256']}`: what was measured less the map, at "
+        f"a lever arm of {facts['lever_arm_m']} m and a latency of {facts['latency_s']:g} s.",
         f"{trained.rows:,} training rows, labels {label}.",
         f"Recordings split by {split.by}: {counts}.",
         f"Test: {names}.",
