@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 from test_features import a_run
 from test_magnetometer import forward64, inputs
 from test_model import RELEASED, a_net
+from test_predictor import KINDS, a_predictor
 
 from magtwin.field.map import AnomalyMap
 from magtwin.learn.features import FEATURES, FULL, SETS, features
@@ -72,6 +73,37 @@ def test_one_reading_is_the_row_of_a_run(names, run, field):
         assert reading.b_total_nt == reading.b_map_nt + reading.b_disturbance_nt
         assert reading.b_sd_nt == 31.0
         assert reading.outside_training == outside[row]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_read_as_in_a_run(kind, run, field):
+    predictor = a_predictor(kind)
+    x = features(run, predictor.features)
+    reader = Reader(predictor, field)
+    read = [reader.read(p, yaw, signals_of(reader, run, row)) for row, (p, yaw) in enumerate(poses(run))]
+    mean, sd = predictor.predict(x)
+    assert_allclose([one.b_disturbance_nt for one in read], mean, rtol=1e-5)  # of up to 10,000 nT
+    assert_allclose([one.b_sd_nt for one in read], sd, rtol=1e-5)
+    assert [one.outside_training for one in read] == predictor.outside(x).tolist()
+
+
+def test_a_hole_is_nan_and_as_the_row_before_to_a_predictor_that_looks_back(run, field):
+    predictor = a_predictor("tcn")
+    run = run.with_columns(
+        battery_a=np.where(np.isin(np.arange(run.rows), [0, 4, 5]), np.nan, run["battery_a"])
+    )
+    reader = Reader(predictor, field)
+    read = [reader.read(p, yaw, signals_of(reader, run, row)) for row, (p, yaw) in enumerate(poses(run))]
+    wanted = predictor.predict(features(run, predictor.features))[0]
+    assert_allclose([one.b_disturbance_nt for one in read], wanted, rtol=1e-5)
+    assert np.flatnonzero(np.isnan(wanted)).tolist() == [0, 4, 5]
+
+
+@pytest.mark.parametrize("kind", ["linear", "hybrid", "ensemble"])
+def test_nan_in_gives_nan_out_of_every_kind(kind, run, field):
+    reader = Reader(a_predictor(kind), field)
+    reading = reader.read((0.0, 0.0), 0.0, signals_of(reader, run, 0) | {"battery_a": math.nan})
+    assert np.isnan([reading.b_total_nt, reading.b_disturbance_nt, reading.b_sd_nt]).all()
 
 
 def test_a_reading_of_the_released_network_errs_by_less_than_a_hundredth_nt(real_data, field):

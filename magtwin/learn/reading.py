@@ -16,9 +16,24 @@ from numpy.typing import NDArray
 
 from magtwin.field import lookup
 from magtwin.field.map import AnomalyMap
-from magtwin.learn.features import FEATURES, carried, circle, degrees_0_360
+from magtwin.learn.ensemble import Ensemble
+from magtwin.learn.features import (
+    FEATURES,
+    carried,
+    circle,
+    degrees_0_360,
+    lags,
+    turned,
+    turned_lags,
+    turned_motion,
+    turning_size,
+)
+from magtwin.learn.heads import LIMIT
+from magtwin.learn.hybrid import Hybrid
 from magtwin.learn.inputs import FAR, Inputs
+from magtwin.learn.linear import Linear
 from magtwin.learn.model import FieldNet
+from magtwin.learn.perceptron import Layer
 from magtwin.learn.predictor import Predictor
 from magtwin.names import RefusedError, hint
 from magtwin.run import COLUMNS
@@ -64,7 +79,8 @@ class Reader:
         """A reader of a predictor on a map.
 
         Args:
-            predictor: Of any kind. One that looks at earlier rows has those that were read since.
+            predictor: Of any kind. One that looks back over earlier rows looks at those that were read
+                before: read it once every `predictor.step_s`, and make a reader for each run.
             field: The map that its labels were made on.
             lever_arm_m: Sensor's place forward and left of where the map has it [m], as its labels had it.
         """
@@ -127,9 +143,14 @@ class Reader:
         """Disturbance, standard deviation and whether a row is outside, of the features at hand."""
         if self._say is not None:
             return self._say(self._x)
-        self._rows.append(self._x.copy())
+        row, whole = self._x.copy(), bool(np.isfinite(self._x).all())
+        outside = bool(self.predictor.outside(row[None])[0])
+        if not whole and self.predictor.context:  # to later rows it is as the last whole one
+            self._rows.extend(list(self._rows)[-1:])
+            return math.nan, math.nan, outside
+        self._rows.append(row)
         means, sds = self.predictor.predict(np.array(self._rows))
-        return float(means[-1]), float(sds[-1]), bool(self.predictor.outside(self._x[None])[0])
+        return float(means[-1]), float(sds[-1]), outside
 
     def _refuse(self, signals: Signals) -> None:
         """Say which signal is not as it should be."""
@@ -163,12 +184,14 @@ def _part(convert: Any, columns: tuple[str, ...]) -> tuple[int, Callable[..., Se
     get = [_column(name) for name in columns]
     if convert is None:
         return COLUMNS[columns[0]].width, get[0]
+    ones = [np.ones((1, COLUMNS[name].width)) for name in columns]
+    wide = int(np.size(convert(*(one[:, 0] if one.shape[1] == 1 else one for one in ones))))
     if convert in _PLAIN:
-        wide, plain = _PLAIN[convert]
+        plain = _PLAIN[convert]
         if len(get) == 1:
             one = get[0]
             return wide, lambda *at: plain(one(*at))
-        return wide, lambda *at: plain(*(column(*at) for column in get))
+        return wide, lambda *at: plain(*[column(*at) for column in get])
 
     def by_arrays(*at: Any) -> Sequence[float]:
         rows = [np.array([column(*at)], float) for column in get]
@@ -176,9 +199,7 @@ def _part(convert: Any, columns: tuple[str, ...]) -> tuple[int, Callable[..., Se
         found: list[float] = np.asarray(convert(*arrays)).reshape(-1).tolist()
         return found
 
-    ones = [np.ones((1, COLUMNS[name].width)) for name in columns]
-    tried = convert(*(one[:, 0] if one.shape[1] == 1 else one for one in ones))
-    return int(np.size(tried)), by_arrays
+    return wide, by_arrays
 
 
 def _column(name: str) -> Callable[[Signals, float, tuple[float, float]], Sequence[float]]:
@@ -225,50 +246,121 @@ def _carried(slopes: Sequence[float], v: Sequence[float]) -> Sequence[float]:
     return slopes[0] * v[0], slopes[1] * v[0]
 
 
-_PLAIN: Mapping[Any, tuple[int, Callable[..., Sequence[float]]]] = {
-    degrees_0_360: (1, _degrees),
-    FEATURES["imu_q_w"].convert: (4, _canonical),
-    circle: (4, _circle),
-    carried: (2, _carried),
+def _lags(
+    v_cmd: Sequence[float], w_cmd: Sequence[float], v: Sequence[float], w: Sequence[float]
+) -> Sequence[float]:
+    return v_cmd[0] - v[0], w_cmd[0] - w[2]
+
+
+def _turned(yaw: Sequence[float], *signals: Sequence[float]) -> Sequence[float]:
+    sin, cos = math.sin(yaw[0]), math.cos(yaw[0])
+    return [way * part for signal in signals for part in signal for way in (sin, cos)]
+
+
+def _turned_motion(yaw: Sequence[float], v: Sequence[float], w: Sequence[float]) -> Sequence[float]:
+    return _turned(yaw, (v[0], w[2], abs(w[2])))
+
+
+_PLAIN: Mapping[Any, Callable[..., Sequence[float]]] = {
+    degrees_0_360: _degrees,
+    FEATURES["imu_q_w"].convert: _canonical,
+    circle: _circle,
+    carried: _carried,
+    lags: _lags,
+    turned: _turned,
+    turned_motion: _turned_motion,
+    turned_lags: lambda yaw, *of: _turned(yaw, _lags(*of)),
+    turning_size: lambda w: (abs(w[2]),),
 }
-"""Conversions of one row without arrays, by those with: how many numbers they give, and what gives them."""
+"""Conversions of one row without arrays, by those with; a conversion that is not here goes by an array."""
 
 
 def _compiled_way(predictor: Predictor, code: Any) -> Say | None:
     """The compiled way of a predictor; none where there is no such way."""
     if isinstance(predictor, FieldNet):
-        net, sd = _Perceptron(predictor, code), predictor.residual_sd_nt
-
-        def say(x: Array) -> tuple[float, float, bool]:
-            mean, outside = net(x)
-            return mean, sd, outside
-
-        return say
+        return _net(predictor, code)
+    if isinstance(predictor, Linear):
+        return _linear(predictor, code)
+    if isinstance(predictor, Hybrid):
+        return _hybrid(predictor, code)
+    if isinstance(predictor, Ensemble):
+        return _ensemble(predictor, code)
     return None
 
 
-class _Perceptron:
-    """A FieldNet for one row."""
+def _net(net: FieldNet, code: Any, held: Inputs | None = None) -> Say:
+    """A perceptron, its inputs held within the training ranges of `held` if that is given."""
+    layers = [(layer.weight, layer.bias) for layer in net.linears]
+    forward, out = _perceptron(layers, _ranges(net.inputs, held), code)
+    y_mean, y_scale, sd = float(net.y_mean), float(net.y_scale), net.residual_sd_nt
 
-    def __init__(self, net: FieldNet, code: Any, *, held: Inputs | None = None) -> None:
-        """A network whose inputs are held within the training ranges of `held`, if that is given."""
-        inputs = net.inputs
-        widths = np.array([len(inputs.features), *net.hidden, 1])
-        parts = [part for layer in net.linears for part in (layer.weight.detach().t(), layer.bias.detach())]
-        table = torch.cat([part.reshape(-1) for part in parts]).numpy()
-        z, work = np.empty(len(inputs.features)), np.empty(2 * int(widths.max()), np.float32)
-        self._out = np.empty(1)
-        self._with = (_ranges(inputs, held), widths, table, z, work, self._out)
-        self._mean, self._scale = float(net.y_mean), float(net.y_scale)
-        self._forward = code.perceptron
+    def say(x: Array) -> tuple[float, float, bool]:
+        outside = forward(x)
+        return y_mean + y_scale * out.item(), sd, outside
 
-    def __call__(self, x: Array) -> tuple[float, bool]:
-        """Disturbance of a row [nT], and whether it is outside the training ranges."""
-        outside = self._forward(x, *self._with)
-        return self._mean + self._scale * self._out.item(), outside
+    return say
 
 
-def _ranges(inputs: Inputs, held: Inputs | None) -> Array:
+def _linear(linear: Linear, code: Any) -> Say:
+    ranges, z, scaled = _ranges(linear.inputs), np.empty(len(linear.features)), code.scaled
+    constant, slopes = linear.constant_nt, linear.coefficients_nt
+    floor, squares = linear.spread.floor_nt2, linear.spread.slopes_nt2
+
+    def say(x: Array) -> tuple[float, float, bool]:
+        outside = scaled(x, ranges, z)
+        return constant + float(slopes @ z), math.sqrt(floor + float(squares @ (z * z))), outside
+
+    return say
+
+
+def _hybrid(hybrid: Hybrid, code: Any) -> Say:
+    base, factor = _linear(hybrid.base, code), hybrid.sd_factor
+    more = None if hybrid.net is None else _net(hybrid.net, code, held=hybrid.base.inputs)
+
+    def say(x: Array) -> tuple[float, float, bool]:
+        mean, sd, outside = base(x)
+        return mean + more(x)[0] if more else mean, factor * sd, outside
+
+    return say
+
+
+def _ensemble(ensemble: Ensemble, code: Any) -> Say:
+    ranges, count = _ranges(ensemble.inputs), ensemble.net.members
+    members = [_perceptron(ensemble.member(i), ranges, code) for i in range(count)]
+    y_mean, y_scale, factor = ensemble.y_mean_nt, ensemble.y_scale_nt, ensemble.sd_factor
+
+    def say(x: Array) -> tuple[float, float, bool]:
+        total = squares = own = 0.0
+        outside = False
+        for forward, out in members:
+            outside = forward(x)
+            mean, log = out.tolist()
+            total += mean
+            squares += mean * mean
+            own += math.exp(min(max(log, -LIMIT), LIMIT)) if log == log else math.nan
+        mean = total / count
+        variance = own / count + max(squares / count - mean * mean, 0.0)
+        return y_mean + y_scale * mean, factor * y_scale * math.sqrt(variance), outside
+
+    return say
+
+
+def _perceptron(layers: Sequence[Layer], ranges: Array, code: Any) -> tuple[Callable[[Array], bool], Array]:
+    """What takes a row through layers and tells whether it is outside, and where its outputs then are."""
+    widths = np.array([ranges.shape[1], *(len(bias) for _, bias in layers)])
+    parts = [part.detach().t().reshape(-1) for layer in layers for part in layer]
+    table = torch.cat(parts).numpy()
+    z, work = np.empty(ranges.shape[1]), np.empty(2 * int(widths.max()), np.float32)
+    out, forward = np.empty(int(widths[-1])), code.perceptron
+
+    def through(x: Array) -> bool:
+        outside: bool = forward(x, ranges, widths, table, z, work, out)
+        return outside
+
+    return through, out
+
+
+def _ranges(inputs: Inputs, held: Inputs | None = None) -> Array:
     """Means, scales, bounds and training ranges, as compiled code wants them, shape (6, F)."""
     anything = np.full(len(inputs.features), np.inf)
     bounds = (-anything, anything) if held is None else (held.low, held.high)
