@@ -491,6 +491,27 @@ def map_continue(
         say(f"Wrote {out}")
 
 
+@map_app.command(name="export")
+def map_export(file: Path, *, out: Path, date: str | None = None, force: Force = False) -> None:
+    """Write a map as a survey's CSVs, one a heading, as map import reads them: of a survey, the same rows.
+
+    Parameters
+    ----------
+    file
+        Map layer or stage (.usd, .usda, .usdc).
+    out
+        Folder to make: 0_map.csv, 90_map.csv, ..., rows of x [m], y [m], heading [rad], field [nT].
+    date
+        Day to take, YYYY-MM-DD, between the map's epochs; the latest unless given.
+    force
+        Replace the folder if it exists.
+    """
+    from magtwin.field.survey import write_survey
+
+    for written in write_survey(_open_map(file, date), out, force=force):
+        say(f"Wrote {written}")
+
+
 @map_app.command(name="epochs")
 def map_epochs(*files: Path, out: Path, force: Force = False, json: Json = False) -> None:
     """Join maps of several days into one layer that knows how the field drifts.

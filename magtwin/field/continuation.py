@@ -95,6 +95,7 @@ def _of_the_dipoles(field: AnomalyMap, start: float, height_m: float) -> Anomaly
         field,
         values_nt=harmonic.magnitude_nt(*field.grid.poses(), height_m=height_m),
         variance_nt2=variance,
+        recorded_yaw=None,
         height_m=height_m,
         method=_said(field, start, height_m, "by its harmonic field"),
         parameters={**field.parameters, "continued_from_m": start},
@@ -150,6 +151,7 @@ def _of_the_grid(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap
         field,
         values_nt=np.stack([layer.continued(step) for layer in layers]),
         variance_nt2=None if field.variance_nt2 is None else _variance(field, step),
+        recorded_yaw=None,
         height_m=height_m,
         method=_said(field, start, height_m, "by the waves of its grid (Blakely 1995, eq. 12.8)"),
         parameters={

@@ -110,6 +110,7 @@ def at_date(maps: Sequence[AnomalyMap], date: str | datetime.date) -> AnomalyMap
         created=day.isoformat(),
         parameters={} if before.parameters != after.parameters else before.parameters,
         harmonic=None,
+        recorded_yaw=None,
     )
 
 

@@ -75,6 +75,9 @@ class AnomalyMap:
     height_m: float | None = None
     """Height of the sensor above the floor at which the values hold [m]; none where unknown."""
 
+    recorded_yaw: Array | None = None
+    """Yaw of the robot when each value was read [rad], shape (H, Y, X); none where values are no readings."""
+
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """Figures of the method, by name: plain numbers, texts, and lists of them, as JSON can hold."""
 
@@ -93,6 +96,8 @@ class AnomalyMap:
         arrays["headings_rad"] = headings = _frozen(self.headings_rad, float)
         if self.variance_nt2 is not None:
             arrays["variance_nt2"] = _frozen(self.variance_nt2, float)
+        if self.recorded_yaw is not None:
+            arrays["recorded_yaw"] = _frozen(self.recorded_yaw, float)
         for name, array in arrays.items():
             shape = values.shape[:1] if name == "headings_rad" else values.shape
             if array.shape != shape:

@@ -14,7 +14,7 @@ from magtwin.field.errors import node_errors
 from magtwin.field.grid import Grid
 from magtwin.field.map import AnomalyMap
 from magtwin.field.readings import Readings
-from magtwin.files import existing, sha256
+from magtwin.files import existing, output, sha256
 from magtwin.frames import wrap_angle
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
@@ -119,6 +119,7 @@ def node_map(readings: Readings) -> AnomalyMap:
         values_nt=np.where(valid, *means).reshape(grid.shape),
         valid=valid.reshape(grid.shape),
         variance_nt2=errors.variance_nt2 / counts[0] if errors.told else None,
+        recorded_yaw=_recorded_yaw(readings, flat, grid),
         origin_m=grid.origin_m,
         cell_m=grid.cell_m,
         headings_rad=np.asarray(grid.headings_rad),
@@ -131,6 +132,59 @@ def node_map(readings: Readings) -> AnomalyMap:
         datum=readings.datum,
         height_m=readings.height_m,
     )
+
+
+def _recorded_yaw(readings: Readings, flat: NDArray[np.intp], grid: Grid) -> Array | None:
+    """Yaw of the one reading of each node, shape (H, Y, X); none where a node has several or none."""
+    if len(np.unique(flat)) < len(flat) or len(flat) < np.prod(grid.shape):
+        return None
+    yaw = np.empty(len(flat))
+    yaw[flat] = readings.yaw
+    return yaw.reshape(grid.shape)
+
+
+def write_survey(field: AnomalyMap, folder: str | os.PathLike[str], *, force: bool = False) -> list[Path]:
+    """Write a map as a survey folder, one CSV a heading, as `read_survey` takes it.
+
+    A row a node, x fastest: x and y in world [m], the heading that was recorded there, else the map's own
+    [rad], and the field [nT], each the number itself and not a rounded one. So the CSVs of a survey come back
+    from its map row by row.
+
+    Args:
+        field: The map. Which nodes are valid has no place in a CSV.
+        folder: Folder to make.
+        force: Whether one that exists is replaced.
+
+    Returns:
+        The files, a heading each.
+
+    Raises:
+        RefusedError: A node has no value, which a survey must have; or the folder exists and `force` was not
+            given.
+    """
+    lost = int(np.count_nonzero(~np.isfinite(field.values_nt)))
+    if lost:
+        raise RefusedError(
+            f"map {field.name!r} has no value at {lost} of its nodes, and a survey's CSV has one at each; "
+            "`magtwin map fit` fills them in"
+        )
+    names = [f"{_degrees(heading)}{SUFFIX}" for heading in field.headings_rad]
+    with output(folder, force=force) as aside:
+        aside.mkdir()
+        for h, name in enumerate(names):
+            yaw = np.full(field.values_nt.shape[1:], field.headings_rad[h])
+            if field.recorded_yaw is not None:
+                yaw = field.recorded_yaw[h]
+            x, y = np.meshgrid(field.x_m, field.y_m)
+            rows = np.stack([x, y, yaw, field.values_nt[h]], axis=-1).reshape(-1, len(COLUMNS)).tolist()
+            lines = [f"# {','.join(COLUMNS)}", *(",".join(map(repr, row)) for row in rows)]
+            (aside / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return [Path(folder, name) for name in names]
+
+
+def _degrees(heading_rad: float) -> str:
+    """A heading in degrees, as a survey's file is named."""
+    return np.format_float_positional(round(math.degrees(heading_rad), 9), trim="-")
 
 
 def read_survey(

@@ -485,7 +485,9 @@ def _grown(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _between_headings(field: AnomalyMap, layers: Array, headings: Array) -> Array:
     """Layers of other headings, as a map is looked up."""
     known = np.isfinite(layers)
-    values = replace(field, values_nt=layers, valid=known, variance_nt2=None, harmonic=None)
+    values = replace(
+        field, values_nt=layers, valid=known, variance_nt2=None, harmonic=None, recorded_yaw=None
+    )
     x, y = np.meshgrid(field.x_m, field.y_m)
     return values.lookup(np.stack([x, y], axis=-1)[None], headings[:, None, None])
 

@@ -45,6 +45,8 @@ SAID = 60
 UNIT = "nT"
 TEXTS = ("name", "method", "source", "licence", "created")
 PLACES = ("frame", "datum")
+RECORDED = ("recorded_nt", "recorded_yaw")
+"""What only a survey has: its readings as they were, and the headings at which they were taken."""
 
 DAYS_PER_SECOND = 24.0
 """Time codes, which are days, that a viewer plays in a second; USD's own figure where a stage has none."""
@@ -53,7 +55,8 @@ DAYS_PER_SECOND = 24.0
 def save_map(field: AnomalyMap, path: str | os.PathLike[str], *, force: bool = False) -> None:
     """Write a map as a layer that any stage can sublayer.
 
-    Values become single precision (steps of 0.004 nT at 42,000 nT); a harmonic field stays as it is.
+    Values become single precision (steps of 0.004 nT at 42,000 nT), but those of a survey's own nodes, which
+    are kept as they were read; a harmonic field stays as it is.
 
     Args:
         field: The map.
@@ -199,9 +202,10 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
         )
     try:
         return AnomalyMap(
-            values_nt=values.reshape(shape).astype(float),
+            values_nt=_exact(prim, values.reshape(shape), _read_recorded(prim, RECORDED[0], sample, shape)),
             valid=valid.reshape(shape).astype(bool),
             variance_nt2=variance.reshape(shape).astype(float) if variance.size else None,
+            recorded_yaw=_read_recorded(prim, RECORDED[1], sample, shape),
             origin_m=tuple(_get(prim, "origin")),
             cell_m=tuple(_get(prim, "cellSize")),
             headings_rad=np.deg2rad(headings),
@@ -213,6 +217,34 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
         )
     except RefusedError as error:
         raise RefusedError(f"{place(prim)}: {error}") from error
+
+
+def _read_recorded(
+    prim: Usd.Prim, name: str, sample: _Sample | None, shape: tuple[int, ...]
+) -> NDArray | None:
+    """What was recorded at the nodes; None where nothing was."""
+    attribute = prim.GetAttribute(attribute_name("anomalyMap", name))
+    value = sample.get(attribute.GetName()) if sample else attribute.Get()
+    if value is None or not len(value):
+        return None
+    recorded = np.array(_check_type(attribute, value), float)
+    if recorded.size != math.prod(shape):
+        raise RefusedError(
+            f"{place(prim)}: {attribute.GetName()} has {recorded.size} numbers for {math.prod(shape)} values"
+        )
+    return recorded.reshape(shape)
+
+
+def _exact(prim: Usd.Prim, values: NDArray, recorded: NDArray | None) -> NDArray[np.float64]:
+    """Values in the precision in which they were read, shape (H, Y, X)."""
+    if recorded is None:
+        return values.astype(float)
+    if not np.array_equal(recorded.astype(np.float32), values, equal_nan=True):
+        raise RefusedError(
+            f"{place(prim)}: the map's values are not those that were recorded, in single precision; make "
+            "the map anew"
+        )
+    return recorded
 
 
 def _read_height(prim: Usd.Prim) -> float | None:
@@ -274,6 +306,9 @@ def _save(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], force: bool)
     latest = maps[-1]
     times = [float(day_number(day_of(m))) for m in maps] if len(maps) > 1 else []
     samples = [_of_a_day(m) for m in maps]
+    for name in (attribute_name("anomalyMap", field) for field in RECORDED):
+        if all(sample[name] is None for sample in samples):
+            samples = [{n: value for n, value in sample.items() if n != name} for sample in samples]
     about = f"Magnetic anomaly map {latest.name}: total field over x, y and heading. {latest.source}"
     with new_stage(path, about, force=force) as stage:
         prim = apply_api(UsdGeom.Xform.Define(stage, MAP).GetPrim(), "anomalyMap")
@@ -315,6 +350,11 @@ def _of_a_day(field: AnomalyMap) -> dict[str, Any]:
     variance = np.empty(0, np.float32)
     if field.variance_nt2 is not None:
         variance = field.variance_nt2.astype(np.float32).ravel()
+    recorded = [None, None]
+    if field.recorded_yaw is not None:
+        recorded = [Vt.DoubleArray.FromNumpy(a.ravel()) for a in (field.values_nt, field.recorded_yaw)]
+        if np.array_equal(values, field.values_nt.ravel(), equal_nan=True):
+            recorded[0] = None
     harmonic = None
     if field.harmonic is not None:
         harmonic = {name: getattr(field.harmonic, name) for name in HARMONIC}
@@ -322,6 +362,7 @@ def _of_a_day(field: AnomalyMap) -> dict[str, Any]:
         "values": Vt.FloatArray.FromNumpy(values),
         "valid": Vt.BoolArray.FromNumpy(valid),
         "variance": Vt.FloatArray.FromNumpy(variance),
+        **dict(zip(RECORDED, recorded, strict=True)),
         "checksum": _checksum(values, valid, variance, harmonic),
         "parameters": _written_parameters(field),
         **{name: getattr(field, name) for name in TEXTS},

@@ -1,0 +1,114 @@
+"""CSV -> USD -> CSV: a survey comes back from its map's layer number by number."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pxr import Usd, Vt
+
+from magtwin.cli import main
+from magtwin.field.epochs import at_date
+from magtwin.field.map import AnomalyMap
+from magtwin.field.survey import import_survey, write_survey
+from magtwin.names import RefusedError
+from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
+
+
+def survey(seed=0, **given):
+    """A map of readings that no single precision holds, at headings a little off the nominal ones."""
+    rng = np.random.default_rng(seed)
+    shape = (4, 3, 5)
+    headings = np.radians([0.0, 90.0, 180.0, 270.0])
+    about = {
+        "values_nt": rng.uniform(3e4, 5e4, shape),
+        "recorded_yaw": headings[:, None, None] + rng.normal(0, 0.1, shape),
+        "origin_m": (-1.0, 0.25),
+        "cell_m": (0.25, 0.25),
+        "headings_rad": headings,
+        "name": "made",
+    }
+    return AnomalyMap(**about | given)
+
+
+def rows(folder):
+    return {file.name: file.read_text().splitlines() for file in sorted(folder.iterdir())}
+
+
+def test_the_real_survey_comes_back_from_usd_row_by_row(real_data, tmp_path, capfd):
+    source = real_data / "aprilab" / "maps"
+    main(["map", "import", str(source), "--out", str(tmp_path / "a.usdc"), "--json"])
+    main(["map", "export", str(tmp_path / "a.usdc"), "--out", str(tmp_path / "csv")])
+    assert "270_map.csv" in capfd.readouterr().out
+    before, after = rows(source), rows(tmp_path / "csv")
+    assert before.keys() == after.keys()
+    for name, lines in before.items():
+        assert after[name] == [line.rstrip() for line in lines], name
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_any_survey_comes_back_from_csv_and_from_usd_to_the_bit(tmp_path_factory, seed):
+    folder, made = tmp_path_factory.mktemp("trip"), survey(seed)
+    save_map(made, folder / "a.usdc")
+    write_survey(load_map(folder / "a.usdc"), folder / "csv")
+    back = import_survey(folder / "csv", keep_latched=True)
+    for name in ("values_nt", "recorded_yaw", "headings_rad", "origin_m", "cell_m"):
+        assert np.array_equal(getattr(back, name), getattr(made, name)), name
+    save_map(replace(back, name="made"), folder / "b.usdc")
+    write_survey(load_map(folder / "b.usdc"), folder / "again")
+    assert rows(folder / "csv") == rows(folder / "again")
+
+
+def test_a_map_that_is_no_survey_is_written_at_its_own_headings(tmp_path):
+    made = survey(recorded_yaw=None, values_nt=np.full((4, 3, 5), 45_000.0))
+    save_map(made, tmp_path / "a.usdc")
+    write_survey(load_map(tmp_path / "a.usdc"), tmp_path / "csv")
+    assert (tmp_path / "csv" / "90_map.csv").read_text().splitlines()[1] == f"-1.0,0.25,{np.pi / 2!r},45000.0"
+    attributes = ("magtwin:anomalyMap:recordedYaw", "magtwin:anomalyMap:recordedNt")
+    prim = Usd.Stage.Open(str(tmp_path / "a.usdc")).GetPrimAtPath
+    assert not any(prim("/World/AnomalyMap").GetAttribute(name).HasAuthoredValue() for name in attributes)
+
+
+def test_each_day_of_a_map_keeps_its_own_readings_and_a_day_between_has_none(tmp_path):
+    days = [survey(1, created="2026-01-01"), survey(2, created="2026-01-11")]
+    save_map_series(days, tmp_path / "a.usdc")
+    epochs = load_epochs(tmp_path / "a.usdc")
+    for epoch, day in zip(epochs, days, strict=True):
+        assert np.array_equal(epoch.values_nt, day.values_nt)
+        assert np.array_equal(epoch.recorded_yaw, day.recorded_yaw)
+    assert at_date(epochs, "2026-01-06").recorded_yaw is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("recordedNt", [45_000.0] * 60, "not those that were recorded"),
+        ("recordedNt", [45_000.0] * 3, "recordedNt has 3 numbers for 60 values"),
+        ("recordedYaw", [0.0] * 3, "recordedYaw has 3 numbers for 60 values"),
+    ],
+)
+def test_readings_that_do_not_fit_the_map_are_refused_by_prim(tmp_path, name, value, said):
+    save_map(survey(), tmp_path / "a.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    stage.GetPrimAtPath("/World/AnomalyMap").GetAttribute(f"magtwin:anomalyMap:{name}").Set(
+        Vt.DoubleArray(value)
+    )
+    stage.Save()
+    with pytest.raises(RefusedError, match=f"</World/AnomalyMap>: .*{said}"):
+        load_map(tmp_path / "a.usdc")
+
+
+def test_a_map_with_a_node_without_a_value_is_not_written_as_a_survey(tmp_path):
+    values = np.full((4, 3, 5), 45_000.0)
+    values[0, 1, 2] = np.nan
+    made = survey(values_nt=values, recorded_yaw=None, valid=np.isfinite(values))
+    with pytest.raises(RefusedError, match="has no value at 1 of its nodes"):
+        write_survey(made, tmp_path / "csv")
+    assert not (tmp_path / "csv").exists()
+
+
+def test_recorded_headings_of_another_shape_are_refused():
+    with pytest.raises(RefusedError, match="recorded_yaw of AnomalyMap must have shape"):
+        survey(recorded_yaw=np.zeros((4, 3, 4)))
