@@ -11,8 +11,9 @@ from pxr import Sdf, Usd, UsdPhysics, UsdShade
 
 from magtwin.export.isaac import GRAPHS, author_graph
 from magtwin.export.ogn import Graph, faults, fits, message_fields, node_types
-from magtwin.io.messages import TOPICS, TYPES, sender_of
+from magtwin.io.messages import SCAN, TOPICS, TYPES, sender_of
 from magtwin.names import RefusedError
+from magtwin.ros.magnetometer import INPUTS
 from magtwin.spec import PlacedRobot
 from magtwin.usd.layers import open_stage
 from magtwin.usd.scene import author_scene, read_scene
@@ -127,6 +128,12 @@ def test_topics_messages_and_qos_are_those_of_magtwins_own_robot(authored):
         *("/robot/battery_state", "/robot/joint_states", "/robot/scan", "/robot/cmd_vel"),
     }
     assert seen["/robot/cmd_vel"].startswith("Subscribe")
+
+
+def test_the_magnetometers_node_finds_in_isaac_every_topic_that_it_can_read(authored):
+    _, _, graph = authored
+    topics = {a.Get() for prim in graph.GetChildren() if (a := prim.GetAttribute("inputs:topicName"))}
+    assert {topic.name for topic in (*INPUTS, SCAN)} <= topics
 
 
 @pytest.mark.parametrize("node", ["publish_pose", "publish_battery"])
