@@ -15,12 +15,12 @@ from magtwin.files import sha256
 from magtwin.io.formats import read_run
 from magtwin.learn.config import read_config
 from magtwin.learn.dataset import build_dataset, open_dataset
+from magtwin.learn.descent import _Descent
 from magtwin.learn.features import features
 from magtwin.learn.magnetometer import NeuralMagnetometer
 from magtwin.learn.model import load_net
 from magtwin.learn.predictor import load_predictor
 from magtwin.learn.split import LEAK
-from magtwin.learn.train import _Training
 from magtwin.run import COLUMNS, Run
 
 FIELD = AnomalyMap(
@@ -154,9 +154,9 @@ def test_a_killed_training_is_resumed_to_the_byte(data, trained, tmp_path, capsy
             raise KeyboardInterrupt
         return one_pass(self, number, advance)
 
-    one_pass = _Training._pass
+    one_pass = _Descent._pass
     with monkeypatch.context() as patch:
-        patch.setattr(_Training, "_pass", killed)
+        patch.setattr(_Descent, "_pass", killed)
         with pytest.raises(SystemExit) as ended:
             main(words)
     assert ended.value.code == 130
@@ -185,8 +185,8 @@ def test_fine_tuning_tells_the_error_before_and_after(data, trained, tmp_path, c
 
 def test_threads_are_those_asked_for_while_training_and_told(data, tmp_path, capsys, monkeypatch):
     seen = []
-    one_pass = _Training._pass
-    monkeypatch.setattr(_Training, "_pass", lambda *a: seen.append(torch.get_num_threads()) or one_pass(*a))
+    one_pass = _Descent._pass
+    monkeypatch.setattr(_Descent, "_pass", lambda *a: seen.append(torch.get_num_threads()) or one_pass(*a))
     words = ["--layers", "4", "--epochs", "1", "--threads", "2", "--json"]
     main(["train", str(data), "--out", str(tmp_path / "f.safetensors"), *words])
     assert (seen, torch.get_num_threads()) == ([2], 1)

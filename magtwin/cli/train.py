@@ -12,7 +12,7 @@ from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
     from magtwin.learn.config import TrainConfig
-    from magtwin.learn.train import Epoch
+    from magtwin.learn.descent import Epoch
 
 Flag = Annotated[bool, Parameter(negative="")]
 Names = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]

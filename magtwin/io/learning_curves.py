@@ -8,7 +8,7 @@ from pathlib import Path
 
 from magtwin.files import output
 from magtwin.io.plots import INK, MAP_INK, new_figure, save
-from magtwin.learn.train import Epoch
+from magtwin.learn.descent import Epoch
 
 
 def plot_learning_curve(

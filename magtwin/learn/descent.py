@@ -12,8 +12,27 @@ import torch
 
 from magtwin.learn.inputs import Array
 from magtwin.learn.state import load_state, save_state
-from magtwin.learn.train import Epoch
 from magtwin.names import RefusedError
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """How a network stood after one pass over the training rows."""
+
+    number: int
+    """1 is the first; 0 is how the weights stood that training went on from."""
+
+    train_rmse_nt: float
+    """Root mean square of label minus prediction in training, with dropout at work but in epoch 0 [nT]."""
+
+    val_rmse_nt: float
+    """The same on the validation rows, without dropout [nT]."""
+
+    val_mae_nt: float
+    """Mean absolute error on the validation rows [nT]."""
+
+    best: bool
+    """Whether no epoch before had a smaller val_rmse_nt; the last such epoch is kept."""
 
 
 class Learner(Protocol):
@@ -31,8 +50,15 @@ class Learner(Protocol):
     def rows(self) -> int:
         """How many rows they are."""
 
+    @property
+    def generators(self) -> Mapping[str, torch.Generator]:
+        """What it draws from beside the order of items, by name."""
+
     def loss(self, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean loss on items, and the sum of squares of their rows' errors [nT^2]."""
+        """Mean loss on items, and the sum of squares of their rows' errors [nT^2] without a gradient.
+
+        Units are dropped while the module is in training mode.
+        """
 
     def errors_nt(self) -> Array:
         """Errors on the validation rows as the module stands [nT], shape (M,)."""
@@ -54,6 +80,23 @@ class Course:
 
     seed: int = 0
     """Of the order of items."""
+
+
+def check_device(device: str) -> None:
+    """Refuse a device that this torch does not have.
+
+    Args:
+        device: As torch calls it: "cpu", "cuda".
+
+    Raises:
+        RefusedError: It has none such.
+    """
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise RefusedError(
+            f"device {device!r}: this torch has none ({str(error).splitlines()[0]})"
+        ) from error
 
 
 def descend(
@@ -104,7 +147,8 @@ class _Descent:
         if not self.trained:
             raise RefusedError("every layer is frozen; there is nothing left to train")
         self.adam = torch.optim.Adam(self.trained.values(), lr=course.lr, fused=True)
-        self.generator = torch.Generator().manual_seed(course.seed)
+        self.order = torch.Generator().manual_seed(course.seed)
+        self.generators = {"order": self.order, **learner.generators}
         self.kept = copy.deepcopy(self.module.state_dict())
         self.history: list[Epoch] = []
 
@@ -121,6 +165,7 @@ class _Descent:
     ) -> None:
         """Train until the last epoch or the end of patience, and leave the module with its best weights."""
         if self.started and not self.history:
+            self.module.eval()
             with torch.inference_mode():
                 everything = torch.arange(self.learner.items).split(8 * self.course.batch)
                 squares = sum(float(self.learner.loss(chosen)[1]) for chosen in everything)
@@ -136,7 +181,7 @@ class _Descent:
             if progress:
                 progress(self.history[-1])
         self.module.load_state_dict(self.kept)
-        self.module.eval()
+        self.module.eval().cpu()
 
     def load(self, checkpoint: str | os.PathLike[str]) -> None:
         """Take the state that a checkpoint holds."""
@@ -155,7 +200,8 @@ class _Descent:
         for name, parameter in self.trained.items():
             state = {key: found[f"adam.{name}.{key}"].to(parameter.device) for key in _ADAM}
             self.adam.state[parameter] = state
-        self.generator.set_state(found["rng"])
+        for name, generator in self.generators.items():
+            generator.set_state(found[f"rng.{name}"])
 
     def _pass(self, number: int, advance: Callable[[int, int], None] | None) -> float:
         """Go over the items once; gives the sum of squares of their errors [nT^2]."""
@@ -163,8 +209,9 @@ class _Descent:
         steps = math.ceil(items / course.batch)
         total, rise = course.epochs * steps, max(1, steps // 2)
         self.module.train()
-        squares, done = 0.0, (number - 1) * items
-        order = torch.randperm(items, generator=self.generator)
+        device = next(self.module.parameters()).device
+        squares, done = torch.zeros((), dtype=torch.float64, device=device), (number - 1) * items
+        order = torch.randperm(items, generator=self.order).to(device)
         for step, chosen in enumerate(order.split(course.batch), (number - 1) * steps):
             share = math.cos(math.pi * (step - rise) / max(1, total - rise))
             for group in self.adam.param_groups:
@@ -173,12 +220,12 @@ class _Descent:
             loss, errors = self.learner.loss(chosen)
             loss.backward()
             self.adam.step()
-            squares += float(errors.detach())
+            squares += errors  # not asked for before the end: a GPU would be waited for
             done += len(chosen)
             if advance:
                 per = self.learner.rows / items
                 advance(round(done * per), round(course.epochs * items * per))
-        return squares
+        return float(squares)
 
     def _note(self, number: int, squares: float, progress: Callable[[Epoch], None] | None) -> None:
         """Judge the module on the validation rows and keep it if it is the best so far."""
@@ -207,7 +254,7 @@ class _Descent:
             for key in _ADAM:
                 empty = torch.zeros(()) if key == "step" else torch.zeros_like(parameter)
                 found[f"adam.{name}.{key}"] = state.get(key, empty)
-        return found | {"rng": self.generator.get_state()}
+        return found | {f"rng.{name}": one.get_state() for name, one in self.generators.items()}
 
 
 _ADAM = ("step", "exp_avg", "exp_avg_sq")

@@ -12,11 +12,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.learn import heads
-from magtwin.learn.descent import Course, descend
+from magtwin.learn.descent import Course, Epoch, check_device, descend
 from magtwin.learn.inputs import Array, Inputs, inputs_from, inputs_of, scaler_tensors
 from magtwin.learn.perceptron import outputs
 from magtwin.learn.state import digest
-from magtwin.learn.train import Epoch
 from magtwin.learn.weights import Fact, Weights, write_weights
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
@@ -231,8 +230,9 @@ def fit_ensemble(
         net.weights[i].requires_grad_(False)
         net.biases[i].requires_grad_(False)
     model = Ensemble(inputs=of, net=net, y_mean_nt=y_mean, y_scale_nt=y_scale)
+    check_device(device)
     net.to(device)
-    course = Course(epochs=epochs, batch=batch, lr=lr, patience=patience, seed=seed % 2**31)
+    course = Course(epochs=epochs, batch=batch, lr=lr, patience=patience, seed=seed)
     settings = {
         "kind": "ensemble",
         "features": list(of.features),
@@ -248,7 +248,7 @@ def fit_ensemble(
     }
     learner = _Rows(model, x, y, weights[:, numbers], x_val, y_val, device)
     history = descend(learner, course, settings, started=init is not None, **going)
-    net.to("cpu").requires_grad_(True)
+    net.requires_grad_(True)
     model.residual_sd_nt = min(epoch.val_rmse_nt for epoch in history)
     return model, history
 
@@ -303,11 +303,14 @@ class _Rows:
     rows = items
 
     def loss(self, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        chosen = chosen.to(self.z.device)
         out, label = self.module(self.z[chosen]), self.label[chosen]
         error = out[..., 0].detach().mean(dim=0) - label
         squares = (error**2).sum() * self.model.y_scale_nt**2
         return heads.loss(out, label, self.weights[:, chosen]) * self.module.members, squares
+
+    @property
+    def generators(self) -> dict[str, torch.Generator]:
+        return {}
 
     def errors_nt(self) -> Array:
         means = [self.module(part)[..., 0].mean(dim=0) for part in self.z_val.split(8192)]

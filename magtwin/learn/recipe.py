@@ -10,13 +10,14 @@ import torch
 
 from magtwin.learn.calibration import transferred_factor
 from magtwin.learn.config import TrainConfig
+from magtwin.learn.descent import Epoch
 from magtwin.learn.ensemble import Ensemble, fit_ensemble
 from magtwin.learn.hybrid import Hybrid
 from magtwin.learn.linear import Fitted, Linear, fit_linear
 from magtwin.learn.material import Material
 from magtwin.learn.predictor import Predictor
 from magtwin.learn.temporal import Temporal, fit_temporal
-from magtwin.learn.train import Epoch, train
+from magtwin.learn.train import train
 from magtwin.names import RefusedError, find
 
 

@@ -12,11 +12,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.learn import heads
-from magtwin.learn.descent import Course, descend
+from magtwin.learn.descent import Course, Epoch, check_device, descend
 from magtwin.learn.inputs import Array, Inputs, inputs_from, inputs_of, scaler_tensors
 from magtwin.learn.perceptron import CHUNK, in_threads
 from magtwin.learn.state import digest
-from magtwin.learn.train import Epoch
 from magtwin.learn.weights import Fact, Weights, write_weights
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
@@ -276,10 +275,9 @@ def fit_temporal(
         of, y_mean, y_scale = init.inputs.grown(of), init.y_mean_nt, init.y_scale_nt
         net.load_state_dict(init.net.state_dict())
     model = Temporal(inputs=of, net=net, y_mean_nt=y_mean, y_scale_nt=y_scale, step_s=step_s)
+    check_device(device)
     net.to(device)
-    course = Course(
-        epochs=epochs, batch=max(1, batch // STRETCH), lr=lr, patience=patience, seed=seed % 2**31
-    )
+    course = Course(epochs=epochs, batch=max(1, batch // STRETCH), lr=lr, patience=patience, seed=seed)
     settings = {
         "kind": "tcn",
         "features": list(of.features),
@@ -294,7 +292,6 @@ def fit_temporal(
     }
     learner = _Stretches(model, tracks, held_out, device)
     history = descend(learner, course, settings, started=init is not None, **going)
-    net.to("cpu")
     model.residual_sd_nt = min(epoch.val_rmse_nt for epoch in history)
     return model, history
 
@@ -349,7 +346,8 @@ class _Stretches:
             starts.append(first + here[some])
             labels[-1] = torch.cat([label.new_full((model.context,), math.nan), labels[-1]])
             first += len(zs[-1])
-        self.z, self.label, self.starts = torch.cat(zs), torch.cat(labels), torch.cat(starts)
+        self.z, self.label, self.starts = torch.cat(zs), torch.cat(labels), torch.cat(starts).to(device)
+        self.offsets = torch.arange(model.context + STRETCH, device=device)
         self.rows = int(torch.isfinite(self.label).sum())
 
     @property
@@ -357,8 +355,7 @@ class _Stretches:
         return len(self.starts)
 
     def loss(self, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        rows = self.starts[chosen][:, None] + torch.arange(self.model.context + STRETCH)
-        rows = rows.to(self.device)
+        rows = self.starts[chosen][:, None] + self.offsets
         label = self.label[rows[:, self.model.context :]]
         known = torch.isfinite(label)
         label = torch.where(known, label, 0.0)
@@ -366,6 +363,10 @@ class _Stretches:
         weight = known / known.float().mean()
         squares = ((out[..., 0].detach() - label) ** 2 * known).sum() * self.model.y_scale_nt**2
         return heads.loss(out, label, weight), squares
+
+    @property
+    def generators(self) -> dict[str, torch.Generator]:
+        return {}
 
     def errors_nt(self) -> Array:
         errors = []

@@ -1,43 +1,20 @@
 """Training: from features and labels to a FieldNet, judged on runs that it never saw."""
 
-import copy
-import hashlib
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.learn.descent import Course, Epoch, check_device, descend
 from magtwin.learn.features import feature_names
 from magtwin.learn.model import Fact, FieldNet
-from magtwin.learn.state import load_state, save_state
+from magtwin.learn.state import digest
 from magtwin.names import RefusedError, find
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Epoch:
-    """How a network stood after one pass over the training rows."""
-
-    number: int
-    """1 is the first; 0 is how the weights stood that training went on from."""
-
-    train_rmse_nt: float
-    """Root mean square of label minus prediction in training, with dropout at work but in epoch 0 [nT]."""
-
-    val_rmse_nt: float
-    """The same on the validation rows, without dropout [nT]."""
-
-    val_mae_nt: float
-    """Mean absolute error on the validation rows [nT]."""
-
-    best: bool
-    """Whether no epoch before had a smaller val_rmse_nt; the last such epoch is kept."""
 
 
 def train(
@@ -111,14 +88,7 @@ def train(
         raise RefusedError(f"epochs, batch and lr must be above 0, got {epochs}, {batch} and {lr}")
     if patience is not None and patience < 1:
         raise RefusedError(f"patience must be 1 epoch at least, got {patience}; leave it out to run them all")
-    if resume and checkpoint is None:
-        raise RefusedError("there is no checkpoint to resume from; name one")
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise RefusedError(
-            f"device {device!r}: this torch has none ({str(error).splitlines()[0]})"
-        ) from error
+    check_device(device)
     seed = int(rng.integers(2**62))
     with torch.random.fork_rng(devices=[]):  # first weights are drawn from torch's own generator
         torch.manual_seed(seed)
@@ -132,175 +102,67 @@ def train(
         "features": list(names),
         "layers": list(net.hidden),
         "dropout": dropout,
-        "epochs": epochs,
-        "batch": batch,
-        "lr": lr,
-        "patience": patience,
         "freeze": sorted(freeze),
-        "seed": seed,
         "device": device,
         "threads": torch.get_num_threads(),
         "torch": str(torch.__version__),
     }
-    training = _Training(net, x, y, x_val, y_val, settings, started=init is not None)
     if checkpoint is not None:
-        settings["rows"] = _digest(x, y, x_val, y_val)
-        settings["init"] = _digest(*init.state_dict().values()) if init is not None else ""
-    if resume and checkpoint is not None:
-        training.load(checkpoint)
-    training.run(checkpoint, progress, advance)
+        settings["rows"] = digest(x, y, x_val, y_val)
+        settings["init"] = digest(*init.state_dict().values()) if init is not None else ""
+    history = descend(
+        _Rows(net, x, y, x_val, y_val, Dropout(dropout, torch.Generator(device).manual_seed(seed + 1))),
+        Course(epochs=epochs, batch=batch, lr=lr, patience=patience, seed=seed),
+        settings,
+        started=init is not None,
+        checkpoint=checkpoint,
+        resume=resume,
+        progress=progress,
+        advance=advance,
+    )
     net.requires_grad_(True)
-    net.residual_sd_nt = training.best
-    return net.eval(), tuple(training.history)
+    net.residual_sd_nt = min(epoch.val_rmse_nt for epoch in history)
+    return net, history
 
 
-class _Training:
-    """A network on its way, and all that its next step depends on."""
+class _Rows:
+    """Rows as a network learns them, on the device that its dropout draws on."""
 
     def __init__(
-        self,
-        net: FieldNet,
-        x: Array,
-        y: Array,
-        x_val: Array,
-        y_val: Array,
-        settings: dict[str, Any],
-        *,
-        started: bool,
+        self, net: FieldNet, x: Array, y: Array, x_val: Array, y_val: Array, drop: "Dropout"
     ) -> None:
-        self.net, self.settings, self.started = net, settings, started
-        device = settings["device"]
+        self.module, self.drop, device = net, drop, drop.generator.device
         self.z = ((torch.from_numpy(x) - net.x_mean) / net.x_scale).float().to(device)
         self.label = ((torch.from_numpy(y) - net.y_mean) / net.y_scale).float().to(device)
         self.x_val, self.y_val = torch.from_numpy(x_val).to(device), y_val
+        self.square_nt2 = float(net.y_scale) ** 2
+        self.generators = {"dropout": drop.generator}
         net.to(device)
-        self.order = torch.Generator().manual_seed(settings["seed"])
-        self.drop = Dropout(settings["dropout"], torch.Generator(device).manual_seed(settings["seed"] + 1))
-        self.trained = {name: p for name, p in net.named_parameters() if p.requires_grad}
-        self.adam = torch.optim.Adam(self.trained.values(), lr=settings["lr"], fused=True)
-        self.kept = copy.deepcopy(net.state_dict())
-        self.history: list[Epoch] = []
 
     @property
-    def best(self) -> float:
-        """Smallest error on the validation rows so far [nT]; inf before the first epoch."""
-        return min((epoch.val_rmse_nt for epoch in self.history), default=math.inf)
+    def items(self) -> int:
+        return len(self.z)
 
-    @property
-    def ended(self) -> bool:
-        """Whether as many epochs as patience admits have passed since the best one."""
-        patience = self.settings["patience"]
-        last = max((i for i, epoch in enumerate(self.history) if epoch.best), default=0)
-        return patience is not None and len(self.history) - 1 - last >= patience
+    rows = items
 
-    def run(
-        self,
-        checkpoint: str | os.PathLike[str] | None,
-        progress: Callable[[Epoch], None] | None,
-        advance: Callable[[int, int], None] | None,
-    ) -> None:
-        """Train until the last epoch or the end of patience, and leave the network with its best weights."""
-        if self.started and not self.history:
-            self._note(0, self._train_error(), progress)
-        first = self.history[-1].number + 1 if self.history else 1
-        for number in range(first, self.settings["epochs"] + 1):
-            if self.ended:
-                break
-            self._note(number, self._pass(number, advance), None)
-            if checkpoint is not None:
-                save_state(checkpoint, self._tensors(), self.settings, [asdict(e) for e in self.history])
-            if progress:
-                progress(self.history[-1])
-        self.net.load_state_dict(self.kept)
-        self.net.cpu()
+    def loss(self, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        z, label = self.z[chosen], self.label[chosen]
+        out = self._forward(z) if self.module.training else self.module.body(z)
+        loss = torch.nn.functional.mse_loss(out, label)
+        return loss, loss.detach() * (len(chosen) * self.square_nt2)
 
-    def load(self, checkpoint: str | os.PathLike[str]) -> None:
-        """Take the state that a checkpoint holds."""
-        found, told = load_state(checkpoint, self._tensors(), self.settings)
-        try:
-            self.history = [Epoch(**epoch) for epoch in told]
-            numbers = [epoch.number for epoch in self.history]
-            sound = numbers == list(range(0 if self.started else 1, self.settings["epochs"] + 1))[: len(told)]
-            sound &= any(epoch.best for epoch in self.history) and math.isfinite(self.best)
-        except TypeError:
-            sound = False
-        if not sound:
-            raise RefusedError(f"{checkpoint}: its epochs are not those of a training; start anew")
-        self.net.load_state_dict(_part(found, "net."))
-        self.kept = _part(found, "kept.")
-        for name, parameter in self.trained.items():
-            state = {key: found[f"adam.{name}.{key}"].to(parameter.device) for key in _ADAM}
-            self.adam.state[parameter] = state
-        self.order.set_state(found["rng.order"])
-        self.drop.generator.set_state(found["rng.dropout"])
-
-    def _pass(self, number: int, advance: Callable[[int, int], None] | None) -> float:
-        """Go over the training rows once; gives the error in training, with dropout at work [nT]."""
-        rows, batch, lr = len(self.z), self.settings["batch"], self.settings["lr"]
-        steps = math.ceil(rows / batch)
-        schedule = _Schedule(self.settings["epochs"] * steps, max(1, steps // 2))
-        device, done = self.z.device, (number - 1) * rows
-        squares = torch.zeros((), dtype=torch.float64, device=device)
-        order = torch.randperm(rows, generator=self.order).to(device)
-        for step, chosen in enumerate(order.split(batch), (number - 1) * steps):
-            for group in self.adam.param_groups:
-                group["lr"] = lr * schedule(step)
-            self.adam.zero_grad(set_to_none=True)
-            loss = torch.nn.functional.mse_loss(self._forward(self.z[chosen]), self.label[chosen])
-            loss.backward()
-            self.adam.step()
-            squares += loss.detach() * len(chosen)
-            done += len(chosen)
-            if advance:
-                advance(done, self.settings["epochs"] * rows)
-        return self._in_nt(float(squares))
+    def errors_nt(self) -> Array:
+        parts = [self.module(part).cpu().numpy() for part in self.x_val.split(8192)]
+        return np.concatenate(parts) - self.y_val
 
     def _forward(self, z: torch.Tensor) -> torch.Tensor:
         """Scaled labels, shape (B,), from scaled features, shape (B, F), units dropped."""
-        *inner, last = self.net.linears
+        *inner, last = self.module.linears
         for i, layer in enumerate(inner):
             z = torch.relu(layer(z))
             if i < len(inner) - 1:
                 z = self.drop(z)
         return last(z).squeeze(-1)
-
-    def _train_error(self) -> float:
-        """Error on the training rows as the network stands, without dropout [nT]."""
-        self.net.eval()
-        with torch.inference_mode():
-            parts = zip(self.z.split(8192), self.label.split(8192), strict=True)
-            return self._in_nt(sum(float(((self.net.body(z) - y) ** 2).sum()) for z, y in parts))
-
-    def _in_nt(self, squares: float) -> float:
-        return float(self.net.y_scale) * math.sqrt(squares / len(self.z)) if squares >= 0 else math.nan
-
-    def _note(self, number: int, train_rmse: float, progress: Callable[[Epoch], None] | None) -> None:
-        """Judge the network on the validation rows and keep it if it is the best so far."""
-        self.net.eval()
-        with torch.inference_mode():
-            parts = [self.net(part).cpu().numpy() for part in self.x_val.split(8192)]
-        error = np.concatenate(parts) - self.y_val
-        rmse = float(np.sqrt(np.mean(error**2)))
-        if not math.isfinite(train_rmse + rmse):
-            lr = self.settings["lr"]
-            raise RefusedError(f"training diverged in epoch {number}; give a step size lr below {lr:g}")
-        better = rmse < self.best
-        self.history.append(Epoch(number, train_rmse, rmse, float(np.abs(error).mean()), better))
-        if better:
-            self.kept = copy.deepcopy(self.net.state_dict())
-        if progress:
-            progress(self.history[-1])
-
-    def _tensors(self) -> dict[str, torch.Tensor]:
-        """Everything that a checkpoint holds, by name."""
-        found = {f"net.{name}": value for name, value in self.net.state_dict().items()}
-        found |= {f"kept.{name}": value for name, value in self.kept.items()}
-        for name, parameter in self.trained.items():
-            state = self.adam.state.get(parameter) or {}
-            for key in _ADAM:
-                empty = torch.zeros(()) if key == "step" else torch.zeros_like(parameter)
-                found[f"adam.{name}.{key}"] = state.get(key, empty)
-        return found | {"rng.order": self.order.get_state(), "rng.dropout": self.drop.generator.get_state()}
 
 
 class Dropout:
@@ -332,14 +194,6 @@ class Dropout:
         return h * kept.to(h.dtype).mul_(self._scale)
 
 
-_ADAM = ("step", "exp_avg", "exp_avg_sq")
-"""What Adam keeps of each parameter."""
-
-
-def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
-
-
 def _go_on_from(net: FieldNet, init: FieldNet, x: Array) -> None:
     """Take over weights and scalers; the training ranges grow by the new rows, or stay unknown."""
     if init.features != net.features or init.hidden != net.hidden:
@@ -361,27 +215,6 @@ def _freeze(net: FieldNet, names: Sequence[str], init: FieldNet | None) -> None:
         find("layer", name, layers).requires_grad_(False)
     if set(names) == set(layers):
         raise RefusedError("every layer is frozen; there is nothing left to train")
-
-
-def _digest(*arrays: Array | torch.Tensor) -> str:
-    """SHA-256 of the numbers of arrays."""
-    found = hashlib.sha256()
-    for array in arrays:
-        found.update(np.ascontiguousarray(array).data)
-    return found.hexdigest()
-
-
-@dataclass(frozen=True)
-class _Schedule:
-    """Factor of the step size: a straight rise, then half a cosine down to 0."""
-
-    total: int
-    rise: int
-
-    def __call__(self, step: int) -> float:
-        if step < self.rise:
-            return (step + 1) / self.rise
-        return 0.5 + 0.5 * math.cos(math.pi * (step - self.rise) / max(1, self.total - self.rise))
 
 
 def _rows(kind: str, x: ArrayLike, y: ArrayLike, names: Sequence[str]) -> tuple[Array, Array]:

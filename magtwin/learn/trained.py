@@ -14,11 +14,11 @@ from magtwin.learn.calibration import coverage
 from magtwin.learn.card import card_of
 from magtwin.learn.config import TrainConfig
 from magtwin.learn.dataset import MANIFEST, Dataset
+from magtwin.learn.descent import Epoch
 from magtwin.learn.material import Material, material
 from magtwin.learn.predictor import Predictor, load_predictor
 from magtwin.learn.recipe import Choice, device_of, make
 from magtwin.learn.split import PARTS, Part, Split
-from magtwin.learn.train import Epoch
 from magtwin.learn.weights import Fact
 from magtwin.report import Figure, Report
 from magtwin.version import __version__
