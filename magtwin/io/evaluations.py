@@ -31,7 +31,10 @@ Array = NDArray[np.float64]
 NAME, PICTURES = "evaluation", "figures"
 """What the report's files are called, and the folder of its pictures."""
 
-INKS = ("0.55", "#1971c2", "#e08214", "#2f9e44", "#9c36b5", "#d6336c", "#0c8599", "#5c4813")
+INKS = (
+    *("0.55", "#1971c2", "#e08214", "#2f9e44", "#9c36b5", "#d6336c", "#0c8599", "#5c4813"),
+    *("#74c0fc", "#ffc078", "#8ce99a", "#e599f7", "#faa2c1", "#66d9e8", "#c5a880"),
+)
 """Colours of the models, the naive one's first."""
 
 MOST_PANELS = 6
@@ -39,6 +42,9 @@ MOST_PANELS = 6
 
 RANKED_HZ = 10.0
 """Readings a second that a rank correlation is taken from: more are too alike to tell more."""
+
+MOST_COLUMNS = 12
+"""Of a table; one with more paths is turned."""
 
 SHOWN_S = 90.0
 """How much of a run is shown against time [s]."""
@@ -72,12 +78,13 @@ def page_of_evaluation(
         f"{against}."
     )
     sections = [
-        Section("Table 1", _lead_of_table(found), (), (_table(found), _intervals(found))),
+        Section("Table 1", _lead_of_table(found), (), (_table(found),)),
         Section("Models and maps", "", (), (_models(found), _maps(found), _left_out(found))),
         Section("Inputs and the disturbance", "", pictured([_ranks(found)])),
         Section("A run", "", pictured([_band(found), _floor_plan(found)])),
         Section("Errors by path", "", pictured([_bars(found), _curves(found, curves or {})])),
         *more,
+        Section("Every score", "", (), (_intervals(found),)),
     ]
     kept = tuple(one for one in sections if one.tables or one.pictures)
     return Page(title, lead, kept, data={**found.summary(), **(data or {})})
@@ -162,23 +169,21 @@ def _lead_of_table(found: Evaluation) -> str:
 
 
 def _table(found: Evaluation) -> Table:
-    """The paper's Table 1, a column a model."""
-    rows = []
-    for case in found.cases:
-        naive, *others = case.scores
-        paper = PAPER.get(case.name)
-        rows.append(
-            (
-                _named(found, case),
-                naive.rows,
-                f"{naive.mae_nt:.1f}",
-                *(f"{one.mae_nt:.1f} ({one.ratio:.3f})" for one in others),
-                "" if paper is None else f"{paper[0]:.1f} / {paper[1]:.1f} ({paper[2]:.3f})",
-            )
-        )
-    head = ("case", "readings", *found.names, "the paper's model / naive")
-    note = "" if len(found.cases) < 3 else "mean: of the rows above, each path counting the same."
-    return Table("Mean absolute errors", head, tuple(rows), note)
+    """The paper's Table 1, turned so that a line is a model."""
+    head = ["model", *(_named(found, case) for case in found.cases)]
+    rows = [["readings", *(case.scores[0].rows for case in found.cases)]]
+    for m, name in enumerate(found.names):
+        told = [(case.scores[m].mae_nt, case.scores[m].ratio) for case in found.cases]
+        rows.append([name, *(f"{mae:.1f} ({ratio:.3f})" if m else f"{mae:.1f}" for mae, ratio in told)])
+    paper = [PAPER.get(case.name) for case in found.cases]
+    if any(paper):
+        rows.append(["the paper's naive", *("" if one is None else f"{one[1]:.1f}" for one in paper)])
+        network = ("" if one is None else f"{one[0]:.1f} ({one[2]:.3f})" for one in paper)
+        rows.append(["the paper's network", *network])
+    if len(head) > MOST_COLUMNS:
+        head, *rows = (list(line) for line in zip(head, *rows, strict=True))
+    note = "" if len(found.cases) < 3 else "mean: of the other paths, each counting the same."
+    return Table("Mean absolute errors", tuple(head), tuple(tuple(row) for row in rows), note)
 
 
 def _named(found: Evaluation, case: Case) -> str:
@@ -200,18 +205,20 @@ def _intervals(found: Evaluation) -> Table:
                     case.name,
                     name,
                     score.mae_nt,
-                    f"{low:.0f}–{high:.0f}",
+                    low,
+                    high,
                     score.ratio,
-                    f"{least:.3f}–{most:.3f}",
+                    least,
+                    most,
                     score.rmse_nt,
                     score.bias_nt,
                     f"{score.coverage:.1%}" if known else "no sd",
                     f"{score.outside:.1%}",
                 )
             )
-    head = ("case", "model", "MAE [nT]", "interval [nT]", "ratio", "interval", "RMSE [nT]", "bias [nT]")
+    head = ("case", "model", "MAE [nT]", "from", "to", "ratio", "from", "to", "RMSE [nT]", "bias [nT]")
     note = f"coverage: share of the readings within the predicted interval of {COVERED:.0%}. out of "
-    note += "distribution: share with an input beyond the training ranges."
+    note += "distribution: share with an input beyond the training ranges. from, to: the interval."
     return Table("With intervals", (*head, "coverage", "out of distribution"), tuple(rows), note)
 
 
@@ -287,9 +294,10 @@ def _every(one: Judged, rate_hz: float) -> int:
 
 
 def of_weights(found: Evaluation) -> list[int]:
-    """The models that came from weights files, or all but the naive one where none did."""
+    """Models that came from weights files, or all but the naive one; `MOST_PANELS` of them at most."""
     own = [i for i, one in enumerate(found.contenders) if "sha256" in one.facts]
-    return (own or list(range(1, len(found.contenders))) or [0])[:MOST_PANELS]
+    own = own or list(range(1, len(found.contenders))) or [0]
+    return own if len(own) <= MOST_PANELS else [own[0], *own[1 - MOST_PANELS :]]
 
 
 def _middle(found: Evaluation) -> Judged:
@@ -332,8 +340,8 @@ def _band(found: Evaluation) -> Drawing:
             ax.margins(x=0)
             ax.tick_params(labelsize=8)
     axes[-1].set_xlabel("time [s]", fontsize=9)
-    told = [entry for ax in axes[:2] for entry in zip(*ax.get_legend_handles_labels(), strict=True)]
-    figure.legend(*zip(*told, strict=True), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    told = {label: line for ax in axes for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(told.values(), told.keys(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     title = f"Figure 5: total field of {one.name} ({one.path}), measured and predicted, and the errors"
     return Drawing("figure_5", title, title, figure, tall=True)
 
@@ -397,7 +405,7 @@ def _bars(found: Evaluation) -> Drawing:
     """The paper's Figure 6 a and b: errors by path, with their intervals."""
     cases = [case for case in found.cases if case.name != "all"]
     count = len(found.contenders)
-    figure = new_figure(max(5.6, 1.6 + 0.14 * count * len(cases)), 3.6)
+    figure = new_figure(float(np.clip(1.6 + 0.14 * count * len(cases), 5.6, 7.4)), 2.9 + 0.1 * count)
     ax = figure.subplots()
     width = 0.84 / count
     for m, name in enumerate(found.names):
@@ -431,9 +439,8 @@ def _curves(found: Evaluation, curves: Mapping[str, Sequence[Mapping[str, float]
         for column, (what, style) in CURVES.items():
             points = [(row[EPOCH], row[column]) for row in rows if column in row]
             if points:
-                mark = "." if len(points) < 40 else ""
                 label = f"{found.names[m]}, {what}"
-                ax.plot(*zip(*points, strict=True), ls=style, marker=mark, color=ink(m), label=label)
+                ax.plot(*zip(*points, strict=True), ls=style, color=ink(m), label=label)
     ax.set_ylim(bottom=0)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("epoch", fontsize=9)
