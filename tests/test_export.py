@@ -34,6 +34,11 @@ LAB = shipped("scenes", "lab", "lab.usda")
 ROBOT, HEAT_MAP = "/World/turtlebot4", "/World/AnomalyMap/HeatMap"
 MAGNETOMETER = f"{ROBOT}/magnetometer_link/magnetometer"
 
+WEIGHTS = read_scene(LAB).robot.magnetometer.network
+"""The default lab's network, whatever it is called."""
+
+ATTACHED = f"/World/{SCOPE}/{WEIGHTS.name.replace('.', '_')}"
+
 BARE = (
     """
 import json, sys
@@ -172,7 +177,7 @@ def test_an_export_names_nothing_by_an_absolute_path_and_nothing_outside(folder,
 
 def test_an_exported_folder_is_the_scene_that_it_was_made_from(folder):
     there, here = read_scene(LAB), read_scene(folder / "lab.usda")
-    assert here.robot.magnetometer.network == (folder / "weights" / "lab.safetensors").resolve()
+    assert here.robot.magnetometer.network == (folder / "weights" / WEIGHTS.name).resolve()
     assert sha256(here.map_layer) == sha256(there.map_layer) == here.map_sha256
     own = replace(here.robot.magnetometer, network=there.robot.magnetometer.network)
     robot = replace(here.robot, asset=there.robot.asset, magnetometer=own)
@@ -193,16 +198,17 @@ def test_every_entry_of_a_package_is_of_a_kind_that_it_may_hold_and_begins_at_64
 
 def test_the_network_and_its_onnx_lie_in_a_package_as_bytes_and_beside_it_as_files(package):
     stage = Usd.Stage.Open(str(package))
-    weights = LAB.parents[2] / "weights" / "lab.safetensors"
-    prim = stage.GetPrimAtPath(f"/World/{SCOPE}/lab_safetensors")
-    assert bytes(prim.GetAttribute(BYTES).Get()) == weights.read_bytes()
-    assert prim.GetAttribute("magtwin:file:sha256").Get() == sha256(weights)
+    prim = stage.GetPrimAtPath(ATTACHED)
+    assert bytes(prim.GetAttribute(BYTES).Get()) == WEIGHTS.read_bytes()
+    assert prim.GetAttribute("magtwin:file:sha256").Get() == sha256(WEIGHTS)
     assert prim.GetRelationship("magtwin:file:of").GetTargets() == [
         f"{MAGNETOMETER}.magtwin:magnetometer:network"
     ]
     beside = package.with_name("lab_magtwin")
-    assert (beside / "weights" / "lab.safetensors").read_bytes() == weights.read_bytes()
-    assert (beside / "weights" / "lab.onnx").read_bytes() == b"ONNX of " + sha256(weights).encode()
+    assert (beside / "weights" / WEIGHTS.name).read_bytes() == WEIGHTS.read_bytes()
+    assert (beside / "weights" / f"{WEIGHTS.stem}.onnx").read_bytes() == b"ONNX of " + sha256(
+        WEIGHTS
+    ).encode()
     assert (beside / PLUGIN / "plugInfo.json").is_file()
 
 
@@ -213,7 +219,7 @@ def test_a_package_becomes_a_folder_again_with_its_network_named_and_its_run_kep
     assert not Usd.Stage.Open(str(root)).GetPrimAtPath(f"/World/{SCOPE}")
     scene = read_scene(out / "lab.usda")
     assert sha256(scene.robot.magnetometer.network) == scene.robot.magnetometer.network_sha256
-    assert (out / "weights" / "lab.onnx").is_file()
+    assert (out / "weights" / f"{WEIGHTS.stem}.onnx").is_file()
     assert_allclose(read_animation(root)["p_world_base"], played["p_world_base"], atol=0)
 
 
@@ -308,7 +314,7 @@ def test_a_single_layer_holds_its_network_and_can_become_a_folder_again(tmp_path
     export_scene(LAB, tmp_path / "lab.usd", trusted=True)
     stage = Usd.Stage.Open(str(tmp_path / "lab.usd"))
     assert len([layer for layer in stage.GetUsedLayers() if not layer.anonymous]) == 1
-    assert stage.GetPrimAtPath(f"/World/{SCOPE}/lab_safetensors").GetAttribute(BYTES).Get()
+    assert stage.GetPrimAtPath(ATTACHED).GetAttribute(BYTES).Get()
     assert not any(named_in(tmp_path / "lab.usd"))
 
 
@@ -328,20 +334,31 @@ def test_metadata_and_page_say_what_an_export_was_made_from_and_under_which_lice
     said = Sdf.Layer.FindOrOpen(str(folder / "lab.usda")).customLayerData["magtwin"]["export"]
     assert said["source"] == "lab.usda"
     assert re.fullmatch("[0-9a-f]{64}", said["sourceSha256"])
-    assert said["licences"] == {
-        "lab/lab.usdc": "Apache-2.0",
-        "turtlebot4/turtlebot4.usda": "Apache-2.0",
-        "weights/lab.safetensors": "Apache-2.0",
-    }
+    weights = said["licences"].pop(f"weights/{WEIGHTS.name}")
+    assert weights in ("Apache-2.0", "not stated")
+    assert said["licences"] == {"lab/lab.usdc": "Apache-2.0", "turtlebot4/turtlebot4.usda": "Apache-2.0"}
     page = (folder / HOWTO).read_text()
     for word in (
         "lab.usda",
         "lab_run.usdc",
         "PXR_PLUGINPATH_NAME",
         said["sourceSha256"],
-        "weights/lab.safetensors",
+        f"weights/{WEIGHTS.name}",
     ):
         assert word in page
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"), [({"licence": "MIT"}, "MIT"), ({}, "not stated"), (None, "not stated")]
+)
+def test_the_licence_of_a_network_is_read_from_its_weights(facts, said, tmp_path):
+    header = {} if facts is None else {"__metadata__": {"magtwin": json.dumps({"facts": facts})}}
+    text = json.dumps(header).encode()
+    (tmp_path / "net.safetensors").write_bytes(struct.pack("<Q", len(text)) + text)
+    scene = scene_from_toml(shipped("scenes", "lab.toml"), network=tmp_path / "net.safetensors")
+    author_scene(scene, tmp_path / "lab")
+    made = export_scene(tmp_path / "lab" / "lab.usda", tmp_path / "out", trusted=True)
+    assert made.licences["weights/net.safetensors"] == said
 
 
 def test_the_plugin_beside_an_export_tells_usd_core_the_schemas(folder):
@@ -362,8 +379,11 @@ def test_robots_of_the_scene_that_newton_loads_have_what_newton_needs(tmp_path):
     joints = [UsdPhysics.RevoluteJoint(p) for p in stage.Traverse() if p.IsA(UsdPhysics.RevoluteJoint)]
     assert joints
     assert (tmp_path / "lab" / "newton_magnetometer.py").is_file()
-    assert (tmp_path / "lab" / "weights" / "lab.onnx").is_file()
-    assert "newton_magnetometer.py lab.usda weights/lab.onnx" in (tmp_path / "lab" / HOWTO).read_text()
+    assert (tmp_path / "lab" / "weights" / f"{WEIGHTS.stem}.onnx").is_file()
+    assert (
+        f"newton_magnetometer.py lab.usda weights/{WEIGHTS.stem}.onnx"
+        in (tmp_path / "lab" / HOWTO).read_text()
+    )
 
 
 # glTF

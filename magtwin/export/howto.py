@@ -1,6 +1,7 @@
 """How-to: the page that lies beside what was exported, for whoever opens it without knowing magtwin."""
 
 from collections.abc import Mapping, Sequence
+from shlex import quote
 
 _HEAD = """# {name}, exported by magtwin {version}
 
@@ -74,14 +75,15 @@ _ISAAC = """
 Enable the extension `isaacsim.ros2.bridge`, open the stage and press Play. The Action Graphs
 below `{graphs}` publish `/clock`, odometry, inertial unit, pose, joint states and scan, and take
 `/robot/cmd_vel`. The robot's asset has Isaac Sim's asset structure 3.0; its variant set `Physics`
-chooses the engine.
+chooses the engine. The graphs were held against the published definitions of their nodes, and not
+run in Isaac Sim.
 """
 
 _SCRIPT = """
-`{script}` drives the robot along a figure of eight and reads the magnetometer at every step, without
-magtwin; its first lines say what it needs.
+`{script}` drives the robot along a figure of eight and reads the magnetometer at every
+step, without magtwin; its first lines say what it needs, and whether it was tested.
 
-    python {script} {root} {onnx} readings.csv
+    {python} {script} {root} {onnx} readings.csv
 """
 
 _LICENCES = """
@@ -120,7 +122,8 @@ def howto(
     if graphs:
         parts.append(_ISAAC.format(graphs=graphs))
     stage = f"../{root}" if attached else root
-    parts += [_SCRIPT.format(script=s, root=stage, onnx=onnx or "NETWORK.onnx") for s in scripts]
+    command = {"python": "./python.sh" if graphs else "python", "root": quote(stage)}
+    parts += [_SCRIPT.format(script=s, onnx=quote(onnx or "NETWORK.onnx"), **command) for s in scripts]
     if plugin:
         parts.append(_PLUGIN)
     if map_prim:

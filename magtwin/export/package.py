@@ -34,6 +34,7 @@ from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import FOLDER as SCHEMA
 from magtwin.usd.schema import attribute_name, place, prims_with
 from magtwin.usd.sensors import MAP_CHECKSUM
+from magtwin.usd.urdf.simready import UNKNOWN
 from magtwin.version import __version__
 
 Profile = Literal["omniverse", "isaac", "newton", "viewer"]
@@ -268,8 +269,8 @@ class _Work:
         for prim in prims_with(world, "anomalyMap"):
             read_map(prim)
             self.map = self.map or str(prim.GetPath())
-            if licence := prim.GetAttribute(attribute_name("anomalyMap", "licence")).Get():
-                self.licences[self._said(_values_layer(prim))] = licence
+            licence = prim.GetAttribute(attribute_name("anomalyMap", "licence")).Get()
+            self.licences[self._said(_values_layer(prim))] = licence or UNKNOWN
         magnetometers = prims_with(world, "magnetometer")
         self.magnetometer = str(magnetometers[0].GetPath()) if magnetometers else ""
         self.networks: list[Path] = []
@@ -286,8 +287,7 @@ class _Work:
                 )
             if file not in self.networks:
                 self.networks.append(file)
-                if licence := _licence_of(file):
-                    self.licences[self._said(file)] = licence
+                self.licences[self._said(file)] = _licence_of(file) or UNKNOWN
         for layer in stage.GetUsedLayers():
             facts = layer.customLayerData.get("SimReady_Metadata", {})
             if layer.realPath and facts.get("asset_license"):
