@@ -33,8 +33,19 @@ def section_of_budget(
         "them."
     )
     drawings = [_waterfall(found, made), _ladder(found, order)]
-    tables = (_budget_table(made), _rms_table(made), _true_table(missed))
+    tables = (_steps_table(found, order), _budget_table(made), _rms_table(made), _true_table(missed))
     return Section("Error budget", lead, pictured(drawings), tables)
+
+
+def _steps_table(found: Evaluation, order: Sequence[int]) -> Table:
+    rows, scores = [], found.every.scores
+    for k, m in enumerate(order):
+        score, before = scores[m], scores[order[max(k - 1, 0)]]
+        bought = (before.mae_nt - score.mae_nt, before.ratio - score.ratio) if k else ("", "")
+        rows.append((found.names[m], found.contenders[m].chart.name, score.mae_nt, score.ratio, *bought))
+    head = ("model", "map", "MAE [nT]", "ratio", "bought [nT]", "bought, ratio")
+    note = "bought: less than the line above; below 0 where the line above was better."
+    return Table("Steps", head, tuple(rows), note)
 
 
 def _budget_table(made: Sequence[Budget]) -> Table:

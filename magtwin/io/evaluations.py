@@ -300,10 +300,15 @@ def of_weights(found: Evaluation) -> list[int]:
     return own if len(own) <= MOST_PANELS else [own[0], *own[1 - MOST_PANELS :]]
 
 
+def _best(found: Evaluation) -> int:
+    """The one of them that errs least."""
+    return min(of_weights(found), key=lambda m: found.every.scores[m].mae_nt)
+
+
 def _middle(found: Evaluation) -> Judged:
-    """The recording in which the last of the models errs as much as in most."""
-    last = of_weights(found)[-1]
-    size = [float(np.mean(np.abs(one.errors().error_nt[last]))) for one in found.judged]
+    """The recording in which the best of the models errs as much as in most."""
+    best = _best(found)
+    size = [float(np.mean(np.abs(one.errors().error_nt[best]))) for one in found.judged]
     return found.judged[int(np.argsort(size, kind="stable")[(len(size) - 1) // 2])]
 
 
@@ -347,24 +352,24 @@ def _band(found: Evaluation) -> Drawing:
 
 
 def _floor_plan(found: Evaluation) -> Drawing | None:
-    """The paper's Figure 7: paths over the map, coloured by the field and by the last model's error."""
+    """The paper's Figure 7: paths over the map, coloured by the field and by the best model's error."""
     from matplotlib.collections import LineCollection
 
     cases = list(dict.fromkeys(one.case for one in found.judged))[:MOST_PANELS]
     shown = [next(one for one in found.judged if one.case == case) for case in cases]
-    last = of_weights(found)[-1]
-    chart = found.contenders[last].chart.field
+    best = _best(found)
+    chart = found.contenders[best].chart.field
     known = np.where(chart.valid.all(axis=0), chart.values_nt.mean(axis=0), np.nan) / 1000
     x0, x1, y0, y1 = chart.extent
     height = np.clip(3.3 * (y1 - y0) / (x1 - x0), 1.2, 5.0)
     figure = new_figure(7.6, 0.9 + (height + 0.35) * len(shown))
     axes = figure.subplots(len(shown), 2, sharex=True, sharey=True, squeeze=False)
     fields = [np.where(one.kept, one.measured_nt, np.nan) / 1000 for one in shown]
-    sizes = [np.where(one.kept, np.abs(one.total_nt[last] - one.measured_nt), np.nan) for one in shown]
+    sizes = [np.where(one.kept, np.abs(one.total_nt[best] - one.measured_nt), np.nan) for one in shown]
     for column, (values, colours, label) in enumerate(
         (
             (fields, "viridis", "total field [µT]"),
-            (sizes, "magma_r", f"error of {found.names[last]}, its size [nT]"),
+            (sizes, "magma_r", f"error of {found.names[best]}, its size [nT]"),
         )
     ):
         every = np.concatenate(values)
@@ -397,7 +402,7 @@ def _floor_plan(found: Evaluation) -> Drawing | None:
         ax.set_xlabel("x [m]", fontsize=9)
     for ax in axes[:, 0]:
         ax.set_ylabel("y [m]", fontsize=9)
-    title = f"Figure 7: paths over the map {found.contenders[last].chart.name} (grey, mean over headings)"
+    title = f"Figure 7: paths over the map {found.contenders[best].chart.name} (grey, mean over headings)"
     return Drawing("figure_7", title, title, figure, "png", tall=True)
 
 
