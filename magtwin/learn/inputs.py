@@ -79,17 +79,22 @@ class Inputs:
         """Rows (x - mean) / scale, shape (N, F)."""
         return (np.asarray(x, float) - self.mean) / self.scale
 
-    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
-        """Whether an input of a row left the range of the training rows, shape (N,).
+    @property
+    def within(self) -> tuple[Array, Array]:
+        """Least and greatest inputs that are not outside, each (F,).
 
-        Where that range is unknown (the released weights do not hold it), an input is outside when it lies
-        more than 5 scales from its mean. nan is outside.
+        Where the training range is unknown (the released weights do not hold it), they lie 5 scales from the
+        mean.
         """
-        x = self.checked(x)
         low = np.where(np.isnan(self.low), self.mean - FAR * self.scale, self.low)
         high = np.where(np.isnan(self.high), self.mean + FAR * self.scale, self.high)
         slack = 1e-9 * np.maximum(np.abs(low), np.abs(high))  # rounding of inputs that never vary
-        low, high = low - slack, high + slack
+        return low - slack, high + slack
+
+    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
+        """Whether an input of a row left what it was trained `within`, shape (N,); nan is outside."""
+        x = self.checked(x)
+        low, high = self.within
         inside = np.empty(len(x), bool)
         for start in range(0, len(x), _BLOCK):
             block = x[start : start + _BLOCK]

@@ -30,7 +30,7 @@ from magtwin.learn.features import (
 )
 from magtwin.learn.heads import LIMIT
 from magtwin.learn.hybrid import Hybrid
-from magtwin.learn.inputs import FAR, Inputs
+from magtwin.learn.inputs import Inputs
 from magtwin.learn.linear import Linear
 from magtwin.learn.model import FieldNet
 from magtwin.learn.perceptron import Layer
@@ -364,7 +364,4 @@ def _ranges(inputs: Inputs, held: Inputs | None = None) -> Array:
     """Means, scales, bounds and training ranges, as compiled code wants them, shape (6, F)."""
     anything = np.full(len(inputs.features), np.inf)
     bounds = (-anything, anything) if held is None else (held.low, held.high)
-    low = np.where(np.isnan(inputs.low), inputs.mean - FAR * inputs.scale, inputs.low)
-    high = np.where(np.isnan(inputs.high), inputs.mean + FAR * inputs.scale, inputs.high)
-    slack = 1e-9 * np.maximum(np.abs(low), np.abs(high))
-    return np.array([inputs.mean, inputs.scale, *bounds, low - slack, high + slack])
+    return np.array([inputs.mean, inputs.scale, *bounds, *inputs.within])
