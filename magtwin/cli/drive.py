@@ -90,9 +90,9 @@ def drive(
                     show = stack.enter_context(live_view(twin.scene, scene))
                 except RefusedError as error:
                     print(f"  no view: {error}", file=sys.stderr)  # noqa: T201
-            device = stack.enter_context(_device(gamepad))
+            source = stack.enter_context(device(gamepad))
             print(f"  {HELP if gamepad is None else 'left stick drives, Start ends'}\r", file=sys.stderr)  # noqa: T201
-            _drive(recorder, hand, device, dt, show)
+            _drive(recorder, hand, source, dt, show)
         folder.mkdir()
         write_commands(recorder.commands("commands.csv"), folder / "commands.csv")
         report = write_run(
@@ -137,7 +137,7 @@ def _drive(recorder: "Recorder", hand: "Hand", device: int, dt: float, show: obj
 
 
 @contextmanager
-def _device(gamepad: Path | None) -> Iterator[int]:
+def device(gamepad: Path | None) -> Iterator[int]:
     """A gamepad, or the terminal, whose keys come one by one; it is as it was before at any end."""
     if gamepad is not None:
         try:

@@ -175,6 +175,143 @@ def magnetometer(
         spin(bus, duration)
 
 
+@ros_app.command(name="follow")
+def follow(
+    path: str,
+    *,
+    where: Where = HERE,
+    robot: Path | None = None,
+    speed: float = 0.2,
+    controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
+    source: Literal["truth", "estimate", "odometry"] = "truth",
+    laps: Whole = 1,
+    continuous: bool = False,
+    flip: bool = False,
+    sim_time: bool = False,
+    stamped_commands: bool = False,
+) -> None:
+    """Drive a robot along a path, by where it says it is; it stands at the end, and where its pose is lost.
+
+    Parameters
+    ----------
+    path
+        Name of a path, or a CSV file of x, y [m].
+    where
+        Where the node stands.
+    robot
+        Asset of the robot, whose limits are kept; the TurtleBot 4 unless given.
+    speed
+        Forward speed where the path is straight [m/s].
+    controller
+        What steers: magtwin's, the released package's with its gain, Stanley's or pure pursuit.
+    source
+        What tells the pose: truth (enu/pose), estimate (estimate/pose) or odometry.
+    laps
+        How often to drive it; an open path is driven back and forth.
+    continuous
+        Drive on without an end.
+    flip
+        Drive it from its end to its beginning.
+    sim_time
+        Go by /clock, as when the robot is simulated.
+    stamped_commands
+        Send cmd_vel as TwistStamped, and not as Twist.
+    """
+    from magtwin.files import shipped
+    from magtwin.path import resolve_path
+    from magtwin.ros.follow import Follower
+    from magtwin.usd.robot import read_robot
+
+    tell = announcer(quiet=False)
+    way = resolve_path(path)
+    drive = read_robot(robot or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
+    with where.bus("magtwin_follow", sim_time=sim_time) as bus:
+        node = Follower(
+            way,
+            drive,
+            bus,
+            speed=speed,
+            controller=controller,
+            source=source,
+            laps=laps,
+            continuous=continuous,
+            flip=flip,
+            stamped_commands=stamped_commands,
+            say=tell,
+        )
+        tell(f"driving {way.name}, {way.length:.1f} m, by {bus.backend}; Ctrl-C ends")
+        try:
+            while not node.done:
+                bus.spin_once(0.1)
+        finally:
+            node.stop()
+            say(f"{node.progress.laps} times along {way.name}, {node.progress.rms_m:.3f} m RMS off it")
+
+
+@ros_app.command(name="teleop")
+def teleop(
+    *,
+    where: Where = HERE,
+    robot: Path | None = None,
+    gamepad: Path | None = None,
+    out: Path | None = None,
+    stamped_commands: bool = False,
+    sim_time: bool = False,
+    force: Force = False,
+) -> None:
+    """Drive a robot by hand, and record it on the way.
+
+    Keys: w/s or up/down for speed, a/d or left/right for turning, x to go straight on, space to stop, q to
+    end.
+
+    Parameters
+    ----------
+    where
+        Where the node stands.
+    robot
+        Asset of the robot, whose limits are kept; the TurtleBot 4 unless given.
+    gamepad
+        A gamepad of Linux to drive with, such as /dev/input/js0, in place of the keyboard: the left stick
+        drives, Start ends.
+    out
+        Bag to record the robot's topics into, as magtwin ros record does.
+    stamped_commands
+        Send cmd_vel as TwistStamped, and not as Twist.
+    sim_time
+        Date messages by /clock, as when the robot is simulated.
+    force
+        Replace what exists.
+    """
+    from contextlib import ExitStack
+
+    from magtwin.cli.drive import device
+    from magtwin.files import existing, shipped
+    from magtwin.io.bag_raw import RawBagWriter
+    from magtwin.ros.record import Recorder
+    from magtwin.ros.teleop import Teleop
+    from magtwin.sim.manual import HELP, Gamepad, Hand, Keyboard
+    from magtwin.usd.robot import read_robot
+
+    if gamepad is not None:
+        existing(gamepad, "gamepad")
+    drive = read_robot(robot or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
+    hand: Hand = Keyboard(drive) if gamepad is None else Gamepad(drive)
+    with ExitStack() as stack:
+        writer = None
+        if out is not None:
+            writer = RawBagWriter(out, force=force)
+            stack.callback(writer.close)
+        bus = stack.enter_context(where.bus("magtwin_teleop", sim_time=sim_time))
+        recorder = None if writer is None else Recorder(bus, writer, say=_warn, sim_time=sim_time)
+        source = stack.enter_context(device(gamepad))
+        announcer(quiet=False)(HELP if gamepad is None else "left stick drives, Start ends")
+        node = Teleop(bus, hand, source, stamped_commands=stamped_commands)
+        with suppress(KeyboardInterrupt):
+            node.run(recorder.step if recorder else lambda: None)
+        node.stop()
+    say(f"{node.sent} commands" + ("" if out is None else f"; wrote {out}"))
+
+
 @ros_app.command(name="record")
 def record(
     out: Path,
@@ -211,7 +348,7 @@ def record(
     try:
         with where.bus("magtwin_record", sim_time=sim_time) as bus:
             announcer(quiet=False)(f"recording by {bus.backend}; Ctrl-C ends")
-            Recorder(bus, writer, topic, say=_warn).run(duration_s=duration)
+            Recorder(bus, writer, topic, sim_time=sim_time, say=_warn).run(duration_s=duration)
     finally:
         counts = dict(writer.counts)
         writer.close()

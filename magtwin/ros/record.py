@@ -39,6 +39,7 @@ class Recorder:
         writer: RawBagWriter,
         topics: Iterable[str] = (),
         *,
+        sim_time: bool = False,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Begin to listen.
@@ -47,29 +48,32 @@ class Recorder:
             bus: The node; its clock dates the messages.
             writer: Where they go.
             topics: Names of those to record; none takes all of the robot's.
+            sim_time: Whether that clock is /clock's, which may go back.
             say: Takes lines for people.
         """
-        self._bus, self._writer, self._say = bus, writer, say
+        self._bus, self._writer, self._say, self._sim_time = bus, writer, say, sim_time
         known = {topic.name: topic for topic in RECORDED}
         names = list(topics) or list(known)
         self._waited = {name: known.get(name) for name in names}
+        self._looked, self._flushed = 0.0, time.monotonic()
         self._last_ns = -1
 
     def run(self, until: Callable[[], bool] = lambda: False, *, duration_s: float | None = None) -> None:
         """Record until that says so, or for a time by the wall [s]."""
-        begin = flushed = time.monotonic()
-        looked = 0.0
-        while not until():
-            now = time.monotonic()
-            if duration_s is not None and now - begin > duration_s:
-                break
-            if now - looked > LOOK_S:
-                looked = now
-                self._look()
-            if now - flushed > FLUSH_S:
-                flushed = now
-                self._writer.flush()
+        begin = time.monotonic()
+        while not until() and (duration_s is None or time.monotonic() - begin < duration_s):
+            self.step()
             self._bus.spin_once(0.05)
+
+    def step(self) -> None:
+        """Look for topics, and write what came, each in its time; to be called often while the bus spins."""
+        now = time.monotonic()
+        if now - self._looked > LOOK_S:
+            self._looked = now
+            self._look()
+        if now - self._flushed > FLUSH_S:
+            self._flushed = now
+            self._writer.flush()
 
     def _look(self) -> None:
         """Listen to what is offered now and was not before."""
@@ -90,12 +94,12 @@ class Recorder:
 
     def _heard(self, name: str, message: Message) -> None:
         now = self._bus.now_ns()
-        if now < self._last_ns:
+        if self._sim_time and now < self._last_ns:
             raise RefusedError(
                 f"time jumped back from {self._last_ns / NS:.3f} to {now / NS:.3f} s, as after a reset: the "
                 "recording ends here; record anew"
             )
-        self._last_ns = now
+        self._last_ns = now = max(now, self._last_ns)  # a clock that was set is not followed back
         self._writer.write(name, now, message.data)
 
 

@@ -150,6 +150,11 @@ class Online:
         return self._track.end_s
 
     @property
+    def pose(self) -> tuple[float, float, float]:
+        """Where it is at the end of the last step: x [m], y [m], yaw [rad] in world."""
+        return self._chassis.pose
+
+    @property
     def commands(self) -> Commands:
         """The commands that were taken, which `simulate` drives again."""
         end = (self._track.steps * self.step_s, 0.0, 0.0)

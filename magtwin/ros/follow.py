@@ -1,0 +1,215 @@
+"""Follow: a robot driven along a path over ROS, by where it says it is, with `simulate`'s controllers."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from magtwin.frames import yaw_from_quat
+from magtwin.io.messages import COMMAND, ODOMETRY, POSE, Topic
+from magtwin.names import RefusedError, find
+from magtwin.path import Path
+from magtwin.ros.bus import NS, Bus, to_bytes
+from magtwin.ros.diagnostics import Reporter, Status
+from magtwin.ros.inputs import Input
+from magtwin.sim.controllers import Guide, guide_along
+from magtwin.sim.follow import CONTROL_RATE_HZ
+from magtwin.spec import DriveSpec
+
+ESTIMATE = replace(POSE, name="/robot/estimate/pose")
+"""Where a localizer thinks that the robot is."""
+
+SOURCES: Mapping[str, tuple[Topic, str, str]] = MappingProxyType(
+    {
+        "truth": (POSE, "mocap_p", "mocap_q_xyzw"),
+        "estimate": (ESTIMATE, "mocap_p", "mocap_q_xyzw"),
+        "odometry": (ODOMETRY, "odom_p", "odom_q_xyzw"),
+    }
+)
+"""What tells where the robot is, with the columns of position and orientation; odometry begins at 0."""
+
+MAX_AGE_S = 0.3
+"""Age at which a pose is not driven by any more [s]."""
+
+STAND_S = 1.0
+"""For how long a stand is commanded at the end [s]."""
+
+LOOK_S = 0.5
+"""Time between looks for topics that were not offered before [s]."""
+
+REPORT_S = 1.0
+"""Time between diagnostics [s]."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a drive has come."""
+
+    laps: int
+    """How often the path's end was reached."""
+
+    off_m: float
+    """Distance from the path at the last step [m]; nan before the path was reached."""
+
+    rms_m: float
+    """Root mean square of that since the path was reached first [m]; nan before."""
+
+
+class Follower:
+    """The node. It stands where it does not know where it is, and drives on when it does."""
+
+    def __init__(
+        self,
+        path: Path,
+        drive: DriveSpec,
+        bus: Bus,
+        *,
+        speed: float = 0.2,
+        controller: str = "follower",
+        source: str = "truth",
+        laps: int = 1,
+        continuous: bool = False,
+        flip: bool = False,
+        stamped_commands: bool = False,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        """Plan the path, and look for the robot.
+
+        Args:
+            path: Where to drive.
+            drive: The robot's limits, and its motors' lag.
+            bus: The node.
+            speed: Wanted forward speed [m/s].
+            controller: A name of `magtwin.sim.controllers.CONTROLLERS`; "release" steers with the gain of the
+                released package.
+            source: A name of `SOURCES`.
+            laps: How often to drive it; an open path is driven back and forth.
+            continuous: Drive on without an end.
+            flip: Drive it from its end to its beginning.
+            stamped_commands: Whether commands are TwistStamped, and not Twist.
+            say: Takes lines for people.
+
+        Raises:
+            RefusedError: The path cannot be driven at that speed, or a name is unknown.
+        """
+        if laps < 1:
+            raise RefusedError(f"laps must be 1 or more, got {laps}")
+        if flip:
+            path = Path(path.name, path.p_xy[::-1], path.closed)
+        self.path, self._drive, self._bus, self._say = path, drive, bus, say
+        self._speed, self._controller = speed, controller
+        self._left = math.inf if continuous else laps
+        self._guide = self._guided(path)
+        topic, self._p, self._q = find("source", source, SOURCES)
+        self._pose = Input(bus, topic, max_age_s=MAX_AGE_S)
+        self._twist = self._pose if topic is ODOMETRY else Input(bus, ODOMETRY, max_age_s=MAX_AGE_S)
+        self._kind = "geometry_msgs/msg/TwistStamped" if stamped_commands else COMMAND.kind
+        self._commands = bus.publisher(COMMAND.name, self._kind, COMMAND.qos)
+        self._reporter = Reporter(bus)
+        self._told, self._stand_s = "", STAND_S
+        self._last = (0.0, 0.0)
+        self._begin_ns: int | None = None
+        self._laps, self._squares, self._count, self._off = 0, 0.0, 0, math.nan
+        self.done = False
+        """Whether the end was reached and the robot told to stand."""
+        self._look()
+        bus.timer(1 / CONTROL_RATE_HZ, self._step)
+        bus.timer(LOOK_S, self._look)
+        bus.timer(REPORT_S, self._report)
+
+    @property
+    def progress(self) -> Progress:
+        """How far the drive has come."""
+        rms = math.sqrt(self._squares / self._count) if self._count else math.nan
+        return Progress(self._laps, self._off, rms)
+
+    def stop(self) -> None:
+        """Tell the robot to stand, as before this node leaves."""
+        self._command(0.0, 0.0)
+
+    def _guided(self, path: Path) -> Guide:
+        return guide_along(self._controller, path, self._drive, speed=self._speed, dt=1 / CONTROL_RATE_HZ)
+
+    def _look(self) -> None:
+        self._pose.look()
+        self._twist.look()
+
+    def _step(self) -> None:
+        """A command, by the newest pose."""
+        now = self._bus.now_ns()
+        if self._guide.done:
+            self._stand_s -= 1 / CONTROL_RATE_HZ
+            self.done = self.done or self._stand_s <= 0
+            self._command(0.0, 0.0)
+            return
+        fresh = self._pose.fresh(now)
+        if fresh is None:
+            self._tell(f"standing: no fresh {self._pose.topic.name}")
+            if self._last != (0.0, 0.0):
+                self._command(0.0, 0.0)
+            return
+        self._tell("driving")
+        if self._begin_ns is None:
+            self._begin_ns = now
+        x, y = fresh[self._p][0, :2].tolist()
+        yaw = float(yaw_from_quat(fresh[self._q])[0])
+        twist = self._twist.fresh(now)
+        v, w = self._last if twist is None else (float(twist["odom_v"][0, 0]), float(twist["odom_w"][0, 2]))
+        wanted = self._guide.command((now - self._begin_ns) / NS, x, y, yaw, v, w)
+        self._command(*wanted)
+        self._measure(x, y)
+        if self._guide.done:
+            self._lap()
+
+    def _measure(self, x: float, y: float) -> None:
+        _, off = self.path.nearest(np.array([[x, y]]))
+        if self._guide.node > 0:  # on its way to the beginning it is on no path
+            self._off = float(off[0])
+            self._squares += self._off**2
+            self._count += 1
+
+    def _lap(self) -> None:
+        self._laps += 1
+        self._left -= 1
+        if self._left <= 0:
+            self._say("the end is reached")
+            return
+        if not self.path.closed:
+            self.path = Path(self.path.name, self.path.p_xy[::-1])
+        self._guide = self._guided(self.path)
+
+    def _command(self, v: float, w: float) -> None:
+        drive = self._drive
+        v = min(max(v, -drive.v_max), drive.v_max)
+        w = min(max(w, -drive.w_max), drive.w_max)
+        self._last = (v, w)
+        self._commands.publish(command_bytes(self._kind, v, w, self._bus.now_ns()))
+
+    def _tell(self, text: str) -> None:
+        if text != self._told:
+            self._told = text
+            self._say(text)
+
+    def _report(self) -> None:
+        now, at = self._bus.now_ns(), self.progress
+        level: Any = "ok" if self._guide.done or self._pose.fresh(now) is not None else "error"
+        values = {
+            "path": self.path.name,
+            "laps": str(at.laps),
+            "off the path [m]": f"{at.off_m:.3f}",
+            "RMS off the path [m]": f"{at.rms_m:.3f}",
+        }
+        status = Status("drive", level, "at the end" if self._guide.done else self._told, values)
+        self._reporter.report([status, self._pose.status(now)], now)
+
+
+def command_bytes(kind: str, v: float, w: float, now_ns: int) -> bytes:
+    """A command of forward speed [m/s] and yaw rate [rad/s], as a Twist or a TwistStamped."""
+    linear, angular = COMMAND.leaves[kind]
+    fields: dict[str, Any] = {linear: [v, 0.0, 0.0], angular: [0.0, 0.0, w]}
+    if kind.endswith("Stamped"):
+        fields |= {"header.stamp": np.int64(now_ns), "header.frame_id": "base_link"}
+    return to_bytes(kind, fields)
