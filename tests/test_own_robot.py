@@ -20,7 +20,7 @@ map = "{shipped("maps", "lab", "lab.usdc")}"
 
 [robot]
 urdf = "{CART}"
-network = "{shipped("weights", "lab.safetensors")}"
+network = "{shipped("weights", "turtlebot4_hybrid.safetensors")}"
 footprint_radius_m = 0.3
 
 [robot.drive]

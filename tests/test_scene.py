@@ -420,12 +420,12 @@ def test_a_toml_of_one_robot_can_say_its_start_and_path_beside_it(own_parts, tmp
 
 
 def test_a_network_brings_its_inputs_and_its_checksum(own_parts):
-    from magtwin.learn.model import load_net
+    from magtwin.learn.predictor import load_predictor
 
-    weights = shipped("weights", "lab.safetensors")
+    weights = shipped("weights", "turtlebot4_hybrid.safetensors")
     (own_parts / "scene.toml").write_text(TOML + f'network = "{weights}"\n')
     magnetometer = magtwin.scene_from_toml(own_parts / "scene.toml").robot.magnetometer
-    assert magnetometer.inputs == load_net(weights).features
+    assert magnetometer.inputs == load_predictor(weights).features
     assert magnetometer.network_sha256 == sha256(weights)
 
 
@@ -804,7 +804,7 @@ def test_a_scene_whose_weights_are_gone_is_read_when_they_are_not_wanted(parts, 
 def test_a_twin_is_opened_with_other_weights_or_none_where_the_scenes_own_are_gone(parts, tmp_path):
     root = author_scene(full_scene(parts), tmp_path / "s")
     (tmp_path / "s" / "weights" / "net.pth").unlink()
-    others = shipped("weights", "lab.safetensors")
+    others = shipped("weights", "turtlebot4_hybrid.safetensors")
     assert open_twin(root, net=others).scene.robot.magnetometer.network == others
     assert open_twin(root, net="none").magnetometer is None
     with pytest.raises(RefusedError, match=r"net\.pth, which is not there"):

@@ -131,7 +131,7 @@ BROKEN = {
     ),
     "network-file": (
         over(MAGNETOMETER, f'string magtwin:magnetometer:networkSha256 = "{"0" * 64}"'),
-        "lab.safetensors has SHA-256",
+        "turtlebot4_hybrid.safetensors has SHA-256",
         "error",
     ),
     "network-inputs": (
