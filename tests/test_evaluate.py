@@ -261,6 +261,18 @@ def test_readings_on_no_common_ground_are_refused_with_counts():
         judged([Contender(one.name, Mean(0.0, 1.0), one) for one in halves])
 
 
+def test_a_path_that_is_called_as_a_total_is_told_from_it():
+    runs = [trial("a", a_run(0, path="all")), trial("b", a_run(1, path="sine"))]
+    assert [case.name for case in judged([FLAT], *runs).cases] == ["path all", "sine", "all", "mean"]
+
+
+def test_two_of_one_name_are_refused():
+    with pytest.raises(RefusedError, match="two models are called 'naive'"):
+        judged([FLAT, FLAT])
+    with pytest.raises(RefusedError, match="two recordings are called 'one'"):
+        judged([FLAT], trial(), trial())
+
+
 def test_nothing_to_judge_by_is_refused():
     with pytest.raises(RefusedError, match="nothing to evaluate"):
         evaluate([FLAT], [], rng=np.random.default_rng(0))

@@ -274,10 +274,12 @@ def _traversals(
 
 def _cases(given: Sequence[str] | None) -> dict[str, str]:
     """Rows by name from words such as D=lawnmower.csv."""
+    from magtwin.learn.evaluate import TOTALS
+
     found: dict[str, str] = {}
     for word in given or ():
         name, equals, path = word.partition("=")
-        if not (name and equals and path) or name in found or name in ("all", "mean"):
+        if not (name and equals and path) or name in found or name in TOTALS:
             raise RefusedError(f"--case is a row of the table and its path, as D=lawnmower.csv, got {word!r}")
         found[name] = path
     return found

@@ -26,11 +26,10 @@ from magtwin.learn.labels import Alignment, labelled
 from magtwin.learn.linear import fit_linear
 from magtwin.learn.magnetometer import NeuralMagnetometer, Read
 from magtwin.learn.recording import thinned
-from magtwin.learn.scores import LEVEL, Errors, Score, scores
+from magtwin.learn.scores import Errors, Score, scores
 from magtwin.learn.split import split
 from magtwin.names import RefusedError
 from magtwin.path import CASES
-from magtwin.report import Figure, Report
 from magtwin.run import Run
 
 Array = NDArray[np.float64]
@@ -45,6 +44,9 @@ PAPER: Mapping[str, tuple[float, float, float]] = MappingProxyType(
     }
 )
 """Table 1 of the paper (Penumarti et al. 2025): MAE and naive MAE [nT], and their ratio."""
+
+TOTALS = ("all", "mean")
+"""Rows of the table that are of no path."""
 
 NAIVE = "naive"
 """Name of the naive model."""
@@ -229,35 +231,6 @@ class Evaluation:
             return math.nan, math.nan
         return GAUSSIAN_MAE * float(np.mean(sd)), float(np.sqrt(np.mean(sd**2)))
 
-    def report(self, title: str = "Evaluation") -> Report:
-        """The table's rows in figures, for people and scripts."""
-        figures = []
-        for case in self.cases:
-            naive = case.scores[0]
-            figures.append(
-                Figure(
-                    f"{case.name} naive MAE",
-                    naive.mae_nt,
-                    "nT",
-                    note=f"{naive.rows:,} readings, {case.recordings} recordings",
-                )
-            )
-            for name, score in zip(self.names[1:], case.scores[1:], strict=True):
-                low, high = score.ratio_interval
-                note = f"ratio {score.ratio:.3f}, {LEVEL:.0%} interval {low:.3f} to {high:.3f}"
-                if not math.isnan(score.coverage):
-                    note += f"; 90 % intervals hold {score.coverage:.1%}"
-                if score.outside:
-                    note += f"; {score.outside:.1%} out of distribution"
-                figures.append(Figure(f"{case.name} {name} MAE", score.mae_nt, "nT", note=note))
-        facts: dict[str, Any] = {
-            "errors against": "exact field" if self.truth else "reading",
-            "maps": ", ".join(chart.name for chart in self.charts),
-            "recordings": len(self.judged),
-            "readings": self.every.scores[0].rows,
-        }
-        return Report(title, tuple(figures), facts | {f"left out, {k}": n for k, n in self.left_out.items()})
-
     def summary(self) -> dict[str, Any]:
         """Everything in plain figures, for JSON."""
         return {
@@ -331,11 +304,18 @@ def evaluate(
         progress: Told of recordings done, of how many, and which.
 
     Raises:
-        RefusedError: There is no recording or model, a recording lacks a column that a model reads or lies
-            off a map, its readings are a network's own, all labels are the same, or no reading is left.
+        RefusedError: There is no recording or model, two have one name, a recording lacks a column that a
+            model reads or lies off a map, its readings are a network's own, all labels are the same, or no
+            reading is left.
     """
     if not trials or not contenders:
         raise RefusedError("nothing to evaluate: name weights, and recordings that they never saw")
+    for what, called in (
+        ("models", [one.name for one in contenders]),
+        ("recordings", [t.name for t in trials]),
+    ):
+        if twice := sorted({name for name in called if called.count(name) > 1}):
+            raise RefusedError(f"two {what} are called {twice[0]!r}; rename one")
     row_of = {path: letter for letter, path in CASES.items()} | {v: k for k, v in (cases or {}).items()}
     judged: list[Judged] = []
     left_out: dict[str, int] = {}
@@ -405,6 +385,8 @@ def _judge(
             kept = kept & known
     p = run["mocap_p"] if {"mocap_p", "mocap_q_xyzw"} <= set(run) else run["p_world_base"]
     row = row_of.get(path, path)
+    if row in TOTALS:
+        row = f"path {row}"
     found = Judged(
         trial.name, session, path, row, run, p[:, :2], measured, kept, map_nt, map_sd, total, sd, outside
     )
