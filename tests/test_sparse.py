@@ -24,7 +24,7 @@ def closed(monkeypatch):
 @pytest.fixture(scope="module")
 def net():
     """Most of whose units are 0 in most rows."""
-    net = a_net(FULL, (64, 96, 96, 64))
+    net = a_net(FULL, (128, 128, 160, 128))
     with torch.no_grad():
         for layer in net.linears[:-1]:
             layer.weight *= 3
@@ -67,7 +67,7 @@ def test_nan_and_inf_come_out_of_a_layer_as_they_do_of_a_dense_one():
 
 def test_a_layer_gives_the_bits_of_this_machines_product_or_is_not_used():
     sparse.warm_up()
-    for shape in ((64, 96), (96, 64), (512, 128)):
+    for shape in ((128, 160), (160, 128), (512, 128)):
         h, weight, bias = (torch.from_numpy(a) for a in a_layer(np.random.default_rng(2), 48, *shape, 0.1))
         out = torch.full((len(h), shape[1]), -1.0)
         worked = Skipping([(weight, bias)]).forward(0, h, out)
@@ -103,12 +103,18 @@ def test_only_layers_most_of_whose_units_are_0_are_worked_on_without(net, monkey
         compiled.forward(h, weight, bias, chunk, out)
 
     monkeypatch.setattr(Skipping, "compiled", SimpleNamespace(forward=spy))
-    monkeypatch.setattr(Skipping, "chunks", {(96, 96): 16, (96, 64): 16, (64, 96): 16})
+    monkeypatch.setattr(Skipping, "chunks", {(128, 128): 16, (128, 160): 16, (160, 128): 16})
     net.predict(inputs(net, 64))
-    assert (64, 64) in shapes  # the last hidden layer
+    assert (64, 128) in shapes  # the last hidden layer
     shapes.clear()
-    a_net(FULL, (64, 96, 64)).predict(inputs(net, 64))  # half of its units are not 0
+    a_net(FULL, (128, 128, 128)).predict(inputs(net, 64))  # half of its units are not 0
     assert not shapes
+
+
+def test_small_layers_stay_dense():
+    sparse.warm_up()
+    h, weight, bias = (torch.from_numpy(a) for a in a_layer(np.random.default_rng(2), 48, 64, 64, 0.05))
+    assert not Skipping([(weight, bias)]).forward(0, h, torch.empty(48, 64))
 
 
 def test_compiled_code_is_opened_once_it_would_have_paid(net, monkeypatch):

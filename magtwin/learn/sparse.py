@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 SPARSE = 0.25
 """Share of units that are not 0 below which it is faster to leave the others out than a dense product."""
 
+LARGE = 128 * 128
+"""Weights of a layer from which on it is so; of a smaller one, finding what is not 0 takes as long."""
+
 LOOKED_AT = 16
 """Rows of a block that this share is estimated from."""
 
@@ -82,6 +85,8 @@ class Skipping:
         Returns:
             Whether it did; else `out` is as it was.
         """
+        if h.shape[1] * out.shape[1] < LARGE:
+            return False
         rows = h.numpy()
         some = rows[:: max(1, len(rows) // LOOKED_AT)]
         share = np.count_nonzero(some) / some.size
