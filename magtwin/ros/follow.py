@@ -17,6 +17,8 @@ from magtwin.ros.diagnostics import Reporter, Status
 from magtwin.ros.inputs import Input
 from magtwin.sim.controllers import Guide, guide_along
 from magtwin.sim.follow import CONTROL_RATE_HZ
+from magtwin.sim.loop import RELEASE
+from magtwin.sim.plan import NODE_M
 from magtwin.spec import DriveSpec
 
 ESTIMATE = replace(POSE, name="/robot/estimate/pose")
@@ -33,6 +35,9 @@ SOURCES: Mapping[str, tuple[Topic, str, str]] = MappingProxyType(
 
 MAX_AGE_S = 0.3
 """Age at which a pose is not driven by any more [s]."""
+
+COASTED_M = 0.3
+"""Way that a robot may drive on after its pose is lost [m]."""
 
 STAND_S = 1.0
 """For how long a stand is commanded at the end [s]."""
@@ -151,10 +156,12 @@ class Follower:
             if self._last != (0.0, 0.0):
                 self._command(0.0, 0.0)
             return
+        x, y = fresh[self._p][0, :2].tolist()
+        if self._told.startswith("standing"):
+            self._rejoin(x, y)
         self._tell("driving")
         if self._begin_ns is None:
             self._begin_ns = now
-        x, y = fresh[self._p][0, :2].tolist()
         yaw = float(yaw_from_quat(fresh[self._q])[0])
         twist = self._twist.fresh(now)
         v, w = self._last if twist is None else (float(twist["odom_v"][0, 0]), float(twist["odom_w"][0, 2]))
@@ -163,6 +170,18 @@ class Follower:
         self._measure(x, y)
         if self._guide.done:
             self._lap()
+
+    def _rejoin(self, x: float, y: float) -> None:
+        """Go on where the robot stands now: it drove on for a while before it stood."""
+        guide = self._guide
+        if guide.law == RELEASE or not guide.node:
+            return
+        ahead = guide.table[:, guide.node : guide.node + round(COASTED_M / NODE_M)]
+        stops = np.flatnonzero(ahead[5] <= 0)
+        count = int(stops[0]) if len(stops) else ahead.shape[1]
+        if count:
+            away = np.hypot(ahead[0, :count] - x, ahead[1, :count] - y)
+            guide.node, guide.driven_m = guide.node + int(np.argmin(away)), 0.0
 
     def _measure(self, x: float, y: float) -> None:
         _, off = self.path.nearest(np.array([[x, y]]))

@@ -23,7 +23,7 @@ SLOWEST = 0.02
 _WHEEL_SHARE = 0.95
 """The same share of the wheels' highest rate, which feedback asks for in sharp bends only."""
 
-_NODE_M = 0.005
+NODE_M = 0.005
 """Spacing of a piece's nodes [m]."""
 
 _JITTER_M = 0.005
@@ -108,11 +108,11 @@ def plan(path: Path, drive: DriveSpec, *, speed: float) -> list[Piece]:
 
 
 def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: float) -> Piece:
-    count = max(3, math.ceil((s_last - s_first) / _NODE_M) + 1)
+    count = max(3, math.ceil((s_last - s_first) / NODE_M) + 1)
     s = np.linspace(s_first, s_last, count)
     p = path.at(np.minimum(s, path.length))
     # Past its ends the piece goes on turned by half a circle about them, so that the ends stay.
-    reach = min(round(_SMOOTH_M / 2 / _NODE_M), count - 1)
+    reach = min(round(_SMOOTH_M / 2 / NODE_M), count - 1)
     before, after = 2 * p[0] - p[reach:0:-1], 2 * p[-1] - p[-2 : -reach - 2 : -1]
     window = 1.0 - np.abs(np.arange(-reach, reach + 1)) / (reach + 1)
     longer = np.vstack([before, p, after])
