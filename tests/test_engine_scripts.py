@@ -48,13 +48,35 @@ def test_scripts_need_nothing_of_magtwin(script):
 def test_the_script_for_isaac_sim_says_first_that_it_is_untested_and_reads_as_the_tested_one_does():
     isaac, newton = parts_of("isaac_magnetometer.py"), parts_of("newton_magnetometer.py")
     assert (SCRIPTS / "isaac_magnetometer.py").read_text().splitlines()[0].startswith('"""UNTESTED')
-    assert isaac["figures"] == newton["figures"]
-    assert isaac["field_map"] == newton["field_map"]
+    for name in ("figures", "field_map", "signals"):
+        assert isaac[name] == newton[name]
     first = next(i for i, line in enumerate(newton["loop"]) if line.startswith("yaw = "))
     last = next(i for i, line in enumerate(newton["loop"]) if line.startswith("asked = "))
     shared = newton["loop"][first : last + 1]
-    assert len(shared) > 15
+    assert len(shared) > 12
     assert [line for line in isaac["loop"] if line in shared] == shared
+
+
+def test_the_script_for_isaac_sim_is_sound_beside_stand_ins_for_isaac_sims_classes(lab_scene, tmp_path):
+    pytest.importorskip("onnxruntime")
+    from magtwin.learn.onnx import export_onnx
+
+    twin = open_twin(lab_scene)
+    export_onnx(twin.scene.robot.magnetometer.network, tmp_path / "lab.onnx")
+    stand_in, script = Path(__file__).with_name("isaac_stand_in.py"), SCRIPTS / "isaac_magnetometer.py"
+    arguments = [lab_scene, tmp_path / "lab.onnx", tmp_path / "readings.csv"]
+    done = subprocess.run(
+        [sys.executable, stand_in, script, *arguments], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    seen = np.genfromtxt(tmp_path / "readings.csv", delimiter=",", names=True)
+    _, aside = figure8().nearest(np.column_stack([seen["x"], seen["y"]]))
+    assert np.abs(aside).max() < 0.02
+    assert abs(seen["t"][-1] * 0.2 - figure8().length) < 0.1
+    at = np.column_stack([seen["x"], seen["y"]])
+    assert np.allclose(seen["b_map_nt"], twin.field.lookup(at, seen["yaw"]), atol=0.1)
+    assert np.ptp(seen["b_disturbance_nt"]) > 1000
+    assert np.allclose(seen["b_total_nt"], seen["b_map_nt"] + seen["b_disturbance_nt"], atol=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +127,8 @@ def test_map_and_network_in_newton_are_the_kinematic_simulators_within_150_nt_at
         "t": driven["t"],
         "p_world_base": np.column_stack([driven["x"], driven["y"], zero]),
         "yaw": driven["yaw"],
+        "v_cmd": driven["v_cmd"],
+        "w_cmd": driven["w_cmd"],
     }
     twin = open_twin(lab_scene)
     run = simulate(twin, Run(poses), seed=seed, rate_hz=50)  # its readings are at those poses, to rounding

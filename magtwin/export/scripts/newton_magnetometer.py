@@ -32,7 +32,6 @@ def figures(noun):
 
 robot, drive = figures("drive")
 grid, battery, lidar = (figures(noun)[1] for noun in ("anomalyMap", "battery", "lidar"))
-volts = battery["voltageFullV"] - battery["resistanceOhm"] * battery["loadW"] / battery["voltageFullV"]
 values = np.where(grid["valid"], grid["values"], np.nan).reshape(grid["shape"])
 values = np.append(values, values[:1], axis=0)  # once round: the last heading is the first
 headings = np.radians([*grid["headings"], grid["headings"][0] + 360])
@@ -49,6 +48,29 @@ def field_map(x, y, yaw):
     i, j = min(int(column), values.shape[2] - 2), min(int(row), values.shape[1] - 2)
     cell = (1 - h) * values[k, j : j + 2, i : i + 2] + h * values[k + 1, j : j + 2, i : i + 2]
     return float(np.array([1 - row + j, row - j]) @ cell @ np.array([1 - column + i, column - i]))
+
+
+def signals(t, pose, q, twist, acceleration, command):
+    """What a network may read, by the names that magtwin has for it; the battery is full."""
+    (x, y, yaw), (v, w), full = pose, twist, battery["voltageFullV"]
+    on = float(lidar["onS"] > 0 and (t + lidar["phaseS"]) % (lidar["onS"] + lidar["offS"]) >= lidar["offS"])
+    watts = battery["loadW"] + on * battery["lidarW"] + battery["dragN"] * abs(v) / battery["motorEfficiency"]
+    known = dict.fromkeys(("odom_v_y", "odom_v_z", "odom_w_x", "odom_w_y", "imu_w_x", "imu_w_y"), 0.0)
+    known |= {"yaw_deg": math.degrees(yaw) % 360, "odom_v_x": v, "odom_w_z": w, "imu_w_z": w}
+    known |= {"imu_a_x": acceleration, "imu_a_y": v * w, "imu_a_z": 0.0, "lidar_on": on, "turning": abs(w)}
+    known |= {f"imu_q_{part}": math.copysign(1, q[3]) * q[n] for n, part in enumerate("xyzw")}
+    known |= {"battery_fraction": 1.0, "battery_a": watts / full}
+    known |= {"battery_v": full - battery["resistanceOhm"] * watts / full}
+    known |= {"lag_v": command[0] - v, "lag_w": command[1] - w}
+    c, s = math.cos(yaw), math.sin(yaw)
+    for name in ("odom_v_x", "odom_w_z", "turning", "lag_v", "lag_w", "lidar_on", "battery_a"):
+        known |= {f"{name}_yaw_sin": known[name] * s, f"{name}_yaw_cos": known[name] * c}
+    known |= {"yaw_sin": s, "yaw_cos": c, "yaw_sin_2": math.sin(2 * yaw), "yaw_cos_2": math.cos(2 * yaw)}
+    for name, a, b in (("forward", c, s), ("left", -s, c)):
+        ends = [field_map(x + step * a, y + step * b, yaw) for step in (-0.001, 0.001)]
+        slope = (ends[1] - ends[0]) / 0.002
+        known |= {f"map_gradient_{name}": slope, f"speed_map_gradient_{name}": slope * v}
+    return known
 
 
 builder = newton.ModelBuilder()
@@ -75,24 +97,20 @@ pose[free : free + 2], pose[free + 3 : free + 7] = path[0], (0, 0, math.sin(half
 now.joint_q.assign(pose)
 newton.eval_fk(model, now.joint_q, now.joint_qd, now)
 
-readings, rates, travelled, wanted, last_v = [], control.joint_target_qd.numpy(), 0.0, 0.0, 0.0
+readings, rates, command = [], control.joint_target_qd.numpy(), (0.0, 0.0)
+travelled = wanted = last_v = 0.0
 while travelled < way[-1]:
     t, (x, y, _, *q) = len(readings) * DT, now.body_q.numpy()[base].tolist()
     vx, vy, _, _, _, w = now.body_qd.numpy()[base].tolist()
     yaw = math.atan2(2 * (q[3] * q[2] + q[0] * q[1]), 1 - 2 * (q[1] ** 2 + q[2] ** 2))
     v = vx * math.cos(yaw) + vy * math.sin(yaw)
-    lidar_on = lidar["onS"] > 0 and (t + lidar["phaseS"]) % (lidar["onS"] + lidar["offS"]) >= lidar["offS"]
-    signals = dict.fromkeys(("odom_v_y", "odom_v_z", "odom_w_x", "odom_w_y", "imu_w_x", "imu_w_y"), 0.0)
-    signals |= {"yaw_deg": math.degrees(yaw) % 360, "odom_v_x": v, "odom_w_z": w, "imu_w_z": w}
-    signals |= {"imu_a_x": (v - last_v) / DT, "imu_a_y": v * w, "imu_a_z": 0.0, "lidar_on": float(lidar_on)}
-    signals |= {"battery_v": volts, "battery_fraction": 1.0}
-    signals |= {f"imu_q_{part}": math.copysign(1, q[3]) * q[n] for n, part in enumerate("xyzw")}
-    if lacking := sorted(set(inputs) - set(signals)):
+    known = signals(t, (x, y, yaw), q, (v, w), (v - last_v) / DT, command)
+    if lacking := sorted(set(inputs) - set(known)):
         sys.exit(f"{sys.argv[2]} reads {', '.join(lacking)}, which this script does not know")
-    last_v, features = v, np.array([[signals[name] for name in inputs]])
+    last_v, features = v, np.array([[known[name] for name in inputs]])
     disturbance, sd = (out.item() for out in network.run(["disturbance_nt", "sd_nt"], {"features": features}))
     b_map = field_map(x, y, yaw)
-    readings.append((t, x, y, yaw, b_map, disturbance, sd, b_map + disturbance))
+    readings.append((t, x, y, yaw, *command, b_map, disturbance, sd, b_map + disturbance))
 
     wanted = min(SPEED, wanted + ACCELERATION * DT)
     travelled += wanted * DT
@@ -100,7 +118,8 @@ while travelled < way[-1]:
     ahead = math.cos(yaw) * (px - x) + math.sin(yaw) * (py - y)
     aside = math.cos(yaw) * (py - y) - math.sin(yaw) * (px - x)
     forward = wanted * math.cos(heading - yaw) + 2 * ahead  # Kanayama and others (1990)
-    apart = wanted * (bend + 8 * aside + 4 * math.sin(heading - yaw)) * drive["wheelSeparationM"] / 2
+    command = forward, wanted * (bend + 8 * aside + 4 * math.sin(heading - yaw))
+    apart = command[1] * drive["wheelSeparationM"] / 2
     asked = np.array([forward - apart, forward + apart]) / drive["wheelRadiusM"]
     rates[wheels] += (1 - math.exp(-DT / max(drive["motorLagS"], 1e-9))) * (asked - rates[wheels])
     control.joint_target_qd.assign(rates)
@@ -109,6 +128,6 @@ while travelled < way[-1]:
         solver.step(now, then, control, None, DT / STEPS)
         now, then = then, now
 
-names = "t,x,y,yaw,b_map_nt,b_disturbance_nt,b_sd_nt,b_total_nt"
+names = "t,x,y,yaw,v_cmd,w_cmd,b_map_nt,b_disturbance_nt,b_sd_nt,b_total_nt"
 np.savetxt(sys.argv[3], readings, "%.6f", ",", header=names, comments="")
 print(f"{len(readings)} readings in {t:.1f} s of driving are in {sys.argv[3]}")
