@@ -214,6 +214,7 @@ class DdsBus:
 
     def _told(self, message: Message) -> None:
         self.clock.tell(int(message.read(["clock"])["clock"]), message.sent_ns)
+        self.clock.run_due()  # at each tick, with what was heard before it, even where several come at once
 
 
 def _deaf(message: Message) -> None:
