@@ -279,6 +279,28 @@ def test_a_robot_alone_can_be_handed_on(tmp_path):
     assert made.licences == {"turtlebot4.usda": "Apache-2.0"}
 
 
+def test_a_layer_of_the_stages_own_is_not_mistaken_for_the_one_of_attached_files(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    Sdf.Layer.OpenAsAnonymous(str(own / "room.usda")).Export(str(own / "files.usdc"))
+    text = (own / "lab.usda").read_text().replace("room.usda", "files.usdc")
+    (own / "lab.usda").write_text(text)
+    made = export_scene(own / "lab.usda", tmp_path / "lab.usdz", trusted=True)
+    stage = Usd.Stage.Open(str(made.root))
+    assert stage.GetPrimAtPath("/World/Lab/Floor")
+    assert stage.GetPrimAtPath("/World/Files").GetChildren()
+
+
+def test_a_prim_in_the_place_of_attached_files_is_refused(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    text = (
+        (own / "lab.usda")
+        .read_text()
+        .replace('    def Xform "turtlebot4"', '    def "Files"\n    {\n    }\n\n    def Xform "turtlebot4"')
+    )
+    (own / "lab.usda").write_text(text)
+    refuse("</World/Files>: is where files are attached; rename", own / "lab.usda", tmp_path, "lab.usdz")
+
+
 # Units
 
 

@@ -18,7 +18,7 @@ from magtwin.export.contents import assets_of, kind_of
 from magtwin.files import sha256
 from magtwin.names import RefusedError
 from magtwin.usd.layers import open_stage, relative_asset
-from magtwin.usd.schema import place
+from magtwin.usd.schema import place as said
 
 SCOPE = "Files"
 """Name of the scope, below the default prim."""
@@ -30,14 +30,14 @@ NAME, BYTES, SHA256, OF = (f"magtwin:file:{name}" for name in ("name", "bytes", 
 
 
 def attach(root: Path, *more: Path) -> None:
-    """Take files of a stage's folder into a layer of it, `files.usdc`, a sublayer of the root layer.
+    """Take files of a stage's folder into a layer beside the root layer, `files.usdc`, its sublayer.
 
     Args:
         root: Root layer; a folder of layers below which all that is named lies.
         more: Files below that folder to attach though no property names them.
 
     Raises:
-        RefusedError: The stage has no default prim for them to stand below.
+        RefusedError: The stage has no default prim for them to stand below, or a prim called as their scope.
     """
     stage = open_stage(root)
     named = {file.resolve(): list[Sdf.Path]() for file in more}
@@ -52,12 +52,16 @@ def attach(root: Path, *more: Path) -> None:
     if not default:
         raise RefusedError(f"{root}: has no default prim to attach files below; set one")
     scope, meta = default.GetPath().AppendChild(SCOPE), stage.GetRootLayer()
+    if stage.GetPrimAtPath(scope):
+        raise RefusedError(f"{root} <{scope}>: is where files are attached; rename that prim")
     layers = [layer for layer in stage.GetUsedLayers() if layer.realPath]
     for layer in layers:
         if any(kind_of(asset) in KINDS for _, asset in assets_of(layer)):
             UsdUtils.ModifyAssetPaths(layer, lambda asset: "" if kind_of(asset) in KINDS else asset)
             layer.Save()
-    files = Sdf.Layer.CreateNew(str(root.with_name("files.usdc")))
+    names = ("files.usdc", *(f"files_{i}.usdc" for i in range(2, 99)))
+    place = next(path for path in map(root.with_name, names) if not path.exists())
+    files = Sdf.Layer.CreateNew(str(place))
     files.documentation = "Files that no package may hold, as bytes"
     files.customLayerData = {"creator": "magtwin"}
     for key in ("metersPerUnit", "upAxis", "kilogramsPerUnit"):
@@ -66,7 +70,7 @@ def attach(root: Path, *more: Path) -> None:
     files.defaultPrim = scope.GetParentPath().name
     _define(files, scope, named)
     files.Save()
-    meta.subLayerPaths.append("./files.usdc")
+    meta.subLayerPaths.append(f"./{place.name}")
     meta.Save()
     for file in named:
         file.unlink()
@@ -119,14 +123,14 @@ def detach(root: Path) -> tuple[Path, ...]:
         value = prim.GetAttribute(BYTES).Get()
         data = bytes(np.array(value, np.uint8)) if isinstance(value, Vt.UCharArray) else b""
         if Path(name).name != name or "\\" in name or kind_of(name) not in KINDS:
-            raise RefusedError(f"{place(prim)}: {NAME} {name!r} is no name of a file that is attached")
+            raise RefusedError(f"{said(prim)}: {NAME} {name!r} is no name of a file that is attached")
         if hashlib.sha256(data).hexdigest() != prim.GetAttribute(SHA256).Get():
             raise RefusedError(
-                f"{place(prim)}: the bytes of {name} are not those that its checksum was taken of"
+                f"{said(prim)}: the bytes of {name} are not those that its checksum was taken of"
             )
         file = root.parent / kind_of(name) / name
         if file.exists():
-            raise RefusedError(f"{place(prim)}: a second file {name}; rename one")
+            raise RefusedError(f"{said(prim)}: a second file {name}; rename one")
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(data)
         targets = prim.GetRelationship(OF).GetTargets()
@@ -135,7 +139,7 @@ def detach(root: Path) -> tuple[Path, ...]:
         for path in targets:
             attribute = stage.GetAttributeAtPath(path)
             if not attribute or attribute.GetTypeName() != Sdf.ValueTypeNames.Asset:
-                raise RefusedError(f"{place(prim)}: {OF} names {path}, which names no file")
+                raise RefusedError(f"{said(prim)}: {OF} names {path}, which names no file")
             layer = next((spec.layer for spec in attribute.GetPropertyStack()), stage.GetRootLayer())
             with Usd.EditContext(stage, layer):
                 attribute.Set(Sdf.AssetPath(relative_asset(layer, file)))

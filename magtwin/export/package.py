@@ -287,7 +287,7 @@ class _Work:
                 )
             if file not in self.networks:
                 self.networks.append(file)
-                self.licences[self._said(file)] = _licence_of(file) or UNKNOWN
+                self.licences[self._said(file)] = licence_of(file) or UNKNOWN
         for layer in stage.GetUsedLayers():
             facts = layer.customLayerData.get("SimReady_Metadata", {})
             if layer.realPath and facts.get("asset_license"):
@@ -433,8 +433,8 @@ def _values_layer(prim: Usd.Prim) -> Path:
     return Path(specs[0].layer.realPath)
 
 
-def _licence_of(network: Path) -> str:
-    """The licence that weights say, "" where they say none."""
+def licence_of(network: Path) -> str:
+    """The licence that the facts of a network's weights say, "" where they say none."""
     if network.suffix != ".safetensors":
         return ""
     with open(network, "rb") as file:
