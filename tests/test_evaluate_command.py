@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -205,6 +206,17 @@ def test_a_budget_is_made_where_the_scene_is_at_hand(room, lab_scene, tmp_path, 
         assert sum(term["bought_nt"] for term in one["terms"]) == pytest.approx(one["mae_nt"])
     pictures = {path.stem for path in (tmp_path / "out" / "figures").iterdir()}
     assert {"budget", "steps", "figure_8"} <= pictures
+
+
+def test_the_example_of_the_docs_runs(room, tmp_path, monkeypatch, capsys):
+    page = (Path(__file__).parents[1] / "docs" / "evaluate.md").read_text(encoding="utf-8")
+    files = {"map.usdc": "hills.usdc", "set": "set", "f.safetensors": "net.safetensors"}
+    for name, of in (files | {"a.parquet": "drive0.parquet", "b.parquet": "drive1.parquet"}).items():
+        (tmp_path / name).symlink_to(room / of)
+    monkeypatch.chdir(tmp_path)
+    exec(page.split("```python")[1].split("```")[0], {})
+    ratio, low, high = map(float, re.findall(r"[\d.]+", capsys.readouterr().out))
+    assert low <= ratio <= high
 
 
 def test_two_drives_of_one_path_lie_over_each_other_once_they_are_aligned(lab_scene):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from magtwin.field.map import AnomalyMap
 from magtwin.files import sha256
-from magtwin.learn.dataset import MANIFEST, Dataset, values_sha256
+from magtwin.learn.dataset import KEPT, MANIFEST, Dataset, values_sha256
 from magtwin.learn.features import CARRIED, CIRCULAR, FEATURES, GRADIENT, features
 from magtwin.learn.labels import Alignment, labelled
 from magtwin.learn.linear import fit_linear
@@ -136,7 +136,7 @@ class Judged:
     """Row of the table that it belongs to."""
 
     run: Run
-    """The recording, as it was read."""
+    """The recording, of the columns that a data set keeps."""
 
     p_xy: Array
     """Where the robot was seen [m], shape (N, 2)."""
@@ -354,6 +354,7 @@ def _judge(
 ) -> tuple[Judged, dict[str, int]]:
     """What every model makes of a recording, and why readings are left out."""
     run = trial.read()
+    run = Run({name: run[name] for name in KEPT if name in run}, run.facts)
     _check_readings(trial.name, run, truth)
     session, path = told_by(run, trial)
     measured = run["b_truth_nt" if truth else "b_measured_nt"]
