@@ -69,8 +69,8 @@ def signals(t, pose, q, twist, acceleration, command):
     known |= {"yaw_deg": math.degrees(yaw) % 360, "odom_v_x": v, "odom_w_z": w, "imu_w_z": w}
     known |= {"imu_a_x": acceleration, "imu_a_y": v * w, "imu_a_z": 0.0, "lidar_on": on, "turning": abs(w)}
     known |= {f"imu_q_{part}": math.copysign(1, q[3]) * q[n] for n, part in enumerate("xyzw")}
-    known |= {"battery_fraction": 1.0, "battery_a": watts / full}
-    known |= {"battery_v": full - battery["resistanceOhm"] * watts / full}
+    volts = full - battery["resistanceOhm"] * watts / full
+    known |= {"battery_fraction": 1.0, "battery_v": volts, "battery_a": watts / volts}
     known |= {"lag_v": command[0] - v, "lag_w": command[1] - w}
     c, s = math.cos(yaw), math.sin(yaw)
     for name in ("odom_v_x", "odom_w_z", "turning", "lag_v", "lag_w", "lidar_on", "battery_a"):
