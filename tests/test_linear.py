@@ -76,6 +76,8 @@ def test_rows_where_the_map_is_poorly_known_count_less_where_that_helps():
     off = {w: np.abs(m.coefficients_nt / m.inputs.scale - [50, -20, 0])[:2].max() for w, m in found.items()}
     assert (found["none"].weighted, found["auto"].weighted) == (False, True)
     assert off["auto"] < 0.5 * off["none"]
+    weight = fit_linear(x, y, of, features=NAMES, sd=sd).weight
+    assert weight[sd > 0].max() < 0.1 < weight[sd == 0].min() == 1.0
 
 
 def test_going_on_from_a_model_pulls_towards_it_not_towards_nothing(fitted):

@@ -298,3 +298,21 @@ def test_weights_that_cannot_be_gone_on_from_are_refused(options, text):
     with pytest.raises(RefusedError) as refused:
         a_training(n=300, epochs=1, init=init, **options)
     assert text in str(refused.value)
+
+
+def test_a_row_counts_as_much_as_it_weighs():
+    rng, (x, y) = np.random.default_rng(3), rows(2000, 1)
+    wrong = rng.random(len(y)) < 0.4
+    spoilt = np.where(wrong, y + 800, y)
+    weight = np.where(wrong, 1e-6, 7.0)
+    options = SMALL | {"epochs": 25, "batch": 128}
+    found = [
+        train(x, spoilt, *rows(500, 2), rng=np.random.default_rng(0), weight=w, **options)[0]
+        for w in (weight, 2 * weight)
+    ]
+    assert found[0].residual_sd_nt < 40  # over 300 nT where all count alike
+    for a, b in zip(found[0].parameters(), found[1].parameters(), strict=True):
+        assert_allclose(a.detach(), b.detach(), rtol=1e-3, atol=1e-5)
+    for bad in (weight[:-1], 0 * weight, np.where(wrong, np.nan, 1.0)):
+        with pytest.raises(RefusedError, match="weight must be above 0 and finite, one for each of 2000"):
+            train(x, y, *rows(500, 2), rng=rng, weight=bad, **options)

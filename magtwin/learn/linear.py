@@ -154,6 +154,9 @@ class Fitted:
     groups: NDArray[np.intp]
     """Which group of recordings each row is of, shape (N,)."""
 
+    weight: Array | None = None
+    """How much each row counted, shape (N,); none where all count alike."""
+
 
 def fit_linear(
     x: ArrayLike,
@@ -200,11 +203,12 @@ def fit_linear(
     folds, groups = _folds(groups)
     label_sd = np.zeros(len(y)) if sd is None else np.asarray(sd, float)
     solve = _Ridge(z, y, folds, towards, penalty)
-    best = solve(np.ones(len(y)))
+    best, weight = solve(np.ones(len(y))), None
     if weighting != "none" and label_sd.any():
         left = float(np.mean((best.held_out - y) ** 2))
         s0_squared = max(left - float(np.mean(label_sd**2)), 0.05 * left)
-        other = solve(s0_squared / (s0_squared + label_sd**2))
+        weight = s0_squared / (s0_squared + label_sd**2)
+        other = solve(weight)
         error, its = (np.abs(one.held_out - y).mean() for one in (best, other))
         if weighting == "label_sd" or its < error:
             best = _Solved(other.beta, other.penalty, other.held_out, weighted=True)
@@ -219,7 +223,7 @@ def fit_linear(
         penalty=best.penalty,
         weighted=best.weighted,
     )
-    return Fitted(model, best.held_out, groups)
+    return Fitted(model, best.held_out, groups, weight if best.weighted else None)
 
 
 def linear_of(weights: Weights) -> Linear:

@@ -150,6 +150,7 @@ def _hybrid(
             stops_x,
             stops.y - base_mean,
             rng=rng,
+            weight=base.weight,
             features=config.inputs,
             device=device_of(config),
             init=None if init is None else init.net,

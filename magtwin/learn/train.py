@@ -24,6 +24,7 @@ def train(
     y_val: ArrayLike,
     *,
     rng: np.random.Generator,
+    weight: ArrayLike | None = None,
     features: str | Sequence[str] = "full",
     layers: Sequence[int] = (512, 512, 512, 512),
     dropout: float = 0.3,
@@ -53,6 +54,7 @@ def train(
         y_val: Their labels [nT], shape (M,).
         rng: Source of the first weights, the order of rows and dropout. One state, one machine, one device
             and one number of threads give the same weights, bit for bit.
+        weight: How much each training row counts, shape (N,), of any scale; all alike unless given.
         features: Names of the features, in order, or of a set of them.
         layers: Widths of the hidden layers.
         dropout: Share of units dropped in training, to the nearest 65,536th.
@@ -82,6 +84,12 @@ def train(
     names = feature_names(features)
     x, y = _rows("training", x, y, names)
     x_val, y_val = _rows("validation", x_val, y_val, names)
+    counts: Array | None = None
+    if weight is not None:
+        counts = np.array(weight, float)
+        if counts.shape != y.shape or not (np.isfinite(counts).all() and (counts > 0).all()):
+            raise RefusedError(f"weight must be above 0 and finite, one for each of {len(y)} training rows")
+        counts /= counts.mean()
     if y.std() < 1e-9:
         raise RefusedError(f"the label is {y[0]:g} nT in every training row; there is nothing to learn")
     if not (epochs > 0 and batch > 0 and lr > 0):
@@ -108,10 +116,12 @@ def train(
         "torch": str(torch.__version__),
     }
     if checkpoint is not None:
-        settings["rows"] = digest(x, y, x_val, y_val)
+        settings["rows"] = digest(x, y, x_val, y_val, *([] if counts is None else [counts]))
         settings["init"] = digest(*init.state_dict().values()) if init is not None else ""
     history = descend(
-        _Rows(net, x, y, x_val, y_val, Dropout(dropout, torch.Generator(device).manual_seed(seed + 1))),
+        _Rows(
+            net, x, y, counts, x_val, y_val, Dropout(dropout, torch.Generator(device).manual_seed(seed + 1))
+        ),
         Course(epochs=epochs, batch=batch, lr=lr, patience=patience, seed=seed),
         settings,
         started=init is not None,
@@ -129,11 +139,19 @@ class _Rows:
     """Rows as a network learns them, on the device that its dropout draws on."""
 
     def __init__(
-        self, net: FieldNet, x: Array, y: Array, x_val: Array, y_val: Array, drop: "Dropout"
+        self,
+        net: FieldNet,
+        x: Array,
+        y: Array,
+        weight: Array | None,
+        x_val: Array,
+        y_val: Array,
+        drop: "Dropout",
     ) -> None:
         self.module, self.drop, device = net, drop, drop.generator.device
         self.z = ((torch.from_numpy(x) - net.x_mean) / net.x_scale).float().to(device)
         self.label = ((torch.from_numpy(y) - net.y_mean) / net.y_scale).float().to(device)
+        self.weight = None if weight is None else torch.from_numpy(weight).float().to(device)
         self.x_val, self.y_val = torch.from_numpy(x_val).to(device), y_val
         self.square_nt2 = float(net.y_scale) ** 2
         self.generators = {"dropout": drop.generator}
@@ -148,8 +166,11 @@ class _Rows:
     def loss(self, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         z, label = self.z[chosen], self.label[chosen]
         out = self._forward(z) if self.module.training else self.module.body(z)
-        loss = torch.nn.functional.mse_loss(out, label)
-        return loss, loss.detach() * (len(chosen) * self.square_nt2)
+        if self.weight is None:
+            loss = torch.nn.functional.mse_loss(out, label)
+            return loss, loss.detach() * (len(chosen) * self.square_nt2)
+        squares = (out - label) ** 2
+        return (self.weight[chosen] * squares).mean(), squares.detach().sum() * self.square_nt2
 
     def errors_nt(self) -> Array:
         parts = [self.module(part).cpu().numpy() for part in self.x_val.split(8192)]
