@@ -7,7 +7,7 @@ import pytest
 from nodes import DOMAINS, spin
 
 from magtwin.files import shipped
-from magtwin.frames import quat_from_yaw
+from magtwin.frames import into_base, quat_from_yaw
 from magtwin.io.messages import BATTERY, CLOCK, IMU, MAGNITUDE, ODOMETRY, POSE, Qos, Topic
 from magtwin.names import RefusedError
 from magtwin.ros.bus import Bus, Message, Publisher, open_bus, to_bytes
@@ -112,26 +112,31 @@ class World:
             self.heard(bus)
         return self.said[-1]
 
-    def expected_nt(self) -> float:
-        """What map and network say of the messages."""
+    def expected(self) -> tuple[float, float]:
+        """What map and network say of the messages, and the standard deviation of that [nT]."""
         assert self.twin.magnetometer is not None
         x, y, yaw = self.pose
+        b_map, slopes = self.twin.field.lookup_with_gradient(np.array([[x, y]]), np.array([yaw]))
         row = {
             "t": [self.t],
             "yaw": [yaw],
+            "v_cmd": [0.0],
+            "w_cmd": [0.0],
             "odom_v": [[0.2, 0, 0]],
             "odom_w": [[0, 0, 0.1]],
             "imu_q_xyzw": [quat_from_yaw(yaw)],
             "imu_w": [[0, 0, 0.1]],
             "imu_a": [[0.0, 0, 0]],
             "battery_v": [15.5],
+            "battery_a": [1.0],
             "battery_fraction": [np.float32(0.8)],
             "lidar_on": [False],
+            "b_map_gradient_nt_m": into_base(slopes[:, :2], np.array([yaw])),
         }
         run = Run({name: np.array(values) for name, values in row.items()}, {})
         (read,) = self.twin.magnetometer.read([run])
-        b_map = self.twin.field.lookup(np.array([[x, y]]), np.array([yaw]))
-        return float(b_map[0] + read.disturbance_nt[0])
+        noise = self.twin.scene.robot.magnetometer.noise_density_nt * np.sqrt(125 / 2)
+        return float(b_map[0] + read.disturbance_nt[0]), float(np.hypot(read.sd_nt[0], noise))
 
     def _hear(self, message: Message) -> None:
         self.said.append({s.name.removeprefix("magnetometer: "): s for s in from_message(message)})
@@ -158,11 +163,11 @@ def test_a_reading_is_map_and_network_at_what_was_heard(world: World) -> None:
     assert read["header.stamp"] == round(world.t * NS)
     assert read["header.frame_id"] == "magnetometer_link"
     nt = float(world.totals[-1].read(["data"])["data"])
-    assert nt == pytest.approx(world.expected_nt(), abs=0.01)
+    expected_nt, expected_sd_nt = world.expected()
+    assert nt == pytest.approx(expected_nt, abs=0.01)
     np.testing.assert_allclose(read["magnetic_field"], [1e-9 * nt, 0, 0], rtol=1e-12)
-    assert world.twin.magnetometer is not None
     sd_nt = 1e9 * np.sqrt(read["magnetic_field_covariance"][0])
-    assert sd_nt == pytest.approx(float(world.twin.magnetometer.net.residual_sd_nt), rel=1e-3)
+    assert sd_nt == pytest.approx(expected_sd_nt, rel=1e-6)
 
 
 def test_in_nt_it_says_so(world: World) -> None:
