@@ -25,14 +25,14 @@ test-slow: $(VENV)/.dev  ## Run the tests that take minutes: fits of large surve
 simready: $(VENV)/.dev  ## Hold robots against NVIDIA's SimReady profiles, in an environment of its own
 	test -x build/simready/bin/simready-validate || $(PYTHON) -m venv build/simready
 	build/simready/bin/python -m pip --disable-pip-version-check -q install 'simready-validate>=2026.8' 'simready-foundation-tier-core>=2026.8' 'simready-foundation-tier-sensors>=2026.8'
-	MAGTWIN_SIMREADY=$(CURDIR)/build/simready/bin/simready-validate $(BIN)/python -m pytest tests/test_urdf_layout.py
+	MAGTWIN_SIMREADY=$(CURDIR)/build/simready/bin/simready-validate $(BIN)/python -m pytest tests/test_urdf_layout.py tests/test_validate.py -k "simready or layout"
 
-ros: $(VENV)/.dev build/ros-jazzy/.installed  ## Cross our nodes with rclpy of ROS 2 Jazzy, in an environment of its own
-	$(ONE_THREAD) $(BIN)/python -m pytest tests/test_ros_bus.py
+ros: $(VENV)/.dev build/ros-jazzy/.installed build/ros-kilted/.installed  ## Cross our nodes with rclpy of ROS 2 Jazzy and Kilted, in environments of their own
+	$(ONE_THREAD) $(BIN)/python -m pytest tests/test_ros_bus.py tests/test_ros_rclpy.py
 
-build/ros-jazzy/.installed:
-	$(PYTHON) -m venv build/ros-jazzy
-	build/ros-jazzy/bin/python -m pip --disable-pip-version-check -q install numpy 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-sensor-msgs ros-jazzy-geometry-msgs ros-jazzy-nav-msgs ros-jazzy-rosgraph-msgs ros-jazzy-diagnostic-msgs
+build/ros-%/.installed:
+	$(PYTHON) -m venv build/ros-$*
+	build/ros-$*/bin/python -m pip --disable-pip-version-check -q install numpy 'ros-$*-rclpy[fastrtps]' ros-$*-sensor-msgs ros-$*-geometry-msgs ros-$*-nav-msgs ros-$*-rosgraph-msgs ros-$*-diagnostic-msgs
 	@touch $@
 
 lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies
@@ -44,7 +44,7 @@ lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies
 
 physics: $(VENV)/.dev  ## Drive converted robots in Newton (extra physics, 600 MB)
 	$(PIP) -e '.[dev,physics]'
-	$(BIN)/python -m pytest -m physics tests/test_newton.py tests/test_engine.py tests/test_engine_scripts.py
+	$(BIN)/python -m pytest -m physics tests/test_newton.py tests/test_engine.py tests/test_engine_scripts.py tests/test_validate.py
 
 bench: $(VENV)/.dev  ## Compare with peers; prints ratios
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done

@@ -246,6 +246,26 @@ def test_a_robot_that_floats_or_leans_is_told(lab):
     assert any("does not stand upright" in t for t in texts)
 
 
+@pytest.mark.parametrize(
+    ("path", "text", "rule"),
+    [
+        ("AnomalyMap", 'token magtwin:anomalyMap:shape = "x"', "map-grid"),
+        (MAGNETOMETER, "double3 magtwin:magnetometer:map = (1, 2, 3)", "targets"),
+    ],
+)
+def test_a_value_of_another_kind_breaks_the_rule_that_reads_it_and_ends_nothing(lab, path, text, rule):
+    found = broken(beside(lab, f"kind_{rule.replace('-', '_')}", over(path, text)), rule)
+    assert "a value is not of its kind" in found[rule][0].text
+
+
+def test_the_docs_list_every_rule_and_every_mend_with_its_sentence():
+    text = (Path(__file__).parents[1] / "docs" / "validate.md").read_text()
+    for rule in EVERY.values():
+        assert f"| `{rule.name}` | {rule.sentence} | {rule.advice} |" in text
+    for fix in (*SAFE.values(), *ASKED.values()):
+        assert f"| `{fix.name}` | {fix.sentence} |" in text
+
+
 def test_a_robots_asset_is_found_for_the_profiles_that_are_for_it(lab, tmp_path):
     (asset,) = robot_assets(subject(lab)).values()
     assert asset.name == "turtlebot4.usda"

@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from pxr import Sdf, Usd, UsdUtils
+from pxr import Sdf, Tf, Usd, UsdUtils
 
 from magtwin.export.findings import Finding, Severity
 from magtwin.names import RefusedError
 from magtwin.usd.schema import prims_with
+
+SAID = 120
+"""Characters of what Python or USD said that a finding quotes."""
 
 _WHERE = re.compile(r"^(?P<file>[^<]*)<(?P<prim>/[^>]*)>:? ?(?P<text>.*)$", re.S)
 """How refusals of usd/ begin, by `magtwin.usd.schema.place`."""
@@ -88,12 +91,23 @@ class Rule:
     look: Callable[[Subject], Iterator[Wrong]]
 
     def findings(self, subject: Subject) -> list[Finding]:
-        """What breaks it; a refusal on the way breaks it too."""
+        """What breaks it; a refusal on the way breaks it too, and a stage too wrong to be looked at."""
         found: list[Wrong] = []
         try:
             found.extend(self.look(subject))
         except RefusedError as error:
             found.append(wrong_of(error))
+        except (
+            Tf.ErrorException,
+            ArithmeticError,
+            AttributeError,
+            LookupError,
+            TypeError,
+            ValueError,
+        ) as error:
+            said = " ".join(str(error).split())
+            text = f"cannot be looked at, a value is not of its kind ({type(error).__name__}: {said[:SAID]})"
+            found.append(Wrong(text, advice="author it anew; docs/schema.md says what each value is"))
         return [
             Finding(self.name, wrong.text, wrong.where, wrong.advice or self.advice, wrong.severity)
             for wrong in found
