@@ -465,6 +465,27 @@ def test_figures_of_physics_are_converted_by_their_units(tmp_path):
         assert_allclose(stage.GetAttributeAtPath(path).Get(), value, rtol=1e-6, err_msg=path)
 
 
+def test_a_variant_that_is_not_chosen_is_converted_too(tmp_path):
+    (tmp_path / "tall.usda").write_text(
+        '#usda 1.0\n(\n    defaultPrim = "box"\n)\ndef Cube "box"\n{\n    double size = 300\n}\n'
+    )
+    text = (
+        '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 0.01\n    upAxis = "Y"\n)\n'
+        'def Xform "World" (variants = {string v = "low"}\nprepend variantSets = "v")\n{\n'
+        'variantSet "v" = {\n"low" {\ndef Cube "box"\n{\ndouble size = 100\n}\n}\n'
+        '"tall" {\ndef "box" (references = @./tall.usda@)\n{\n}\n}\n}\n}\n'
+    )
+    made = export_scene(write(tmp_path, text), tmp_path / "out", convert_units=True, trusted=True)
+    stage = Usd.Stage.Open(str(made.root))
+    world = stage.GetPrimAtPath("/World")
+    for variant, size in (("low", 1), ("tall", 3)):
+        world.GetVariantSet("v").SetVariantSelection(variant)
+        box = stage.GetPrimAtPath("/World/box")
+        assert box.GetAttribute("size").Get() == pytest.approx(size)
+        up = UsdGeom.XformCache().GetLocalToWorldTransform(box).TransformDir(Gf.Vec3d(0, 1, 0))
+        assert_allclose(up, [0, 0, 1], atol=1e-9)
+
+
 def test_lengths_of_physics_engines_that_are_not_known_are_noted(tmp_path):
     text = YARD.replace(
         "        float physics:mass = 5",

@@ -56,11 +56,7 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
     """
     open_stage(root)  # refuses
     root = root.resolve()
-    heard = UsdUtils.CoalescingDiagnosticDelegate()
-    try:
-        layers, assets, lost = UsdUtils.ComputeAllDependencies(str(root))
-    finally:
-        heard.TakeUncoalescedDiagnostics()
+    layers, assets, lost = dependencies(root)
     files = {Path(layer.realPath).resolve(): layer for layer in layers}
     others = [Path(asset).resolve() for asset in assets]
     for name in lost:
@@ -77,6 +73,16 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
     for file in others:
         _copied(file, folder / places[file])
     return folder / places[root]
+
+
+def dependencies(root: Path) -> tuple[list[Sdf.Layer], list[str], list[str]]:
+    """The layers of a stage, in any variant, the other files that they name, and names of what is not there."""
+    heard = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
+    try:
+        layers, assets, lost = UsdUtils.ComputeAllDependencies(str(root))
+    finally:
+        heard.TakeUncoalescedDiagnostics()
+    return layers, assets, lost
 
 
 def assets_of(layer: Sdf.Layer) -> Iterator[tuple[Sdf.Path, str]]:

@@ -130,7 +130,7 @@ def export_scene(
             the stage has. Nothing is written.
     """
     scene_file, out = Path(scene_file), Path(out)
-    kind = find("kind of export", out.suffix, KINDS) if out.suffix in KINDS else _no_kind(out)
+    kind = KINDS.get(out.suffix) or _no_kind(out)
     name: str = profile or ("omniverse" if kind in ("folder", "package") else "viewer")
     find("profile", name, PROFILES)
     if kind in ("layer", "web") and name != "viewer":

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
+from magtwin.export.contents import dependencies
 from magtwin.names import RefusedError
 from magtwin.usd.layers import open_stage
 
@@ -85,7 +86,7 @@ def to_metres_z_up(root: Path) -> tuple[str, ...]:
     metres, up = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)
     if not (math.isfinite(metres) and metres > 0):
         raise RefusedError(f"{root}: metersPerUnit is {metres!r}; it must be a length above 0")
-    layers = [layer for layer in stage.GetUsedLayers() if layer.realPath]
+    layers = dependencies(root)[0]
     foreign: set[str] = set()
     if metres != 1:
         with Sdf.ChangeBlock():
@@ -174,7 +175,7 @@ def _times(value: Any, factor: float) -> Any:
 
 
 def _turn(stage: Usd.Stage) -> None:
-    """Turn what stands in the world: a default prim that is only its root passes the turn on."""
+    """Turn what stands in the world: a default prim that is only the root of the rest passes the turn on."""
     for prim in _standing(stage.GetPseudoRoot().GetFilteredChildren(Usd.PrimAllPrimsPredicate)):
         _turned(prim)
     for prim in stage.TraverseAll():
@@ -191,8 +192,8 @@ def _standing(prims: Iterable[Usd.Prim]) -> list[Usd.Prim]:
     found = []
     for prim in prims:
         xformable = UsdGeom.Xformable(prim)
-        bare = prim.GetTypeName() in ("", "Scope", "Xform") and not prim.HasAPI(UsdPhysics.RigidBodyAPI)
-        root = prim == prim.GetStage().GetDefaultPrim()
+        bare = not prim.HasAPI(UsdPhysics.RigidBodyAPI) and not prim.HasVariantSets()
+        root = prim.GetTypeName() == "Xform" and prim == prim.GetStage().GetDefaultPrim()
         if not xformable or (bare and root and not xformable.GetOrderedXformOps()):
             found += _standing(prim.GetFilteredChildren(Usd.PrimAllPrimsPredicate))
         else:
