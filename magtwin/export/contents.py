@@ -76,7 +76,7 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
 
 
 def dependencies(root: Path) -> tuple[list[Sdf.Layer], list[str], list[str]]:
-    """The layers of a stage, in any variant, the other files that they name, and names of what is not there."""
+    """A stage's layers, in any variant, the other files that they name, and names of what is not there."""
     heard = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
     try:
         layers, assets, lost = UsdUtils.ComputeAllDependencies(str(root))
