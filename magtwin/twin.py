@@ -147,12 +147,19 @@ def on_its_day(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> Twi
     Args:
         twin: The twin of the run.
         facts: Those of the run.
+
+    Raises:
+        RefusedError: They do not say which day that was.
     """
     from magtwin.sim.session import session_of
 
     if "session_seed" not in facts:
         return twin
-    robot = session_of(twin.scene.robot, int(facts["session_seed"]), int(facts["session"]))
+    try:
+        seed, day = int(facts["session_seed"]), int(facts["session"])
+    except (KeyError, ValueError) as error:
+        raise RefusedError(f"the facts of the run do not say which session it was of: {error}") from error
+    robot = session_of(twin.scene.robot, seed, day)
     return dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot))
 
 

@@ -153,6 +153,11 @@ def test_a_run_of_another_scene_is_refused(drives, truth, found, train):
         budgets(other, [0], truth, train)
 
 
+def test_a_run_of_no_known_session_is_refused(twin):
+    with pytest.raises(RefusedError, match="do not say which session it was of"):
+        on_its_day(twin, {"session_seed": 1, "session": "monday"})
+
+
 def test_a_run_without_the_truth_is_refused(drives, truth, found, train):
     bare = Run({k: v for k, v in drives["d2"].items() if k != "b_truth_nt"}, drives["d2"].facts)
     other = replace(found, judged=(replace(found.judged[0], name="d8", run=bare),))

@@ -123,7 +123,7 @@ def evaluate(
         sections.append(section)
         data["budget"] = told
     if against is not None or engine is not None:
-        section, told = _traversals(found, scene, against, engine, quiet=json)
+        section, told = _traversals(found, scene, against, engine)
         sections.append(section)
         data["traversals"] = told
     curves = {name: read_curve(path) for path, name in zip(weights, names, strict=True)}
@@ -247,10 +247,9 @@ def _budget(
 
 
 def _traversals(
-    found: "Evaluation", scene: Path | None, against: Path | None, engine: str | None, *, quiet: bool
+    found: "Evaluation", scene: Path | None, against: Path | None, engine: str | None
 ) -> "tuple[Section, dict[str, Any]]":
     """One path driven twice, as a section and in figures."""
-    from magtwin.cli.terminal import announcer
     from magtwin.compare import traversals
     from magtwin.io.formats import read_run
     from magtwin.io.provenance import made_again
@@ -265,8 +264,10 @@ def _traversals(
         able = [one for one in found.judged if one.path == path and one.name != name]
         first = able[0] if able else first
     else:
-        announcer(quiet=quiet)(f"Driving {first.path} by {engine}")
-        other = made_again(first.run, scene, engine=engine, seed=int(first.run.facts.get("seed", 0)) + 1)
+        seed = first.run.facts.get("seed")
+        seed = seed + 1 if isinstance(seed, int) and seed >= 0 else 1
+        with progress(f"Driving {first.path}") as advance:
+            other = made_again(first.run, scene, engine=engine, seed=seed, progress=advance)
         name = f"{first.path} by {engine}"
     both = traversals(first.run, other)
     return section_of_traversals(both, (first.name, name)), both.summary()
