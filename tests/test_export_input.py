@@ -564,8 +564,11 @@ def test_the_command_draws_a_thumbnail_and_plays_a_run(tmp_path, capsys):
     assert "Wrote" in capsys.readouterr().out
 
 
-def test_the_command_refuses_a_scene_that_is_not_there_with_status_1(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("scene", "text"), [("lap", "did you mean 'lab'"), ("lab.toml", "magtwin scene lab.toml --out DIR")]
+)
+def test_the_command_refuses_what_is_no_stage_with_status_1(scene, text, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
-        main(["export", "lap", "--out", str(tmp_path / "lab")])
+        main(["export", scene, "--out", str(tmp_path / "lab")])
     assert ended.value.code == 1
-    assert "did you mean 'lab'" in capsys.readouterr().err
+    assert text in capsys.readouterr().err

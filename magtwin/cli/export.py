@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Literal
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, announcer, print_report, say
+from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
     from magtwin.run import Run
@@ -71,6 +72,10 @@ def export(
 
 def _stage(scene: Path) -> Path:
     """A stage's file, or that of one that ships with magtwin."""
+    if scene.suffix == ".toml":
+        raise RefusedError(
+            f"{scene}: says what a stage is to be; make it with `magtwin scene {scene} --out DIR`"
+        )
     if scene.suffix or scene.exists():
         return scene
     from magtwin.files import shipped
