@@ -139,9 +139,11 @@ def protocol(stage: Path, out: Path, *, released: Path | None = None, shorter: i
     do("dataset", "build", out / "train", "--map", harmonic, "--align", "fit", "--out", out / "hybrid_set")
     weights = [out / f"{name}.safetensors" for name in SHIPPED]
     leak = out / "leak.safetensors"
-    paper = ("--model", "paper", "--epochs", max(12 // shorter, 2))
+    paper = ("--model", "paper", "--epochs", max(8 // shorter, 2))
+    hybrid = ("--model", "hybrid", "--features", "platform", "--dropout", 0.2)
+    slowly = ("--lr", 3e-4, "--epochs", max(12 // shorter, 2))
     do("train", out / "paper_set", *paper, "--out", weights[0])
-    do("train", out / "hybrid_set", "--model", "hybrid", "--features", "platform", "--out", weights[1])
+    do("train", out / "hybrid_set", *hybrid, *slowly, "--out", weights[1])
     do("train", out / "paper_set", *paper, "--split", "row", "--out", leak)
     given = [*weights, *([released] if released else [])]
     do(
