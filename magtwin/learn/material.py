@@ -46,11 +46,6 @@ class Material:
         x, rows = self._beside("train"), self.rows["train"]
         return fit_linear(x, rows.y, self.groups["train"], features=self._terms, sd=rows.sd)
 
-    @cached_property
-    def yardstick(self) -> Yardstick:
-        """How the ridge's standard deviations held, by which those of other models are calibrated."""
-        return self.yardstick_of(self.ridge, *self.ridge_of("validation"))
-
     def ridge_of(self, part: Part) -> tuple[Array, Array]:
         """What the ridge says of a part: disturbances and standard deviations [nT], each (N,)."""
         return self.ridge.model.predict(self._beside(part))
@@ -59,14 +54,13 @@ class Material:
         """How the standard deviations of a linear model held on all recordings, none of which it had seen.
 
         Args:
-            fitted: A fit to the training rows.
+            fitted: A fit of the material's own features to the training rows.
             mean_nt: What its model says of the validation rows [nT].
             sd_nt: The standard deviations that it tells of them [nT].
         """
         train, validation = self.rows["train"], self.rows["validation"]
-        x = self._beside("train") if fitted is self.ridge else train.x
         error = np.concatenate([fitted.held_out_nt - train.y, mean_nt - validation.y])
-        sd = np.concatenate([fitted.model.predict(x)[1], sd_nt])
+        sd = np.concatenate([fitted.model.predict(train.x)[1], sd_nt])
         groups = np.concatenate([self.groups["train"], self.groups["validation"]])
         return yardstick(error, sd, groups, np.arange(len(error)) >= len(train.y))
 

@@ -185,7 +185,7 @@ def _ensemble(
         **config.options("members", "layers", "freeze", *_COURSE),
         **going,
     )
-    return _calibrated(model, history, material)
+    return _calibrated(config, model, history, material)
 
 
 def _tcn(config: TrainConfig, material: Material, init: Any, going: Going, rng: np.random.Generator) -> Made:
@@ -200,15 +200,20 @@ def _tcn(config: TrainConfig, material: Material, init: Any, going: Going, rng: 
         **config.options("layers", "kernel", *_COURSE),
         **going,
     )
-    return _calibrated(model, history, material)
+    return _calibrated(config, model, history, material)
 
 
-def _calibrated(model: Ensemble | Temporal, history: tuple[Epoch, ...], material: Material) -> Made:
-    """With a factor by which its standard deviations hold."""
+def _calibrated(
+    config: TrainConfig, model: Ensemble | Temporal, history: tuple[Epoch, ...], material: Material
+) -> Made:
+    """With a factor by which its standard deviations hold, beside those of a linear model of its inputs."""
     mean, sd = material.told(model, "validation")
     error = mean - material.rows["validation"].y
     groups = material.groups["validation"]
-    model.sd_factor = transferred_factor(error, sd, groups, material.yardstick)
+    learned = material.rows["train"]
+    peer = fit_linear(learned.x, learned.y, material.groups["train"], features=config.inputs, sd=learned.sd)
+    told = peer.model.predict(material.rows["validation"].x)
+    model.sd_factor = transferred_factor(error, sd, groups, material.yardstick_of(peer, *told))
     return Made(model, history)
 
 
