@@ -117,6 +117,6 @@ def test_a_stranger_in_rclpy_sees_the_robot_obeys_its_clock_and_drives_it(
     assert seen["speed"] > 0.2
     sim = seen["sim"]
     assert abs(seen["stamp"] - sim[-1]) < 0.5
-    assert all(b > a for a, b in zip(sim, sim[1:], strict=False))
+    assert sorted(set(sim)) == sim
     # 19 steps of 0.1 s of /clock; by the wall they would be 7.6 s of it at four times real time.
     assert 1.7 < sim[-1] - sim[0] < 4.0

@@ -1,0 +1,1 @@
+"""Nodes of magtwin as executables of ROS 2."""

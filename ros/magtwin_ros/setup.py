@@ -1,0 +1,21 @@
+"""The ament package of magtwin's nodes: magtwin itself comes from pip."""
+
+from setuptools import setup
+
+NODES = ("sim", "magnetometer", "follow", "record", "replay", "teleop")
+
+setup(
+    name="magtwin_ros",
+    version="0.1.0",
+    packages=["magtwin_ros"],
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/magtwin_ros"]),
+        ("share/magtwin_ros", ["package.xml"]),
+        ("share/magtwin_ros/launch", ["launch/magtwin.launch.py"]),
+    ],
+    install_requires=["setuptools", "magtwin"],
+    zip_safe=True,
+    license="Apache-2.0",
+    description="The simulator, the neural-network magnetometer and the path follower as nodes.",
+    entry_points={"console_scripts": [f"{node} = magtwin_ros.nodes:{node}" for node in NODES]},
+)
