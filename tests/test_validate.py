@@ -149,6 +149,11 @@ BROKEN = {
         "it is off the floor",
         "error",
     ),
+    "robot-clear": (
+        over("turtlebot4", "double3 xformOp:translate = (2.9, 0, 0)"),
+        "m from /World/Lab/Walls/East, and needs",
+        "error",
+    ),
     "figures": (over("turtlebot4", "double magtwin:drive:wheelRadiusM = -1"), "wheel_radius_m", "error"),
     "sensor-types": (over(IMU, "float sensorPeriod = 1"), "has a period of 1.0 s", "error"),
     "robot-schema": (

@@ -32,6 +32,7 @@ from magtwin.usd.figures import plain_value, target
 from magtwin.usd.furniture import read_magnets
 from magtwin.usd.lab import read_lab
 from magtwin.usd.maps import HEAT_MAP, checksums, heading_variants, read_map
+from magtwin.usd.obstacles import read_obstacles
 from magtwin.usd.robot import robot_of
 from magtwin.usd.schema import NOUNS, attribute_name
 from magtwin.usd.sensors import (
@@ -366,6 +367,28 @@ def robot_inside(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"stands {z:g} m above the floor", where)
         if at.TransformDir(Gf.Vec3d(0, 0, 1)).GetNormalized()[2] < UPRIGHT:
             yield Wrong("does not stand upright", where)
+
+
+@rule_into(RULES, "start it elsewhere: a run that begins in something is refused")
+def robot_clear(subject: Subject) -> Iterator[Wrong]:
+    """Every robot stands clear of what it collides with, and of the other robots."""
+    robots = subject.having("robot")
+    if not (robots and subject.having("lab")):
+        return
+    obstacles, cache = read_obstacles(subject.stage), UsdGeom.XformCache()
+    places = [np.array(cache.GetLocalToWorldTransform(prim).ExtractTranslation())[:2] for prim in robots]
+    radii = [read_footprint(prim) for prim in robots]
+    for i, prim in enumerate(robots):
+        distance, which = obstacles.clearance(places[i][None], reach_m=radii[i] + 1.0)
+        if distance[0] < radii[i] - SAME_M:
+            what = obstacles.names[int(which[0])]
+            yield Wrong(
+                f"is {distance[0]:.3g} m from {what}, and needs {radii[i]:g} m about it", str(prim.GetPath())
+            )
+        for j in range(i):
+            apart = float(np.linalg.norm(places[i] - places[j]))
+            if apart < radii[i] + radii[j] - SAME_M:
+                yield Wrong(f"stands {apart:.3g} m from <{robots[j].GetPath()}>", str(prim.GetPath()))
 
 
 @rule_into(RULES, "set the figure within the range that docs/schema.md gives")
