@@ -256,6 +256,26 @@ def test_the_configuration_of_any_kind_repeats_its_weights_to_the_byte(data, kin
     assert again.read_bytes() == kinds[kind][0].read_bytes()
 
 
+@pytest.mark.parametrize("kind", ["hybrid", "ensemble", "tcn"])
+def test_a_killed_training_of_any_kind_is_resumed_to_the_byte(data, kinds, kind, tmp_path, monkeypatch):
+    out = tmp_path / f"{kind}.safetensors"
+    words = ["train", str(data), "--out", str(out), "--model", kind, *SMALL[kind], "--hold-out", "f", "g"]
+    one_pass = _Descent._pass
+
+    def killed(self, number, advance):
+        if number == 2:
+            raise KeyboardInterrupt
+        return one_pass(self, number, advance)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_Descent, "_pass", killed)
+        with pytest.raises(SystemExit) as ended:
+            main([*words, "--json"])
+    assert ended.value.code == 130
+    main([*words, "--resume", "--json"])
+    assert out.read_bytes() == kinds[kind][0].read_bytes()
+
+
 def test_a_model_that_is_fitted_at_once_has_no_learning_curve(kinds):
     beside = sorted(path.name for path in kinds["linear"][0].parent.glob("linear.*"))
     assert beside == ["linear.md", "linear.safetensors"]
