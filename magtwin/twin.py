@@ -341,6 +341,7 @@ def simulate(
     twin, seed = _opened(twin, net, magnetometer, "simulate"), _seed(seed)
     network = twin.magnetometer
     path = way_of(path)
+    _check_commands(path, network)
     read: Read | None = None
 
     def disturbance_nt(run: Run) -> NDArray[Any]:
@@ -426,6 +427,8 @@ def simulate_robots(
         ways[name] = way_of((paths or {}).get(name, one.path or "figure8"))
     wanted = [name for name in placed if robots is None or name in set(robots)]
     led = {name: led_by(twin, name) for name in placed}
+    for name, way in ways.items():
+        _check_commands(way, led[name].magnetometer)
     reads: dict[str, Read] = {}
 
     def disturbance_of(name: str, network: "NeuralMagnetometer") -> Callable[[Run], NDArray[Any]]:
@@ -554,6 +557,7 @@ def simulate_many(
         scene = twin.scene if robot is None else scenes[id(robot)]
         if isinstance(path, str | FilePath):
             path = resolved[path]
+        _check_commands(path, twin.magnetometer)
         jobs.append(Job(scene, path, seed, speed))
     network = twin.magnetometer
     configs = {id(scene): _config_sha256(scene) for scene in (twin.scene, *scenes.values())}
@@ -611,6 +615,18 @@ def _each(name: str, values: Any, count: int) -> Sequence[Any]:
     if len(values) != count:
         raise RefusedError(f"{name} and seeds must be equally many, got {len(values)} and {count}")
     return values
+
+
+def _check_commands(way: "Path | Commands | Run | str", network: "NeuralMagnetometer | None") -> None:
+    """Refuse to drive a run once more that does not tell its commands, for a network that reads them."""
+    if network is None or not isinstance(way, Run):
+        return
+    for column in ("v_cmd", "w_cmd"):
+        if column in network.columns and column not in way:
+            raise RefusedError(
+                f"the run to drive once more has no {column!r}, and the network {network.name} reads what is "
+                "commanded beyond what is driven; take one that does not, such as the paper's, or none"
+            )
 
 
 def _check_magnetometer(twin: Twin, robot: RobotSpec) -> None:

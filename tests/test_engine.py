@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.cli import main
+from magtwin.files import shipped
 from magtwin.io.tables import read_parquet
 from magtwin.names import RefusedError
 from magtwin.obstacles import Obstacles
@@ -43,6 +44,18 @@ def test_a_run_that_is_replayed_has_the_poses_of_the_run_to_the_last_bit(twin):
     assert_allclose(again["b_truth_nt"], first["b_truth_nt"], atol=1e-8)
     for name in ("b_vector_nt", "imu_a", "imu_w", "odom_p", "odom_v", "mocap_p", "battery_v"):
         assert_allclose(again[name], first[name], atol=1e-9, err_msg=name)
+
+
+def test_a_run_without_commands_is_not_replayed_for_a_network_that_reads_them(lab_scene):
+    neural = open_twin(lab_scene)
+    assert "lag_v" in neural.magnetometer.features
+    t = np.arange(200) / 20.0
+    p = np.column_stack([0.2 * t - 1, 0 * t, 0.05 + 0 * t])
+    told = Run({"t": t, "p_world_base": p, "yaw": 0 * t})
+    with pytest.raises(RefusedError, match=r"has no 'v_cmd', and the network turtlebot4_hybrid\.safetensors"):
+        simulate(neural, told)
+    paper = open_twin(lab_scene, net=shipped("weights", "turtlebot4_paper.safetensors"))
+    assert np.isfinite(simulate(paper, told)["b_total_nt"]).all()
 
 
 def test_a_replay_of_rows_that_do_not_tell_the_steps_goes_evenly_from_row_to_row(twin):
