@@ -162,6 +162,18 @@ def test_without_either_backend_one_line_tells_both_ways(monkeypatch: pytest.Mon
         open_bus("node")
 
 
+def test_where_rclpy_is_broken_cyclonedds_is_taken_and_who_asks_for_rclpy_is_told(
+    domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "rclpy.py").write_text("raise ImportError('librcl.so: cannot open')")
+    monkeypatch.syspath_prepend(tmp_path)
+    node = open_bus("node", domain=domain)
+    assert node.backend == "cyclonedds"
+    node.close()
+    with pytest.raises(RefusedError, match="rclpy is installed but cannot be imported: librcl"):
+        open_bus("node", domain=domain, backend="rclpy")
+
+
 def test_a_topic_is_of_one_type_in_a_node(pair: tuple[Bus, Bus]) -> None:
     pair[0].publisher("odom", ODOMETRY.kind, SENSOR_DATA)
     with pytest.raises(RefusedError, match="/robot/odom has messages of nav_msgs/msg/Odometry"):

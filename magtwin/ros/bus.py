@@ -129,6 +129,9 @@ class Bus(Protocol):
     def subscribe(self, topic: str, kind: str, heard: Heard, qos: Qos) -> Subscription:
         """Have `heard` called for each message of a topic, in the thread that spins."""
 
+    def knows(self, kind: str) -> bool:
+        """Whether messages of a type can be said and heard here."""
+
     def types(self, topic: str) -> tuple[str, ...]:
         """Types in which others offer a topic, as far as they have been discovered."""
 
@@ -236,21 +239,25 @@ def open_bus(
         domain = int(told)
     if not 0 <= domain <= 232:
         raise RefusedError(f"a domain of ROS must be from 0 to 232, got {domain}")
-    there = available()
-    if backend == "auto":
-        if not there:
-            raise RefusedError(MISSING)
-        backend = there[0]  # type: ignore[assignment]
-    elif backend not in there:
-        find("backend", backend, BACKENDS)
-        raise RefusedError(MISSING if not there else f"{backend} cannot be imported here; {there[0]} can")
-    module, kind = BACKENDS[backend]
-    try:
-        opened = getattr(importlib.import_module(module), kind)
-    except ImportError as error:
-        raise RefusedError(f"{backend} is there but cannot be imported ({error}); {MISSING}") from error
+    opened = _backend(backend)
     bus: Bus = opened(name, names or Names(), sim_time=sim_time, domain=domain, parameters=parameters or {})
     return bus
+
+
+def _backend(name: Backend) -> Any:
+    """The class of who carries a bus: of that name, or the first that can be imported."""
+    there = available()
+    if name != "auto" and name not in there:
+        find("backend", name, BACKENDS)
+        raise RefusedError(MISSING if not there else f"{name} cannot be imported here; {there[0]} can")
+    broken = []
+    for one in there if name == "auto" else (name,):
+        module, kind = BACKENDS[one]
+        try:
+            return getattr(importlib.import_module(module), kind)
+        except ImportError as error:
+            broken.append(f"{one} is installed but cannot be imported: {str(error).splitlines()[0]}")
+    raise RefusedError("; ".join(broken) or MISSING)
 
 
 def localhost_only() -> bool:

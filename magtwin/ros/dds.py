@@ -27,11 +27,11 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 
-from magtwin.io.messages import CLOCK, Qos
+from magtwin.io.messages import CLOCK, TYPES, Qos
 from magtwin.names import RefusedError
 from magtwin.ros.bus import Heard, Message, Names, localhost_only
 from magtwin.ros.clock import Alarm, Clock
-from magtwin.ros.types import raw, ros_name, struct_of
+from magtwin.ros.types import PARTED, raw, ros_name, struct_of
 
 NS = 10**9
 
@@ -143,6 +143,10 @@ class DdsBus:
         self._conditions.append(fresh)
         self._subscriptions.append(subscription)
         return subscription
+
+    def knows(self, kind: str) -> bool:
+        """As for `Bus`: all of the table, and those with parts of their own."""
+        return kind in TYPES or kind in PARTED
 
     def types(self, topic: str) -> tuple[str, ...]:
         """As for `Bus`."""

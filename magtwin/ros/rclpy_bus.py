@@ -113,6 +113,13 @@ class RclpyBus:
         self._node.create_subscription(class_of(kind), whole, come, qos_of(qos), raw=True)
         return RclpySubscription(whole, kind, self._node)
 
+    def knows(self, kind: str) -> bool:
+        """As for `Bus`: those whose package is installed."""
+        try:
+            return class_of(kind) is not None
+        except RefusedError:
+            return False
+
     def types(self, topic: str) -> tuple[str, ...]:
         """As for `Bus`."""
         whole = self._names.resolve(topic)

@@ -10,7 +10,7 @@ import numpy as np
 from magtwin.io.bag_raw import RawBagWriter
 from magtwin.io.bag_writer import Stream, sender_for
 from magtwin.io.cdr import encode, leaves
-from magtwin.io.messages import TYPES, Qos, Unit
+from magtwin.io.messages import Qos, Unit
 from magtwin.names import RefusedError
 from magtwin.ros.bus import NS, Bus, Message, Publisher
 from magtwin.ros.topics import READ, RECORDED, SAMPLED
@@ -78,7 +78,7 @@ class Recorder:
     def _look(self) -> None:
         """Listen to what is offered now and was not before."""
         for name, topic in list(self._waited.items()):
-            kinds = [kind for kind in self._bus.types(name) if kind in TYPES or _parted(kind)]
+            kinds = [kind for kind in self._bus.types(name) if self._bus.knows(kind)]
             if not kinds:
                 continue
             del self._waited[name]
@@ -101,10 +101,6 @@ class Recorder:
             )
         self._last_ns = now = max(now, self._last_ns)  # a clock that was set is not followed back
         self._writer.write(name, now, message.data)
-
-
-def _parted(kind: str) -> bool:
-    return kind in ("tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticArray")
 
 
 class Player:
@@ -134,7 +130,7 @@ class Player:
         self._run = run
         who = sender_for(twin, units, run.facts.get("rate_hz"))
         self._stream = Stream(run, who, None, topics=(*READ, *SAMPLED.values()), whole=True)
-        said = [t for t in self._stream.topics if not topics or t.name in topics]
+        said = [t for t in self._stream.topics if bus.knows(t.kind) and (not topics or t.name in topics)]
         if not said:
             raise RefusedError(f"the run has no columns of {', '.join(topics) or 'any topic'}")
         self._publishers: dict[str, Publisher] = {t.name: bus.publisher(t.name, t.kind, t.qos) for t in said}

@@ -122,7 +122,10 @@ class Simulator:
         warm = self._online()
         rows = [warm.step() for _ in range(WARM)]
         for topic in (*self._streamed(rows[0]).topics, *SAMPLED.values(), SCAN):
-            self._publisher(topic)
+            if bus.knows(topic.kind):
+                self._publishers[topic.name] = bus.publisher(topic.name, topic.kind, topic.qos)
+            else:
+                say(f"{topic.name} is left out: no {topic.kind} is installed here")
         self._begin_ns = 0
         self._reset = False
         if units == "nT":
@@ -212,22 +215,17 @@ class Simulator:
 
     def _queue(self, said: Said) -> None:
         topic, times, form, fields = said
-        if not len(times):
+        publisher = self._publishers.get(topic.name)
+        if publisher is None or not len(times):
             return
         if self._begin_ns:
             fields = {
                 name: value + self._begin_ns if name.endswith("stamp") or name == "clock" else value
                 for name, value in fields.items()
             }
-        publisher = self._publisher(topic)
         for t, data in zip(times.tolist(), encode(leaves(form), fields, len(times)), strict=True):
             self._count += 1
             heapq.heappush(self._events, (t, self._count, publisher, data.tobytes()))
-
-    def _publisher(self, topic: Topic) -> Publisher:
-        if topic.name not in self._publishers:
-            self._publishers[topic.name] = self._bus.publisher(topic.name, topic.kind, topic.qos)
-        return self._publishers[topic.name]
 
     def _publish_until(self, pace: Pace, due_s: float) -> None:
         """Publish what falls due before a wall time, each message in its time, and hear what comes."""

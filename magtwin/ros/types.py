@@ -26,6 +26,9 @@ _NUMBERS = {
 _FLAGS = {"present": bool, "level": idl.byte}
 """Leaves of one byte that are no numbers in ROS."""
 
+PARTED = ("tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticArray")
+"""Types that are not in the table, as their parts have parts of their own."""
+
 _STRUCTS = {
     "header": "std_msgs::msg::dds_::Header_",
     "position": "geometry_msgs::msg::dds_::Point_",
@@ -75,11 +78,11 @@ def raw(kind: str, data: bytes) -> Any:
 
 
 def _whole(kind: str) -> type[IdlStruct]:
-    if kind == "tf2_msgs/msg/TFMessage":
+    if kind == PARTED[0]:
         return _struct(
             dds_name(kind), {"transforms": idl.sequence[_part("geometry_msgs/msg/TransformStamped")]}
         )
-    if kind == "diagnostic_msgs/msg/DiagnosticArray":
+    if kind == PARTED[1]:
         word = _struct("diagnostic_msgs::msg::dds_::KeyValue_", {"key": str, "value": str})
         texts = dict.fromkeys(("name", "message", "hardware_id"), str)
         status = _struct(
