@@ -69,7 +69,7 @@ def assert_same_kinematics(urdf, before, after, back, atol):
     rng = np.random.default_rng(0)
     moving = [j for j in after.joints.values() if j.type in MOVING and j.mimic is None]
     assert moving
-    for _ in range(5):
+    for _ in range(2):
         values = {joint.name: rng.uniform(-1, 1) for joint in moving}
         one, two = link_poses(urdf, values), link_poses(back, values)
         assert one.keys() == two.keys()
@@ -96,10 +96,9 @@ def assert_same_inertia(before, after):
         assert_allclose(I2, I1, rtol=0, atol=2e-7 * np.abs(I1).max(), err_msg=name)
 
 
-@pytest.mark.parametrize("profile", ["general", "diff-drive"])
-def test_our_robot_comes_back_with_equal_kinematics_and_inertia(tmp_path, profile):
+def test_our_robot_comes_back_with_equal_kinematics_and_inertia(tmp_path):
     urdf = shipped("robots", "turtlebot4", "turtlebot4.urdf")
-    before, after, back = there_and_back(urdf, tmp_path, profile=profile)
+    before, after, back = there_and_back(urdf, tmp_path, profile="diff-drive")
     assert (after.name, after.root) == (before.name, before.root)
     assert {j.name for j in after.joints.values() if j.type in MOVING} == {
         "left_wheel_joint",
@@ -182,8 +181,8 @@ def test_the_urdf_of_a_stage_is_the_same_bytes_every_time(tmp_path):
     assert (tmp_path / "a" / "robot.urdf").read_bytes() == (tmp_path / "b" / "robot.urdf").read_bytes()
 
 
-def test_the_robot_of_a_scene_is_written_as_it_stands_in_its_own_frame(tmp_path, lab_scene):
-    write_urdf(lab_scene, tmp_path / "robot.urdf")
+def test_the_robot_of_a_scene_is_written_as_it_stands_in_its_own_frame(tmp_path):
+    write_urdf(shipped("scenes", "lab", "lab.usda"), tmp_path / "robot.urdf")
     urdf = shipped("robots", "turtlebot4", "turtlebot4.urdf")
     after = read_description(tmp_path / "robot.urdf")
     assert_same_kinematics(urdf, read_description(urdf), after, tmp_path / "robot.urdf", 1e-12)
