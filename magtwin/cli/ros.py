@@ -27,6 +27,9 @@ class Node:
     namespace: str = "robot"
     """Namespace of its topics; "" is the root."""
 
+    name: str | None = None
+    """Its name, magtwin_sim and so on unless given; two of one name cannot be told apart."""
+
     remap: tuple[str, ...] = ()
     """A name that it has on the network instead, as odom:=/wheel/odom; may be given several times."""
 
@@ -42,7 +45,7 @@ class Node:
         from magtwin.ros.bus import names_of, open_bus
 
         bus = open_bus(
-            name,
+            self.name or name,
             names=names_of(self.namespace, self.remap),
             sim_time=sim_time,
             backend=self.backend,
