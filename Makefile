@@ -32,7 +32,7 @@ ros: $(VENV)/.dev build/ros-jazzy/.installed build/ros-kilted/.installed  ## Cro
 
 build/ros-%/.installed:
 	$(PYTHON) -m venv build/ros-$*
-	build/ros-$*/bin/python -m pip --disable-pip-version-check -q install numpy 'ros-$*-rclpy[fastrtps]' ros-$*-sensor-msgs ros-$*-geometry-msgs ros-$*-nav-msgs ros-$*-rosgraph-msgs ros-$*-diagnostic-msgs
+	build/ros-$*/bin/python -m pip --disable-pip-version-check -q install numpy 'ros-$*-rclpy[fastrtps]' ros-$*-sensor-msgs ros-$*-geometry-msgs ros-$*-nav-msgs ros-$*-rosgraph-msgs ros-$*-diagnostic-msgs ros-$*-std-srvs
 	@touch $@
 
 lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies

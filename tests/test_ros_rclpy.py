@@ -6,11 +6,13 @@ import subprocess
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 from nodes import DOMAINS
 
 from magtwin.files import shipped
-from magtwin.ros.bus import open_bus
+from magtwin.io.messages import MAGNITUDE
+from magtwin.ros.bus import Message, open_bus
 from magtwin.ros.simulate import Simulator
 from magtwin.twin import Twin, open_twin
 
@@ -120,3 +122,61 @@ def test_a_stranger_in_rclpy_sees_the_robot_obeys_its_clock_and_drives_it(
     assert sorted(set(sim)) == sim
     # 19 steps of 0.1 s of /clock; by the wall they would be 7.6 s of it at four times real time.
     assert 1.7 < sim[-1] - sim[0] < 4.0
+
+
+OURS = """
+import sys, threading, time
+sys.path[:0] = sys.argv[1:]
+from magtwin.files import shipped
+from magtwin.ros.bus import open_bus
+from magtwin.ros.simulate import Simulator
+from magtwin.twin import open_twin
+import rclpy
+from std_srvs.srv import Empty
+
+twin = open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="map-only")
+lines = []
+bus = open_bus("sim")
+simulator, over = Simulator(twin, bus, speed=2.0, say=lines.append), threading.Event()
+simulated = threading.Thread(target=simulator.run, args=(over.is_set,))
+simulated.start()
+rclpy.init()
+node = rclpy.create_node("caller")
+client = node.create_client(Empty, "/robot/reset")
+assert client.wait_for_service(10.0)
+while simulator.online.t < 3.0:
+    time.sleep(0.05)
+rclpy.spin_until_future_complete(node, client.call_async(Empty.Request()), timeout_sec=10.0)
+while not any("reset" in line for line in lines):
+    time.sleep(0.01)
+assert simulator.online.t < 2.0
+over.set()
+simulated.join()
+print(bus.backend, len(lines))
+bus.close()
+"""
+
+
+def test_the_robot_is_simulated_on_rclpy_too_and_reset_by_its_service(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    python = BUILD / "ros-jazzy" / "bin" / "python"
+    if not python.exists():
+        pytest.skip("no rclpy of jazzy: `make ros` installs it into build/ros-jazzy")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    domain = next(DOMAINS)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    libraries = str(Path(np.__file__).parents[1])  # magtwin's own, beside rclpy of that environment
+    ear, heard = open_bus("ear", backend="cyclonedds"), list[Message]()
+    ear.subscribe(MAGNITUDE.name, MAGNITUDE.kind, heard.append, MAGNITUDE.qos)
+    command = [python, "-c", OURS, str(BUILD.parent), libraries]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ours:
+        while ours.poll() is None:
+            ear.spin_once(0.05)
+        said, errors = ours.communicate()
+    ear.close()
+    assert said.startswith("rclpy"), errors
+    stamps = [m.read(["header.stamp"])["header.stamp"] for m in heard]
+    assert len(stamps) > 200
+    assert min(np.diff(stamps)) < -1e9  # time began anew
+    assert 2e-5 < heard[-1].read(["magnetic_field"])["magnetic_field"][0] < 7e-5

@@ -129,6 +129,12 @@ class Bus(Protocol):
     def subscribe(self, topic: str, kind: str, heard: Heard, qos: Qos) -> Subscription:
         """Have `heard` called for each message of a topic, in the thread that spins."""
 
+    def service(self, name: str, called: Callable[[], None]) -> bool:
+        """Offer a service without arguments (std_srvs/srv/Empty); whether that can be done here.
+
+        DDS alone cannot: each middleware of ROS 2 has its own way of telling whom an answer is for.
+        """
+
     def knows(self, kind: str) -> bool:
         """Whether messages of a type can be said and heard here."""
 

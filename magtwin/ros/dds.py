@@ -144,6 +144,10 @@ class DdsBus:
         self._subscriptions.append(subscription)
         return subscription
 
+    def service(self, name: str, called: Callable[[], None]) -> bool:
+        """As for `Bus`."""
+        return False
+
     def knows(self, kind: str) -> bool:
         """As for `Bus`: all of the table, and those with parts of their own."""
         return kind in TYPES or kind in PARTED

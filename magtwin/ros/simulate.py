@@ -24,7 +24,8 @@ from magtwin.sim.online_sensors import Samples
 from magtwin.twin import Twin
 
 RESET = "/robot/reset"
-"""Topic (std_msgs/Empty) that puts the robot back to its start, and the time to 0."""
+"""Topic (std_msgs/Empty), and with rclpy service (std_srvs/Empty), that puts the robot back to its start and
+the time to 0."""
 
 LEAD_S = 0.006
 """How long before its begin a control step is computed, so that its first message is not late [s]."""
@@ -116,6 +117,7 @@ class Simulator:
         self._kind = "geometry_msgs/msg/TwistStamped" if stamped_commands else COMMAND.kind
         self._input = bus.subscribe(COMMAND.name, self._kind, self._commanded, COMMAND.qos)
         bus.subscribe(RESET, "std_msgs/msg/Empty", lambda message: self.reset(), Qos())
+        bus.service(RESET, self.reset)
         self._reporter = Reporter(bus)
         self._stream: Stream | None = None
         self._moved: NDArray[np.float64] | None = None
