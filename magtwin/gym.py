@@ -9,7 +9,7 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -22,9 +22,12 @@ from numpy.typing import NDArray
 from magtwin.names import RefusedError, find
 from magtwin.path import Path, check_clear, check_on_floor, resolve_path
 from magtwin.run import COLUMNS
-from magtwin.sim.fleet import Fleet
+from magtwin.sim.fleet import SENSED, Fleet
 from magtwin.sim.session import draw_session
 from magtwin.twin import Kind, Twin, open_twin
+
+if TYPE_CHECKING:
+    from magtwin.learn.magnetometer import NeuralMagnetometer
 
 Array = NDArray[np.float64]
 
@@ -153,12 +156,8 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         if isinstance(scene, Twin) and (net is not None or magnetometer is not None):
             raise RefusedError("net and magnetometer go to open_twin where scene is a Twin")
         twin = scene if isinstance(scene, Twin) else open_twin(scene, net=net, magnetometer=magnetometer)
-        if twin.magnetometer and twin.magnetometer.net.context:
-            raise RefusedError(
-                f"{twin.magnetometer.name}: a {twin.magnetometer.net.kind} looks at "
-                f"{twin.magnetometer.net.context} earlier readings, which MagNav does not keep; give a "
-                "network that reads one row at a time"
-            )
+        if twin.magnetometer:
+            _check_network(twin.magnetometer)
         robot = twin.scene.robot
         self.path = path if isinstance(path, Path) else resolve_path(path)
         check_on_floor(self.path, twin.scene.lab.floor_m, robot.footprint_radius_m)
@@ -309,6 +308,20 @@ class MagNavEnv(gymnasium.Env[Any, Any]):
         one = np.asarray(action, float)[None]
         observations, rewards, ended, truncated, infos = self.robots.step(one)
         return observations[0], float(rewards[0]), bool(ended[0]), bool(truncated[0]), _first(infos)
+
+
+def _check_network(network: "NeuralMagnetometer") -> None:
+    """Refuse a network that reads what robots that step together do not have."""
+    if network.net.context:
+        raise RefusedError(
+            f"{network.name}: a {network.net.kind} looks at {network.net.context} earlier readings, which "
+            "MagNav does not keep; give a network that reads one row at a time"
+        )
+    if missing := sorted(network.columns - SENSED):
+        raise RefusedError(
+            f"{network.name}: reads {', '.join(missing)}, which MagNav does not simulate; give a network of "
+            'other inputs, such as those of the set "gradient", or take magnetometer="physical"'
+        )
 
 
 def _first(infos: dict[str, Any]) -> dict[str, Any]:

@@ -149,10 +149,21 @@ def test_robots_that_step_together_have_no_network_that_looks_back(lab_scene, tm
     a_predictor("tcn").save(tmp_path / "n.safetensors")
     with pytest.raises(RefusedError, match=r"n\.safetensors: a tcn looks at 6 earlier readings"):
         MagNavEnv(scene=lab_scene, net=tmp_path / "n.safetensors")
-    a_predictor("hybrid").save(tmp_path / "h.safetensors")
+
+
+@pytest.mark.parametrize("inputs", SETS)
+def test_robots_that_step_together_read_every_set_of_inputs_but_the_vector_axes(lab_scene, tmp_path, inputs):
+    pytest.importorskip("gymnasium")
+    from magtwin.gym import MagNavEnv
+
+    a_predictor("hybrid", SETS[inputs]).save(tmp_path / "h.safetensors")
+    if inputs == "vector":
+        with pytest.raises(RefusedError, match="reads b_vector_measured_nt, which MagNav does not simulate"):
+            MagNavEnv(scene=lab_scene, net=tmp_path / "h.safetensors")
+        return
     env = MagNavEnv(scene=lab_scene, net=tmp_path / "h.safetensors")
     env.reset(seed=0)
-    assert np.isfinite(env.step(env.action_space.sample())[0]).all()
+    assert np.isfinite(env.step(np.array([0.2, 0.1], np.float32))[0]).all()
 
 
 # Files that are not what they should be

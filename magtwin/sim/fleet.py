@@ -56,6 +56,16 @@ class _Before:
         return self.moment
 
 
+SENSED = frozenset(
+    (
+        *("t", "p_world_base", "yaw", "v_base", "w_base", "v_cmd", "w_cmd", "lidar_on", "flag_bump"),
+        *("odom_p", "odom_q_xyzw", "odom_v", "odom_w", "imu_q_xyzw", "imu_w", "imu_a"),
+        *("battery_v", "battery_a", "battery_fraction", "b_map_nt", "b_map_gradient_nt_m"),
+    )
+)
+"""Columns that a network of a fleet can read."""
+
+
 class Fleet:
     """Robots of one kind in one lab, which meet obstacles and not each other."""
 
@@ -210,6 +220,8 @@ class Fleet:
             "yaw": yaw,
             "v_base": np.column_stack([now.v, zero, zero]),
             "w_base": np.column_stack([zero, zero, now.w]),
+            "v_cmd": now.v_cmd,
+            "w_cmd": now.w_cmd,
             "lidar_on": on,
             "flag_bump": now.bump | beyond,
         }
