@@ -1,58 +1,65 @@
 """The twin and its magnetometer: `ros2 launch magtwin_ros magtwin.launch.py scene:=lab.usda path:=figure8`.
 
-With `sim:=false` the magnetometer alone, for a real robot or Isaac Sim.
+With `sim:=false` the magnetometer alone, for a real robot; for Isaac Sim with `use_sim_time:=true` too.
 """
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PythonExpression
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+SETTINGS = PathJoinSubstitution([FindPackageShare("magtwin_ros"), "config", "magnetometer.yaml"])
 
 
 def generate_launch_description() -> LaunchDescription:
     """What is launched."""
-    said = {
-        "scene": ("", "USD stage of the twin"),
-        "namespace": ("robot", "namespace of the topics"),
-        "sim": ("true", "whether the robot is simulated"),
-        "units": ("T", "unit of fields: T, or nT as APRILab's robot has it"),
-        "path": ("", "path that is driven; none unless given"),
-        "speed": ("0.2", "forward speed [m/s]"),
+    value = {
+        name: LaunchConfiguration(name)
+        for name in ("scene", "namespace", "sim", "use_sim_time", "units", "settings", "path", "speed")
     }
-    value = {name: LaunchConfiguration(name) for name in said}
-    space = ["--namespace", value["namespace"]]
-    simulated = IfCondition(value["sim"])
-    driven = IfCondition(PythonExpression(["'", value["path"], "' != ''"]))
-    sim_time = PythonExpression(
-        ["'use_sim_time:=true' if '", value["sim"], "' == 'true' else 'use_sim_time:=false'"]
-    )
-    follow_time = PythonExpression(["'--sim-time' if '", value["sim"], "' == 'true' else '--no-sim-time'"])
+    words = {name: ParameterValue(one, value_type=str) for name, one in value.items()}
+    timed = {"use_sim_time": ParameterValue(value["use_sim_time"], value_type=bool)}
+    nodes = {"package": "magtwin_ros", "namespace": value["namespace"], "output": "screen"}
     return LaunchDescription(
         [
-            *(
-                DeclareLaunchArgument(name, default_value=default, description=text)
-                for name, (default, text) in said.items()
+            DeclareLaunchArgument("scene", description="USD stage of the twin"),
+            DeclareLaunchArgument("namespace", default_value="robot", description="where the topics stand"),
+            DeclareLaunchArgument("sim", default_value="true", description="whether the robot is simulated"),
+            DeclareLaunchArgument(
+                "use_sim_time", default_value=value["sim"], description="whether time is /clock's"
             ),
+            DeclareLaunchArgument(
+                "units", default_value="T", description="unit of fields: T, or nT as APRILab's robot has it"
+            ),
+            DeclareLaunchArgument(
+                "settings", default_value=SETTINGS, description="file of the magnetometer's parameters"
+            ),
+            DeclareLaunchArgument(
+                "path", default_value="", description="path that is driven; none unless given"
+            ),
+            DeclareLaunchArgument("speed", default_value="0.2", description="forward speed [m/s]"),
             Node(
-                package="magtwin_ros",
                 executable="sim",
-                arguments=[value["scene"], "--no-magnetometer", *space],
-                condition=simulated,
-                output="screen",
+                parameters=[{"scene": words["scene"], "magnetometer": False}],
+                condition=IfCondition(value["sim"]),
+                **nodes,
             ),
             Node(
-                package="magtwin_ros",
                 executable="magnetometer",
-                arguments=[value["scene"], ["units:=", value["units"]], sim_time, *space],
-                output="screen",
+                parameters=[
+                    value["settings"],
+                    {"scene": words["scene"], "units": words["units"], **timed},
+                ],
+                **nodes,
             ),
             Node(
-                package="magtwin_ros",
                 executable="follow",
-                arguments=[value["path"], "--speed", value["speed"], follow_time, *space],
-                condition=driven,
-                output="screen",
+                parameters=[{"path": words["path"], "speed": words["speed"], **timed}],
+                condition=IfCondition(PythonExpression(["'", value["path"], "' != ''"])),
+                **nodes,
             ),
         ]
     )
