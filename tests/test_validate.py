@@ -335,6 +335,25 @@ def test_validators_that_are_not_installed_say_how_to_get_them(lab, tmp_path, mo
     assert "asked for and not run: nvidia" in capfd.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("said", "result"),
+    [("Profile 'Sensor-IMU' is not registered", "not run"), ("it broke", "failed")],
+)
+def test_an_empty_report_of_simreadys_counts_as_passed_for_no_profile(
+    lab, tmp_path, monkeypatch, said, result
+):
+    program = tmp_path / "simready-validate"
+    program.write_text(
+        f"#!{sys.executable}\nimport sys\nopen(sys.argv[6], 'w').write('{{}}')\nsys.exit({said!r})\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv(others.SIMREADY, str(program))
+    checks = others.simready({"/a": lab})
+    assert {check.result for check in checks} == {result}
+    for check in checks:
+        assert "make simready" in check.not_run if check.not_run else said in check.findings[0].text
+
+
 def test_nvidias_validator_names_rule_and_prim(lab):
     (clean,) = validate(lab, ["nvidia"]).checks
     assert (clean.result, clean.count("warning")) == ("passed", 0)
