@@ -23,6 +23,9 @@ JOINT_API, NEWTON_API, NEWTON_MIMIC_API = "IsaacJointAPI", "NewtonJointAPI", "Ne
 PHYSX_API, PHYSX_AXIS_API, PHYSX_MIMIC_API = "PhysxJointAPI", "PhysxJointAxisAPI", "PhysxMimicJointAPI"
 """Applied schemas of Isaac Sim, Newton and PhysX, by name: their plugins live elsewhere."""
 
+AXIS = "magtwin:axis"
+"""Key of a joint's customData: its axis in the child's body in double precision, where it is oblique."""
+
 KINDS = {
     "revolute": UsdPhysics.RevoluteJoint,
     "continuous": UsdPhysics.RevoluteJoint,
@@ -78,6 +81,9 @@ def define_joint(
     if reason is None:
         token, turn = _axis(joint.axis)
         length = float(np.linalg.norm(joint.axis))
+        if not np.array_equal(np.abs(turn), np.abs(np.round(turn))):  # single precision would turn it by 1e-7
+            unit = np.asarray(joint.axis, float) / length
+            made.GetPrim().SetCustomDataByKey(AXIS, Gf.Vec3d(*map(float, unit)))
         if abs(length - 1) > 1e-3:
             description.note(f"joint {joint.name!r} has an axis of length {length:.3g}: taken as a direction")
         axes = _free_axes(made, joint, token, description)

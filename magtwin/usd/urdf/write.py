@@ -25,6 +25,7 @@ from magtwin.report import Figure, Report
 from magtwin.usd.geometry import SHOWN, Shape, read_shapes, srgb_from_linear
 from magtwin.usd.layers import open_stage
 from magtwin.usd.schema import place
+from magtwin.usd.urdf.joint import AXIS
 from magtwin.usd.urdf.link import SITE_API
 
 Array = NDArray[np.float64]
@@ -247,12 +248,14 @@ class _Writer:
         if kind == "fixed":
             return made
         token = self._token(prim, kind)
-        made.axis = _tidy(frames[1][:3, "XYZ".index(token)])
-        value = _value(np.linalg.inv(frames[0]) @ T @ frames[1], token, kind)
-        if abs(value) > AT_REST:
-            made.T = T @ _moved(made.axis, -value, kind)
+        made.axis = _tidy(frames[1][:3, "XYZ".index(token)], prim.GetCustomDataByKey(AXIS))
         if kind != "planar":
             self._figures(prim, made)
+        value = _value(np.linalg.inv(frames[0]) @ T @ frames[1], token, kind)
+        if made.mimic is not None and abs(value - made.mimic[2]) < AT_REST:
+            value = made.mimic[2]  # it follows a leader that stands at 0
+        if abs(value) > AT_REST:
+            made.T = T @ _moved(made.axis, -value, kind)
         return made
 
     def _end(self, prim: Usd.Prim, relationship: Usd.Relationship) -> _Link | None:
@@ -472,10 +475,12 @@ def _frame(p: Any, q: Any) -> Array:
     return T
 
 
-def _tidy(axis: Array) -> Array:
-    """An axis from single precision: along the frame's own where it is so to that precision."""
-    nearest = np.round(axis)
-    return nearest if np.abs(axis - nearest).max() < 1e-6 and np.linalg.norm(nearest) == 1 else axis
+def _tidy(axis: Array, told: Any) -> Array:
+    """An axis from single precision: as it was told, or along the frame's own, where it is so to that."""
+    for better in (np.round(axis), np.array(told if isinstance(told, Gf.Vec3d) else (0, 0, 0), float)):
+        if np.abs(axis - better).max() < SAME and np.linalg.norm(better) > 0.5:
+            return better
+    return axis
 
 
 def _value(M: Array, token: str, kind: str) -> float:
