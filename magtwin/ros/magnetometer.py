@@ -249,10 +249,11 @@ class Magnetometer:
             if count:
                 level = "warn" if level == "ok" else level
                 words.append(f"{count} {text}")
-        late = 1e3 * np.percentile(self.latencies_s, 99) if self.latencies_s else np.nan
+        half, most = 1e3 * np.percentile(self.latencies_s or [np.nan], (50, 99))
         values = {
             "rate [Hz]": f"{rate:.1f}",
-            "p99 latency [ms]": f"{late:.2f}",
+            "median latency [ms]": f"{half:.2f}",
+            "p99 latency [ms]": f"{most:.2f}",
             "skipped": str(self._skipped),
             "outside map": str(self._outside),
             "out of distribution": str(self._strange),
