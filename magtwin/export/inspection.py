@@ -42,6 +42,7 @@ def inspect(
     against: Collection[str],
     *,
     root: Path | None = None,
+    home: Path | None = None,
     inputs: Collection[str] | None = None,
     fix: Collection[str] = (),
 ) -> Inspection:
@@ -50,7 +51,8 @@ def inspect(
     Args:
         file: What the user named.
         against: Of "core", "isaac" and "magtwin".
-        root: Root layer of the folder that a .usdz was unpacked to; the file itself unless given.
+        root: Root layer of a .usdz that was unpacked; the file itself unless given.
+        home: Folder that it was unpacked to.
         inputs: Names of the inputs that a network may have.
         fix: Names of what to mend first.
 
@@ -62,7 +64,7 @@ def inspect(
         job = {
             "file": str(file),
             "root": str(root or file),
-            "packed": root is not None,
+            "home": None if home is None else str(home),
             "against": sorted(against),
             "inputs": None if inputs is None else sorted(inputs),
             "fix": list(fix),
@@ -89,19 +91,21 @@ def inspect(
             raise RuntimeError(f"the inspection of {file} ended with {done.returncode}: {last}")
         said = json.loads(answer.read_text(encoding="utf-8"))
     if said.get("refused"):
-        raise RefusedError(_as_named(said["refused"], root, file))
-    checks = json.loads(_as_named(json.dumps(said["checks"], ensure_ascii=False), root, file))
+        raise RefusedError(_as_named(said["refused"], home, file))
+    for check in said["checks"]:
+        for finding in check["findings"]:
+            finding |= {name: _as_named(finding[name], home, file) for name in ("text", "where")}
     return Inspection(
-        tuple(check_from(check) for check in checks),
+        tuple(check_from(check) for check in said["checks"]),
         {prim: None if asset is None else Path(asset) for prim, asset in said["robots"].items()},
         said["bodies"],
         tuple(said["mended"]),
     )
 
 
-def _as_named(text: str, root: Path | None, file: Path) -> str:
+def _as_named(text: str, home: Path | None, file: Path) -> str:
     """What was said of the folder that a package was unpacked to, said of the package."""
-    for folder in () if root is None else (root.parent.resolve(), root.parent):
+    for folder in () if home is None else (home.resolve(), home):
         text = text.replace(folder.as_posix(), file.as_posix())
     return text
 
@@ -118,11 +122,12 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     from magtwin.export.rules import RULES, robot_assets
 
     file, root = Path(job["file"]), Path(job["root"])
+    packed = None if job["home"] is None else Path(job["home"])
     heard = UsdUtils.CoalescingDiagnosticDelegate()  # keeps what USD says off the terminal
     checks: list[Check] = []
     try:
         lost: list[Finding] = []
-        if job["packed"]:
+        if packed is not None:
             try:
                 detach(root)
             except RefusedError as error:
@@ -134,9 +139,9 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
         for layer in stage.GetUsedLayers():
             _take_out(layer)
         if "core" in job["against"]:
-            checks.append(_core(stage if not job["packed"] else Usd.Stage.Open(str(file))))
+            checks.append(_core(stage if packed is None else Usd.Stage.Open(str(file))))
         inputs = None if job["inputs"] is None else frozenset(job["inputs"])
-        subject = Subject(stage, root, inputs, job["packed"])
+        subject = Subject(stage, root, inputs, packed)
         for name, rules in (("isaac", ISAAC_RULES), ("magtwin", RULES)):
             if name in job["against"]:
                 found = [finding for rule in rules.values() for finding in rule.findings(subject)]
@@ -144,7 +149,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
                 checks.append(Check(name, tuple(found), scope=f"{len(rules)} rules"))
         assets = robot_assets(subject)
         bodies = sum(prim.HasAPI(UsdPhysics.RigidBodyAPI) for prim in subject.prims)
-    except Tf.ErrorException as error:
+    except (Tf.ErrorException, UnicodeError, MemoryError) as error:
         raise RefusedError(
             f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD"
         ) from error

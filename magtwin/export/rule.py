@@ -48,13 +48,13 @@ class Subject:
     inputs: frozenset[str] | None = None
     """Names of the inputs that a network may have; None where nobody said."""
 
-    packed: bool = False
-    """Whether it came out of a .usdz, which nothing may lead out of."""
+    packed: Path | None = None
+    """Folder that it was unpacked to where it is a .usdz, which nothing may lead out of."""
 
     @property
     def folder(self) -> Path:
         """Folder that the stage and what it names lie in."""
-        return self.file.resolve().parent
+        return (self.packed or self.file.resolve().parent).resolve()
 
     @cached_property
     def prims(self) -> list[Usd.Prim]:

@@ -62,11 +62,12 @@ def validate(
         )
     say = progress or (lambda name: None)
     with tempfile.TemporaryDirectory() as folder:
-        root = unpack(file, Path(folder)) if file.suffix == ".usdz" else None
+        home = Path(folder) if file.suffix == ".usdz" else None
+        root = None if home is None else unpack(file, home)
         seen = Inspection(())
         if fix or set(wanted) - {"nvidia"}:
             say("core, isaac and magtwin")
-            seen = inspect(file, wanted, root=root, inputs=inputs, fix=fix)
+            seen = inspect(file, wanted, root=root, home=home, inputs=inputs, fix=fix)
         checks = {check.validator: [check] for check in seen.checks}
         for name, look in (
             ("nvidia", lambda: [nvidia(file)]),
