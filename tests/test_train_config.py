@@ -74,3 +74,9 @@ def test_a_file_that_says_what_cannot_be_is_refused(tmp_path, text, said):
     with pytest.raises(RefusedError) as refused:
         read_config(tmp_path / "c.toml")
     assert str(refused.value).endswith(said)
+
+
+def test_a_licence_is_kept_in_a_configuration_and_none_is_left_out():
+    assert 'licence = "MIT"' in TrainConfig(licence="MIT").to_toml()
+    assert "licence" not in TrainConfig().to_toml()
+    assert TrainConfig(licence="MIT").with_options(model="linear").licence == "MIT"

@@ -40,7 +40,7 @@ nominal ones, and what its four headings leave at a node, 79 nT, is 1.5 cm of th
 TRAINING = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
 """What is driven to learn from: the paper's kinds, and a driver at random for its manual drives."""
 
-DAYS, RUNS, SECONDS, RATE_HZ = 8, 75, 60, 20
+DAYS, RUNS, SECONDS, RATE_HZ = 12, 75, 60, 20
 """Of the training: 75 min, as published; neighbours at 135 Hz are too alike to be worth their time."""
 
 TEST_DAYS = 12
@@ -67,7 +67,9 @@ def aprilab(surveys: Path, out: Path) -> Path:
     """
     robot = read_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
     height = robot.base_height_m + robot.p_base_magnetometer[2]
-    readings = read_readings(surveys).with_(height_m=height)
+    about = read_toml(shipped("maps", "lab", "map.toml"))
+    where = from_table(EarthFieldSpec, about["earth"], shipped("maps", "lab", "map.toml"), "earth")
+    readings = read_readings(surveys).with_(height_m=height, earth_nt=where.b_world_nt)
     found = raster(fit(readings, "harmonic"), readings, spacing_m=0.25).harmonic
     assert found is not None
     sources = [
@@ -88,8 +90,6 @@ def aprilab(surveys: Path, out: Path) -> Path:
                 magnetization=tuple(map(float, magnetization)),
             )
         )
-    about = read_toml(shipped("maps", "lab", "map.toml"))
-    where = from_table(EarthFieldSpec, about["earth"], shipped("maps", "lab", "map.toml"), "earth")
     layer = out / "published.usdc"
     save_map(read_survey(surveys, name="published", licence="MIT")[0], layer, force=True)
     scene = Scene(
@@ -139,8 +139,9 @@ def protocol(stage: Path, out: Path, *, released: Path | None = None, shorter: i
     do("dataset", "build", out / "train", "--map", harmonic, "--align", "fit", "--out", out / "hybrid_set")
     weights = [out / f"{name}.safetensors" for name in SHIPPED]
     leak = out / "leak.safetensors"
-    paper = ("--model", "paper", "--epochs", max(8 // shorter, 2))
-    hybrid = ("--model", "hybrid", "--features", "platform", "--dropout", 0.2)
+    licence = ("--licence", "Apache-2.0")
+    paper = (*licence, "--model", "paper", "--epochs", max(8 // shorter, 2))
+    hybrid = (*licence, "--model", "hybrid", "--features", "platform", "--dropout", 0.2)
     slowly = ("--lr", 3e-4, "--epochs", max(12 // shorter, 2))
     do("train", out / "paper_set", *paper, "--out", weights[0])
     do("train", out / "hybrid_set", *hybrid, *slowly, "--out", weights[1])

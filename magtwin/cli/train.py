@@ -37,6 +37,7 @@ def train(
     lr: float | None = None,
     patience: Whole | None = None,
     seed: Whole | None = None,
+    licence: str | None = None,
     split: Literal["session", "run", "path", "row"] | None = None,
     hold_out: Names = None,
     threads: Whole | None = None,
@@ -93,6 +94,8 @@ def train(
         Stop after so many epochs without a better one on the validation recordings.
     seed
         Of the split, the first weights, the order of rows and dropout; 0 unless given.
+    licence
+        Licence of the weights, an SPDX identifier such as MIT.
     split
         What is never on two sides of training, validation and test: session, unless given, run or path;
         row shows what a split by row hides.
@@ -153,6 +156,7 @@ def train(
         "lr": lr,
         "patience": patience,
         "seed": seed,
+        "licence": licence,
         "split": split,
         "hold_out": None if hold_out is None else tuple(hold_out),
         "threads": threads,

@@ -39,6 +39,8 @@ def card_of(trained: "Trained", name: str, checksum: str) -> str:
         "Predicts what a robot adds to a map of the magnetic field at its magnetometer [nT]. "
         f"{NOUNS[net.kind]}: {net.layers_text}, {net.parameters_count:,} parameters. SHA-256 `{checksum}`."
     )
+    if trained.config.licence:
+        what += f" Licence: {trained.config.licence}."
     if trained.config.init is not None:
         kept = ", ".join(trained.config.freeze) or "no layer"
         what += f" It goes on from `{facts['init']}` (SHA-256 `{facts['init_sha256']}`), {kept} frozen."

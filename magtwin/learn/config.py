@@ -49,7 +49,7 @@ MODELS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
 )
 """Models by name: the options that each reads beside those that all do, and what they are unless given."""
 
-ALL_READ = ("model", "seed", "split", "hold_out", "init")
+ALL_READ = ("model", "seed", "split", "hold_out", "init", "licence")
 """Options that every model reads."""
 
 
@@ -116,6 +116,9 @@ class TrainConfig:
 
     init: Path | None = None
     """Weights file that training goes on from, .safetensors or .pth, of the same kind and features."""
+
+    licence: str = ""
+    """Licence of the weights, an SPDX identifier such as MIT."""
 
     freeze: tuple[str, ...] = ()
     """Layers that stay as `init` has them: "layers.0" is the first; of a hybrid, "base" too."""
@@ -199,7 +202,7 @@ class TrainConfig:
         lines = []
         for field in fields(self):
             value = getattr(self, field.name)
-            if value is None or value == ():
+            if value is None or value in ((), ""):
                 continue
             value = value.as_posix() if isinstance(value, Path) else value
             text = json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)

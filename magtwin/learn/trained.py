@@ -251,6 +251,8 @@ def _facts(config: TrainConfig, dataset: Dataset, split: Split, rows: int, devic
     if config.kind != "linear":
         threads = config.threads or torch.get_num_threads()
         facts |= {"threads": threads, "torch": str(torch.__version__), "device": device}
+    if config.licence:
+        facts["licence"] = config.licence
     if config.init is not None:
         facts |= {"init": config.init.name, "init_sha256": sha256(config.init)}
     return facts
