@@ -141,8 +141,11 @@ class Bus(Protocol):
     def types(self, topic: str) -> tuple[str, ...]:
         """Types in which others offer a topic, as far as they have been discovered."""
 
-    def timer(self, period_s: float, due: Callable[[], None]) -> Timer:
-        """Have `due` called each `period_s` of the bus's clock, in the thread that spins."""
+    def publishers(self, topic: str) -> int:
+        """How many offer a topic, this node among them, as far as they have been discovered."""
+
+    def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Timer:
+        """Have `due` called each `period_s` of the bus's clock, or of the wall's, in the thread that spins."""
 
     def now_ns(self) -> int:
         """Time on the bus's clock [ns]: wall time, or /clock's in sim time (0 before the first)."""

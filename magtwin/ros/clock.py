@@ -14,6 +14,7 @@ class Alarm:
     period_ns: int
     due: Callable[[], None]
     next_ns: int
+    wall: bool = False
     live: bool = True
 
     def cancel(self) -> None:
@@ -46,35 +47,36 @@ class Clock:
         back = now_ns < self._now_ns
         self._now_ns = now_ns
         for alarm in self._alarms:
-            if back or not alarm.next_ns:
+            if not alarm.wall and (back or not alarm.next_ns):
                 alarm.next_ns = now_ns + alarm.period_ns
 
-    def timer(self, period_s: float, due: Callable[[], None]) -> Alarm:
-        """Call `due` in steps of `period_s` [s] from now on."""
+    def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Alarm:
+        """Call `due` in steps of `period_s` [s] from now on, of this clock or of the wall's."""
         period_ns = max(int(period_s * NS), 1)  # rounded up it would miss steps of a /clock as fine
-        now = self._time_ns()
-        alarm = Alarm(period_ns, due, now + period_ns if now else 0)
+        wall = wall or not self.sim_time
+        now = self._time_ns(wall)
+        alarm = Alarm(period_ns, due, now + period_ns if now else 0, wall)
         self._alarms.append(alarm)
         return alarm
 
     def left_s(self, most_s: float) -> float:
         """Wall time until the next timer, at most `most_s` [s]; sim time cannot be foreseen."""
-        live = [alarm.next_ns for alarm in self._alarms if alarm.live]
-        if self.sim_time or not live:
+        live = [alarm.next_ns for alarm in self._alarms if alarm.live and alarm.wall]
+        if not live:
             return most_s
-        return min(max((min(live) - self._time_ns()) / NS, 0.0), most_s)
+        return min(max((min(live) - time.monotonic_ns()) / NS, 0.0), most_s)
 
     def run_due(self) -> None:
         """Call the timers whose time has come."""
         self._alarms = [alarm for alarm in self._alarms if alarm.live]
-        now = self._time_ns()
         for alarm in list(self._alarms):
+            now = self._time_ns(alarm.wall)
             if alarm.live and alarm.next_ns and alarm.next_ns <= now:
                 if not self.sim_time:
                     self.due_wall_ns = time.time_ns() - (now - alarm.next_ns)
                 alarm.next_ns += alarm.period_ns * ((now - alarm.next_ns) // alarm.period_ns + 1)
                 alarm.due()
 
-    def _time_ns(self) -> int:
+    def _time_ns(self, wall: bool) -> int:
         # Steps of wall time are the monotonic clock's, which nobody sets.
-        return self._now_ns if self.sim_time else time.monotonic_ns()
+        return time.monotonic_ns() if wall else self._now_ns

@@ -8,6 +8,7 @@ it be asked for parameters: those are rclpy's own doing.
 import os
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -120,7 +121,7 @@ class DdsBus:
         self._subscriptions: list[DdsSubscription] = []
         self._conditions: list[ReadCondition] = []
         self._offers: BuiltinDataReader | None = None
-        self._offered: dict[str, set[str]] = {}
+        self._offered: dict[Any, tuple[str, str]] = {}
         self.clock = Clock(sim_time=sim_time)
         if sim_time:
             self.subscribe(CLOCK.name, CLOCK.kind, self._told, replace(CLOCK.qos, depth=CLOCK_DEPTH))
@@ -154,17 +155,15 @@ class DdsBus:
 
     def types(self, topic: str) -> tuple[str, ...]:
         """As for `Bus`."""
-        if self._offers is None:
-            self._offers = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
-        while taken := self._offers.take(N=MOST_TAKEN):
-            for offer in taken:
-                if offer.sample_info.valid_data:
-                    self._offered.setdefault(offer.topic_name, set()).add(ros_name(offer.type_name))
-        return tuple(sorted(self._offered.get(f"rt{self._names.resolve(topic)}", set()) - {""}))
+        return tuple(sorted({kind for kind in self._offers_of(topic) if kind}))
 
-    def timer(self, period_s: float, due: Callable[[], None]) -> Alarm:
+    def publishers(self, topic: str) -> int:
         """As for `Bus`."""
-        return self.clock.timer(period_s, due)
+        return len(self._offers_of(topic))
+
+    def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Alarm:
+        """As for `Bus`."""
+        return self.clock.timer(period_s, due, wall=wall)
 
     def now_ns(self) -> int:
         """As for `Bus`."""
@@ -194,6 +193,19 @@ class DdsBus:
         self._topics.clear()
         del self._waiting, self._participant
 
+    def _offers_of(self, topic: str) -> list[str]:
+        """The type of each that offers a topic now; "" for one that is none of ROS."""
+        if self._offers is None:
+            self._offers = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        while taken := self._offers.take(N=MOST_TAKEN):
+            for offer in taken:
+                if offer.sample_info.valid_data:
+                    self._offered[offer.key] = offer.topic_name, ros_name(offer.type_name)
+                elif offer.sample_info.instance_state != InstanceState.Alive:
+                    self._offered.pop(offer.key, None)
+        whole = f"rt{self._names.resolve(topic)}"
+        return [kind for name, kind in self._offered.values() if name == whole]
+
     def _topic(self, whole: str, kind: str) -> "DdsTopic[Any]":
         known = self._topics.get(whole)
         if known is None:
@@ -221,7 +233,8 @@ class DdsBus:
             subscription.heard(Message(subscription.kind, data, sent_ns, now))
 
     def _told(self, message: Message) -> None:
-        self.clock.tell(int(message.read(["clock"])["clock"]), message.sent_ns)
+        with suppress(RefusedError):  # no clock is told by what is none
+            self.clock.tell(int(message.read(["clock"])["clock"]), message.sent_ns)
         self.clock.run_due()  # at each tick, with what was heard before it, even where several come at once
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -141,7 +142,11 @@ class RclpyBus:
         offers = self._node.get_publishers_info_by_topic(whole)
         return tuple(sorted({offer.topic_type for offer in offers}))
 
-    def timer(self, period_s: float, due: Callable[[], None]) -> Any:
+    def publishers(self, topic: str) -> int:
+        """As for `Bus`."""
+        return int(self._node.count_publishers(self._names.resolve(topic)))
+
+    def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Any:
         """As for `Bus`."""
 
         def call() -> None:
@@ -149,7 +154,8 @@ class RclpyBus:
             self._due_ns = time.time_ns()  # rclpy does not tell when it was due
             due()
 
-        return self._node.create_timer(period_s, call)
+        clock = Clock(clock_type=ClockType.STEADY_TIME) if wall else None
+        return self._node.create_timer(period_s, call, clock=clock)
 
     def now_ns(self) -> int:
         """As for `Bus`."""
