@@ -145,7 +145,7 @@ class Bus(Protocol):
         """How many offer a topic, this node among them, as far as they have been discovered."""
 
     def timer(self, period_s: float, due: Callable[[], None], *, wall: bool = False) -> Timer:
-        """Have `due` called each `period_s` of the bus's clock, or of the wall's, in the thread that spins."""
+        """Have `due` called each `period_s` of the bus's clock, or the wall's, in the thread that spins."""
 
     def now_ns(self) -> int:
         """Time on the bus's clock [ns]: wall time, or /clock's in sim time (0 before the first)."""

@@ -1,6 +1,6 @@
 """Diagnostics: how a node fares, on /diagnostics, as ROS's own monitors read it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -16,6 +16,12 @@ LEVELS: Mapping[str, int] = {"ok": 0, "warn": 1, "error": 2, "stale": 3}
 
 KIND = "diagnostic_msgs/msg/DiagnosticArray"
 TOPIC = "/diagnostics"
+
+REPORT_S = 1.0
+"""Time between diagnostics [s]."""
+
+WATCH_S = 1.5
+"""Wall time after which a clock that did not move stands still [s]."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +82,22 @@ class Reporter:
     def __init__(self, bus: Bus) -> None:
         """Offer /diagnostics."""
         self._bus, self._publisher = bus, bus.publisher(TOPIC, KIND, Qos())
+        self._watched_ns = -1
+
+    def each(self, report: Callable[[str], None]) -> None:
+        """Have `report` called each `REPORT_S` of the node's clock, and by the wall while that stands still.
+
+        It is given what is wrong with the clock; "" for nothing.
+        """
+
+        def watch() -> None:
+            now = self._bus.now_ns()
+            if now == self._watched_ns:
+                report("/clock stands still" if now else "nobody says /clock")
+            self._watched_ns = now
+
+        self._bus.timer(REPORT_S, lambda: report(""))
+        self._bus.timer(WATCH_S, watch, wall=True)
 
     def report(self, statuses: Sequence[Status], stamp_ns: int) -> None:
         """Say how things fare; names are put behind the node's."""

@@ -45,8 +45,8 @@ STAND_S = 1.0
 LOOK_S = 0.5
 """Time between looks for topics that were not offered before [s]."""
 
-REPORT_S = 1.0
-"""Time between diagnostics [s]."""
+BACK_S = 0.2
+"""A clock that went back by more began anew [s]."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,9 @@ class Follower:
             path = Path(path.name, path.p_xy[::-1], path.closed)
         self.path, self._drive, self._bus, self._say = path, drive, bus, say
         self._speed, self._controller = speed, controller
-        self._left = math.inf if continuous else laps
+        self._wanted = self._left = math.inf if continuous else laps
+        self._begins = path
+        self._now_ns = 0
         self._guide = self._guided(path)
         topic, self._p, self._q = find("source", source, SOURCES)
         self._pose = Input(bus, topic, max_age_s=MAX_AGE_S)
@@ -123,7 +125,7 @@ class Follower:
         self._look()
         bus.timer(1 / CONTROL_RATE_HZ, self._step)
         bus.timer(LOOK_S, self._look)
-        bus.timer(REPORT_S, self._report)
+        self._reporter.each(self._report)
 
     @property
     def progress(self) -> Progress:
@@ -145,6 +147,9 @@ class Follower:
     def _step(self) -> None:
         """A command, by the newest pose."""
         now = self._bus.now_ns()
+        if now < self._now_ns - BACK_S * NS:
+            self._restart()
+        self._now_ns = now
         if self._guide.done:
             self._stand_s -= 1 / CONTROL_RATE_HZ
             self.done = self.done or self._stand_s <= 0
@@ -170,6 +175,16 @@ class Follower:
         self._measure(x, y)
         if self._guide.done:
             self._lap()
+
+    def _restart(self) -> None:
+        """Time began anew, and the robot with it."""
+        self._say("time jumped back: the path is driven from its beginning")
+        self._pose.forget()
+        self._twist.forget()
+        self.path, self._left = self._begins, self._wanted
+        self._guide = self._guided(self.path)
+        self._begin_ns, self._stand_s = None, STAND_S
+        self._laps, self._squares, self._count, self._off = 0, 0.0, 0, math.nan
 
     def _rejoin(self, x: float, y: float) -> None:
         """Go on where the robot stands now: it drove on for a while before it stood."""
@@ -212,16 +227,21 @@ class Follower:
             self._told = text
             self._say(text)
 
-    def _report(self) -> None:
+    def _report(self, clock: str) -> None:
         now, at = self._bus.now_ns(), self.progress
-        level: Any = "ok" if self._guide.done or self._pose.fresh(now) is not None else "error"
+        fares = not clock and (self._guide.done or self._pose.fresh(now) is not None)
+        level: Any = "ok" if fares else "error"
+        said = clock or ("at the end" if self._guide.done else self._told)
+        if (others := self._bus.publishers(COMMAND.name) - 1) > 0:
+            level = "warn" if fares else level
+            said += f"; {others} others command the robot too"
         values = {
             "path": self.path.name,
             "laps": str(at.laps),
             "off the path [m]": f"{at.off_m:.3f}",
             "RMS off the path [m]": f"{at.rms_m:.3f}",
         }
-        status = Status("drive", level, "at the end" if self._guide.done else self._told, values)
+        status = Status("drive", level, said, values)
         self._reporter.report([status, self._pose.status(now)], now)
 
 

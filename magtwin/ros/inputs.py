@@ -34,15 +34,18 @@ SETTLE = 50
 class Input:
     """A topic that is heard as soon as somebody offers it, in any of the types that it can have."""
 
-    def __init__(self, bus: Bus, topic: Topic, *, max_age_s: float) -> None:
+    def __init__(
+        self, bus: Bus, topic: Topic, *, max_age_s: float, wanted: frozenset[str] | None = None
+    ) -> None:
         """Begin to look for it.
 
         Args:
             bus: The node.
             topic: What it is called, and what its messages give.
             max_age_s: Age at which its newest message is stale [s].
+            wanted: Columns that are read, all unless given; what stands in the others is nothing to it.
         """
-        self.topic, self.max_age_s, self._bus = topic, max_age_s, bus
+        self.topic, self.max_age_s, self._bus, self._wanted = topic, max_age_s, bus, wanted
         self.name = topic.name
         self._kind = ""
         self._subscription: Subscription | None = None
@@ -125,7 +128,8 @@ class Input:
         except RefusedError:
             self.broken += 1
             return
-        if not all(np.isfinite(values).all() for values in columns.values()):
+        wanted = columns.keys() if self._wanted is None else self._wanted & columns.keys()
+        if not all(_is_told(name, columns[name]) for name in wanted):
             self.broken += 1
             return
         now = self._bus.now_ns()
@@ -148,6 +152,13 @@ class Input:
         if self._gravity is not None:
             columns = self._gravity.without(columns)
         return stamp, columns
+
+
+def _is_told(name: str, values: NDArray[Any]) -> bool:
+    """Whether values are finite, and a rotation one: what tracks a robot says zeros where it lost it."""
+    if name.endswith("_xyzw"):
+        return bool(abs(np.linalg.norm(values) - 1) < 0.1)
+    return bool(np.isfinite(values).all())
 
 
 class Gravity:

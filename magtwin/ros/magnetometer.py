@@ -56,14 +56,14 @@ PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
 INPUTS: tuple[Topic, ...] = (POSE, ODOMETRY, IMU, BATTERY, COMMAND)
 """What it can hear, beside scans."""
 
+_ALWAYS = frozenset(("mocap_p", "mocap_q_xyzw"))
+"""Columns that are read whatever the network reads: the map's."""
+
 MADE = frozenset(("t", "yaw", "b_map_nt", "b_map_gradient_nt_m", "lidar_on"))
 """Columns that it makes of those."""
 
 LOOK_S = 0.5
 """Time between looks for topics that were not offered before [s]."""
-
-REPORT_S = 1.0
-"""Time between diagnostics [s]."""
 
 BACK_S = 0.2
 """A clock that went back by more began anew [s]."""
@@ -108,9 +108,12 @@ class Magnetometer:
                 f"the network reads {', '.join(beyond)}, which no topic of this node tells; train it without"
             )
         chosen = [topic for topic in INPUTS if topic is POSE or needed & _columns_of(topic)]
+        read = needed | ({"imu_q_xyzw"} if "imu_a" in needed else frozenset())  # which frees it of gravity
         ages = {BATTERY.name: settings["battery_max_age_s"]}
         self.inputs = {
-            topic.name: Input(bus, topic, max_age_s=ages.get(topic.name, settings["max_age_s"]))
+            topic.name: Input(
+                bus, topic, max_age_s=ages.get(topic.name, settings["max_age_s"]), wanted=read | _ALWAYS
+            )
             for topic in chosen
         }
         self._needed = needed
@@ -135,7 +138,7 @@ class Magnetometer:
         self._look()
         bus.timer(1 / self._rate, self._read)
         bus.timer(LOOK_S, self._look)
-        bus.timer(REPORT_S, self._report)
+        self._reporter.each(self._report)
 
     def _look(self) -> None:
         for one in self.inputs.values():
@@ -226,7 +229,7 @@ class Magnetometer:
             self._network = Following(self._twin.magnetometer)
         self._last_ns = 0
 
-    def _report(self) -> None:
+    def _report(self, clock: str) -> None:
         now = self._bus.now_ns()
         span = (now - self._reported_ns) / NS
         rate = (self._published - self._published_before) / span if 0 < span < 60 else 0.0
@@ -234,9 +237,9 @@ class Magnetometer:
         self._reported_ns = now
         level: Any = "ok"
         words = []
-        if self._missing:
+        if clock or self._missing:
             level = "error"
-            words.append(f"no reading: {self._missing}")
+            words.append(f"no reading: {clock or self._missing}")
         elif 0 < span < 60 and rate < 0.9 * self._rate:
             level = "warn"
             words.append(f"{rate:.0f} readings a second in place of {self._rate:g}")
@@ -244,9 +247,10 @@ class Magnetometer:
             (self._outside, "poses were outside the map"),
             (self._strange, "readings were beyond what the network was trained on"),
             (self._resets, "times time jumped back"),
+            (self._bus.publishers(MAGNITUDE.name) - 1, f"others say {self._magnitude.topic} too"),
         )
         for count, text in troubles:
-            if count:
+            if count > 0:
                 level = "warn" if level == "ok" else level
                 words.append(f"{count} {text}")
         half, most = 1e3 * np.percentile(self.latencies_s or [np.nan], (50, 99))

@@ -17,7 +17,7 @@ from magtwin.names import RefusedError
 from magtwin.ros.bus import NS, Bus, Message, Publisher
 from magtwin.ros.diagnostics import Reporter, Status
 from magtwin.ros.network import Following
-from magtwin.ros.topics import READ, SAMPLED
+from magtwin.ros.topics import READ, SAMPLED, TICKS
 from magtwin.run import Run
 from magtwin.sim.online import Online
 from magtwin.sim.online_sensors import Samples
@@ -245,8 +245,11 @@ class Simulator:
 
     def _commanded(self, message: Message) -> None:
         linear, angular = COMMAND.leaves[self._kind]
-        read = message.read([linear, angular])
-        v, w = float(read[linear][0]), float(read[angular][2])
+        try:
+            read = message.read([linear, angular])
+            v, w = float(read[linear][0]), float(read[angular][2])
+        except RefusedError:
+            v = w = math.nan
         if not (math.isfinite(v) and math.isfinite(w)):
             self._refused += 1
             return
@@ -266,6 +269,13 @@ class Simulator:
         if self._refused:
             level = "warn"
             words.append(f"{self._refused} commands were not finite")
+        if others := [kind for kind in self._bus.types(COMMAND.name) if kind != self._kind]:
+            level = "warn"
+            words.append(f"commands come as {', '.join(others)} and are not heard; {self._kind} is")
+        for topic in (TICKS, MAGNITUDE) if self._reads else (TICKS,):
+            if (count := self._bus.publishers(topic.name)) > 1:
+                level = "warn"
+                words.append(f"{count} publishers on {topic.name}")
         values = {
             "sim time [s]": f"{self.online.t:.2f}",
             "real-time factor": f"{factor:.3f}",
