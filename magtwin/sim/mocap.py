@@ -31,10 +31,7 @@ def sense_mocap(
     delays, noise, gaps = rng.spawn(3)
     stamps, latest = held(t, spec.rate_hz, latency_s=spec.latency_s, jitter_s=spec.jitter_s, rng=delays)
     pose = moment_at(motion, stamps).pose
-    forward, left = spec.offset_m
-    cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    x, y = pose[:, 0] - forward * cos + left * sin, pose[:, 1] - forward * sin - left * cos
-    p = np.column_stack([x, y, np.full(len(stamps), height_m)])
+    p = taken_for_base(spec, pose, height_m)
     white = noise.standard_normal((len(stamps), 6))
     q = quat_multiply(quat_from_yaw(pose[:, 2]), quat_from_rpy(spec.angle_noise_std * white[:, 3:]))
     lost = dropouts(spec, stamps, gaps)
@@ -44,6 +41,14 @@ def sense_mocap(
         "mocap_q_xyzw": canonical(q).take(seen, axis=0),
         "flag_pose_lost": lost[latest],
     }
+
+
+def taken_for_base(spec: MocapSpec, pose: NDArray[np.float64], height_m: float) -> NDArray[np.float64]:
+    """Where base_link is taken to be in world [m], shape (N, 3), of where it is: x, y, yaw, shape (N, 3)."""
+    forward, left = spec.offset_m
+    cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    x, y = pose[:, 0] - forward * cos + left * sin, pose[:, 1] - forward * sin - left * cos
+    return np.column_stack([x, y, np.full(len(pose), height_m)])
 
 
 def dropouts(spec: MocapSpec, stamps: ArrayLike, rng: np.random.Generator) -> NDArray[np.bool_]:

@@ -24,6 +24,7 @@ from magtwin.sim.magnetometer import (
     rounded,
     vector_gain,
 )
+from magtwin.sim.mocap import taken_for_base
 from magtwin.sim.sensors import Moving, axes_in_base, into_sensor, moment_at
 from magtwin.spec import BatterySpec, DriveSpec, ImuSpec, MagnetometerSpec, MocapSpec, Quat
 
@@ -225,8 +226,7 @@ class Mocap:
             pose = moment_at(motion, stamps).pose
             white = self._noise.standard_normal((len(stamps), 6))
             spec = self._spec
-            p = np.column_stack([pose[:, :2], np.full(len(stamps), self._height)])
-            p = p + spec.p_noise_std_m * white[:, :3]
+            p = taken_for_base(spec, pose, self._height) + spec.p_noise_std_m * white[:, :3]
             q = quat_multiply(quat_from_yaw(pose[:, 2]), quat_from_rpy(spec.angle_noise_std * white[:, 3:]))
             q = canonical(q)
             lost = self._lost(stamps)
