@@ -143,7 +143,8 @@ def test_a_battery_survives_the_stage(spec, voltages):
 @unhurried
 @given(st.data())
 def test_motion_capture_survives_the_stage(data):
-    spec = MocapSpec(**{f.name: data.draw(above_zero) for f in fields(MocapSpec)})
+    places = {"offset_m": st.tuples(number, number), "offset_drift_m": st.tuples(number, number)}
+    spec = MocapSpec(**{f.name: data.draw(places.get(f.name, above_zero)) for f in fields(MocapSpec)})
     stage = stage_with_link()
     prim = stage.GetPrimAtPath("/robot")
     assert sensors.read_mocap(prim) == MocapSpec()
