@@ -107,6 +107,33 @@ def test_a_node_sees_how_many_send_on_a_topic_and_in_which_types(pair: tuple[Bus
     assert [p.topic for p in offered] == ["/robot/odom"] * 2
 
 
+def test_who_left_offers_nothing_more(domain: int) -> None:
+    ear, (one, other) = (
+        open_bus("ear", backend="cyclonedds", domain=domain),
+        (open_bus(name, backend="cyclonedds", domain=domain) for name in ("one", "other")),
+    )
+    for node in (one, other):
+        node.publisher(ODOMETRY.name, ODOMETRY.kind, ODOMETRY.qos)
+    spin(lambda: ear.publishers(ODOMETRY.name) == 2, ear)
+    one.close()
+    spin(lambda: ear.publishers(ODOMETRY.name) == 1, ear)
+    other.close()
+    spin(lambda: not ear.types(ODOMETRY.name), ear)
+    ear.close()
+
+
+def test_a_broken_message_tells_no_clock_and_wall_timers_go_on_without_it(domain: int) -> None:
+    bus = open_bus("node", backend="cyclonedds", domain=domain, sim_time=True)
+    due: list[str] = []
+    bus.timer(0.01, lambda: due.append("sim"))
+    bus.timer(0.01, lambda: due.append("wall"), wall=True)
+    bus._told(Message("rosgraph_msgs/msg/Clock", b"\0\1\0\0\5", 0, 0))
+    spin(lambda: len(due) > 2, bus)
+    assert bus.now_ns() == 0
+    assert set(due) == {"wall"}
+    bus.close()
+
+
 def test_timers_of_sim_time_follow_slash_clock(domain: int) -> None:
     one = open_bus("one", backend="cyclonedds", domain=domain)
     other = open_bus("other", backend="cyclonedds", domain=domain, sim_time=True)

@@ -14,6 +14,7 @@ from magtwin.io.messages import CLOCK, COMMAND, ODOMETRY, POSE, Qos
 from magtwin.names import RefusedError
 from magtwin.path import Path
 from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
+from magtwin.ros.diagnostics import KIND, Status, from_message
 from magtwin.ros.follow import Follower
 from magtwin.ros.simulate import Simulator
 from magtwin.ros.teleop import Teleop
@@ -145,6 +146,31 @@ def test_without_a_fresh_pose_it_stands_and_then_drives_on(nodes: Callable[..., 
     assert max(v for v, _ in robot.commands[-20:]) > 0.1
     assert robot.x > here
     assert not node.done
+
+
+def test_where_time_jumps_back_the_path_begins_anew(nodes: Callable[..., Bus]) -> None:
+    robot = Ideal(nodes)
+    node, bus = started(robot, nodes)
+    robot.tick(bus, 100)
+    assert robot.x > 0.2
+    robot.t, robot.x, robot.y, robot.yaw = 0.1, 0.0, 0.0, 0.0  # as after a reset
+    robot.track.clear()
+    while not node.done and robot.t < 10:
+        robot.tick(bus, 5)
+    assert node.progress.laps == 1
+    assert min(x for x, _ in robot.track) > -0.01
+    np.testing.assert_allclose((robot.x, robot.y), LINE.p_xy[-1], atol=0.03)
+
+
+def test_another_who_commands_the_robot_is_told_of(nodes: Callable[..., Bus]) -> None:
+    robot, said = Ideal(nodes), list[Status]()
+    robot.bus.subscribe("/diagnostics", KIND, lambda m: said.extend(from_message(m)), Qos(depth=100))
+    nodes("other").publisher(COMMAND.name, COMMAND.kind, COMMAND.qos)
+    _, bus = started(robot, nodes)
+    robot.tick(bus, 60)
+    spin(lambda: said, robot.bus)
+    assert said[0].level == "warn"
+    assert said[0].message == "driving; 1 others command the robot too"
 
 
 def test_an_open_path_is_driven_back_and_forth(nodes: Callable[..., Bus]) -> None:

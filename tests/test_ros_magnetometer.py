@@ -232,6 +232,69 @@ def test_a_message_that_is_no_number_is_not_used(world: World) -> None:
     assert "20 messages could not be used" in said["input /robot/enu/pose"].message
 
 
+def test_a_rotation_that_is_none_is_not_used(world: World) -> None:
+    bus = world.start("max_age_s:=0.05")
+    world.tick(bus, 3)
+    last = world.t
+    for _ in range(20):  # as motion capture says that it lost a robot
+        world.send(POSE, **{"pose.position": [0.0, 0.0, 0.0], "pose.orientation": [0.0, 0, 0, 0]})
+        world.tick(bus, quiet=(POSE,))
+    stamps = [m.read(["header.stamp"])["header.stamp"] / NS for m in world.readings]
+    assert max(stamps) <= last + 0.05 + 1e-9
+    said = world.diagnose(bus, quiet=(POSE,))
+    assert "20 messages could not be used" in said["input /robot/enu/pose"].message
+
+
+def test_a_message_that_is_cut_short_is_not_used(world: World) -> None:
+    bus = world.start()
+    world.tick(bus, 3)
+    for name, one in world.nodes[0].inputs.items():
+        whole = to_bytes(one.topic.kind, {})
+        for data in (whole[:9], whole[:40], b"", b"\xff" * len(whole)):  # DDS stops them, not every RMW does
+            one._hear(Message(one.topic.kind, data, 0, 0))
+        assert one.broken == 4, name
+    said = world.diagnose(bus)
+    assert world.heard(bus)
+    for topic in (POSE, ODOMETRY, IMU, BATTERY):
+        assert "messages could not be used" in said[f"input {topic.name}"].message
+
+
+def test_what_no_column_is_read_of_may_be_no_number(world: World) -> None:
+    from magtwin.ros.inputs import Input
+
+    for wanted in (frozenset({"battery_v"}), frozenset({"battery_v", "battery_a"})):
+        one = Input(world.robot, BATTERY, max_age_s=1.0, wanted=wanted)
+        fields = {"header.stamp": np.int64(5), "voltage": 15.0, "current": np.nan}
+        one._kind = BATTERY.kind
+        one._hear(Message(BATTERY.kind, to_bytes(BATTERY.kind, fields), 0, 0))
+        assert (one.fresh(6) is not None) == ("battery_a" not in wanted)
+
+
+def test_a_clock_that_stands_still_is_said_by_the_wall(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("magtwin.ros.diagnostics.WATCH_S", 0.05)
+    bus = world.start()
+
+    def told(text: str) -> bool:
+        world.ear.spin_once(0.0)
+        return bool(world.said) and world.said[-1]["readings"].message == f"no reading: {text}"
+
+    spin(lambda: told("nobody says /clock"), bus)
+    world.tick(bus, 3)
+    before = world.heard(bus)
+    spin(lambda: told("/clock stands still"), bus)
+    assert world.heard(bus) == before
+    world.tick(bus, 3)
+    assert world.heard(bus) > before
+
+
+def test_another_who_says_the_field_is_told_of(world: World) -> None:
+    world.send_on(MAGNITUDE)
+    bus = world.start()
+    said = world.diagnose(bus)
+    assert "1 others say /robot/qtfm/magnitude too" in said["readings"].message
+    assert said["readings"].level == "warn"
+
+
 def test_stamps_from_the_future_wait_until_it_is_their_time(world: World) -> None:
     bus = world.start()
     world.tick(bus, 10, ahead_s=0.5)

@@ -15,7 +15,7 @@ from magtwin.io.bag_raw import RawBagWriter
 from magtwin.io.bag_reader import _Bag
 from magtwin.io.cdr import decode, leaves
 from magtwin.io.formats import read_run
-from magtwin.io.messages import COMMAND, LATCHED, MAGNITUDE, ODOMETRY, TYPES, Qos, diagnostics
+from magtwin.io.messages import CLOCK, COMMAND, LATCHED, MAGNITUDE, ODOMETRY, TYPES, Qos, diagnostics
 from magtwin.names import RefusedError
 from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND, Status, from_message, to_fields
@@ -251,6 +251,26 @@ def test_a_command_that_is_no_number_is_not_obeyed_and_said(twin: Twin, nodes: C
     assert said[0].level == "warn"
     assert "commands were not finite" in said[0].message
     assert "2 publishers on /robot/cmd_vel" in said[0].message
+    assert simulator.online.commands.rows[:, 1:].any() == np.False_
+
+
+def test_commands_that_it_cannot_hear_and_others_on_its_topics_are_said(
+    twin: Twin, nodes: Callable[..., Bus]
+) -> None:
+    simulator, hand = Simulator(twin, nodes("sim"), speed=2.0), nodes("hand")
+    said: list[Status] = []
+    hand.subscribe("/diagnostics", KIND, lambda m: said.extend(from_message(m)), Qos())
+    nodes("stamped").publisher(COMMAND.name, "geometry_msgs/msg/TwistStamped", COMMAND.qos)
+    for topic in (CLOCK, MAGNITUDE):
+        hand.publisher(topic.name, topic.kind, topic.qos)
+    spin(lambda: hand.types("/diagnostics"), hand)
+    simulator._commanded(Message(COMMAND.kind, command(0.3, 0.0)[:20], 0, 0))
+    simulator.run(lambda: hand.spin_once(0.0) or bool(said))
+    assert said[0].level == "warn"
+    assert "1 commands were not finite" in said[0].message
+    assert "commands come as geometry_msgs/msg/TwistStamped and are not heard" in said[0].message
+    assert "2 publishers on /clock" in said[0].message
+    assert "2 publishers on /robot/qtfm/magnitude" in said[0].message
     assert simulator.online.commands.rows[:, 1:].any() == np.False_
 
 
