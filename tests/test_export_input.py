@@ -1,5 +1,6 @@
 """Exports of what others made: refused with what to do and nothing written, or converted point by point."""
 
+import json
 import shutil
 import signal
 import struct
@@ -562,6 +563,19 @@ def test_the_command_draws_a_thumbnail_and_plays_a_run(tmp_path, capsys):
     assert struct.unpack_from(">II", picture, 16) == (256, 256)
     assert (out / "lab_run.usdc").is_file()
     assert "Wrote" in capsys.readouterr().out
+
+
+def test_a_stage_that_shows_nothing_is_exported_without_a_thumbnail_and_says_so(tmp_path, capsys):
+    stage, out = tmp_path / "bare.usda", tmp_path / "out"
+    stage.write_text(
+        '#usda 1.0\n(\n    defaultPrim = "A"\n    metersPerUnit = 1\n    upAxis = "Z"\n)\n'
+        'def Xform "A"\n{\n}\n'
+    )
+    main(["export", str(stage), "--out", str(out), "--json"])
+    (note,) = json.loads(capsys.readouterr().out)["facts"]["notes"]
+    assert note.startswith("no thumbnail was drawn: bare.usda: shows nothing")
+    assert (out / "bare.usda").is_file()
+    assert not (out / ".thumbs").exists()
 
 
 @pytest.mark.parametrize(

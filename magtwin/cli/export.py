@@ -115,4 +115,4 @@ def _has_onnx() -> bool:
 def _draw(stage: Path, out: Path) -> None:
     from magtwin.io.pictures import picture_of_stage
 
-    picture_of_stage(stage, out, size=(256, 256))
+    picture_of_stage(stage, out, size=(256, 256), legend=False)  # whose numbers would not fit

@@ -118,6 +118,7 @@ def export_scene(
         to_onnx: Writes a network as ONNX, which then lies beside its weights: called with the weights and the
             file to make. What it refuses becomes a note.
         thumbnail: Draws a folder's stage: called with its root layer and the PNG to make, 256 pixels square.
+            What it refuses becomes a note.
         convert_units: Whether a stage that is not in metres with Z up is converted, see `to_metres_z_up`.
         trusted: Whether the stage was made here. Otherwise it is first read in a process of its own, as a
             damaged layer can end its reader; that takes a second.
@@ -396,7 +397,12 @@ class _Work:
             picture = out / THUMBNAIL / f"{self.root.name}.png"
             picture.parent.mkdir(parents=True, exist_ok=True)
             picture.unlink(missing_ok=True)  # of a folder that was exported before
-            thumbnail(out / self.root.name, picture)
+            try:
+                thumbnail(out / self.root.name, picture)
+            except RefusedError as error:  # there is nothing to draw, or nothing to draw with
+                self.notes.append(f"no thumbnail was drawn: {str(error).replace(f'{out}{os.sep}', '')}")
+                if not any(picture.parent.iterdir()):
+                    shutil.rmtree(picture.parents[1])
 
     def _explain(self, folder: Path, root: str, *, attached: bool) -> None:
         """Lay the how-to into a folder, and the schema plugin where programs can use it."""
