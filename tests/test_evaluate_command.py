@@ -135,6 +135,14 @@ def test_of_its_own_data_set_weights_are_judged_by_their_test_recordings(room, c
     )
 
 
+def test_a_recording_that_baselines_learn_from_is_refused_whatever_its_file_is_called(room, tmp_path, capsys):
+    write_run(a_run(3, "figure8"), tmp_path / "new.parquet")
+    own = ["--train", room / "set", "--map", room / "hills.usdc", "--out", room / "x"]
+    said = refused(capsys, room / "net.safetensors", "--runs", tmp_path / "new.parquet", *own)
+    assert "new: is 'r3' of" in said
+    assert said.endswith("which was learned from; judge by others")
+
+
 def test_weights_for_another_map_are_refused_with_both_checksums(room, capsys):
     said = refused(capsys, room / "net.safetensors", "--runs", room / "drive0.parquet", "--out", room / "x",
                    "--map", room / "higher.usdc")  # fmt: skip

@@ -219,6 +219,11 @@ F8 = torch.float64
         ({"metadata": {"magtwin": "{"}}, "its metadata is not JSON (Expecting property name enclosed in "
                                          "double quotes: line 1 column 2 (char 1))"),
         (
+            {"metadata": {"magtwin": "[" * 100_000}},
+            "its metadata is not JSON (maximum recursion depth exceeded while decoding a JSON array from a "
+            "unicode string)",
+        ),
+        (
             {"metadata": {"format": "pt"}},
             "safetensors without magtwin's metadata; not a network of magtwin's",
         ),

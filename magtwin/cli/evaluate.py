@@ -176,7 +176,7 @@ def _trials(
     """Recordings to judge by; and the data set that baselines are fitted to, with its recordings for that."""
     from magtwin.cli.dataset import _files, _sources
     from magtwin.learn.dataset import open_dataset
-    from magtwin.learn.evaluate import Trial, check_apart, trials_of, unseen
+    from magtwin.learn.evaluate import Trial, check_apart, trials_of, unlearned, unseen
 
     if (runs is None) == (dataset is None):
         raise RefusedError("judge by --runs or by a --dataset, one of the two")
@@ -184,7 +184,8 @@ def _trials(
     learned = [] if learning is None else [(learning, learning.names)]
     if dataset is None:
         sources = _sources(_files(runs or []), "fact", "fact", {})
-        return [Trial(one.name, one.read) for one in sources], learned
+        trials = [Trial(one.name, one.read) for one in sources]
+        return (trials if learning is None else unlearned(trials, learning)), learned
     judged = open_dataset(dataset)
     names, rest = unseen(judged, own)
     if learning is not None:

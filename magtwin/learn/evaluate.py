@@ -10,7 +10,7 @@ import math
 import os
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -663,6 +663,41 @@ def trials_of(dataset: Dataset, names: Sequence[str]) -> list[Trial]:
 
     told = [dataset.recording(name) for name in names]
     return [Trial(one.name, partial(read, one.name), one.session, one.path) for one in told]
+
+
+def unlearned(trials: Sequence[Trial], dataset: Dataset, names: Sequence[str] | None = None) -> list[Trial]:
+    """Recordings that refuse to be read if a training set holds them, whatever they are called there.
+
+    Args:
+        trials: Recordings to judge by.
+        dataset: Training recordings, of which some rows may have been left out.
+        names: Which of them; all unless given.
+    """
+    learned: dict[tuple[bytes, bytes], list[tuple[str, Array, Array]]] = {}
+    for one, run in dataset.runs(names):
+        t, b = run["t"], run["b_measured_nt"]
+        learned.setdefault(_first(t, b), []).append((one.name, t, b))
+
+    def read(trial: Trial) -> Run:
+        run = trial.read()
+        t, b = run["t"], run.get("b_measured_nt")
+        if b is None or not run.rows:
+            return run
+        for name, its_t, its_b in learned.get(_first(t, b), []):
+            at = np.minimum(np.searchsorted(t, its_t), run.rows - 1)
+            common = t[at] == its_t
+            if common.sum() > 1 and np.array_equal(b[at][common], its_b[common], equal_nan=True):
+                raise RefusedError(
+                    f"{trial.name}: is {name!r} of {dataset.folder}, which was learned from; judge by others"
+                )
+        return run
+
+    return [replace(one, read=partial(read, one)) for one in trials]
+
+
+def _first(t: Array, b: Array) -> tuple[bytes, bytes]:
+    """When a recording begins, and what it read first; thinning keeps both."""
+    return t[:1].tobytes(), np.nan_to_num(b[:1], nan=np.inf).tobytes()
 
 
 def check_apart(train: Dataset, names: Sequence[str], judged: Dataset, of: Sequence[str]) -> None:

@@ -105,7 +105,7 @@ def report_onnx(path: str | os.PathLike[str]) -> Report:
         raise RefusedError(f"{path}: no ONNX file, or damaged; export it again") from error
     try:
         return _report(model, str(path))
-    except (KeyError, ValueError, TypeError, AttributeError) as error:
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise RefusedError(
             f"{path}: ONNX, but no network of magtwin's: its metadata do not tell features and units"
         ) from error

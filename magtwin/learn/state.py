@@ -79,7 +79,7 @@ def load_state(
             found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         about = json.loads(metadata["magtwin training"])
         version, told, history = (about[key] for key in ("format_version", "settings", "history"))
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise RefusedError(f"{path}: not the checkpoint of a training, or damaged; start anew") from error
     if version != FORMAT_VERSION:
         raise RefusedError(f"{path}: format version {version!r}, this magtwin reads {FORMAT_VERSION}")

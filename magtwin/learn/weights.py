@@ -213,7 +213,7 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
         raise RefusedError(f"{path}: safetensors without magtwin's metadata; not a network of magtwin's")
     try:
         about = json.loads(metadata["magtwin"])
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise RefusedError(f"{path}: its metadata is not JSON ({error})") from error
     version = about.get("format_version") if isinstance(about, dict) else None
     kind = about.get("kind", "mlp") if isinstance(about, dict) else "mlp"
