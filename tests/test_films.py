@@ -7,10 +7,12 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
+from pxr import Usd, UsdGeom
 
 from magtwin.cli import main
 from magtwin.files import shipped
 from magtwin.io.films import LONGEST_S, film_of_run, frame_times
+from magtwin.io.pictures import Camera, turntable
 from magtwin.io.scenery import Scenery, View, picture_of_run
 from magtwin.io.tables import write_parquet
 from magtwin.names import RefusedError
@@ -140,6 +142,39 @@ def test_the_commands_draw_a_moment_a_film_and_a_stage(run, lab_scene, tmp_path,
     main(["film", str(file), "--out", str(tmp_path / "a.mp4"), *pace])
     assert (tmp_path / "a.mp4").stat().st_size > 1000
     assert "changed since" not in capsys.readouterr().err
+
+
+def test_a_turntable_goes_once_round_a_stage_from_one_distance(tmp_path):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "post.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    for name, x in (("Foot", 0.0), ("Arm", 1.0)):
+        cube = UsdGeom.Cube.Define(stage, f"/{name}")
+        cube.CreateSizeAttr(0.2)
+        cube.AddTranslateOp().Set((x, 0.0, 0.0))
+    stage.Save()
+    camera = Camera(azimuth_deg=-90, elevation_deg=0)
+    frames = [np.array(f) for f in turntable(tmp_path / "post.usda", 4, size=SIZE, camera=camera)]
+    spans = []
+    for frame in frames:
+        (columns,) = np.nonzero((np.abs(frame.astype(int) - frame[0, 0]) > 20).any(axis=(0, 2)))
+        assert 0 < columns[0] <= columns[-1] < SIZE[0] - 1
+        spans.append(np.ptp(columns))
+    assert abs(spans[0] - spans[2]) <= 1  # x to the right, then to the left: as large
+    assert spans[1] < spans[0] / 3  # along x
+    assert spans[3] < spans[0] / 3
+    assert not np.array_equal(frames[1], frames[3])
+
+
+def test_the_command_turns_a_stage_and_refuses_what_only_a_run_has(lab_scene, tmp_path, capsys):
+    view = ["--camera", "turntable", "--size", "64x48", "--fps", "0.4"]
+    main(["film", str(lab_scene), "--out", str(tmp_path / "a.gif"), *view])
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == 4
+    with pytest.raises(SystemExit):
+        main(["film", str(lab_scene), "--out", str(tmp_path / "b.gif"), *view, "--speed", "2"])
+    assert "takes no --speed" in capsys.readouterr().err
+    assert not (tmp_path / "b.gif").exists()
 
 
 @pytest.mark.parametrize(

@@ -84,17 +84,17 @@ def film(
     scene: Path | None = None,
     force: Force = False,
 ) -> None:
-    """Draw a run in its lab as a film.
+    """Draw a run in its lab as a film, or a stage on a turntable.
 
     Parameters
     ----------
     file
-        A run, in any format that magtwin reads.
+        A run, in any format that magtwin reads; or, for a turntable, a stage.
     out
         MP4 or GIF to write.
     camera
-        orbit, going slowly round the lab; top, straight from above; chase, from behind the robot; or
-        x,y,z:x,y,z, from where to where in metres.
+        orbit, going slowly round the lab; top, straight from above; chase, from behind the robot;
+        x,y,z:x,y,z, from where to where in metres; or turntable, once round a stage as it stands, in 10 s.
     fps
         Frames a second.
     speed
@@ -108,25 +108,35 @@ def film(
         Replace what exists.
     """
     from magtwin.files import check_free, existing
-    from magtwin.io.films import film_of_run
+    from magtwin.io.films import film_of_run, film_of_stage
 
-    existing(file, "run")
+    existing(file, "stage" if camera == "turntable" else "run")
     check_free(out, force=force)
     pixels = None if size is None else _size(size)
-    run, stage = _run_and_scene(file, scene)
+    turned = camera == "turntable"
+    if turned and (speed is not None or scene is not None):
+        raise RefusedError("a turntable shows a stage as it stands: it takes no --speed and no --scene")
+    run, stage = (None, file) if turned else _run_and_scene(file, scene)
     start = time.monotonic()
     with progress("Drawing frames") as advance:
-        film_of_run(
-            run,
-            stage,
-            out,
-            fps=fps,
-            speed=speed,
-            camera=camera,
-            size=pixels,
-            force=force,
-            advance=lambda k, n: advance(k, n, f"{k / (time.monotonic() - start):.3g} frames/s"),
-        )
+
+        def told(k: int, n: int) -> None:
+            advance(k, n, f"{k / (time.monotonic() - start):.3g} frames/s")
+
+        if run is None:
+            film_of_stage(stage, out, fps=fps, size=pixels, force=force, advance=told)
+        else:
+            film_of_run(
+                run,
+                stage,
+                out,
+                fps=fps,
+                speed=speed,
+                camera=camera,
+                size=pixels,
+                force=force,
+                advance=told,
+            )
     say(f"Wrote {out}")
 
 

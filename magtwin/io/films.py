@@ -1,12 +1,12 @@
-"""Films: a run in its lab as an MP4 or a GIF, frame by frame off screen."""
+"""Films: a run in its lab, or a stage on a turntable, as an MP4 or a GIF, frame by frame off screen."""
 
 import math
 import os
 import re
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.files import check_free, output
+from magtwin.io.pictures import turntable
 from magtwin.io.scenery import Scenery, View
 from magtwin.names import RefusedError
 from magtwin.run import Run
@@ -26,6 +27,9 @@ SIZES = {".mp4": (1280, 720), ".gif": (640, 360)}
 
 LONGEST_S = 30.0
 """A run longer than this is shown faster, so that the film is no longer, unless a speed is given [s]."""
+
+TURN_S = 10.0
+"""Time that a turntable takes to go round once [s]."""
 
 MOST_FRAMES = 100_000
 MOST_GIF_FRAMES = 2_000
@@ -66,33 +70,85 @@ def film_of_run(
         RefusedError: As for `magtwin.io.scenery.Scenery`; an option is out of range; `out` is no film, is
             there already or cannot be written.
     """
-    out = Path(out)
-    suffix = out.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise RefusedError(f"{out}: films end in {' or '.join(SUFFIXES)}")
-    check_free(out, force=force)
-    view = View.of(camera)
-    times, speed = frame_times(run, fps, speed, MOST_GIF_FRAMES if suffix == ".gif" else MOST_FRAMES)
-    size = size or SIZES[suffix]
-    if suffix == ".mp4" and (size[0] % 2 or size[1] % 2):
-        raise RefusedError(f"an MP4's width and height must be even, got {size[0]} x {size[1]}")
-    most = MOST_GIF_FPS if suffix == ".gif" else MOST_FPS
-    if fps > most:
-        raise RefusedError(f"fps must be at most {most:g} in a {suffix[1:].upper()}, got {fps:g}")
-    with (
-        output(out, force=force) as aside,
-        Scenery(run, scene_file, times, view=view, size=size, speed=speed) as scenery,
-    ):
+    out, view = Path(out), View.of(camera)
+    size = _checked(out, size, fps, force=force)
+    times, speed = frame_times(run, fps, speed, _most_frames(out))
 
-        def frames() -> Iterator[Image]:
+    with Scenery(run, scene_file, times, view=view, size=size, speed=speed) as scenery:
+
+        def frames() -> Generator[Image, None, None]:
             for k in range(len(times)):
                 yield scenery.frame(k)
                 advance(k + 1, len(times))
 
-        if suffix == ".gif":
-            _write_gif(frames(), aside, fps, out)
+        return _write(frames(), out, size, fps, force=force)
+
+
+def film_of_stage(
+    stage_file: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    fps: float = 25.0,
+    size: tuple[int, int] | None = None,
+    force: bool = False,
+    advance: Callable[[int, int], None] = lambda done, total: None,
+) -> Path:
+    """Draw a stage as it stands, on a turntable: once round in `TURN_S`, so that the film can be repeated.
+
+    Args:
+        stage_file: The stage.
+        out: MP4 (H.264) or GIF to write.
+        fps: Frames a second.
+        size: Width and height [pixel]; as for `film_of_run` unless given.
+        force: Whether a file that is there is replaced.
+        advance: Called after each frame with how many are done, and of how many.
+
+    Raises:
+        RefusedError: As for `magtwin.io.pictures.picture_of_stage`; an option is out of range; `out` is no
+            film, is there already or cannot be written.
+    """
+    out = Path(out)
+    size = _checked(out, size, fps, force=force)
+    count = max(1, round(TURN_S * fps))
+
+    def frames() -> Generator[Image, None, None]:
+        for k, image in enumerate(turntable(stage_file, count, size=size)):
+            yield image
+            advance(k + 1, count)
+
+    return _write(frames(), out, size, fps, force=force)
+
+
+def _checked(out: Path, size: tuple[int, int] | None, fps: float, *, force: bool) -> tuple[int, int]:
+    """The size of a film, once it, its rate and its name are not refused."""
+    suffix = out.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise RefusedError(f"{out}: films end in {' or '.join(SUFFIXES)}")
+    check_free(out, force=force)
+    size = size or SIZES[suffix]
+    if suffix == ".mp4" and (size[0] % 2 or size[1] % 2):
+        raise RefusedError(f"an MP4's width and height must be even, got {size[0]} x {size[1]}")
+    most = MOST_GIF_FPS if suffix == ".gif" else MOST_FPS
+    if not 0 < fps < math.inf:
+        raise RefusedError(f"fps must be above 0 and finite, got {fps:g}")
+    if fps > most:
+        raise RefusedError(f"fps must be at most {most:g} in a {suffix[1:].upper()}, got {fps:g}")
+    return size
+
+
+def _most_frames(out: Path) -> int:
+    return MOST_GIF_FRAMES if out.suffix.lower() == ".gif" else MOST_FRAMES
+
+
+def _write(
+    frames: Generator[Image, None, None], out: Path, size: tuple[int, int], fps: float, *, force: bool
+) -> Path:
+    """Frames as what the film's name ends in."""
+    with output(out, force=force) as aside, closing(frames):
+        if out.suffix.lower() == ".gif":
+            _write_gif(frames, aside, fps, out)
         else:
-            _write_mp4(frames(), aside, size, fps, out)
+            _write_mp4(frames, aside, size, fps, out)
     return out
 
 

@@ -3,7 +3,8 @@
 import ctypes
 import os
 import sys
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -149,8 +150,9 @@ def _draw(
     *,
     legend: bool = True,
     ground: bool | None = None,
-) -> None:
-    """A stage as it stands, lit, before a camera; arguments as for `picture_of_stage`."""
+    soft: bool = True,
+) -> NDArray[np.float64]:
+    """A stage as it stands, lit, before a camera; arguments as for `picture_of_stage`. Returns its points."""
     stage = open_stage(path)
     shapes = read_shapes(stage)
     if not shapes:
@@ -169,11 +171,43 @@ def _draw(
         ground = camera.elevation_deg > 0 and all(s.link for s in shapes)
     if ground:
         _add_ground(plotter, everything)
-    light(plotter, everything)
+    light(plotter, everything, soft=soft)
     aim(plotter, camera, everything, size)
     scale = read_colour_scale(stage) if legend else None
     if scale is not None:
         add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
+    return everything
+
+
+def turntable(
+    path: str | os.PathLike[str], count: int, *, size: tuple[int, int], camera: Camera | None = None
+) -> Iterator[NDArray[np.uint8]]:
+    """Pictures of a stage as it stands, from once round it, the last one step before the first.
+
+    Args:
+        path: USD file.
+        count: Number of pictures.
+        size: Width and height [pixel].
+        camera: Where from at first; all are taken from one distance, where everything is always in view.
+
+    Yields:
+        Arrays of shape (height, width, 3).
+
+    Raises:
+        RefusedError: As for `picture_of_stage`.
+    """
+    check_size(size)
+    first = camera or Camera()
+    cameras = [replace(first, azimuth_deg=first.azimuth_deg + 360 * k / count) for k in range(count)]
+    plotter = plotter_of(size)
+    try:
+        everything = _draw(plotter, path, size, first, soft=False)
+        farthest = max(distance_of(camera, everything, size) for camera in cameras)
+        for camera in cameras:
+            aim(plotter, replace(camera, distance_m=farthest), everything, size)
+            yield plotter.screenshot(return_img=True, window_size=list(size))
+    finally:
+        plotter.close()
 
 
 def view_distance(
@@ -331,20 +365,33 @@ def light(plotter: Any, everything: NDArray, *, soft: bool = True) -> None:
 
 def aim(plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int]) -> None:
     """Set the camera, at the distance from which everything is seen unless it gives its own."""
-    target = (everything.min(axis=0) + everything.max(axis=0)) / 2
-    target = target if camera.target is None else np.array(camera.target)
+    target, axes = _target(camera, everything), _axes(camera)
+    plotter.camera.position = target + distance_of(camera, everything, size) * axes[2]
+    plotter.camera.focal_point = target
+    plotter.camera.up = axes[1]
+    plotter.camera.view_angle = camera.view_angle_deg
+    plotter.renderer.ResetCameraClippingRange()
+
+
+def distance_of(camera: Camera, everything: NDArray, size: tuple[int, int]) -> float:
+    """How far from its target a camera stands [m]: so that everything is seen unless it says."""
+    v = np.radians(camera.view_angle_deg) / 2
+    h = np.arctan(np.tan(v) * size[0] / size[1])
+    target, axes = _target(camera, everything), _axes(camera)
+    return camera.distance_m or MARGIN * view_distance(everything, target, axes, (h, v))
+
+
+def _target(camera: Camera, everything: NDArray) -> NDArray[np.float64]:
+    middle: NDArray[np.float64] = (everything.min(axis=0) + everything.max(axis=0)) / 2
+    return middle if camera.target is None else np.array(camera.target, float)
+
+
+def _axes(camera: Camera) -> NDArray[np.float64]:
+    """Right, up and back axes of a camera in world, rows, shape (3, 3)."""
     a, e = np.radians([camera.azimuth_deg, camera.elevation_deg])
     back = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([-np.sin(a), np.cos(a), 0.0])
-    up = np.cross(back, right)
-    v = np.radians(camera.view_angle_deg) / 2
-    h = np.arctan(np.tan(v) * size[0] / size[1])
-    distance = camera.distance_m or MARGIN * view_distance(everything, target, [right, up, back], (h, v))
-    plotter.camera.position = target + distance * back
-    plotter.camera.focal_point = target
-    plotter.camera.up = up
-    plotter.camera.view_angle = camera.view_angle_deg
-    plotter.renderer.ResetCameraClippingRange()
+    return np.array([right, np.cross(back, right), back])
 
 
 def add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: str) -> None:
