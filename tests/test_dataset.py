@@ -197,6 +197,10 @@ def test_the_report_says_what_there_is_to_learn_from(made):
             "a: none of 240 readings has a label on the map 'hills'",
         ),
         (
+            {"a": RUNS["a"].with_facts(magnetometer="neural")},
+            "a: its readings are those of a neural magnetometer, and what learns from them learns that model",
+        ),
+        (
             {"a": RUNS["a"].with_columns(b_measured_nt=labels(RUNS["a"], FIELD).map_nt)},
             "every label on the map 'hills' is 0 nT: there is nothing to learn",
         ),

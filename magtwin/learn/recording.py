@@ -144,13 +144,18 @@ def read(source: Source) -> Run:
     """The run of a source, that it can be labelled.
 
     Raises:
-        RefusedError: It tells no pose, or no field.
+        RefusedError: It tells no pose, or no field, or a field that a network or a map made up.
     """
     run = source.read()
     posed = {"mocap_p", "mocap_q_xyzw"} <= set(run) or {"p_world_base", "yaw"} <= set(run)
     if not posed or "b_measured_nt" not in run:
         wanted = "b_measured_nt" if posed else "mocap_p with mocap_q_xyzw, or p_world_base with yaw"
         raise RefusedError(f"{source.name}: nothing to label: it has no column {wanted}")
+    if (kind := run.facts.get("magnetometer")) in ("neural", "map-only"):
+        raise RefusedError(
+            f"{source.name}: its readings are those of a {kind} magnetometer, and what learns from them learns "
+            "that model; record a robot, or drive the twin with --magnetometer physical"
+        )
     return run
 
 
