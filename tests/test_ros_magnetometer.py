@@ -1,6 +1,7 @@
 """The magnetometer's node: what it reads, and what it does when its inputs fail."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from magtwin.io.messages import BATTERY, CLOCK, IMU, MAGNITUDE, ODOMETRY, POSE, 
 from magtwin.names import RefusedError
 from magtwin.ros.bus import Bus, Message, Publisher, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND, Status, from_message
+from magtwin.ros.inputs import GRAVITY, Gravity, Input
 from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
 from magtwin.ros.parameters import settings
 from magtwin.run import Run
@@ -186,6 +188,8 @@ def test_before_its_inputs_it_waits_and_says_for_what(world: World) -> None:
     assert said["readings"].message == "no reading: no fresh /robot/battery_state"
     assert said["input /robot/battery_state"].level == "stale"
     assert said["input /robot/odom"].level == "ok"
+    assert said["input /robot/cmd_vel"].message == "no commands: the robot is taken to stand"
+    assert said["input /robot/cmd_vel"].level == "ok"
     world.tick(bus, 3)
     assert world.heard(bus)
 
@@ -260,8 +264,6 @@ def test_a_message_that_is_cut_short_is_not_used(world: World) -> None:
 
 
 def test_what_no_column_is_read_of_may_be_no_number(world: World) -> None:
-    from magtwin.ros.inputs import Input
-
     for wanted in (frozenset({"battery_v"}), frozenset({"battery_v", "battery_a"})):
         one = Input(world.robot, BATTERY, max_age_s=1.0, wanted=wanted)
         fields = {"header.stamp": np.int64(5), "voltage": 15.0, "current": np.nan}
@@ -309,6 +311,19 @@ def test_two_who_send_one_topic_are_told_of(world: World) -> None:
     said = world.diagnose(bus)
     assert "2 publishers" in said["input /robot/imu"].message
     assert said["input /robot/imu"].level == "warn"
+
+
+def test_an_input_that_comes_back_in_another_type_is_told_of(world: World) -> None:
+    topic = replace(BATTERY, name="/robot/pack")
+    bus, first, again = (world.bus(name) for name in ("node", "first", "again"))
+    one = Input(bus, topic, max_age_s=1.0)
+    first.publisher(topic.name, topic.kind, topic.qos)
+    spin(lambda: one.look() or one._subscription, bus)
+    world.buses.remove(first)
+    first.close()
+    again.publisher(topic.name, "std_msgs/msg/Float64", topic.qos)
+    told = "nothing heard yet; offered as std_msgs/msg/Float64 now: start this node anew"
+    spin(lambda: one.look() or one.status(bus.now_ns()).message == told, bus)
 
 
 def test_where_time_jumps_back_it_begins_anew(world: World) -> None:
@@ -359,8 +374,6 @@ def test_a_wrong_parameter_is_refused_by_name_and_range(given: str, said: str) -
 
 
 def test_gravity_in_accelerations_is_taken_off() -> None:
-    from magtwin.ros.inputs import GRAVITY, Gravity
-
     q = quat_from_yaw(0.3)[None]
     freed = Gravity().without({"imu_a": np.array([[0.1, 0.0, GRAVITY]]), "imu_q_xyzw": q})
     np.testing.assert_allclose(freed["imu_a"], [[0.1, 0, 0]], atol=1e-12)

@@ -54,15 +54,19 @@ class Input:
         self.sent_ns = 0
         self._heard_before, self._reported_ns = 0, 0
         self._trouble = ""
+        self.silence = ""
+        """What it means that nothing fresh is heard, where that is an answer too."""
         self._gravity: Gravity | None = Gravity() if "imu_a" in topic.carries else None
 
     def look(self) -> None:
         """Listen, if it is offered and was not heard yet."""
-        if self._subscription is not None:
-            return
         kinds = self._bus.types(self.topic.name)
         known = [kind for kind in (self.topic.kind, *self.topic.read) if kind in kinds]
-        if known:
+        if self._subscription is not None:
+            other = kinds and self._kind not in kinds
+            self._trouble = f"offered as {', '.join(kinds)} now: start this node anew" if other else ""
+        elif known:
+            self._trouble = ""
             self._kind = known[0]
             self._subscription = self._bus.subscribe(self.topic.name, self._kind, self._hear, SENSOR_DATA)
         elif kinds:
@@ -101,7 +105,10 @@ class Input:
         elif found[1] > self.max_age_s:
             level = "stale"
             words.append(f"its newest is {found[1]:.2f} s old, more than {self.max_age_s:g} s")
+        if level == "stale" and self.silence and not self._trouble:
+            level, words = "ok", [self.silence]
         troubles = (
+            (bool(self._trouble and self._subscription), self._trouble),
             (senders > 1, f"{senders} publishers; the newest message counts"),
             (bool(self.broken), f"{self.broken} messages could not be used"),
             (bool(self.jumps), f"stamps jumped back {self.jumps} times"),

@@ -116,6 +116,8 @@ class Magnetometer:
             )
             for topic in chosen
         }
+        if COMMAND.name in self.inputs:
+            self.inputs[COMMAND.name].silence = "no commands: the robot is taken to stand"
         self._needed = needed
         self._scans: Scanning | None = None
         if settings["lidar"] == "scan" and twin.magnetometer and "lidar_on" in twin.magnetometer.columns:
