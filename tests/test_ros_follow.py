@@ -12,7 +12,7 @@ from magtwin.files import shipped
 from magtwin.frames import quat_from_yaw
 from magtwin.io.messages import CLOCK, COMMAND, ODOMETRY, POSE, Qos
 from magtwin.names import RefusedError
-from magtwin.path import Path
+from magtwin.path import PATHS, Path
 from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND, Status, from_message
 from magtwin.ros.follow import Follower
@@ -103,6 +103,28 @@ def started(robot: Ideal, nodes: Callable[..., Bus], **how: object) -> tuple[Fol
     return node, bus
 
 
+def driven(
+    twin: Twin, nodes: Callable[..., Bus], path: Path, *, clock: float, **how: object
+) -> tuple[Follower, np.ndarray]:
+    """A follower that has driven the twin along a path, and each step's true x, y, yaw."""
+    simulator = Simulator(twin, nodes("sim"), speed=clock)
+    bus = nodes("follower", sim_time=True)
+    node = Follower(path, twin.scene.robot.drive, bus, **how)  # type: ignore[arg-type]
+    track: list[tuple[float, float, float]] = []
+
+    def ended() -> bool:
+        track.append(simulator.online.pose)
+        return node.done
+
+    most_s = 30.0 + 2 * path.length / 0.2
+    simulated = threading.Thread(target=simulator.run, args=(ended,), kwargs={"duration_s": most_s})
+    simulated.start()
+    while simulated.is_alive():
+        bus.spin_once(0.01)
+    assert node.done
+    return node, np.array(track)
+
+
 def test_the_twin_is_driven_along_a_path_over_ros_and_stands_at_its_end(
     twin: Twin, nodes: Callable[..., Bus]
 ) -> None:
@@ -110,28 +132,29 @@ def test_the_twin_is_driven_along_a_path_over_ros_and_stands_at_its_end(
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     bend = np.array([[0, 0], [0.2, 0.0], [0.35, 0.05], [0.45, 0.15]])
     path = Path("bend", bend @ turn.T + [x, y])
-    simulator = Simulator(twin, nodes("sim"), speed=2.0)
-    bus = nodes("follower", sim_time=True)
     lines: list[str] = []
-    node = Follower(path, twin.scene.robot.drive, bus, speed=0.25, say=lines.append)
-    track: list[tuple[float, float, float]] = []
-
-    def ended() -> bool:
-        pose = simulator.online.pose
-        track.append(pose)
-        return node.done
-
-    simulated = threading.Thread(target=simulator.run, args=(ended,), kwargs={"duration_s": 30.0})
-    simulated.start()
-    while simulated.is_alive():
-        bus.spin_once(0.01)
-    assert node.done
-    _, off = path.nearest(np.array(track)[:, :2])
+    node, track = driven(twin, nodes, path, clock=2.0, speed=0.25, say=lines.append)
+    _, off = path.nearest(track[:, :2])
     assert np.sqrt(np.mean(off**2)) < 0.01  # the standard is 0.06 m
     assert node.progress.rms_m < 0.01
-    np.testing.assert_allclose(track[-1][:2], path.p_xy[-1], atol=0.03)
-    assert np.ptp(np.array(track)[-20:], axis=0).max() < 1e-3
+    np.testing.assert_allclose(track[-1, :2], path.p_xy[-1], atol=0.03)
+    assert np.ptp(track[-20:], axis=0).max() < 1e-3
     assert lines[-1] == "the end is reached"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PATHS)
+def test_the_twin_is_driven_around_every_path_over_ros(
+    twin: Twin, nodes: Callable[..., Bus], name: str
+) -> None:
+    path = PATHS[name]()
+    node, track = driven(twin, nodes, path, clock=10.0)
+    begun = int(np.argmin(np.hypot(*(track[:, :2] - path.p_xy[0]).T)[: len(track) // 3]))
+    _, off = path.nearest(track[begun:, :2])
+    assert np.sqrt(np.mean(off**2)) < 0.06
+    assert node.progress.rms_m < 0.06
+    _, missed = Path("driven", track[begun:, :2]).nearest(path.p_xy)
+    assert missed.max() < 0.1  # all of it was driven
 
 
 def test_without_a_fresh_pose_it_stands_and_then_drives_on(nodes: Callable[..., Bus]) -> None:
