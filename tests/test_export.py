@@ -316,6 +316,15 @@ def test_a_single_layer_holds_its_network_and_can_become_a_folder_again(tmp_path
     assert len([layer for layer in stage.GetUsedLayers() if not layer.anonymous]) == 1
     assert stage.GetPrimAtPath(ATTACHED).GetAttribute(BYTES).Get()
     assert not any(named_in(tmp_path / "lab.usd"))
+    export_scene(tmp_path / "lab.usd", tmp_path / "lab", trusted=True)
+    again, network = (
+        Usd.Stage.Open(str(tmp_path / "lab" / "lab.usd")),
+        read_scene(LAB).robot.magnetometer.network,
+    )
+    named = again.GetAttributeAtPath(f"{MAGNETOMETER}.magtwin:magnetometer:network").Get()
+    assert named.path == f"./weights/{network.name}"
+    assert Path(named.resolvedPath).read_bytes() == network.read_bytes()
+    assert not again.GetPrimAtPath(ATTACHED)
 
 
 def test_the_same_inputs_make_the_same_bytes(folder, package, web, played, tmp_path):

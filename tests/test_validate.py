@@ -17,6 +17,7 @@ from magtwin.cli import main
 from magtwin.export.findings import Check, Finding, Findings, check_from
 from magtwin.export.fix import ASKED, SAFE, mend
 from magtwin.export.isaac_rules import ISAAC_RULES
+from magtwin.export.package import export_scene
 from magtwin.export.rule import Subject, climbs, is_absolute
 from magtwin.export.rules import RULES, robot_assets
 from magtwin.export.usdz import pack
@@ -352,6 +353,24 @@ def test_an_empty_report_of_simreadys_counts_as_passed_for_no_profile(
     assert {check.result for check in checks} == {result}
     for check in checks:
         assert "make simready" in check.not_run if check.not_run else said in check.findings[0].text
+
+
+def test_a_layer_that_holds_its_network_is_sound_until_its_bytes_are_others(lab, tmp_path):
+    layer = tmp_path / "lab.usdc"
+    export_scene(lab, layer, trusted=True)
+    (check,) = validate(layer, ["magtwin"]).checks
+    assert not check.findings
+    stage = Usd.Stage.Open(str(layer))
+    (file,) = stage.GetPrimAtPath("/World/Files").GetChildren()
+    file.GetAttribute("magtwin:file:bytes").Set([1, 2, 3])
+    stage.Save()
+    (check,) = validate(layer, ["magtwin"]).checks
+    assert [(f.rule, f.severity) for f in check.findings] == [("network-file", "error")]
+    assert "attached network has SHA-256 039058c6f2c0" in check.findings[0].text
+    stage.RemovePrim("/World/Files")
+    stage.Save()
+    (check,) = validate(layer, ["magtwin"]).checks
+    assert [(f.rule, f.severity) for f in check.findings] == [("network-file", "warning")]
 
 
 def test_nvidias_validator_names_rule_and_prim(lab):

@@ -114,14 +114,9 @@ def detach(root: Path) -> tuple[Path, ...]:
         RefusedError: A file is damaged, or its name or kind is none that magtwin attaches.
     """
     stage = open_stage(root)
-    default = stage.GetDefaultPrim()
-    scope = default.GetChild(SCOPE) if default else Usd.Prim()
-    found = [prim for prim in scope.GetChildren() if prim.HasAttribute(BYTES)] if scope else []
-    unnamed = []
+    found, unnamed = _found(stage), []
     for prim in found:
-        name = str(prim.GetAttribute(NAME).Get() or "")
-        value = prim.GetAttribute(BYTES).Get()
-        data = bytes(np.array(value, np.uint8)) if isinstance(value, Vt.UCharArray) else b""
+        name, data = str(prim.GetAttribute(NAME).Get() or ""), _bytes(prim)
         if Path(name).name != name or "\\" in name or kind_of(name) not in KINDS:
             raise RefusedError(f"{said(prim)}: {NAME} {name!r} is no name of a file that is attached")
         if hashlib.sha256(data).hexdigest() != prim.GetAttribute(SHA256).Get():
@@ -147,11 +142,31 @@ def detach(root: Path) -> tuple[Path, ...]:
         return ()
     handles = stage.GetLayerStack(includeSessionLayers=False)
     layers = [Sdf.Layer.FindOrOpen(layer.identifier) for layer in handles]  # which keeps them
-    _remove(layers, scope.GetPath())
+    _remove(layers, found[0].GetParent().GetPath())
     for layer in layers:
         if layer.dirty:
             layer.Save()
     return tuple(unnamed)
+
+
+def attached_sha256(attribute: Usd.Attribute) -> str:
+    """The SHA-256 of the bytes that are attached for what an attribute names; "" where there are none."""
+    for prim in _found(attribute.GetStage()):
+        if attribute.GetPath() in prim.GetRelationship(OF).GetTargets():
+            return hashlib.sha256(_bytes(prim)).hexdigest()
+    return ""
+
+
+def _found(stage: Usd.Stage) -> list[Usd.Prim]:
+    """The prims that hold files."""
+    default = stage.GetDefaultPrim()
+    scope = default.GetChild(SCOPE) if default else Usd.Prim()
+    return [prim for prim in scope.GetChildren() if prim.HasAttribute(BYTES)] if scope else []
+
+
+def _bytes(prim: Usd.Prim) -> bytes:
+    value = prim.GetAttribute(BYTES).Get()
+    return bytes(np.array(value, np.uint8)) if isinstance(value, Vt.UCharArray) else b""
 
 
 def _remove(layers: list[Sdf.Layer], scope: Sdf.Path) -> None:

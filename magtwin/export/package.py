@@ -225,6 +225,7 @@ class _Work:
             if not trusted:
                 inspect(self.source, ())
             self.root = bring_together(self.source, self.folder)
+            detach(self.root)  # of a single layer, which holds its network
             self.checksum = stage_sha256(self.source)
         stage = open_stage(self.root)
         metres, up = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
+from magtwin.export.attached import attached_sha256
 from magtwin.export.findings import Severity
 from magtwin.export.rule import (
     Rule,
@@ -273,11 +274,20 @@ def network_file(subject: Subject) -> Iterator[Wrong]:
         if spec.kind != "neural":
             continue
         file = network_of(prim)
-        if spec.network is None and spec.network_sha256:
+        attached = attached_sha256(prim.GetAttribute(NETWORK))
+        if spec.network is None and attached:  # in a layer that brings its network as bytes
+            if attached != spec.network_sha256.lower():
+                yield Wrong(
+                    f"its attached network has SHA-256 {attached[:12]}..., it names "
+                    f"{spec.network_sha256[:12]}...",
+                    where,
+                    "export the layer anew",
+                )
+        elif spec.network is None and spec.network_sha256:
             yield Wrong(
                 f"keeps the checksum {spec.network_sha256[:12]}... of a network that it does not name",
                 where,
-                "a layer for viewers does not bring it; name it again to read this magnetometer",
+                "name it again to read this magnetometer",
                 severity="warning",
             )
         elif spec.network is None:
