@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
@@ -40,7 +40,7 @@ class Node:
     """What carries it: rclpy where it can be imported, else cyclonedds."""
 
     @contextmanager
-    def bus(self, name: str, *, sim_time: bool = False, parameters: Any = None) -> "Iterator[Bus]":
+    def bus(self, name: str, *, sim_time: bool = False) -> "Iterator[Bus]":
         """The node, until the end or Ctrl-C."""
         from magtwin.ros.bus import names_of, open_bus
 
@@ -50,7 +50,6 @@ class Node:
             sim_time=sim_time,
             backend=self.backend,
             domain=self.domain,
-            parameters=parameters,
         )
         try:
             with suppress(KeyboardInterrupt):
@@ -172,7 +171,7 @@ def magnetometer(
     tell(f"opening {scene}")
     twin = open_twin(scene, net=net)
     sim_time = values["use_sim_time"]
-    with where.bus("magtwin_magnetometer", sim_time=sim_time, parameters=values) as bus:
+    with where.bus("magtwin_magnetometer", sim_time=sim_time) as bus:
         Magnetometer(twin, bus, values, say=tell)
         tell(f"reading by {bus.backend}; Ctrl-C ends")
         spin(bus, duration)

@@ -17,6 +17,7 @@ import numpy as np
 from magtwin.io.cdr import Messages, decode, encode, leaves
 from magtwin.io.messages import TYPES, Qos
 from magtwin.names import RefusedError, find
+from magtwin.ros.parameters import Parameter
 
 Backend = Literal["auto", "rclpy", "cyclonedds"]
 
@@ -135,6 +136,19 @@ class Bus(Protocol):
         DDS alone cannot: each middleware of ROS 2 has its own way of telling whom an answer is for.
         """
 
+    def settable(
+        self, table: Mapping[str, Parameter], values: Mapping[str, Any], changed: Callable[[str, Any], None]
+    ) -> bool:
+        """Let others read a node's parameters, and set them while it runs; whether that can be done here.
+
+        DDS alone cannot, for the reason that it has no services. `use_sim_time` is the bus's own.
+
+        Args:
+            table: What can be set, with ranges.
+            values: What it is set to.
+            changed: Called with name and value of what others set, if it may be; in the thread that spins.
+        """
+
     def knows(self, kind: str) -> bool:
         """Whether messages of a type can be said and heard here."""
 
@@ -224,7 +238,6 @@ def open_bus(
     sim_time: bool = False,
     backend: Backend = "auto",
     domain: int | None = None,
-    parameters: Mapping[str, Any] | None = None,
 ) -> Bus:
     """Join ROS 2 as a node.
 
@@ -234,7 +247,6 @@ def open_bus(
         sim_time: Whether its clock is /clock's.
         backend: Who carries it; "auto" takes rclpy where it can be imported, else cyclonedds.
         domain: The domain; None takes ROS_DOMAIN_ID, or 0.
-        parameters: What the node is set to, for those who ask it (rclpy alone can be asked).
 
     Raises:
         RefusedError: The backend cannot be imported, or the domain is none.
@@ -249,7 +261,7 @@ def open_bus(
     if not 0 <= domain <= 232:
         raise RefusedError(f"a domain of ROS must be from 0 to 232, got {domain}")
     opened = _backend(backend)
-    bus: Bus = opened(name, names or Names(), sim_time=sim_time, domain=domain, parameters=parameters or {})
+    bus: Bus = opened(name, names or Names(), sim_time=sim_time, domain=domain)
     return bus
 
 

@@ -32,6 +32,7 @@ from magtwin.io.messages import CLOCK, TYPES, Qos
 from magtwin.names import RefusedError
 from magtwin.ros.bus import Heard, Message, Names, localhost_only
 from magtwin.ros.clock import Alarm, Clock
+from magtwin.ros.parameters import Parameter
 from magtwin.ros.types import PARTED, raw, ros_name, struct_of
 
 NS = 10**9
@@ -100,9 +101,7 @@ class DdsBus:
 
     backend = "cyclonedds"
 
-    def __init__(
-        self, name: str, names: Names, *, sim_time: bool, domain: int, parameters: Mapping[str, Any]
-    ) -> None:
+    def __init__(self, name: str, names: Names, *, sim_time: bool, domain: int) -> None:
         self.name, self._names = name, names
         try:
             if domain not in _DOMAINS and "CYCLONEDDS_URI" not in os.environ:
@@ -146,6 +145,12 @@ class DdsBus:
         return subscription
 
     def service(self, name: str, called: Callable[[], None]) -> bool:
+        """As for `Bus`."""
+        return False
+
+    def settable(
+        self, table: Mapping[str, Parameter], values: Mapping[str, Any], changed: Callable[[str, Any], None]
+    ) -> bool:
         """As for `Bus`."""
         return False
 

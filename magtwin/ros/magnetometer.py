@@ -28,7 +28,7 @@ from magtwin.io.messages import (
     sender_of,
 )
 from magtwin.names import RefusedError
-from magtwin.ros.bus import NS, Bus, to_bytes
+from magtwin.ros.bus import NS, Bus, Timer, to_bytes
 from magtwin.ros.diagnostics import Reporter, Status
 from magtwin.ros.inputs import Input, Scanning, newest_sent_ns
 from magtwin.ros.network import Following
@@ -98,9 +98,6 @@ class Magnetometer:
                 "robots' sensors tell it to a network: name weights, or a scene with a neural magnetometer"
             )
         self._twin, self._bus, self._settings, self._say = twin, bus, dict(settings), say
-        self._rate = float(settings["rate_hz"])
-        self._who = sender_of(twin.scene.robot, unit=settings["units"], rate_hz=self._rate)
-        self._noise_nt = spec.noise_density_nt * np.sqrt(self._rate / 2)
         needed = (twin.magnetometer.columns if twin.magnetometer else frozenset()) - MADE
         told = {column for topic in INPUTS for column in _columns_of(topic)}
         if beyond := sorted(needed - told):
@@ -109,18 +106,15 @@ class Magnetometer:
             )
         chosen = [topic for topic in INPUTS if topic is POSE or needed & _columns_of(topic)]
         read = needed | ({"imu_q_xyzw"} if "imu_a" in needed else frozenset())  # which frees it of gravity
-        ages = {BATTERY.name: settings["battery_max_age_s"]}
         self.inputs = {
-            topic.name: Input(
-                bus, topic, max_age_s=ages.get(topic.name, settings["max_age_s"]), wanted=read | _ALWAYS
-            )
+            topic.name: Input(bus, topic, max_age_s=settings["max_age_s"], wanted=read | _ALWAYS)
             for topic in chosen
         }
         if COMMAND.name in self.inputs:
             self.inputs[COMMAND.name].silence = "no commands: the robot is taken to stand"
         self._needed = needed
         self._scans: Scanning | None = None
-        if settings["lidar"] == "scan" and twin.magnetometer and "lidar_on" in twin.magnetometer.columns:
+        if twin.magnetometer and "lidar_on" in twin.magnetometer.columns:
             lidar = twin.scene.robot.lidar
             self._scans = Scanning(bus, SCAN, gap_s=lidar.latency_s + 2.5 / max(lidar.scan_rate_hz, 0.1))
         self._network = Following(twin.magnetometer) if twin.magnetometer else None
@@ -135,17 +129,41 @@ class Magnetometer:
         self.latencies_s: deque[float] = deque(maxlen=10_000)
         """From when its step was due, or the newest message of an input was sent if that was later, to when a
         reading went out [s], of the last readings."""
-        if settings["units"] == "nT":
-            say("fields are published in nT, as APRILab's robot does; ROS means tesla")
+        self._timer: Timer | None = None
+        self._rate, self._units = 0.0, "T"
+        self._adopt()
+        bus.settable(PARAMETERS, self._settings, self._set)
         self._look()
-        bus.timer(1 / self._rate, self._read)
         bus.timer(LOOK_S, self._look)
         self._reporter.each(self._report)
+
+    def _set(self, name: str, value: Any) -> None:
+        """A setting that is changed while the node runs."""
+        self._settings[name] = value
+        self._say(f"{name} is {value} now")
+        self._adopt()
+
+    def _adopt(self) -> None:
+        """Do as the settings say."""
+        settings, robot = self._settings, self._twin.scene.robot
+        for one in self.inputs.values():
+            one.max_age_s = settings["battery_max_age_s" if one.topic is BATTERY else "max_age_s"]
+        self._who = sender_of(robot, unit=settings["units"], rate_hz=settings["rate_hz"])
+        if settings["rate_hz"] != self._rate:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._rate = float(settings["rate_hz"])
+            self._timer = self._bus.timer(1 / self._rate, self._read)
+        self._noise_nt = robot.magnetometer.noise_density_nt * np.sqrt(self._rate / 2)
+        if settings["units"] != self._units:
+            self._units = settings["units"]
+            if self._units == "nT":
+                self._say("fields are published in nT, as APRILab's robot does; ROS means tesla")
 
     def _look(self) -> None:
         for one in self.inputs.values():
             one.look()
-        if self._scans is not None:
+        if self._scans is not None and self._settings["lidar"] == "scan":
             self._scans.look()
 
     def _read(self) -> None:
@@ -196,7 +214,8 @@ class Magnetometer:
         xy = columns["mocap_p"][:, :2]
         outside: Literal["clamp", "nan"] = "clamp" if self._settings["outside"] == "clamp" else "nan"
         b_map, slopes = self._twin.field.lookup_with_gradient(xy, yaw, outside=outside)
-        spins = self._scans.on(now) if self._scans is not None else self._settings["lidar"] == "on"
+        told = self._settings["lidar"]
+        spins = told == "on" or (told == "scan" and self._scans is not None and self._scans.on(now))
         made = {
             "t": np.array([now / NS]),
             "yaw": yaw,
@@ -268,7 +287,7 @@ class Magnetometer:
         }
         statuses = [Status("readings", level, "; ".join(words) or "reading", values)]
         statuses += [one.status(now) for one in self.inputs.values()]
-        if self._scans is not None:
+        if self._scans is not None and self._settings["lidar"] == "scan":
             statuses.append(self._scans.status(now))
         self._reporter.report(statuses, now)
         self._skipped = self._outside = self._strange = self._resets = 0

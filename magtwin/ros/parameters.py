@@ -46,20 +46,30 @@ def settings(table: Mapping[str, Parameter], given: Iterable[str]) -> dict[str, 
 
 
 def _value(name: str, parameter: Parameter, text: str) -> Any:
+    """The value that a text of a command line stands for."""
     kind = type(parameter.default)
     if kind is bool:
         if text.lower() not in ("true", "false"):
             raise RefusedError(f"parameter {name} is true or false, got {text!r}")
         return text.lower() == "true"
     if kind is str:
-        if parameter.words and text not in parameter.words:
-            raise RefusedError(f"parameter {name} is {' or '.join(parameter.words)}, got {text!r}")
-        return text
+        return checked(name, parameter, text)
     try:
-        value = kind(text)
+        number = kind(text)
     except ValueError:
         raise RefusedError(f"parameter {name} is a number, got {text!r}") from None
+    return checked(name, parameter, number)
+
+
+def checked(name: str, parameter: Parameter, value: Any) -> Any:
+    """A value of a parameter's kind, if it is one that the parameter may have.
+
+    Raises:
+        RefusedError: It is out of the range, or none of the words.
+    """
+    if parameter.words and value not in parameter.words:
+        raise RefusedError(f"parameter {name} is {' or '.join(parameter.words)}, got {value!r}")
     low, high = parameter.low, parameter.high
     if not ((low is None or value >= low) and (high is None or value <= high)):
-        raise RefusedError(f"parameter {name} must be from {low:g} to {high:g}, got {text}")
+        raise RefusedError(f"parameter {name} must be from {low:g} to {high:g}, got {value:g}")
     return value

@@ -6,16 +6,18 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import rclpy
+import rclpy.parameter
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from magtwin.io.messages import Qos
 from magtwin.names import RefusedError
 from magtwin.ros.bus import Heard, Message, Names
+from magtwin.ros.parameters import Parameter, checked
 
 MOST_AT_ONCE = 256
 """Callbacks that are run before `spin_once` gives back."""
@@ -45,6 +47,16 @@ def class_of(kind: str) -> Any:
             f"the ROS package {package} is not installed, so there are no messages {kind}; install "
             f"ros-jazzy-{package.replace('_', '-')} or that of your distribution, or take cyclonedds"
         ) from error
+
+
+def _descriptor(parameter: Parameter) -> Any:
+    """What `ros2 param describe` tells of a parameter."""
+    told = ParameterDescriptor(description=parameter.doc, additional_constraints=" or ".join(parameter.words))
+    if parameter.low is not None and parameter.high is not None:
+        told.floating_point_range = [
+            FloatingPointRange(from_value=float(parameter.low), to_value=float(parameter.high))
+        ]
+    return told
 
 
 class RclpyPublisher:
@@ -78,9 +90,7 @@ class RclpyBus:
 
     backend = "rclpy"
 
-    def __init__(
-        self, name: str, names: Names, *, sim_time: bool, domain: int, parameters: Mapping[str, Any]
-    ) -> None:
+    def __init__(self, name: str, names: Names, *, sim_time: bool, domain: int) -> None:
         self.name, self._names = name, names
         self._context = Context()
         rclpy.init(args=[], context=self._context, domain_id=domain)
@@ -89,11 +99,8 @@ class RclpyBus:
             context=self._context,
             namespace=names.namespace or "/",
             use_global_arguments=False,
-            parameter_overrides=[Parameter("use_sim_time", value=sim_time)],
+            parameter_overrides=[rclpy.parameter.Parameter("use_sim_time", value=sim_time)],
         )
-        for key, value in parameters.items():
-            if key != "use_sim_time":  # which every node has
-                self._node.declare_parameter(key, value)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._calls, self._due_ns = 0, 0
@@ -127,6 +134,28 @@ class RclpyBus:
             return response
 
         self._node.create_service(kind, self._names.resolve(name), answer)
+        return True
+
+    def settable(
+        self, table: Mapping[str, Parameter], values: Mapping[str, Any], changed: Callable[[str, Any], None]
+    ) -> bool:
+        """As for `Bus`."""
+        own = {name: parameter for name, parameter in table.items() if name != "use_sim_time"}
+
+        def wanted(asked: list[Any]) -> Any:
+            known = [one for one in asked if one.name in own]
+            try:
+                for one in known:
+                    checked(one.name, own[one.name], one.value)
+            except RefusedError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            for one in known:
+                changed(one.name, one.value)
+            return SetParametersResult(successful=True)
+
+        for name, parameter in own.items():
+            self._node.declare_parameter(name, values[name], _descriptor(parameter))
+        self._node.add_on_set_parameters_callback(wanted)
         return True
 
     def knows(self, kind: str) -> bool:
