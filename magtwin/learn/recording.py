@@ -153,8 +153,8 @@ def read(source: Source) -> Run:
         raise RefusedError(f"{source.name}: nothing to label: it has no column {wanted}")
     if (kind := run.facts.get("magnetometer")) in ("neural", "map-only"):
         raise RefusedError(
-            f"{source.name}: its readings are those of a {kind} magnetometer, and what learns from them learns "
-            "that model; record a robot, or drive the twin with --magnetometer physical"
+            f"{source.name}: its readings are those of a {kind} magnetometer, and what learns from them "
+            "learns that model; record a robot, or drive the twin with --magnetometer physical"
         )
     return run
 
