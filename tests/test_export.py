@@ -18,6 +18,7 @@ from numpy.testing import assert_allclose
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, UsdValidation
 from validators import assert_valid
 
+from magtwin.cli import main
 from magtwin.export.attached import BYTES, SCOPE
 from magtwin.export.glb import corner_normals
 from magtwin.export.package import HOWTO, PLUGIN, export_scene, licence_of
@@ -343,9 +344,8 @@ def test_metadata_and_page_say_what_an_export_was_made_from_and_under_which_lice
     said = Sdf.Layer.FindOrOpen(str(folder / "lab.usda")).customLayerData["magtwin"]["export"]
     assert said["source"] == "lab.usda"
     assert re.fullmatch("[0-9a-f]{64}", said["sourceSha256"])
-    weights = said["licences"].pop(f"weights/{WEIGHTS.name}")
-    assert weights in ("Apache-2.0", "not stated")
-    assert said["licences"] == {"lab/lab.usdc": "Apache-2.0", "turtlebot4/turtlebot4.usda": "Apache-2.0"}
+    parts = ("lab/lab.usdc", "turtlebot4/turtlebot4.usda", f"weights/{WEIGHTS.name}")
+    assert said["licences"] == dict.fromkeys(parts, "Apache-2.0")
     page = (folder / HOWTO).read_text()
     for word in (
         "lab.usda",
@@ -363,6 +363,12 @@ def test_the_licence_of_a_network_is_read_from_its_weights(facts, said, tmp_path
     text = json.dumps(header).encode()
     (tmp_path / "net.safetensors").write_bytes(struct.pack("<Q", len(text)) + text)
     assert licence_of(tmp_path / "net.safetensors") == said
+
+
+def test_a_released_network_is_handed_on_under_the_licence_that_it_was_converted_with(real_data, tmp_path):
+    pth = real_data / "aprilab" / "models" / "nn_magnetometer_model_v0.0.1.pth"
+    main(["net", "convert", str(pth), "--out", str(tmp_path / "n.safetensors"), "--licence", "MIT"])
+    assert licence_of(tmp_path / "n.safetensors") == "MIT"
 
 
 def test_the_plugin_beside_an_export_tells_usd_core_the_schemas(folder):

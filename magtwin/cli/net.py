@@ -12,7 +12,7 @@ app.command(net_app)
 
 
 @net_app.command(name="convert")
-def net_convert(pth: Path, *, out: Path, force: Force = False) -> None:
+def net_convert(pth: Path, *, out: Path, licence: str = "", force: Force = False) -> None:
     """Convert a released checkpoint (.pth) to safetensors, executing nothing of what it holds.
 
     Parameters
@@ -21,13 +21,15 @@ def net_convert(pth: Path, *, out: Path, force: Force = False) -> None:
         Checkpoint with the weights and the two scalers.
     out
         File to write, .safetensors.
+    licence
+        Licence of the weights, an SPDX identifier such as MIT; an export says it.
     force
         Replace the file if it exists.
     """
     from magtwin.learn.model import convert
 
     check_suffix(out, (".safetensors",), "a network")
-    net = convert(pth, out, force=force)
+    net = convert(pth, out, licence=licence, force=force)
     print_report(net.report(str(out)), as_json=False)
     say(f"Wrote {out}")
 

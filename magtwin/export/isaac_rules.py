@@ -123,7 +123,7 @@ def joint_drives(subject: Subject) -> Iterator[Wrong]:
     ISAAC_RULES, "say convexHull or convexDecomposition: a body that moves cannot collide as triangles"
 )
 def collider_shapes(subject: Subject) -> Iterator[Wrong]:
-    """No rigid body collides as bare triangles, nor by a collider that is not there."""
+    """No rigid body collides as bare triangles."""
     for body in subject.prims:
         if not body.HasAPI(UsdPhysics.RigidBodyAPI):
             continue

@@ -219,19 +219,26 @@ def load_net(path: str | os.PathLike[str]) -> FieldNet:
 
 
 def convert(
-    checkpoint: str | os.PathLike[str], out: str | os.PathLike[str], *, force: bool = False
+    checkpoint: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    licence: str = "",
+    force: bool = False,
 ) -> FieldNet:
     """Turn a released `.pth` into safetensors, once; its inputs are the paper's 20.
 
     Args:
         checkpoint: The `.pth`, read as data (see `magtwin.learn.checkpoint`).
         out: The safetensors file to write.
+        licence: Licence of the weights, which no checkpoint says; kept in their facts.
         force: Whether one that exists is replaced.
 
     Raises:
         RefusedError: Not such a checkpoint, or `out` exists.
     """
     net = net_of_checkpoint(existing(checkpoint, "checkpoint"))
+    if licence:
+        net.facts["licence"] = licence
     net.save(out, force=force)
     return net
 
