@@ -7,6 +7,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -381,7 +382,14 @@ def test_a_robot_with_its_urdf_beside_it_is_described(made, tmp_path):
     twin = magtwin.open_twin(shipped("scenes", "lab", "lab.usda"))
     write_bag(made[0], tmp_path / "run.mcap", twin)
     said = messages(tmp_path / "run.mcap")["/robot/robot_description"]
-    assert said[0][1].data == shipped("robots", "turtlebot4", "turtlebot4.urdf").read_text()
+    urdf = ElementTree.parse(shipped("robots", "turtlebot4", "turtlebot4.urdf")).getroot()
+    told = ElementTree.fromstring(said[0][1].data)
+    assert [link.get("name") for link in told.iter("link")] == [
+        link.get("name") for link in urdf.iter("link")
+    ]
+    parents = {j.find("child").get("link"): j.find("parent").get("link") for j in told.iter("joint")}
+    assert "base_link" not in parents  # /tf puts it below odom
+    assert parents["base_footprint"] == "base_link"
 
 
 def test_a_run_of_few_columns_is_written_without_a_twin(made, tmp_path):

@@ -22,6 +22,7 @@ from magtwin.spec import (
     RobotSpec,
     Spec,
 )
+from magtwin.usd.geometry import BASE_LINK
 from magtwin.usd.layers import open_stage
 from magtwin.usd.schema import NOUNS, prims_with
 from magtwin.usd.sensors import (
@@ -38,6 +39,7 @@ from magtwin.usd.sensors import (
 from magtwin.usd.urdf.convert import convert_with_report
 from magtwin.usd.urdf.options import DEFAULTS, Options
 from magtwin.usd.urdf.report import ConversionReport
+from magtwin.usd.urdf.reroot import reroot
 
 _DEFAULTS = RobotSpec(name="", asset=Path())
 
@@ -143,15 +145,33 @@ def read_robot(asset: str | os.PathLike[str]) -> RobotSpec:
 
 
 def read_description(asset: str | os.PathLike[str]) -> str:
-    """The URDF that an asset was converted from, if it still lies beside it, unchanged; else ""."""
+    """The URDF that an asset was converted from, its root base_link, if `description_of` finds it; else "".
+
+    Raises:
+        RefusedError: It is none that can be read.
+    """
+    source = description_of(asset)
+    if source is None:
+        return ""
+    try:
+        text = source.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise RefusedError(
+            f"{source}: is not UTF-8, which ROS says descriptions in; save it as that"
+        ) from error
+    return reroot(text, BASE_LINK, source)
+
+
+def description_of(asset: str | os.PathLike[str]) -> Path | None:
+    """The URDF that an asset was converted from, if it still lies beside it, unchanged."""
     stage = open_stage(
         existing(asset, "robot asset")
     )  # held in a name: a layer does not keep its stage alive
     said = stage.GetRootLayer().customLayerData.get("magtwin", {})
     source = Path(asset).parent / Path(str(said.get("source", ""))).name
     if source.suffix != ".urdf" or not source.is_file() or sha256(source) != said.get("sourceSha256"):
-        return ""
-    return source.read_text(encoding="utf-8")
+        return None
+    return source
 
 
 def robot_of(prim: Usd.Prim) -> RobotSpec:

@@ -31,7 +31,7 @@ from magtwin.usd.furniture import FURNITURE, define_furniture, read_magnets
 from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, read_lab
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, open_stage, relative_asset
 from magtwin.usd.maps import MAP, load_map, read_map
-from magtwin.usd.robot import RobotSettings, build_robot, read_robot, robot_of
+from magtwin.usd.robot import RobotSettings, build_robot, description_of, read_robot, robot_of
 from magtwin.usd.schema import only_prim_with, place, prims_with, require_api
 from magtwin.usd.sensors import (
     MAP_CHECKSUM,
@@ -540,7 +540,10 @@ def _copied(file: Path, folder: Path) -> Path:
 
 
 def _copied_asset(asset: Path, folder: Path) -> Path:
-    """A USD file copied with every file that it names, in the same arrangement, and its picture."""
+    """A USD file copied with every file that it names, in the same arrangement, its picture and its URDF.
+
+    The URDF is what live robots and bags say of it; the meshes that it names stay behind: the asset has them.
+    """
     asset = asset.resolve()
     layers, assets, unresolved = UsdUtils.ComputeAllDependencies(str(asset))
     if unresolved:
@@ -553,6 +556,8 @@ def _copied_asset(asset: Path, folder: Path) -> Path:
     picture = asset.parent / THUMBNAILS / f"{asset.name}.png"
     for file in (*files, *([picture] if picture.is_file() else [])):
         _copied(file, (folder / file.relative_to(common)).parent)
+    if (urdf := description_of(asset)) is not None:
+        _copied(urdf, (folder / asset.relative_to(common)).parent)
     return folder / asset.relative_to(common)
 
 

@@ -347,7 +347,7 @@ class _Writer:
                     own = ElementTree.SubElement(element, role, name=_shape_name(prim))
                     if solid is not None:
                         T, tag, sizes = solid
-                        _write_origin(own, T)
+                        write_origin(own, T)
                         ElementTree.SubElement(ElementTree.SubElement(own, "geometry"), tag, sizes)
                     else:
                         name = f"{link.name}_{role}_{len(meshes)}.stl"
@@ -548,7 +548,8 @@ def _rpy(R: Array) -> tuple[float, float, float]:
     return math.atan2(R[2, 1], R[1, 1]), pitch, yaw
 
 
-def _write_origin(element: Element, T: Array) -> None:
+def write_origin(element: Element, T: Array) -> None:
+    """Tell an element's place by a child `origin`, none where it is that of its parent."""
     if not _is_root(T):
         ElementTree.SubElement(element, "origin", xyz=_text(T[:3, 3]), rpy=_text(_rpy(T[:3, :3])))
 
@@ -582,7 +583,7 @@ def _write_joint(xml: Element, joint: _Joint) -> None:
     element = ElementTree.SubElement(xml, "joint", name=joint.name, type=joint.kind)
     ElementTree.SubElement(element, "parent", link=joint.parent)
     ElementTree.SubElement(element, "child", link=joint.child)
-    _write_origin(element, joint.T)
+    write_origin(element, joint.T)
     if joint.axis is not None:
         ElementTree.SubElement(element, "axis", xyz=_text(joint.axis))
     for tag, figures in (("limit", joint.limit), ("dynamics", joint.dynamics)):
