@@ -72,7 +72,7 @@ def train(
         Widths of the hidden layers in place of the model's, as 256,256.
     features
         Set of inputs, or names with commas between; full, the paper's 20, unless given, circular of a linear
-        model, gradient of a hybrid, an ensemble and a tcn.
+        model, platform of a hybrid, gradient of an ensemble and a tcn.
     members
         Networks of an ensemble; 5 unless given.
     kernel

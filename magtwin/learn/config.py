@@ -29,7 +29,7 @@ MODELS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "released": {"layers": (512, 512, 512, 128), **_PAPER},
         "linear": {"features": "circular", **_RIDGE},
         "hybrid": {
-            "features": "gradient",
+            "features": "platform",
             **_RIDGE,
             "layers": (64, 64),
             "dropout": 0.1,
