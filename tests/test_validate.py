@@ -345,7 +345,8 @@ def test_an_empty_report_of_simreadys_counts_as_passed_for_no_profile(
 ):
     program = tmp_path / "simready-validate"
     program.write_text(
-        f"#!{sys.executable}\nimport sys\nopen(sys.argv[6], 'w').write('{{}}')\nsys.exit({said!r})\n"
+        f"#!{sys.executable}\nimport sys\nopen(sys.argv[6], 'w').write('{{}}')\n"
+        f"print({said!r})\nsys.exit(1)\n"
     )
     program.chmod(0o755)
     monkeypatch.setenv(others.SIMREADY, str(program))

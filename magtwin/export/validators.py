@@ -105,7 +105,9 @@ def _profile(command: str, profile: str, version: str, robots: Mapping[str, Path
                 [command, "--profile", profile, "--version", version, "--output", str(report), str(asset)]
             )
             facts = _facts(report)
-        if facts is None and "is not registered" in said.stderr:  # of a tier that is not installed
+        if (
+            facts is None and "is not registered" in said.stdout + said.stderr
+        ):  # of a tier that is not installed
             get = f"{command} has not the profile; `make simready` makes an environment that has"
             return Check(f"simready {profile} {version}", not_run=get)
         if facts is None:
