@@ -3,7 +3,9 @@
 import json
 
 import numpy as np
+import pyarrow as pa
 import pytest
+from pyarrow import csv, parquet
 
 from magtwin.cli import main
 from magtwin.files import sha256, shipped
@@ -77,6 +79,39 @@ def test_sessions_are_told_by_folder_on_request(recorded, tmp_path, capsys):
     assert [one.session for one in found.recordings] == ["monday", "tuesday"]
     assert [one.path for one in found.recordings] == list(found.names)
     assert {one.rows for one in found.recordings} == {40}
+
+
+@pytest.mark.parametrize("end", [".csv", ".parquet"])
+def test_a_table_of_another_program_is_read_by_its_own_names_of_columns(recorded, tmp_path, end):
+    run = read_run(recorded / "c.parquet")
+    p, yaw = run["p_world_base"], run["yaw"]
+    table = {"time": run["t"], "east": p[:, 0], "north": p[:, 1], "heading": yaw, "B": run["b_measured_nt"]}
+    theirs = tmp_path / f"theirs{end}"
+    (csv.write_csv if end == ".csv" else parquet.write_table)(pa.table(table), theirs)
+    names = ["t=time", "p_world_base_x=east", "p_world_base_y=north", "yaw=heading", "b_measured_nt=B"]
+    words = [word for name in names for word in ("--column", name)]
+    main(["dataset", "build", str(theirs), "--map", str(MAP), "--out", str(tmp_path / "set"), *words])
+    ((_, found),) = open_dataset(tmp_path / "set").runs()
+    np.testing.assert_array_equal(found["b_measured_nt"], run["b_measured_nt"])
+    np.testing.assert_array_equal(found["p_world_base"], p * [1, 1, 0])
+    assert np.isfinite(found["label_nt"]).any()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--column", "t=tim"], "no column 'tim'; did you mean 'time'"),
+        (["--column", "time"], "--column takes NAME=THEIRS, each once, such as yaw=heading, got 'time'"),
+        (["--column", "t=time", "--column", "yaw=time"], "got 'yaw=time'"),
+    ],
+)
+def test_columns_that_a_table_lacks_or_that_are_named_twice_are_refused(tmp_path, capsys, words, said):
+    (tmp_path / "theirs.csv").write_text("time,B\n0,1\n1,2\n")
+    files = [str(tmp_path / "theirs.csv"), "--map", str(MAP), "--out", str(tmp_path / "set")]
+    with pytest.raises(SystemExit):
+        main(["dataset", "build", *files, *words])
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "set").exists()
 
 
 def test_a_folder_of_runs_stands_for_its_runs_and_their_sessions(recorded, tmp_path):

@@ -34,6 +34,7 @@ def build(
     rate_hz: float | None = None,
     topic: Annotated[list[str] | None, Parameter(negative="")] = None,
     field_unit: Literal["nT", "uT", "T", "mG", "G"] | None = None,
+    column: Annotated[list[str] | None, Parameter(negative="")] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -67,6 +68,9 @@ def build(
         What a topic is called in a robot's own bag, as NAME=THEIRS. Repeatable.
     field_unit
         Unit of the field in a robot's own bag; told by its size unless given.
+    column
+        What a CSV or Parquet of another program calls a column of a run, as NAME=THEIRS, a vector's by its
+        parts: b_measured_nt=field, p_world_base_x=east. Repeatable. A p_world_base without z is on the floor.
     force
         Replace the folder if it exists.
     json
@@ -83,6 +87,7 @@ def build(
     if given and align == "fit":
         raise RefusedError("--align fit finds lever arm and latency; drop it, or --lever-arm and --latency")
     options: dict[str, Any] = {"topics": _named(topic) if topic else None, "unit": field_unit}
+    options["columns"] = _columns(column) if column else None
     options = {name: value for name, value in options.items() if value is not None}
     sources = _sources(_files(run), session_by, path_by, options)
     alignment: Any = "fit" if align == "fit" else None
@@ -176,6 +181,17 @@ def correlate(
     print_report(result.report(f"Correlation with the disturbance in {dataset}"), json)
     if out is not None and not json:
         say(f"Wrote {out}")
+
+
+def _columns(given: Sequence[str]) -> dict[str, str]:
+    """Names of a table's columns, by those of a Run."""
+    found: dict[str, str] = {}
+    for word in given:
+        name, _, theirs = word.partition("=")
+        if not (name and theirs) or name in found or theirs in found.values():
+            raise RefusedError(f"--column takes NAME=THEIRS, each once, such as yaw=heading, got {word!r}")
+        found[name] = theirs
+    return found
 
 
 def _files(given: Sequence[Path]) -> list[Path]:

@@ -51,7 +51,8 @@ class Format:
 
 
 _TABLES = "magtwin.io.tables"
-_PARQUET = Format("Parquet", _TABLES, "read_parquet", "write_parquet")
+_NAMED = frozenset(("columns",))
+_PARQUET = Format("Parquet", _TABLES, "read_parquet", "write_parquet", reads=_NAMED)
 _BAG = Format(
     "rosbag2",
     "magtwin.io.rosbag",
@@ -71,7 +72,7 @@ _USD = Format(
 FORMATS: Mapping[str, Format] = MappingProxyType(
     {
         ".parquet": _PARQUET,
-        ".csv": Format("CSV", _TABLES, "read_csv", "write_csv"),
+        ".csv": Format("CSV", _TABLES, "read_csv", "write_csv", reads=_NAMED),
         ".npz": Format("npz", _TABLES, "read_npz", "write_npz"),
         ".rrd": Format(
             "Rerun",
@@ -97,7 +98,8 @@ def read_run(path: str | os.PathLike[str], **options: Any) -> Run:
     Args:
         path: A file whose name ends as one of `FORMATS`; or a folder: a bag's, the part files of a Parquet
             file that was never finished, or the one that `magtwin run --out` makes.
-        options: Of single formats: `topics` and `unit` of a robot's own bag.
+        options: Of single formats: `topics` and `unit` of a robot's own bag, `columns` of a table that
+            another program wrote.
 
     Raises:
         RefusedError: The file is missing, of no known kind, damaged, holds no run, or its format has no such

@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import zipfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -30,7 +31,7 @@ from magtwin.arrow import (
     table_of,
 )
 from magtwin.files import check_free, existing, output
-from magtwin.names import RefusedError
+from magtwin.names import RefusedError, find
 from magtwin.run import COLUMNS, Run, check_clock
 
 _MAGIC = b"PAR1"
@@ -59,7 +60,7 @@ def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool = False
         pq.write_table(table, aside, compression="zstd", use_dictionary=False, column_encoding=split)
 
 
-def read_parquet(path: str | os.PathLike[str]) -> Run:
+def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Run:
     """The run that `write_parquet` wrote, to the last bit; or that a folder of parts holds.
 
     A file that another program wrote is read too where it has the column names: without the metadata
@@ -67,13 +68,19 @@ def read_parquet(path: str | os.PathLike[str]) -> Run:
 
     Args:
         path: The file; or the folder that a `ParquetParts` left when its program ended before its time.
+        columns: What another program's file calls a Run's columns, as for `read_csv`.
 
     Raises:
-        RefusedError: The file is missing, is not Parquet, was cut short, or holds no run.
+        RefusedError: The file is missing, is not Parquet, was cut short, lacks a column, or holds no run.
     """
     path = existing(path, "Parquet file")
     try:
-        return _read_parts(path) if path.is_dir() else run_of(_table(path), path)
+        if path.is_dir():
+            return _read_parts(path)
+        table = _table(path)
+        if columns:
+            table = _on_the_floor(table.rename_columns(_renamed(table.column_names, columns, path)))
+        return run_of(table, path)
     except UnicodeDecodeError as error:
         raise RefusedError(f"{path}: damaged Parquet (a name is no text); write it again") from error
 
@@ -216,7 +223,7 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
         pa.csv.write_csv(table, file, pa.csv.WriteOptions(include_header=False, quoting_style="none"))
 
 
-def read_csv(path: str | os.PathLike[str]) -> Run:
+def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Run:
     """The run that `write_csv` wrote, to the last bit.
 
     A file that another program wrote is read too where its columns have the names of a Run's, a vector's
@@ -224,9 +231,12 @@ def read_csv(path: str | os.PathLike[str]) -> Run:
 
     Args:
         path: The file.
+        columns: What another program's file calls a Run's columns: its names by those of a Run, a vector's
+            as `odom_p_x`. A p_world_base given without its z lies on the floor.
 
     Raises:
-        RefusedError: The file is missing, is no CSV of numbers, was cut short, or holds no run.
+        RefusedError: The file is missing, is no CSV of numbers, was cut short, lacks a column, or holds no
+            run.
     """
     path = existing(path, "CSV file")
     if path.is_dir():
@@ -236,6 +246,8 @@ def read_csv(path: str | os.PathLike[str]) -> Run:
         file.seek(-1, os.SEEK_END)
         cut = file.read(1) != b"\n"
     rows, facts, said = _csv_about(about, path)
+    if columns:
+        names = _renamed(names, columns, path)
     types = {name: pa.bool_() if _is_flag(name) else pa.float64() for name in names}
     for name in said.keys() & types.keys():
         try:
@@ -267,7 +279,27 @@ def read_csv(path: str | os.PathLike[str]) -> Run:
             "edited; copy it again, or take that line out"
         )
     fields = [f.with_metadata(said.get(f.name) or None) for f in table.schema]
-    return run_of(table.cast(pa.schema(fields, metadata={FACTS: facts})), path)
+    table = table.cast(pa.schema(fields, metadata={FACTS: facts}))
+    return run_of(_on_the_floor(table) if columns else table, path)
+
+
+def _renamed(names: Sequence[str], columns: Mapping[str, str], path: Path) -> list[str]:
+    """Names of columns, those that are called otherwise by a Run's own."""
+    known, own = {name: name for name in names}, {}
+    for name, theirs in columns.items():
+        try:
+            own[find("column", theirs, known)] = name
+        except RefusedError as error:
+            raise RefusedError(f"{path}: {error}") from error
+    return [own.get(name, name) for name in names]
+
+
+def _on_the_floor(table: pa.Table) -> pa.Table:
+    """A table whose positions have a z: 0 where x and y stand alone."""
+    x, y, z = (f"p_world_base_{axis}" for axis in "xyz")
+    if not {x, y} <= set(table.column_names) or z in table.column_names:
+        return table
+    return table.add_column(table.column_names.index(y) + 1, z, pa.array(np.zeros(table.num_rows)))
 
 
 def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str], int]:
