@@ -357,6 +357,12 @@ def test_metadata_and_page_say_what_an_export_was_made_from_and_under_which_lice
         assert word in page
 
 
+def test_the_page_beside_an_export_says_what_plays_the_run(folder, package, isaac):
+    assert "`lab_run.usdc` plays a run" in (folder / HOWTO).read_text()
+    assert "`lab.usdz` plays a run" in (package.with_name("lab_magtwin") / HOWTO).read_text()
+    assert "plays a run" not in (isaac / HOWTO).read_text()
+
+
 @pytest.mark.parametrize(("facts", "said"), [({"licence": "MIT"}, "MIT"), ({}, ""), (None, "")])
 def test_the_licence_of_a_network_is_read_from_its_weights(facts, said, tmp_path):
     header = {} if facts is None else {"__metadata__": {"magtwin": json.dumps({"facts": facts})}}

@@ -202,6 +202,7 @@ class _Work:
         self.notes: list[str] = []
         self.licences: dict[str, str] = {}
         self.run: Path | None = None
+        self.plays = False
         self.onnx: list[Path] = []
         self.scripts = sorted(SCRIPTS.glob(f"{profile}_*.py"))
         self.checksum = ""
@@ -346,7 +347,7 @@ class _Work:
     def animate(self, run: Run) -> None:
         """Lay a run over the stage."""
         self.progress("Writing the run")
-        self.run = self.root.with_name(f"{self.root.stem}_run.usdc")
+        self.run, self.plays = self.root.with_name(f"{self.root.stem}_run.usdc"), True
         write_animation(run, self.run, self.root)
         layer, below = Sdf.Layer.FindOrOpen(str(self.run)), Sdf.Layer.FindOrOpen(str(self.root))
         layer.customLayerData = {**dict(layer.customLayerData), "magtwin": below.customLayerData["magtwin"]}
@@ -408,6 +409,7 @@ class _Work:
     def _explain(self, folder: Path, root: str, *, attached: bool) -> None:
         """Lay the how-to into a folder, and the schema plugin where programs can use it."""
         viewer = self.profile == "viewer"
+        run = root if attached or self.run is None else self.run.name  # what plays it
         if not viewer:
             for name in GENERATED:
                 _copied(SCHEMA / name, folder / PLUGIN / name)
@@ -415,7 +417,7 @@ class _Work:
             name=self.source.stem,
             version=__version__,
             root=root,
-            run=self.run.name if self.run and not attached else "",
+            run=run if self.plays else "",
             flat=viewer,
             plugin=not viewer,
             map_prim=self.map,
