@@ -80,6 +80,11 @@ def test_a_reference_in_a_variant_that_is_not_chosen_is_refused_too(tmp_path):
     )
 
 
+def test_a_folder_is_refused_with_the_stage_that_is_meant(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    refuse(r"lab: a folder; give a USD file in it, such as \S*lab/lab\.usda", own, tmp_path)
+
+
 def test_a_network_that_is_not_there_is_refused_with_the_prim_that_names_it(lab, tmp_path):
     own = shutil.copytree(lab, tmp_path / "lab")
     next((own / "weights").glob("*.safetensors")).unlink()

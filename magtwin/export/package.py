@@ -142,7 +142,10 @@ def export_scene(
     for target in filter(None, (out, beside)):
         check_free(target, force=force)
     if existing(scene_file, "stage").is_dir():
-        raise RefusedError(f"{scene_file}: a folder; give a USD file in it")
+        own = scene_file / f"{scene_file.resolve().name}.usda"
+        raise RefusedError(
+            f"{scene_file}: a folder; give a USD file in it{f', such as {own}' if own.is_file() else ''}"
+        )
     for target in filter(None, (out, beside)):
         if target.resolve() in (scene_file.resolve(), *scene_file.resolve().parents):
             raise RefusedError(f"{target}: is or holds the stage that is exported; name another place")
