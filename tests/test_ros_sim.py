@@ -16,6 +16,8 @@ from magtwin.io.bag_reader import _Bag
 from magtwin.io.cdr import decode, leaves
 from magtwin.io.formats import read_run
 from magtwin.io.messages import CLOCK, COMMAND, LATCHED, MAGNITUDE, ODOMETRY, TYPES, Qos, diagnostics
+from magtwin.learn.recording import Source
+from magtwin.learn.recording import read as read_source
 from magtwin.names import RefusedError
 from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND, Status, from_message, to_fields
@@ -289,7 +291,6 @@ def test_a_run_is_said_again_as_its_robot_said_it(
     listener = nodes("recorder")
     writer = RawBagWriter(tmp_path / "again.mcap")
     recorder = Recorder(listener, writer)
-    recorder.run(duration_s=0.3)
     said = threading.Thread(target=player.run, kwargs={"speed": 2.0})
     said.start()
     recorder.run(lambda: not said.is_alive())
@@ -299,6 +300,10 @@ def test_a_run_is_said_again_as_its_robot_said_it(
     assert again.rows == part.rows
     for name in ("t", "b_measured_nt", "odom_p", "imu_w", "p_world_base"):
         np.testing.assert_allclose(again[name], part[name], rtol=1e-12, err_msg=name)
+    assert again.facts == part.facts
+    assert again.facts["magnetometer"] == "neural"
+    with pytest.raises(RefusedError, match="those of a neural magnetometer"):  # so no network learns from one
+        read_source(Source("again", lambda: again))
 
 
 def test_a_recording_of_nothing_leaves_nothing(nodes: Callable[..., Bus], tmp_path: Path) -> None:

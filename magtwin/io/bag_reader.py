@@ -188,14 +188,8 @@ class _Bag:
 
     def facts(self) -> Facts:
         """What magtwin noted of the run."""
-        facts: Facts = {}
-        for key, value in self.notes.items():
-            if key.startswith(FACTS):
-                said = json.loads(value)
-                if not isinstance(said, str | int | float | bool):
-                    raise RefusedError(f"fact {key!r} is neither a text nor a number")
-                facts[key.removeprefix(FACTS)] = said
-        return facts
+        notes = self.notes.items()
+        return _plain({k.removeprefix(FACTS): json.loads(v) for k, v in notes if k.startswith(FACTS)})
 
     def messages(self, topics: Iterable[str]) -> dict[str, Messages]:
         """The messages of topics, each in the order in which they were received."""
@@ -239,6 +233,16 @@ def _files(path: Path) -> tuple[list[Path], dict[str, str]]:
     if strange:
         raise RefusedError(f"{strange[0]} is neither a .mcap nor a .db3 file")
     return [path / name for name in names], _custom(about)
+
+
+def _plain(said: Any) -> Facts:
+    """Facts, which are texts and numbers by name."""
+    if not isinstance(said, dict):
+        raise RefusedError("its facts are no table")
+    for key, value in said.items():
+        if not isinstance(value, str | int | float | bool):
+            raise RefusedError(f"fact {key!r} is neither a text nor a number")
+    return said
 
 
 def _custom(about: Any) -> dict[str, str]:
@@ -304,7 +308,7 @@ def _own(bag: _Bag) -> Run:
             specs[name] = spec_said(said, tuple(map(str, column["parts"])))
     if "t" in columns:
         _check_order(bag.path, READING.name, columns["t"])
-    return Run(columns, bag.facts(), specs)
+    return Run(columns, {**_plain(table.get("facts", {})), **bag.facts()}, specs)
 
 
 def _held(topic: Topic, messages: Messages, rows: Index, unit: str) -> dict[str, NDArray[Any]]:

@@ -414,7 +414,8 @@ class Stream:
             who: The robot.
             scans: What its LiDAR will have seen; none says nothing of it.
             topics: Those that are said, as far as the run has their columns.
-            whole: Whether /magtwin/reading tells every column, and not only those that no other topic does.
+            whole: Whether /magtwin/reading tells every column, and not only those that no other topic does,
+                and /magtwin/columns the run's facts, which who records live topics knows from nowhere else.
         """
         self._who, self._scans = who, scans
         self._t = -np.inf
@@ -425,7 +426,7 @@ class Stream:
         self._carried: dict[str, Topic] = carried
         self._rest = [name for name in run if name not in self._carried]
         self._columns = {name: (values.dtype, values.shape[1:]) for name, values in run.items()}
-        self._table = self._told(run)
+        self._table = self._told(run, run.facts if whole else {})
         for name, values in run.items():
             if values.ndim > 2 or values.dtype.kind not in "bfiu":
                 raise RefusedError(
@@ -532,7 +533,7 @@ class Stream:
             sent &= _finite(run, topic.needs)
         return np.flatnonzero(sent)
 
-    def _told(self, run: Run) -> str:
+    def _told(self, run: Run, facts: Mapping[str, Any]) -> str:
         """What columns there are, and where each is: the content of /magtwin/columns."""
         columns, first = [], 0
         for name, (dtype, shape) in self._columns.items():
@@ -546,7 +547,8 @@ class Stream:
                 told["first"] = first
                 first += shape[0] if shape else 1
             columns.append(told)
-        return json.dumps({"unit": self._who.unit, "columns": columns}, ensure_ascii=False, indent=1)
+        table = {"unit": self._who.unit, "columns": columns, **({"facts": dict(facts)} if facts else {})}
+        return json.dumps(table, ensure_ascii=False, indent=1)
 
 
 def form_of(topic: Topic, fields: Mapping[str, Any]) -> str:

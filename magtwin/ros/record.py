@@ -26,6 +26,9 @@ LOOK_S = 0.5
 DEPTH = 1000
 """Messages of a topic that may wait to be taken in: none is lost while a file is written."""
 
+SETTLE_S = 1.5
+"""Time that others have to find topics before the first message is said, by the wall [s]."""
+
 AT_A_TIME = 1024
 """Rows of a run that are turned into messages at a time."""
 
@@ -134,12 +137,12 @@ class Player:
         if not said:
             raise RefusedError(f"the run has no columns of {', '.join(topics) or 'any topic'}")
         self._publishers: dict[str, Publisher] = {t.name: bus.publisher(t.name, t.kind, t.qos) for t in said}
-        self._bus = bus
+        self._bus, self._begun = bus, time.monotonic()
 
     def run(self, until: Callable[[], bool] = lambda: False, *, speed: float = 1.0) -> int:
-        """Say it in real time, `speed` times as fast; how many messages that were."""
+        """Say it, `speed` times as fast as it was, once others had `SETTLE_S`; how many messages that were."""
         first = float(self._run["t"][0])
-        begin = time.monotonic()
+        begin = max(time.monotonic(), self._begun + SETTLE_S)
         count = 0
         for row in range(0, self._run.rows, AT_A_TIME):
             rows = self._run.take(slice(row, row + AT_A_TIME))

@@ -143,6 +143,7 @@ class Online:
         self._rows: list[tuple[float, float, float]] = []
         self._facts: dict[str, str | int | float | bool]
         self._facts = {"scene": scene.name, "controller": "commands", "rate_hz": float(self.rate_hz)}
+        self._facts |= {"lidar": lidar, "magnetometer": "neural" if network else robot.magnetometer.kind}
 
     @property
     def t(self) -> float:
