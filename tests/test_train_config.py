@@ -55,6 +55,7 @@ def test_weights_to_go_on_from_lie_beside_the_file_that_names_them(tmp_path):
         ("dropout = 1", "c.toml:1: dropout must lie in 0..1, 1 left out, got 1.0"),
         ("seed = -1", "c.toml:1: seed must be 0 or more, got -1"),
         ("layers = [8, 0]", "c.toml:1: layers must be above 0 wide, got (8, 0)"),
+        ("layers = [99999, 99999]", "make 10,001,899,980 weights; take 100,000,000 at most"),
         ('split = "day"', "c.toml:1: split must be one of 'session', 'run', 'path', 'row', got 'day'"),
         ('features = "ful"', "no feature set 'ful'; did you mean 'full'?"),
         ('features = "yaw_sin, lidar"', "no feature 'lidar'; did you mean 'lidar_on'?"),

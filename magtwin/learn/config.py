@@ -1,5 +1,6 @@
 """TrainConfig: everything that decides a training, beside its data."""
 
+import itertools
 import json
 import math
 import os
@@ -48,6 +49,9 @@ MODELS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     }
 )
 """Models by name: the options that each reads beside those that all do, and what they are unless given."""
+
+MOST_WEIGHTS = 100_000_000
+"""Of a network: with its gradients and Adam's moments they take 1.6 GB."""
 
 ALL_READ = ("model", "seed", "split", "hold_out", "init", "licence")
 """Options that every model reads."""
@@ -159,6 +163,12 @@ class TrainConfig:
             raise RefusedError(f"seed must be 0 or more, got {self.seed!r}")
         if not all(width > 0 for width in self.layers) or not inputs:
             raise RefusedError(f"layers must be above 0 wide, got {self.layers!r}")
+        widths = (len(inputs), *self.layers, 1)
+        weights = sum(a * b for a, b in itertools.pairwise(widths)) * (self.members or 1) * (self.kernel or 1)
+        if weights > MOST_WEIGHTS:
+            raise RefusedError(
+                f"layers {self.layers!r} make {weights:,} weights; take {MOST_WEIGHTS:,} at most"
+            )
         if self.freeze and self.init is None:
             raise RefusedError("freeze keeps layers of trained weights: give init too")
 
