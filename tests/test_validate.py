@@ -455,7 +455,7 @@ def test_a_package_with_an_entry_that_climbs_out_is_refused_with_nothing_written
 def test_a_package_is_looked_at_whole(lab, tmp_path):
     package = tmp_path / "a.usdz"
     folder = tmp_path / "in"
-    shutil.copytree(lab.parent / "robot", folder)
+    shutil.copytree(lab.parent / "robot", folder, ignore=shutil.ignore_patterns("*.urdf"))
     root = folder / "turtlebot4.usda"
     pack(root, package)
     found = validate(package, ["core", "isaac", "magtwin"])
