@@ -92,11 +92,6 @@ def message_fields(message: str) -> dict[str, Kind]:
     return _kinds(_table()["messages"].get(message, {}))
 
 
-def isaac_version() -> str:
-    """Version of Isaac Sim whose definitions these are."""
-    return str(_table()["sources"]["isaac"]["version"])
-
-
 def fits(given: Kind, taken: Kind) -> bool:
     """Whether an output of one kind may be connected to an input of another.
 
