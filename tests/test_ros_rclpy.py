@@ -177,7 +177,7 @@ def test_the_robot_is_simulated_on_rclpy_too_and_reset_by_its_service(
     ear.close()
     assert said.startswith("rclpy"), errors
     stamps = [m.read(["header.stamp"])["header.stamp"] for m in heard]
-    assert len(stamps) > 200
+    assert len(stamps) > 50  # who hears late hears less
     assert min(np.diff(stamps)) < -1e9  # time began anew
     assert 2e-5 < heard[-1].read(["magnetic_field"])["magnetic_field"][0] < 7e-5
 
