@@ -11,7 +11,7 @@ from magtwin.files import shipped
 from magtwin.frames import into_base, quat_from_yaw
 from magtwin.io.messages import BATTERY, CLOCK, IMU, MAGNITUDE, ODOMETRY, POSE, Qos, Topic
 from magtwin.names import RefusedError
-from magtwin.ros.bus import Bus, Message, Publisher, open_bus, to_bytes
+from magtwin.ros.bus import Bus, Message, Publisher, names_of, open_bus, to_bytes
 from magtwin.ros.diagnostics import KIND, Status, from_message
 from magtwin.ros.inputs import GRAVITY, Gravity, Input
 from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
@@ -217,6 +217,13 @@ def test_before_its_inputs_it_waits_and_says_for_what(world: World) -> None:
     assert said["input /robot/cmd_vel"].level == "ok"
     world.tick(bus, 3)
     assert world.heard(bus)
+
+
+def test_in_a_namespace_inputs_are_told_of_by_the_names_that_they_have_there(world: World) -> None:
+    bus = world.bus("magnetometer", names=names_of("tb4", ("odom:=/wheel/odom",)))
+    node = Magnetometer(world.twin, bus, settings(PARAMETERS, ()))
+    told = {one.status(0).name for one in node.inputs.values()}
+    assert {"input /tb4/enu/pose", "input /wheel/odom", "input /tb4/battery_state"} <= told
 
 
 def test_a_stale_input_is_never_read_as_fresh_and_what_comes_back_is_read_again(world: World) -> None:

@@ -1,5 +1,6 @@
 """`magtwin ros`: the twin and its sensors as nodes of ROS 2."""
 
+import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -40,8 +41,14 @@ class Node:
     """What carries it: rclpy where it can be imported, else cyclonedds."""
 
     @contextmanager
-    def bus(self, name: str, *, sim_time: bool = False) -> "Iterator[Bus]":
-        """The node, until the end or Ctrl-C."""
+    def bus(self, name: str, *, sim_time: bool = False, duration: float | None = None) -> "Iterator[Bus]":
+        """The node, until the end or Ctrl-C.
+
+        Raises:
+            RefusedError: It cannot be there, or not for a `duration` [s].
+        """
+        if duration is not None and not duration > 0:
+            raise RefusedError(f"duration must be above 0 s, got {duration!r}")
         from magtwin.ros.bus import names_of, open_bus
 
         bus = open_bus(
@@ -51,6 +58,7 @@ class Node:
             backend=self.backend,
             domain=self.domain,
         )
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # which a script's jobs begin without
         try:
             with suppress(KeyboardInterrupt):
                 yield bus
@@ -116,7 +124,7 @@ def sim(
     tell = announcer(quiet=False)
     tell(f"opening {scene}")
     twin = open_twin(scene, net=net)
-    with where.bus("magtwin_sim") as bus:
+    with where.bus("magtwin_sim", duration=duration) as bus:
         node = Simulator(
             twin,
             bus,
@@ -171,7 +179,7 @@ def magnetometer(
     tell(f"opening {scene}")
     twin = open_twin(scene, net=net)
     sim_time = values["use_sim_time"]
-    with where.bus("magtwin_magnetometer", sim_time=sim_time) as bus:
+    with where.bus("magtwin_magnetometer", sim_time=sim_time, duration=duration) as bus:
         Magnetometer(twin, bus, values, say=tell)
         tell(f"reading by {bus.backend}; Ctrl-C ends")
         spin(bus, duration)
@@ -348,7 +356,7 @@ def record(
 
     writer = RawBagWriter(out, force=force)
     try:
-        with where.bus("magtwin_record", sim_time=sim_time) as bus:
+        with where.bus("magtwin_record", sim_time=sim_time, duration=duration) as bus:
             announcer(quiet=False)(f"recording by {bus.backend}; Ctrl-C ends")
             Recorder(bus, writer, topic, sim_time=sim_time, say=_warn).run(duration_s=duration)
     finally:

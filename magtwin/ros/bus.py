@@ -152,6 +152,9 @@ class Bus(Protocol):
     def knows(self, kind: str) -> bool:
         """Whether messages of a type can be said and heard here."""
 
+    def resolve(self, topic: str) -> str:
+        """The name of a topic on the network."""
+
     def types(self, topic: str) -> tuple[str, ...]:
         """Types in which others offer a topic, as far as they have been discovered."""
 

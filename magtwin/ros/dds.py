@@ -158,6 +158,10 @@ class DdsBus:
         """As for `Bus`: all of the table, and those with parts of their own."""
         return kind in TYPES or kind in PARTED
 
+    def resolve(self, topic: str) -> str:
+        """As for `Bus`."""
+        return self._names.resolve(topic)
+
     def types(self, topic: str) -> tuple[str, ...]:
         """As for `Bus`."""
         return tuple(sorted({kind for kind in self._offers_of(topic) if kind}))

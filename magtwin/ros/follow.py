@@ -157,7 +157,7 @@ class Follower:
             return
         fresh = self._pose.fresh(now)
         if fresh is None:
-            self._tell(f"standing: no fresh {self._pose.topic.name}")
+            self._tell(f"standing: {self._pose.missing(now)}")
             if self._last != (0.0, 0.0):
                 self._command(0.0, 0.0)
             return

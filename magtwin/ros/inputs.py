@@ -24,6 +24,9 @@ JUMP_S = 1.0
 AHEAD_S = 0.05
 """How far stamps may be ahead of the node's clock before that is said [s]."""
 
+OTHER_S = 1e7
+"""Stamps that are further from the node's clock are another clock's: sim time begins at 0 [s]."""
+
 GRAVITY = 9.80665
 """Standard gravity [m/s2]."""
 
@@ -46,7 +49,8 @@ class Input:
             wanted: Columns that are read, all unless given; what stands in the others is nothing to it.
         """
         self.topic, self.max_age_s, self._bus, self._wanted = topic, max_age_s, bus, wanted
-        self.name = topic.name
+        self.name = bus.resolve(topic.name)
+        """Its name on the network."""
         self._kind = ""
         self._subscription: Subscription | None = None
         self._kept: deque[tuple[int, Columns]] = deque(maxlen=KEPT)
@@ -88,6 +92,18 @@ class Input:
         found = self.at(now_ns)
         return None if found is None or found[1] > self.max_age_s else found[0]
 
+    def missing(self, now_ns: int) -> str:
+        """What to say where nothing is fresh."""
+        return f"no fresh {self.name}{self._other_clock(now_ns)}"
+
+    def _other_clock(self, now_ns: int) -> str:
+        """A word on stamps that are years from this node's clock; "" where they are not."""
+        if not self._kept or abs(now_ns - self._kept[-1][0]) < OTHER_S * NS:
+            return ""
+        simulated = self._kept[-1][0] < now_ns
+        hint = "it is simulated: --sim-time, use_sim_time:=true" if simulated else "this node goes by /clock"
+        return f", whose stamps are of another clock ({hint})"
+
     def status(self, now_ns: int) -> Status:
         """How it fares since this was asked last."""
         found = self.at(now_ns)
@@ -105,6 +121,7 @@ class Input:
         elif found[1] > self.max_age_s:
             level = "stale"
             words.append(f"its newest is {found[1]:.2f} s old, more than {self.max_age_s:g} s")
+            words[-1] += self._other_clock(now_ns)
         if level == "stale" and self.silence and not self._trouble:
             level, words = "ok", [self.silence]
         troubles = (
@@ -119,14 +136,14 @@ class Input:
                 level = "warn" if level == "ok" else level
                 words.append(text)
         values = {
-            "topic": self._subscription.topic if self._subscription else self.topic.name,
+            "topic": self.name,
             "type": self._kind,
             "age [s]": "" if found is None else f"{found[1]:.3f}",
             "rate [Hz]": f"{rate:.1f}",
             "publishers": str(senders),
         }
         self.broken = self.jumps = self.ahead = 0
-        return Status(f"input {self.topic.name}", level, "; ".join(words) or "fresh", values)
+        return Status(f"input {self.name}", level, "; ".join(words) or "fresh", values)
 
     def _hear(self, message: Message) -> None:
         self.heard += 1
@@ -222,7 +239,7 @@ class Scanning:
     def status(self, now_ns: int) -> Status:
         """As for `Input`; no scans are an answer too, so it is never stale."""
         told = "spins" if self.on(now_ns) else "no scans: it is taken as off"
-        return Status(f"input {self._topic.name}", "ok", told, {"scans": str(self.heard)})
+        return Status(f"input {self._bus.resolve(self._topic.name)}", "ok", told, {"scans": str(self.heard)})
 
     def _hear(self, message: Message) -> None:
         self.heard += 1

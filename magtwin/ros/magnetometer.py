@@ -181,7 +181,7 @@ class Magnetometer:
             if fresh is None and one.topic is COMMAND:
                 fresh = {"v_cmd": np.zeros(1), "w_cmd": np.zeros(1)}  # a robot that is told nothing stands
             if fresh is None:
-                self._skip(f"no fresh {one.topic.name}")
+                self._skip(one.missing(now))
                 return
             columns |= fresh
         rows = self._rows(now, columns)

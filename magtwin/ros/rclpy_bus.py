@@ -165,6 +165,10 @@ class RclpyBus:
         except RefusedError:
             return False
 
+    def resolve(self, topic: str) -> str:
+        """As for `Bus`."""
+        return self._names.resolve(topic)
+
     def types(self, topic: str) -> tuple[str, ...]:
         """As for `Bus`."""
         whole = self._names.resolve(topic)

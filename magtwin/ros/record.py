@@ -140,7 +140,7 @@ class Player:
         self._bus, self._begun = bus, time.monotonic()
 
     def run(self, until: Callable[[], bool] = lambda: False, *, speed: float = 1.0) -> int:
-        """Say it, `speed` times as fast as it was, once others had `SETTLE_S`; how many messages that were."""
+        """Say it, `speed` times as fast as it was, once others had `SETTLE_S`; how many messages."""
         first = float(self._run["t"][0])
         begin = max(time.monotonic(), self._begun + SETTLE_S)
         count = 0

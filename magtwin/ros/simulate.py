@@ -33,6 +33,9 @@ LEAD_S = 0.006
 SLIP_S = 0.1
 """Delay after which a machine that is too slow gives up real time [s]."""
 
+MOST_HZ = 1000.0
+"""Readings a second that can be said one by one [Hz], the magnetometer node's own limit."""
+
 WARM = 5
 """Steps of another robot that are made beforehand: they open libraries, and tell which topics there are."""
 
@@ -103,6 +106,8 @@ class Simulator:
         """
         if not 0 < speed <= 100:
             raise RefusedError(f"speed must be above 0 and at most 100 times real time, got {speed!r}")
+        if rate_hz is not None and rate_hz > MOST_HZ:
+            raise RefusedError(f"rate_hz must be at most {MOST_HZ:g} Hz live, got {rate_hz!r}")
         self._twin, self._bus, self._seed, self._rate, self._lidar = twin, bus, seed, rate_hz, lidar
         self._speed, self._wall, self._say = speed, stamps == "wall", say
         self._reads = magnetometer
@@ -275,7 +280,7 @@ class Simulator:
         for topic in (TICKS, MAGNITUDE) if self._reads else (TICKS,):
             if (count := self._bus.publishers(topic.name)) > 1:
                 level = "warn"
-                words.append(f"{count} publishers on {topic.name}")
+                words.append(f"{count} publishers on {self._bus.resolve(topic.name)}")
         values = {
             "sim time [s]": f"{self.online.t:.2f}",
             "real-time factor": f"{factor:.3f}",
