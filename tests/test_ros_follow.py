@@ -252,3 +252,17 @@ def test_keys_become_commands_until_the_end_which_is_a_stand(nodes: Callable[...
     said = [m.read(["linear", "angular"]) for m in heard]
     assert max(one["linear"][0] for one in said) == pytest.approx(0.15)
     assert max(one["angular"][2] for one in said) == pytest.approx(0.25)
+
+
+def test_a_simulated_robot_is_told_from_a_real_one_by_its_stamps(nodes: Callable[..., Bus]) -> None:
+    robot, lines = Ideal(nodes), list[str]()
+    bus = nodes("follower")
+    for topic in (POSE, ODOMETRY):
+        spin(lambda topic=topic: bus.types(topic.name), bus)
+    Follower(LINE, DriveSpec(), bus, say=lines.append)
+    spin(robot.poses.subscribers, bus)
+    for _ in range(3):
+        place = {"header.stamp": np.int64(3 * NS), "pose.orientation": quat_from_yaw(0.0)}
+        robot.poses.publish(to_bytes(POSE.kind, place))
+    spin(lambda: any("of another clock (it is simulated: --sim-time" in line for line in lines), bus)
+    assert not robot.commands
