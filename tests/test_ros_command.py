@@ -41,6 +41,16 @@ def test_a_robot_is_simulated_for_a_while(capsys: pytest.CaptureFixture[str]) ->
     assert "published in nT" in said
 
 
+def test_the_profile_of_the_release_publishes_nt_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    quickly = ["--net", "none", "--duration", "0.1", "--speed", "4", "--profile", "aprilab"]
+    main(["ros", "sim", SCENE, *quickly])
+    assert "published in nT" in capsys.readouterr().err
+    main(["ros", "sim", SCENE, *quickly, "--units", "T"])
+    assert "published in nT" not in capsys.readouterr().err
+    main(["ros", "magnetometer", SCENE, "--profile", "aprilab", "--duration", "0.1"])
+    assert "published in nT" in capsys.readouterr().err
+
+
 def test_the_magnetometer_waits_for_a_robot(capsys: pytest.CaptureFixture[str]) -> None:
     main(["ros", "magnetometer", SCENE, "rate_hz:=50", "--duration", "0.3"])
     assert "reading by cyclonedds" in capsys.readouterr().err

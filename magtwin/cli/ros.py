@@ -2,10 +2,11 @@
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
@@ -68,6 +69,11 @@ class Node:
 
 Where = Annotated[Node, Parameter(name="*")]
 HERE = Node()
+Profile = Literal["ros", "aprilab"]
+
+UNITS: Mapping[Profile, Literal["T", "nT"]] = MappingProxyType({"ros": "T", "aprilab": "nT"})
+"""Unit of fields by profile: tesla as ROS has it, or what programs expect that were written against APRILab's
+release."""
 
 
 @ros_app.command(name="sim")
@@ -80,7 +86,8 @@ def sim(
     seed: Seed = 0,
     net: Path | None = None,
     rate_hz: float | None = None,
-    units: Literal["T", "nT"] = "T",
+    profile: Profile = "ros",
+    units: Literal["T", "nT"] | None = None,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     stamps: Literal["sim", "wall"] = "sim",
     stamped_commands: bool = False,
@@ -107,8 +114,10 @@ def sim(
         Weights to use in place of the scene's; "none" for a physical magnetometer.
     rate_hz
         Readings of the magnetometer a second [Hz]; the scene's unless given.
+    profile
+        Whose habits: ros, fields in tesla; aprilab, in nT, for programs written against APRILab's release.
     units
-        Unit of fields: T, as ROS has them, or nT, as APRILab's robot publishes them.
+        Unit of fields, T or nT; the profile's unless given.
     lidar
         Whether the LiDAR follows its schedule, or stays on or off.
     stamps
@@ -131,7 +140,7 @@ def sim(
             seed=seed,
             speed=speed,
             rate_hz=rate_hz,
-            units=units,
+            units=units or UNITS[profile],
             lidar=lidar,
             stamps=stamps,
             stamped_commands=stamped_commands,
@@ -148,6 +157,7 @@ def magnetometer(
     *settings: str,
     where: Where = HERE,
     net: Path | None = None,
+    profile: Profile = "ros",
     duration: float | None = None,
 ) -> None:
     """Read a robot's sensors through map and network: the magnetometer alone, for any robot or simulator.
@@ -167,6 +177,9 @@ def magnetometer(
         Where the node stands.
     net
         Weights to use in place of the scene's.
+    profile
+        Whose habits, unless settings say otherwise: ros, fields in tesla; aprilab, in nT, for programs written
+        against APRILab's release.
     duration
         How long, by the wall [s]; without an end unless given.
     """
@@ -174,7 +187,7 @@ def magnetometer(
     from magtwin.ros.parameters import settings as settings_of
     from magtwin.twin import open_twin
 
-    values = settings_of(PARAMETERS, settings)
+    values = settings_of(PARAMETERS, (f"units:={UNITS[profile]}", *settings))
     tell = announcer(quiet=False)
     tell(f"opening {scene}")
     twin = open_twin(scene, net=net)
