@@ -178,8 +178,8 @@ def magnetometer(
     net
         Weights to use in place of the scene's.
     profile
-        Whose habits, unless settings say otherwise: ros, fields in tesla; aprilab, in nT, for programs written
-        against APRILab's release.
+        Whose habits, unless settings say otherwise: ros, fields in tesla; aprilab, in nT, as programs want
+        that were written against APRILab's release.
     duration
         How long, by the wall [s]; without an end unless given.
     """
