@@ -90,7 +90,7 @@ def _waterfall(found: Evaluation, made: Sequence[Budget]) -> Drawing:
             now, then = before[k], before[k - 1]
             ax.bar(k, abs(bought), 0.7, bottom=min(now, then), color=SAVED if bought >= 0 else LOST)
             ax.plot([k - 1.35, k + 0.35], [then, then], color="0.6", lw=0.7)
-            ax.text(k, max(now, then) + 0.02 * most, f"{-bought:+.0f}", ha="center", va="bottom", fontsize=8)
+            ax.text(k, max(now, then) + 0.02 * most, _signed(-bought), ha="center", va="bottom", fontsize=8)
         ax.set_title(f"{one.name}: {one.mae_nt / one.naive_mae_nt:.3f} of naive", fontsize=9, loc="left")
         ax.set_ylabel("MAE [nT]", fontsize=9)
         ax.set_ylim(0, 1.18 * most)
@@ -114,7 +114,7 @@ def _ladder(found: Evaluation, order: Sequence[int]) -> Drawing:
         if np.isfinite(low + high):
             spread = [[max(mae - low, 0.0)], [max(high - mae, 0.0)]]
             ax.errorbar(mae, k, xerr=spread, fmt="none", ecolor=INK, elinewidth=0.8, capsize=2)
-        step = "" if not k else f", {mae - scores[order[k - 1]].mae_nt:+.0f}"
+        step = "" if not k else f", {_signed(mae - scores[order[k - 1]].mae_nt)}"
         words = f"{mae:.0f} nT ({scores[m].ratio:.3f}{step})"
         at = high if np.isfinite(high) else mae
         end = (max(at, mae), k)
@@ -128,3 +128,8 @@ def _ladder(found: Evaluation, order: Sequence[int]) -> Drawing:
         ax.spines[side].set_visible(False)
     title = "Steps: each model's error (ratio to naive, change from the line above)"
     return Drawing("steps", title, title, figure)
+
+
+def _signed(change: float) -> str:
+    """A change in whole nT, with its sign where it is not 0."""
+    return f"{round(change):+d}" if round(change) else "0"
