@@ -2,9 +2,8 @@
 
 import itertools
 import math
-import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,12 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.learn import heads
 from magtwin.learn.descent import Course, Epoch, check_device, descend
-from magtwin.learn.inputs import Array, Inputs, inputs_from, inputs_of, scaler_tensors
+from magtwin.learn.inputs import Array, inputs_from, inputs_of, scaler_tensors
 from magtwin.learn.perceptron import outputs
 from magtwin.learn.state import digest
-from magtwin.learn.weights import Fact, Weights, write_weights
+from magtwin.learn.weights import Weights
 from magtwin.names import RefusedError, find
-from magtwin.report import Figure, Report
 
 
 class Members(torch.nn.Module):
@@ -65,38 +63,20 @@ class Members(torch.nn.Module):
 
 
 @dataclass(kw_only=True)
-class Ensemble:
+class Ensemble(heads.Headed):
     """The mean of the members' means, with what each says of its error and how far they differ."""
 
-    inputs: Inputs
     net: Members
-    y_mean_nt: float
-    y_scale_nt: float
-    sd_factor: float = 1.0
-    """What the standard deviation is multiplied by, so that it holds on recordings never seen."""
-
-    residual_sd_nt: float = math.nan
-    facts: dict[str, Fact] = field(default_factory=dict)
 
     kind = "ensemble"
     context = 0
     step_s = 0.0
 
     @property
-    def features(self) -> tuple[str, ...]:
-        """Names of the inputs, in order."""
-        return self.inputs.features
-
-    @property
     def layers_text(self) -> str:
         """How many members, and their layers."""
         widths = "-".join(str(n) for n in (len(self.features), *self.net.hidden, 2))
         return f"{self.net.members} x {widths}"
-
-    @property
-    def parameters_count(self) -> int:
-        """Weights and biases of all members."""
-        return sum(p.numel() for p in self.net.parameters())
 
     def member(self, i: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
         """Layers of a member: weights (out, in) and biases (out,), first to last."""
@@ -121,45 +101,9 @@ class Ensemble:
         sd = np.sqrt(variance / count + np.maximum(squares / count - mean**2, 0.0))
         return self.y_mean_nt + mean, self.sd_factor * sd
 
-    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
-        """Whether an input of a row left the range of the training rows; see `Inputs.outside`."""
-        return self.inputs.outside(x)
-
-    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write it to one safetensors file; the same model, the same bytes.
-
-        Raises:
-            RefusedError: The file exists and `force` was not given.
-        """
-        write_weights(
-            path,
-            self.kind,
-            self.inputs.tensors() | self.net.state_dict(),
-            features=self.features,
-            residual_sd_nt=self.residual_sd_nt,
-            facts=self.facts,
-            members=self.net.members,
-            hidden=self.net.hidden,
-            y_mean_nt=self.y_mean_nt,
-            y_scale_nt=self.y_scale_nt,
-            sd_factor=self.sd_factor,
-            force=force,
-        )
-
-    def report(self, title: str) -> Report:
-        """What it is, in figures."""
-        figures = [
-            Figure("kind", self.kind),
-            Figure("layers", self.layers_text),
-            Figure("parameters", self.parameters_count),
-            Figure("inputs", ", ".join(self.features)),
-            Figure("label mean", self.y_mean_nt, "nT"),
-            Figure("label sd", self.y_scale_nt, "nT"),
-            Figure("sd factor", self.sd_factor, note="calibrated on validation recordings"),
-        ]
-        if not math.isnan(self.residual_sd_nt):
-            figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out recordings"))
-        return Report(title, tuple(figures), dict(self.facts))
+    def settings(self) -> dict[str, Any]:
+        """Members, widths of their layers, and what turns outputs into nT."""
+        return {"members": self.net.members, "hidden": self.net.hidden, **super().settings()}
 
 
 def fit_ensemble(

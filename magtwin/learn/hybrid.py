@@ -1,29 +1,33 @@
 """Hybrid: a linear base, and a small network for what the base leaves, where that does better."""
 
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from magtwin.learn.inputs import Array
+from magtwin.learn.inputs import Array, Inputs
 from magtwin.learn.linear import Linear, like, linear_from
 from magtwin.learn.model import FieldNet, net_of
-from magtwin.learn.weights import Fact, Weights, write_weights
+from magtwin.learn.regressor import Regressor
+from magtwin.learn.weights import Weights
 from magtwin.names import RefusedError
-from magtwin.report import Figure, Report
+from magtwin.report import Figure
 
 
 @dataclass(kw_only=True)
-class Hybrid:
+class Hybrid(Regressor):
     """A disturbance y = base(x) + net(x clipped to the training ranges), or the base alone.
 
     Outside the training ranges the network stays as it is at their edge, while the base goes on as a straight
     line: what is extrapolated is what physics extrapolates.
     """
+
+    inputs: Inputs = field(init=False)
+    """Those of the base."""
 
     base: Linear
     net: FieldNet | None
@@ -32,17 +36,12 @@ class Hybrid:
     sd_factor: float = 1.0
     """What the spread of the base is multiplied by."""
 
-    residual_sd_nt: float = math.nan
-    facts: dict[str, Fact] = field(default_factory=dict)
-
     kind = "hybrid"
     context = 0
     step_s = 0.0
 
-    @property
-    def features(self) -> tuple[str, ...]:
-        """Names of the inputs, in order."""
-        return self.base.features
+    def __post_init__(self) -> None:
+        self.inputs = self.base.inputs
 
     @property
     def layers_text(self) -> str:
@@ -56,53 +55,33 @@ class Hybrid:
 
     def predict(self, x: ArrayLike) -> tuple[Array, Array]:
         """Disturbances and standard deviations of their errors [nT], each (N,), from features (N, F)."""
-        of = self.base.inputs
-        x = of.checked(x)
+        x = self.inputs.checked(x)
         mean, sd = self.base.predict(x)
         if self.net is not None:
-            mean += self.net.predict(np.clip(x, of.low, of.high))[0]
+            mean += self.net.predict(np.clip(x, self.inputs.low, self.inputs.high))[0]
         return mean, sd * self.sd_factor
 
-    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
-        """Whether an input of a row left the range of the training rows; see `Inputs.outside`."""
-        return self.base.outside(x)
-
-    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write it to one safetensors file; the same model, the same bytes.
-
-        Raises:
-            RefusedError: The file exists and `force` was not given.
-        """
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Those of the base and those of the network, under the names of both."""
         tensors = {f"base.{name}": value for name, value in self.base.tensors().items()}
         if self.net is not None:
             tensors |= {f"net.{name}": value for name, value in self.net.state_dict().items()}
-        write_weights(
-            path,
-            self.kind,
-            tensors,
-            features=self.features,
-            residual_sd_nt=self.residual_sd_nt,
-            facts=self.facts,
-            penalty=self.base.penalty,
-            weighted=self.base.weighted,
-            dropout=self.net.dropout if self.net else 0.0,
-            sd_factor=self.sd_factor,
-            force=force,
-        )
+        return tensors
 
-    def report(self, title: str) -> Report:
-        """The base's terms, the network's layers, and the spread of its errors."""
-        figures = [
-            Figure("kind", self.kind),
+    def settings(self) -> dict[str, Any]:
+        """Those of the base, dropout of the network, and the factor of the spread."""
+        dropout = self.net.dropout if self.net else 0.0
+        return {**self.base.settings(), "dropout": dropout, "sd_factor": self.sd_factor}
+
+    def figures(self) -> list[Figure]:
+        """The network's layers, the base's terms, and the spread of its errors."""
+        return [
             Figure("layers", self.layers_text),
             Figure("parameters", self.parameters_count),
             Figure("constant", self.base.constant_nt, "nT", note="of the base, at the means"),
-            *self.base.figures()[:-1],
+            *self.base.terms(),
             Figure("sd at the means", math.sqrt(self.base.spread.floor_nt2) * self.sd_factor, "nT"),
         ]
-        if not math.isnan(self.residual_sd_nt):
-            figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out recordings"))
-        return Report(title, tuple(figures), dict(self.facts))
 
 
 def hybrid_of(weights: Weights) -> Hybrid:

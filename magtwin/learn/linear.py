@@ -5,10 +5,9 @@ form of Tolles and Lawson's compensation: hard iron goes once about with the hea
 """
 
 import math
-import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,9 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.learn.calibration import Spread, few_groups_factor, fit_spread, quantile_factor
 from magtwin.learn.features import FEATURES
 from magtwin.learn.inputs import Array, Inputs, inputs_from, inputs_of, scaler_tensors
-from magtwin.learn.weights import Fact, Weights, write_weights
+from magtwin.learn.regressor import Regressor
+from magtwin.learn.weights import Weights
 from magtwin.names import RefusedError
-from magtwin.report import Figure, Report
+from magtwin.report import Figure
 
 PENALTIES = tuple(float(p) for p in np.logspace(-8, 1, 19))
 """Penalties that cross-validation chooses among."""
@@ -34,10 +34,9 @@ Weighting = Literal["auto", "label_sd", "none"]
 
 
 @dataclass(kw_only=True)
-class Linear:
+class Linear(Regressor):
     """A disturbance constant + sum_j c_j z_j with z = (x - mean) / scale, and the spread of its errors."""
 
-    inputs: Inputs
     constant_nt: float
     """Disturbance at the means of the inputs [nT]."""
 
@@ -53,17 +52,9 @@ class Linear:
     weighted: bool = False
     """Whether rows counted by how well the map is known there."""
 
-    residual_sd_nt: float = math.nan
-    facts: dict[str, Fact] = field(default_factory=dict)
-
     kind = "linear"
     context = 0
     step_s = 0.0
-
-    @property
-    def features(self) -> tuple[str, ...]:
-        """Names of the inputs, in order."""
-        return self.inputs.features
 
     @property
     def layers_text(self) -> str:
@@ -87,12 +78,8 @@ class Linear:
         z = self.inputs.scaled(self.inputs.checked(x))
         return self.mean_nt(z), self.spread.sd_nt(z)
 
-    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
-        """Whether an input of a row left the range of the training rows; see `Inputs.outside`."""
-        return self.inputs.outside(x)
-
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Everything that its file holds, by name, float64."""
+        """Scaler, ranges, coefficients and spread, float64."""
         spread = self.spread
         return {
             **self.inputs.tensors(),
@@ -102,34 +89,17 @@ class Linear:
             "spread_slopes_nt2": torch.as_tensor(spread.slopes_nt2),
         }
 
-    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write it to one safetensors file; the same model, the same bytes.
-
-        Raises:
-            RefusedError: The file exists and `force` was not given.
-        """
-        write_weights(
-            path,
-            self.kind,
-            self.tensors(),
-            features=self.features,
-            residual_sd_nt=self.residual_sd_nt,
-            facts=self.facts,
-            penalty=self.penalty,
-            weighted=self.weighted,
-            force=force,
-        )
-
-    def report(self, title: str) -> Report:
-        """Its terms with their coefficients in the features' own units, and the spread of its errors."""
-        figures = [Figure("kind", self.kind), Figure("constant", self.constant_nt, "nT", note="at the means")]
-        figures += self.figures()
-        if not math.isnan(self.residual_sd_nt):
-            figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out recordings"))
-        return Report(title, tuple(figures), dict(self.facts))
+    def settings(self) -> dict[str, Any]:
+        """Penalty and weighting."""
+        return {"penalty": self.penalty, "weighted": self.weighted}
 
     def figures(self) -> list[Figure]:
-        """Coefficients, penalty and spread."""
+        """Its terms, and the spread of its errors."""
+        constant = Figure("constant", self.constant_nt, "nT", note="at the means")
+        return [constant, *self.terms(), Figure("sd at the means", math.sqrt(self.spread.floor_nt2), "nT")]
+
+    def terms(self) -> list[Figure]:
+        """Coefficients in the features' own units, and the penalty that held them down."""
         figures = []
         for name, value, scale in zip(self.features, self.coefficients_nt, self.inputs.scale, strict=True):
             unit = FEATURES[name].unit
@@ -137,9 +107,7 @@ class Linear:
             note = f"{value:+.3g} nT a standard deviation"
             figures.append(Figure(name, float(value / scale), per, note=note))
         note = "rows weighted by how well the map is known" if self.weighted else ""
-        figures.append(Figure("ridge penalty", self.penalty, note=note))
-        figures.append(Figure("sd at the means", math.sqrt(self.spread.floor_nt2), "nT"))
-        return figures
+        return [*figures, Figure("ridge penalty", self.penalty, note=note)]
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,8 @@
 
 import itertools
 import math
-import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.learn import heads
 from magtwin.learn.descent import Course, Epoch, check_device, descend
-from magtwin.learn.inputs import Array, Inputs, inputs_from, inputs_of, scaler_tensors
+from magtwin.learn.inputs import Array, inputs_from, inputs_of, scaler_tensors
 from magtwin.learn.perceptron import CHUNK, in_threads
 from magtwin.learn.state import digest
-from magtwin.learn.weights import Fact, Weights, write_weights
+from magtwin.learn.weights import Weights
 from magtwin.names import RefusedError
-from magtwin.report import Figure, Report
+from magtwin.report import Figure
 
 STRETCH = 64
 """Rows of a run that are learned from together."""
@@ -76,28 +75,14 @@ class Convolutions(torch.nn.Module):
 
 
 @dataclass(kw_only=True)
-class Temporal:
+class Temporal(heads.Headed):
     """A disturbance with its standard deviation from a row and those before it."""
 
-    inputs: Inputs
     net: Convolutions
-    y_mean_nt: float
-    y_scale_nt: float
     step_s: float
     """Time between the rows that it was trained on [s]."""
 
-    sd_factor: float = 1.0
-    """What the standard deviation is multiplied by, so that it holds on recordings never seen."""
-
-    residual_sd_nt: float = math.nan
-    facts: dict[str, Fact] = field(default_factory=dict)
-
     kind = "tcn"
-
-    @property
-    def features(self) -> tuple[str, ...]:
-        """Names of the inputs, in order."""
-        return self.inputs.features
 
     @property
     def context(self) -> int:
@@ -109,11 +94,6 @@ class Temporal:
         """Widths, kernel, and how far back it looks."""
         widths = "-".join(str(n) for n in (len(self.features), *self.net.channels, 2))
         return f"{widths}, kernel {self.net.kernel}, {self.context} rows back"
-
-    @property
-    def parameters_count(self) -> int:
-        """Weights and biases."""
-        return sum(p.numel() for p in self.net.parameters())
 
     def predict(self, x: ArrayLike) -> tuple[Array, Array]:
         """Disturbances and standard deviations of their errors [nT], each (N,), from one run's rows (N, F).
@@ -145,47 +125,15 @@ class Temporal:
                 block[: rows + self.context] = z[start : start + rows + self.context]
                 found[start : start + rows] = self.net(torch.from_numpy(block)).numpy()[:rows]
 
-    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
-        """Whether an input of a row left the range of the training rows; see `Inputs.outside`."""
-        return self.inputs.outside(x)
+    def settings(self) -> dict[str, Any]:
+        """Widths, kernel, time between rows, and what turns outputs into nT."""
+        own = {"channels": self.net.channels, "kernel": self.net.kernel, "step_s": self.step_s}
+        return own | super().settings()
 
-    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write it to one safetensors file; the same model, the same bytes.
-
-        Raises:
-            RefusedError: The file exists and `force` was not given.
-        """
-        write_weights(
-            path,
-            self.kind,
-            self.inputs.tensors() | self.net.state_dict(),
-            features=self.features,
-            residual_sd_nt=self.residual_sd_nt,
-            facts=self.facts,
-            channels=self.net.channels,
-            kernel=self.net.kernel,
-            step_s=self.step_s,
-            y_mean_nt=self.y_mean_nt,
-            y_scale_nt=self.y_scale_nt,
-            sd_factor=self.sd_factor,
-            force=force,
-        )
-
-    def report(self, title: str) -> Report:
+    def figures(self) -> list[Figure]:
         """What it is, in figures."""
-        figures = [
-            Figure("kind", self.kind),
-            Figure("layers", self.layers_text),
-            Figure("parameters", self.parameters_count),
-            Figure("inputs", ", ".join(self.features)),
-            Figure("rows apart", self.step_s, "s"),
-            Figure("label mean", self.y_mean_nt, "nT"),
-            Figure("label sd", self.y_scale_nt, "nT"),
-            Figure("sd factor", self.sd_factor, note="calibrated on validation recordings"),
-        ]
-        if not math.isnan(self.residual_sd_nt):
-            figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out recordings"))
-        return Report(title, tuple(figures), dict(self.facts))
+        layers, parameters, inputs, *scales = super().figures()
+        return [layers, parameters, inputs, Figure("rows apart", self.step_s, "s"), *scales]
 
 
 @dataclass(frozen=True)
