@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -35,6 +35,9 @@ from magtwin.ros.network import Following
 from magtwin.ros.parameters import Parameter
 from magtwin.run import Run
 from magtwin.twin import Twin
+
+if TYPE_CHECKING:
+    from magtwin.learn.reading import Reader, Reading
 
 PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
     {
@@ -118,6 +121,7 @@ class Magnetometer:
             lidar = twin.scene.robot.lidar
             self._scans = Scanning(bus, SCAN, gap_s=lidar.latency_s + 2.5 / max(lidar.scan_rate_hz, 0.1))
         self._network = Following(twin.magnetometer) if twin.magnetometer else None
+        self._reader: Reader | None = None  # where a row tells all, and nothing is asked of the map's border
         self._magnitude = bus.publisher(MAGNITUDE.name, MAGNITUDE.kind, MAGNITUDE.qos)
         self._total = bus.publisher(TOTAL_FIELD.name, TOTAL_FIELD.kind, TOTAL_FIELD.qos)
         self._reporter = Reporter(bus)
@@ -154,7 +158,15 @@ class Magnetometer:
                 self._timer.cancel()
             self._rate = float(settings["rate_hz"])
             self._timer = self._bus.timer(1 / self._rate, self._read)
-        self._noise_nt = robot.magnetometer.noise_density_nt * np.sqrt(self._rate / 2)
+        self._noise_nt = float(robot.magnetometer.noise_density_nt * np.sqrt(self._rate / 2))
+        network = self._twin.magnetometer
+        alone = network is not None and not network.net.context and settings["outside"] == "silent"
+        if not alone:
+            self._reader = None
+        elif self._reader is None and network is not None:
+            from magtwin.learn.reading import Reader
+
+            self._reader = Reader(network.net, self._twin.field)
         if settings["units"] != self._units:
             self._units = settings["units"]
             if self._units == "nT":
@@ -184,22 +196,16 @@ class Magnetometer:
                 self._skip(one.missing(now))
                 return
             columns |= fresh
-        rows = self._rows(now, columns)
-        if not np.isfinite(rows["b_map_nt"][0]):
+        reading = self._reading(now, columns)
+        if not np.isfinite(reading.b_map_nt):
             self._outside += 1
             self._skip("the pose is outside the map")
             return
-        sd, disturbance = self._noise_nt, 0.0
-        if self._network is not None:
-            gave, spread, strange = self._network(rows)
-            disturbance = float(gave[0])
-            sd = float(np.hypot(spread[0], self._noise_nt)) if np.isfinite(spread[0]) else 0.0
-            self._strange += bool(strange is not None and strange[0])
-        total = float(rows["b_map_nt"][0]) + disturbance
-        if not np.isfinite(total):
+        self._strange += reading.outside_training
+        if not np.isfinite(reading.b_total_nt):
             self._skip("the network gave no number")
             return
-        self._publish(now, total, sd)
+        self._publish(now, reading.b_total_nt, reading.b_sd_nt)
         begun = max(self._bus.due_wall_ns(), newest_sent_ns(self.inputs))
         self.latencies_s.append((time.time_ns() - begun) / NS)
         if self._missing:
@@ -208,14 +214,34 @@ class Magnetometer:
         self._last_ns = now
         self._published += 1
 
-    def _rows(self, now: int, columns: dict[str, Any]) -> Run:
+    def _reading(self, now: int, columns: dict[str, Any]) -> "Reading":
+        """What map and network say of this step; the sd has the sensor's noise in it, 0 where unknown."""
+        from magtwin.learn.reading import Reading
+
+        told = self._settings["lidar"]
+        spins = told == "on" or (told == "scan" and self._scans is not None and self._scans.on(now))
+        if self._reader is not None:
+            signals = {name: column[0] for name, column in columns.items()} | {"lidar_on": float(spins)}
+            x, y = columns["mocap_p"][0, :2].tolist()
+            found = self._reader.read((x, y), float(yaw_from_quat(columns["mocap_q_xyzw"])[0]), signals)
+            return found._replace(b_sd_nt=self._with_noise(found.b_sd_nt))
+        rows = self._rows(now, columns, spins)
+        b_map = float(rows["b_map_nt"][0])
+        if self._network is None or not np.isfinite(b_map):
+            return Reading(b_map, b_map, 0.0, self._noise_nt, outside_training=False)
+        (gave,), (spread,), strange = self._network(rows)
+        outside = bool(strange is not None and strange[0])
+        return Reading(b_map + float(gave), b_map, float(gave), self._with_noise(float(spread)), outside)
+
+    def _with_noise(self, sd_nt: float) -> float:
+        return float(np.hypot(sd_nt, self._noise_nt)) if np.isfinite(sd_nt) else 0.0
+
+    def _rows(self, now: int, columns: dict[str, Any], spins: bool) -> Run:
         """One row of a Run, of what the network and the map read."""
         yaw = yaw_from_quat(columns["mocap_q_xyzw"])
         xy = columns["mocap_p"][:, :2]
         outside: Literal["clamp", "nan"] = "clamp" if self._settings["outside"] == "clamp" else "nan"
         b_map, slopes = self._twin.field.lookup_with_gradient(xy, yaw, outside=outside)
-        told = self._settings["lidar"]
-        spins = told == "on" or (told == "scan" and self._scans is not None and self._scans.on(now))
         made = {
             "t": np.array([now / NS]),
             "yaw": yaw,
