@@ -9,7 +9,12 @@ from magtwin.ros.bus import Bus
 
 SLOWEST_S = 15.0
 
-DOMAINS = itertools.count(1 + os.getpid() % 200)
+_EACH = 50
+_WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 2
+_FIRST = os.getpid() % _EACH
+
+DOMAINS = (1 + _EACH * _WORKER + k % _EACH for k in itertools.count(_FIRST))
+"""Domains up to 100, whose ports lie below those that systems hand out; those of two workers are apart."""
 
 
 def spin(until: Callable[[], object], *nodes: Bus) -> None:

@@ -148,7 +148,7 @@ def test_the_twin_is_driven_around_every_path_over_ros(
     twin: Twin, nodes: Callable[..., Bus], name: str
 ) -> None:
     path = PATHS[name]()
-    node, track = driven(twin, nodes, path, clock=10.0)
+    node, track = driven(twin, nodes, path, clock=3.0)
     begun = int(np.argmin(np.hypot(*(track[:, :2] - path.p_xy[0]).T)[: len(track) // 3]))
     _, off = path.nearest(track[begun:, :2])
     assert np.sqrt(np.mean(off**2)) < 0.06
