@@ -60,7 +60,12 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
             scene_file,
             "figure8",
             folder,
-            facts={"scene_file": scene_file.relative_to(folder).as_posix()},
+            # a day as those that its network learned from: the robot as it ships is that of the survey
+            facts={
+                "scene_file": scene_file.relative_to(folder).as_posix(),
+                "session_seed": seed,
+                "session": 0,
+            },
             steps=steps,
             seed=seed,
             speed=0.2,
@@ -320,17 +325,18 @@ def _drive(
     replay: Path | None = None,
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
-    facts: Mapping[str, str] = MappingProxyType({}),
+    facts: Mapping[str, str | int] = MappingProxyType({}),
     **options: Any,
 ) -> _Driven:
     """Run a scene: along `path`, unless commands or a run say otherwise.
 
-    `facts` say where files will lie as seen from the run's own, for those that move with it.
+    `facts` say where files will lie as seen from the run's own, for those that move with it, and on which day
+    it drives, if on one (`session_seed`, `session`).
     """
     from magtwin.io.formats import read_run
     from magtwin.path import resolve_path
     from magtwin.sim.commands import read_commands
-    from magtwin.twin import open_twin, scan, simulate
+    from magtwin.twin import on_its_day, open_twin, scan, simulate
 
     planned = None
     what: Any = path
@@ -340,7 +346,7 @@ def _drive(
         what = read_run(replay)
     elif path != "random":
         what = planned = resolve_path(path)
-    twin = open_twin(scene_file, net=net, magnetometer=magnetometer)
+    twin = on_its_day(open_twin(scene_file, net=net, magnetometer=magnetometer), facts)
     if commands is not None and what.beyond(twin.scene.robot.drive):
         print(f"  {what.beyond(twin.scene.robot.drive)}", file=sys.stderr)  # noqa: T201
     steps(f"Driving {planned.name if planned else path}")
