@@ -14,6 +14,7 @@ from magtwin.field.map import AnomalyMap
 from magtwin.files import output
 from magtwin.io.charts import Picture, thinned
 from magtwin.io.correlations import figure_of_correlations
+from magtwin.io.learning_curves import label_epochs
 from magtwin.io.pages import WRITERS, Page, Section, Table
 from magtwin.io.plots import INK, drawn, new_figure
 from magtwin.learn.correlation import correlations
@@ -433,8 +434,6 @@ def _bars(found: Evaluation) -> Drawing:
 
 def _curves(found: Evaluation, curves: Mapping[str, Sequence[Mapping[str, float]]]) -> Drawing | None:
     """The paper's Figure 6 c: learning curves, of the weights that have one beside them."""
-    from matplotlib.ticker import MaxNLocator
-
     shown = {m: curves[name] for m, name in enumerate(found.names) if curves.get(name)}
     if not shown:
         return None
@@ -446,12 +445,7 @@ def _curves(found: Evaluation, curves: Mapping[str, Sequence[Mapping[str, float]
             if points:
                 label = f"{found.names[m]}, {what}"
                 ax.plot(*zip(*points, strict=True), ls=style, color=ink(m), label=label)
-    ax.set_ylim(bottom=0)
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlabel("epoch", fontsize=9)
-    ax.set_ylabel("RMSE [nT]", fontsize=9)
-    ax.tick_params(labelsize=8)
-    ax.grid(color="0.9")
+    label_epochs(ax)
     figure.legend(loc="outside lower center", ncols=2, fontsize=7.5, frameon=False)
     title = "Figure 6 c: error in training and on validation recordings over the epochs"
     return Drawing("figure_6c", title, title, figure)

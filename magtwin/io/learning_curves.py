@@ -5,10 +5,14 @@ import os
 from collections.abc import Sequence
 from dataclasses import astuple, fields
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from magtwin.files import output
 from magtwin.io.plots import INK, MAP_INK, new_figure, save
 from magtwin.learn.descent import Epoch
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def plot_learning_curve(
@@ -31,8 +35,6 @@ def plot_learning_curve(
     Raises:
         RefusedError: `out` is no picture or exists.
     """
-    from matplotlib.ticker import MaxNLocator
-
     figure = new_figure(5.6, 3.4)
     ax = figure.subplots()
     numbers = [epoch.number for epoch in history]
@@ -43,17 +45,24 @@ def plot_learning_curve(
         ax.axhline(naive_rmse_nt, color="0.5", ls="--", lw=1, label="validation, naive mean")
     kept = next(epoch for epoch in reversed(history) if epoch.best)
     ax.plot(kept.number, kept.val_rmse_nt, "o", mfc="none", mec=INK, ms=9, label=f"kept: epoch {kept.number}")
+    label_epochs(ax)
+    ax.set_axisbelow(True)
+    if title:
+        ax.set_title(title, fontsize=10)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=7.5, frameon=False)
+    save(figure, out, force)
+
+
+def label_epochs(ax: "Axes") -> None:
+    """Axes, ticks and grid of errors [nT] over whole epochs."""
+    from matplotlib.ticker import MaxNLocator
+
     ax.set_ylim(bottom=0)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("epoch", fontsize=9)
     ax.set_ylabel("RMSE [nT]", fontsize=9)
     ax.tick_params(labelsize=8)
     ax.grid(color="0.9")
-    ax.set_axisbelow(True)
-    if title:
-        ax.set_title(title, fontsize=10)
-    figure.legend(loc="outside lower center", ncols=4, fontsize=7.5, frameon=False)
-    save(figure, out, force)
 
 
 def write_learning_curve(
