@@ -16,7 +16,7 @@ import numpy as np
 from magtwin.field.bodies import SHAPES, Body, check_mesh, induced_magnetization
 from magtwin.field.earth import MODEL, SPAN
 from magtwin.frames import IDENTITY_XYZW, quat_multiply, rotate
-from magtwin.furniture import parts_of
+from magtwin.furniture import Part, parts_of
 from magtwin.names import RefusedError, find, hint
 
 Vec2 = tuple[float, float]
@@ -858,7 +858,7 @@ class FurnitureSpec(Spec):
     """Name of its prim."""
 
     kind: str
-    """What it is, a name of `magtwin.furniture.KINDS`."""
+    """What it is, a name of `magtwin.furniture.KINDS`, or "box", "cylinder" or "mesh"."""
 
     p_world: Vec3
     """Where it stands: the middle of its footprint, on the floor [m]."""
@@ -872,17 +872,42 @@ class FurnitureSpec(Spec):
     susceptibility: float = 0.0
     """Volume susceptibility of its steel parts [1]."""
 
+    material: str = ""
+    """What a box, cylinder or mesh is made of, a name of `magtwin.furniture.MATERIALS`."""
+
+    size_m: Vec3 = ZERO3
+    """Size of a box along its own x, y and z, or diameter, diameter and height of a cylinder [m]."""
+
+    vertices_m: tuple[Vec3, ...] = ()
+    """Vertices of a mesh about the middle of its box [m], in single precision; the mesh stands on the floor."""
+
+    faces: tuple[tuple[int, int, int], ...] = ()
+    """Corners of a mesh's triangles, counter-clockwise from outside."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         self._unit("q_world_xyzw")
         self._not_negative("susceptibility")
-        steel = [part.name for part in parts_of(self.kind) if part.steel]
+        steel = [part.name for part in self.parts if part.steel]
         fits = len(self.magnetization) in (0, len(steel))
-        self._require(
-            "magnetization", fits, f"have one number for each of {', '.join(steel)}", self.magnetization
-        )
+        what = f"have one number for each of {', '.join(steel)}" if steel else "be left out: it has no steel"
+        self._require("magnetization", fits, what, self.magnetization)
         if not any(self.magnetization):
             object.__setattr__(self, "magnetization", ())
+        if self.faces:
+            object.__setattr__(self, "vertices_m", self.parts[0].vertices_m)
+            self.sources()  # refuses a steel mesh that is not closed
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """What it consists of."""
+        return parts_of(
+            self.kind,
+            material=self.material,
+            size_m=self.size_m,
+            vertices_m=self.vertices_m,
+            faces=self.faces,
+        )
 
     def sources(self, *, in_world: bool = True) -> tuple[SourceSpec, ...]:
         """Its steel, a source each, named after the piece and the part.
@@ -890,7 +915,7 @@ class FurnitureSpec(Spec):
         Args:
             in_world: Whether they stand where it does; otherwise they are in its own axes.
         """
-        steel = [part for part in parts_of(self.kind) if part.steel]
+        steel = [part for part in self.parts if part.steel]
         turn = self.q_world_xyzw if in_world else IDENTITY_XYZW
         sources = []
         for part, m in zip(steel, self.magnetization or (0.0,) * len(steel), strict=True):
@@ -901,7 +926,9 @@ class FurnitureSpec(Spec):
                     p_world=(float(x), float(y), float(z)),
                     shape=part.shape,
                     q_world_xyzw=turn,
-                    size_m=part.size_m,
+                    size_m=ZERO3 if part.faces else part.size_m,
+                    vertices_m=part.vertices_m,
+                    faces=part.faces,
                     magnetization=tuple(m * (k == part.along) for k in range(3)),  # type: ignore[arg-type]
                     susceptibility=self.susceptibility,
                 )
