@@ -20,11 +20,12 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from magtwin.names import RefusedError, find
-from magtwin.path import Path, check_clear, check_on_floor, resolve_path
+from magtwin.path import Path, check_clear, check_on_floor
+from magtwin.placement import path_in
 from magtwin.run import COLUMNS
 from magtwin.sim.fleet import SENSED, Fleet
 from magtwin.sim.session import draw_session
-from magtwin.twin import Kind, Twin, open_twin
+from magtwin.twin import Kind, Twin, open_twin, room_of
 
 if TYPE_CHECKING:
     from magtwin.learn.magnetometer import NeuralMagnetometer
@@ -159,7 +160,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         if twin.magnetometer:
             _check_network(twin.magnetometer)
         robot = twin.scene.robot
-        self.path = path if isinstance(path, Path) else resolve_path(path)
+        self.path = path if isinstance(path, Path) else path_in(room_of(twin), path)
         check_on_floor(self.path, twin.scene.lab.floor_m, robot.footprint_radius_m)
         check_clear(self.path, twin.obstacles, robot.footprint_radius_m)
         if not callable(reward):

@@ -15,7 +15,7 @@ from magtwin.field.map import AnomalyMap
 from magtwin.files import existing, git_revision, sha256
 from magtwin.names import RefusedError, find
 from magtwin.obstacles import Obstacles
-from magtwin.path import Path, resolve_path
+from magtwin.path import Path
 from magtwin.run import Run
 from magtwin.spec import MagnetometerSpec, RobotSpec, Scene
 
@@ -24,6 +24,7 @@ Facts = dict[str, str | int | float | bool]
 
 if TYPE_CHECKING:
     from magtwin.learn.magnetometer import NeuralMagnetometer, Read
+    from magtwin.placement import Room
     from magtwin.sim.commands import Commands
     from magtwin.sim.controllers import Controller
     from magtwin.sim.engine import Engine
@@ -284,13 +285,36 @@ def engine_named(
     return Newton(twin.scene_file, twin.scene.robot, progress)
 
 
-def way_of(way: "Path | Commands | Run | str | FilePath") -> "Path | Commands | Run | str":
+def way_of(
+    way: "Path | Commands | Run | str | FilePath", twin: Twin, *, fit: bool = False
+) -> "Path | Commands | Run | str":
     """What is to be driven: the path that a name or a CSV file stands for, all else ("random" too) as it is.
 
+    Args:
+        way: What is given.
+        twin: Where it is driven: named paths are scaled to its floor, see `magtwin.placement.path_in`.
+        fit: Whether a path that does not fit is moved and made smaller until it does.
+
     Raises:
-        RefusedError: There is no such path.
+        RefusedError: There is no such path, or no room for it.
     """
-    return resolve_path(way) if isinstance(way, str | FilePath) and way != "random" else way  # type: ignore[return-value]
+    from magtwin.placement import fitted, path_in
+
+    if isinstance(way, str | FilePath):
+        if way == "random":
+            return way
+    elif not (fit and isinstance(way, Path)):
+        return way
+    room = room_of(twin)
+    path = way if isinstance(way, Path) else path_in(room, way)
+    return fitted(path, room) if fit else path
+
+
+def room_of(twin: Twin) -> "Room":
+    """What a path of a twin's first robot must fit into."""
+    from magtwin.placement import Room
+
+    return Room(twin.scene.lab.floor_m, twin.scene.robot.footprint_radius_m, twin.obstacles)
 
 
 def simulate(
@@ -340,7 +364,7 @@ def simulate(
 
     twin, seed = _opened(twin, net, magnetometer, "simulate"), _seed(seed)
     network = twin.magnetometer
-    path = way_of(path)
+    path = way_of(path, twin)
     _check_commands(path, network)
     read: Read | None = None
 
@@ -422,11 +446,11 @@ def simulate_robots(
     placed = {one.robot.name: one for one in twin.scene.robots}
     for name in (*(paths or {}), *(robots or ())):
         find("robot", name, placed)
+    led = {name: led_by(twin, name) for name in placed}
     ways: dict[str, Path | Commands | Run | str] = {}
     for name, one in placed.items():
-        ways[name] = way_of((paths or {}).get(name, one.path or "figure8"))
+        ways[name] = way_of((paths or {}).get(name, one.path or "figure8"), led[name])
     wanted = [name for name in placed if robots is None or name in set(robots)]
-    led = {name: led_by(twin, name) for name in placed}
     for name, way in ways.items():
         _check_commands(way, led[name].magnetometer)
     reads: dict[str, Read] = {}
@@ -541,7 +565,9 @@ def simulate_many(
         )
     count = len(numbers)
     given = _each("paths", paths, count)
-    resolved: dict[Any, Any] = {path: way_of(path) for path in given if isinstance(path, str | FilePath)}
+    resolved: dict[Any, Any] = {
+        path: way_of(path, twin) for path in given if isinstance(path, str | FilePath)
+    }
     scenes: dict[int, Scene] = {}
     jobs = []
     for seed, path, speed, robot in zip(
@@ -671,6 +697,8 @@ def path_facts(path: "Path | Commands | Run | str") -> Facts:
     else:
         arrays, what, file = (path.rows,), "commands", path.file
     facts: Facts = {f"{what}_file": file} if file else {}
+    if isinstance(path, Path) and path.placing:
+        facts["path_placing"] = " ".join(map(repr, path.placing))
     checksum = hashlib.sha256()
     for array in arrays:
         checksum.update(np.ascontiguousarray(array).tobytes())

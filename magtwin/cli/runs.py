@@ -20,6 +20,7 @@ def runs(
     out: Path = Path("runs"),
     count: Whole = 100,
     path: Names = None,
+    fit: Annotated[bool, Parameter(negative="")] = False,
     seed: Seed = 0,
     sessions: Whole = 0,
     speed: float | None = None,
@@ -50,6 +51,8 @@ def runs(
     path
         Paths to drive in turn, as for `magtwin run`: names, cases A to E, random, CSV files; figure8 unless
         given.
+    fit
+        As for `magtwin run`.
     seed
         Seed of the first run; each next one's is one more.
     sessions
@@ -81,10 +84,9 @@ def runs(
     from magtwin.files import existing, output
     from magtwin.io.tables import write_parquet
     from magtwin.names import RefusedError
-    from magtwin.path import resolve_path
     from magtwin.report import Figure, Report
     from magtwin.sim.session import draw_speed, session_of
-    from magtwin.twin import open_twin, simulate_many
+    from magtwin.twin import open_twin, simulate_many, way_of
 
     existing(scene, "scene")
     for name, value, least in (("count", count, 1), ("sessions", sessions, 0), ("seed", seed, 0)):
@@ -94,7 +96,7 @@ def runs(
     with output(out, force=force) as folder:
         steps("Opening the scene")
         twin = open_twin(scene, net=net, magnetometer=magnetometer)
-        paths = [name if name == "random" else resolve_path(name) for name in path or ["figure8"]]
+        paths = [way_of(name, twin, fit=fit) for name in path or ["figure8"]]
         robot = twin.scene.robot
         days = [robot]
         if sessions:
