@@ -15,7 +15,15 @@ if TYPE_CHECKING:
     from magtwin.path import Path
     from magtwin.run import COLUMNS, Run
     from magtwin.spec import Scene
-    from magtwin.twin import Twin, open_twin, scene_from_toml, simulate, simulate_many, simulate_robots
+    from magtwin.twin import (
+        Twin,
+        author_scene,
+        open_twin,
+        scene_from_toml,
+        simulate,
+        simulate_many,
+        simulate_robots,
+    )
 
 _HOME = {
     "AnomalyMap": "magtwin.field.map",
@@ -25,6 +33,7 @@ _HOME = {
     "Run": "magtwin.run",
     "Scene": "magtwin.spec",
     "Twin": "magtwin.twin",
+    "author_scene": "magtwin.twin",
     "open_twin": "magtwin.twin",
     "scene_from_toml": "magtwin.twin",
     "simulate": "magtwin.twin",
@@ -40,6 +49,7 @@ __all__ = [
     "Run",
     "Scene",
     "Twin",
+    "author_scene",
     "open_twin",
     "scene_from_toml",
     "simulate",

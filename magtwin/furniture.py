@@ -139,8 +139,9 @@ def _radiator() -> Iterator[Part]:
     """A panel radiator, 1 m wide and 0.6 m high, 0.12 m above the floor: two panels, two pipes below."""
     deep, wide, high, low, panel = 0.1, 1.0, 0.6, 0.12, 0.016
     for name, side in (("front", 1), ("rear", -1)):
-        at = (side * (deep - panel) / 2, 0, low + high / 2)
-        yield Part(name, at, (panel, wide, high), "Enamel", fill=0.4)
+        yield Part(
+            name, (side * (deep - panel) / 2, 0, low + high / 2), (panel, wide, high), "Enamel", fill=0.4
+        )
     inner = deep - 2 * panel
     yield Part("grille", (0, 0, low + high - 0.004), (inner, wide, 0.008), "Enamel", fill=0.1)
     for k, side in enumerate((1, -1)):

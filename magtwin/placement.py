@@ -180,10 +180,10 @@ class _Free:
         """Whether all points (N, 2) are free under each of the shifts (M, 2), shape (M,)."""
         if self._free.all():
             return np.ones(len(np.asarray(shifts)), bool)
-        most = np.array(self._free.shape) - 1
+        most: Array = np.array(self._free.shape) - 1.0
         held = []
         for shift in np.asarray(shifts):
-            cell = np.clip(np.rint((points + shift - self._low) / self.step_m).astype(int), 0, most)
+            cell = np.clip(np.rint((points + shift - self._low) / self.step_m), 0, most).astype(int)
             held.append(bool(self._free[cell[:, 0], cell[:, 1]].all()))
         return np.array(held)
 

@@ -879,7 +879,7 @@ class FurnitureSpec(Spec):
     """Size of a box along its own x, y and z, or diameter, diameter and height of a cylinder [m]."""
 
     vertices_m: tuple[Vec3, ...] = ()
-    """Vertices of a mesh about the middle of its box [m], in single precision; the mesh stands on the floor."""
+    """Vertices of a mesh about the middle of its box [m], in single precision; it stands on the floor."""
 
     faces: tuple[tuple[int, int, int], ...] = ()
     """Corners of a mesh's triangles, counter-clockwise from outside."""
@@ -940,6 +940,40 @@ class FurnitureSpec(Spec):
 def _steel(piece: FurnitureSpec) -> tuple[SourceSpec, ...]:
     """`piece.sources()`, kept, as every run of a furnished lab asks for them."""
     return tuple(piece.sources())
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurveySpec(Spec):
+    """How a robot surveys a scene that names no map: it stands at each node of a grid in each heading."""
+
+    spacing_m: float = 0.25
+    """Distance between nodes [m]."""
+
+    headings_deg: tuple[float, ...] = (0.0, 90.0, 180.0, 270.0)
+    """Headings in which it stands at each node, ascending [deg]."""
+
+    readings: int = 135
+    """Readings whose mean a node gives."""
+
+    height_m: float | None = None
+    """Height of the sensor above the floor [m]; by default the robot's own."""
+
+    heading_error_deg: float = 0.0
+    """Standard deviation of its heading about the node's [deg]."""
+
+    position_error_m: float = 0.0
+    """Standard deviation of where it stands about the node, along x and y [m]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._above_zero("spacing_m")
+        self._require("readings", self.readings >= 1, "be at least 1", self.readings)
+        self._not_negative("heading_error_deg", "position_error_m")
+        self._require("height_m", (self.height_m or 0.0) >= 0, "not be below 0", self.height_m)
+        headings = self.headings_deg
+        rises = bool(headings) and list(headings) == sorted(set(headings))
+        within = rises and headings[0] >= 0 and headings[-1] < 360
+        self._require("headings_deg", within, "ascend from 0 to below 360", headings)
 
 
 @dataclass(frozen=True, kw_only=True)

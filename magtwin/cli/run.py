@@ -260,8 +260,12 @@ def run(
         if robot is None and (path or commands or replay):
             raise RefusedError(f"which of {', '.join(robots)} is to drive {way}? say it with --robot NAME")
         if fit and robot is None:
-            raise RefusedError(f"whose path is to be fitted, of {', '.join(robots)}? say it with --robot NAME")
-        _run_together(scene, wanted, robot=robot, path=path, fit=fit, meet=meet, scans=scans, quiet=json, **options)
+            raise RefusedError(
+                f"whose path is to be fitted, of {', '.join(robots)}? say it with --robot NAME"
+            )
+        _run_together(
+            scene, wanted, robot=robot, path=path, fit=fit, meet=meet, scans=scans, quiet=json, **options
+        )
         return
     if meet is not None:
         raise RefusedError(f"--meet is for several robots, and {scene} has one; drop it")
@@ -345,7 +349,7 @@ def _drive(
     from magtwin.sim.commands import read_commands
     from magtwin.twin import on_its_day, open_twin, scan, simulate, way_of
 
-    planned = None
+    planned: Any = None
     what: Any = path
     if commands is not None:
         what = read_commands(commands)
@@ -353,7 +357,8 @@ def _drive(
         what = read_run(replay)
     twin = on_its_day(open_twin(scene_file, net=net, magnetometer=magnetometer), facts)
     if commands is None and replay is None and path != "random":
-        what = planned = way_of(path, twin, fit=fit)
+        what = way_of(path, twin, fit=fit)
+        planned = what
         _say_placing(planned, steps)
     if commands is not None and what.beyond(twin.scene.robot.drive):
         print(f"  {what.beyond(twin.scene.robot.drive)}", file=sys.stderr)  # noqa: T201
