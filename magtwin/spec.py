@@ -103,6 +103,7 @@ class MagnetometerSpec(MountSpec):
     """A scalar magnetometer, whose vector axes are measured in turn; see `magtwin.sim.magnetometer`."""
 
     link: str = "magnetometer_link"
+    """Name of the robot link that carries the sensor."""
 
     kind: Literal["physical", "neural", "map-only"] = "physical"
     """"physical": the disturbance is the exact field less the map; "neural": `network` predicts it;
@@ -433,7 +434,10 @@ class DriveSpec(Spec):
     """A differential drive: its size, its limits and its odometry."""
 
     left_wheel_joint: str = "left_wheel_joint"
+    """Name of the left wheel's joint."""
+
     right_wheel_joint: str = "right_wheel_joint"
+    """Name of the right wheel's joint."""
 
     wheel_separation_m: float = 0.233
     """Distance between the wheels' contact points [m]."""
@@ -682,7 +686,7 @@ class LabSpec(Spec):
     """A room: a floor centred on the world's origin, low walls, posts of a motion-capture frame."""
 
     floor_m: tuple[float, float] = (6.0, 3.5)
-    """Extent of the floor in x and y [m]."""
+    """Size of the floor in x and y [m]."""
 
     wall_height_m: float = 0.3
     """Height of the walls [m]; 0 for none."""
@@ -720,13 +724,13 @@ class EarthFieldSpec(Spec):
     """Height above the WGS 84 ellipsoid [m]."""
 
     date: str
-    """Day for which the field holds, YYYY-MM-DD."""
+    """Date of the field, YYYY-MM-DD."""
 
     north_deg: float = 0.0
-    """Where true north lies: angle from world +y about world +z, counter-clockwise from above [deg]."""
+    """Angle from the world's y to true north, counter-clockwise seen from above [deg]."""
 
     measured: bool = False
-    """Whether the field was measured; otherwise it is the IGRF's, whose span then holds the day."""
+    """Whether the field was measured, so that it may differ from the model's."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -752,7 +756,7 @@ class SourceSpec(Spec):
     """A magnetised thing: a point dipole, or a uniformly magnetised body of some shape."""
 
     name: str
-    """Name of its prim."""
+    """Name of its prim: letters, digits and _, no digit first."""
 
     p_world: Vec3
     """Where it is: the middle of all but a mesh [m]."""
@@ -944,7 +948,7 @@ def _steel(piece: FurnitureSpec) -> tuple[SourceSpec, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class SurveySpec(Spec):
-    """How a robot surveys a scene that names no map: it stands at each node of a grid in each heading."""
+    """How the robot surveys a scene that names no map: it stands at each node of a grid in each heading."""
 
     spacing_m: float = 0.25
     """Distance between nodes [m]."""

@@ -232,27 +232,40 @@ def _placed(prim: Usd.Prim, check_network: bool) -> PlacedRobot:
 
 @dataclass(frozen=True, kw_only=True)
 class _RobotTable(RobotSettings):
-    """[robot] of a scene's TOML: an asset, or a URDF with what a URDF cannot say.
+    """The robot: an asset, or a URDF and what a URDF cannot say. For several robots, write [[robot]] each."""
 
-    Of several, a [[robot]] each, `name` is that of its prim.
-    """
+    name: str = ""
+    """Name of its prim, required for each of several robots. With urdf, the name that the URDF must give."""
 
     start: Vec3 | None = None
+    """Where it stands at first: x [m], y [m] and yaw [rad]. By default that of the scene or, of several
+    robots, where its path begins. Refused inside of furniture; the refusal names the nearest free place."""
+
     path: str = ""
-    """What it drives: the name of a path, "random", or a CSV file."""
+    """What it drives unless told otherwise: the name of a path, "random", or a CSV file of x,y. Default:
+    figure8."""
 
     asset: Path | None = None
+    """Robot that ships, by its name ("turtlebot4"), or USD file made by `magtwin robot`."""
+
     urdf: Path | None = None
+    """URDF or xacro file to convert, in place of an asset."""
+
     network: Path | None = None
+    """Weights that predict the robot's disturbance, for a neural magnetometer."""
+
     kind: Literal["physical", "neural", "map-only"] | None = None
-    """Of its magnetometer; "neural" where a network is named, unless given."""
+    """What its magnetometer reads: the exact field, the map and the network's prediction, or the map. By
+    default neural with a network, else physical."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _EarthTable(EarthFieldSpec):
-    """[earth] of a scene's TOML: its field may be left out, and then follows from the rest."""
+    """The Earth's field, uniform over the room. It follows from place and date by the IGRF-14, to 2030."""
 
     b_world_nt: Vec3 = ZERO3
+    """Field in world axes [nT], where it was measured. Unless measured is true, it must be the model's within
+    1 nT."""
 
     @property
     def spec(self) -> EarthFieldSpec:
@@ -262,19 +275,27 @@ class _EarthTable(EarthFieldSpec):
 
 @dataclass(frozen=True, kw_only=True)
 class _SourcesTable:
-    """[sources] of a scene's TOML."""
+    """Furniture and sources in a file of their own."""
 
     file: Path
+    """TOML with [[furniture]] and [[source]] tables, which are added to those of the scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class _SceneFile:
-    """A scene's TOML; its tables have the keys of their specs."""
+class SceneFile:
+    """A scene's TOML; docs/scenes.md is made from it."""
 
     name: str
+    """Name of the scene and of its root layer: any that a file can have on every system."""
+
     robot: tuple[_RobotTable, ...]
+
     map: Path | None = None
+    """USD layer of the magnetic map. By default the scene is surveyed, see above."""
+
     start: Vec3 = ZERO3
+    """Where the robot stands at first: x [m], y [m] and yaw [rad]. A path begins where it begins."""
+
     seed: int = 0
     """Seed of the magnetization of furniture that gives none, and of the survey's noise."""
 
@@ -284,6 +305,10 @@ class _SceneFile:
     sources: _SourcesTable | None = None
     source: tuple[SourceSpec, ...] = ()
     furniture: tuple[FurnitureTable, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise RefusedError(f"seed must not be below 0, got {self.seed}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -324,7 +349,7 @@ def scene_from_toml(
     alone = isinstance(table.get("robot"), dict)  # [robot], not [[robot]]
     if alone:
         table = table | {"robot": [table["robot"]]}
-    given = from_table(_SceneFile, table, path)
+    given = from_table(SceneFile, table, path)
     if not given.robot:
         raise RefusedError(f"{path}: has no robot; add a [robot] table")
     layer = Path(map_layer).resolve() if map_layer is not None else given.map
