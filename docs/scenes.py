@@ -82,7 +82,7 @@ need be, makes it smaller.
 """
 
 
-UNIT = r"\[([A-Za-z1][^\]]{0,40})\]"
+UNIT = r"(?<!\[)\[([A-Za-z1][^\]]{0,40})\](?!\])"
 """A unit in a docstring."""
 
 LATER = ("robot",)
@@ -127,15 +127,10 @@ def _table(cls: type, section: str, about: str, *, many: bool = False) -> list[s
             below.append((kind, name, docs.get(field.name, ""), array))
             continue
         text = docs.get(field.name, "")
-        unit = re.search(r"\[([^\]]{1,40})\]", text)
-        meaning = re.sub(r" ?\[[^\]]{1,40}\]", "", text, count=1) if unit else text
-        cells = [
-            f"`{field.name}`",
-            _kind(hints[field.name]),
-            unit[1] if unit else "",
-            _default(field),
-            meaning,
-        ]
+        units = list(dict.fromkeys(re.findall(UNIT, text)))
+        meaning = re.sub(f" {UNIT}", "", text) if len(units) == 1 else text
+        kind, unit = _kind(hints[field.name]), ", ".join(units)
+        cells = [f"`{field.name}`", kind, unit, _default(field), meaning]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
     below.sort(key=lambda one: one[1] in LATER)
     for kind, name, text, array in below:
@@ -188,13 +183,19 @@ def _kind(kind: Any) -> str:
         return _kind(next(a for a in args if a is not type(None)))
     if origin is tuple:
         if args[-1] is Ellipsis:
-            return f"list of {_kind(args[0])}s"
-        return f"{len(args)} {_kind(args[0])}s"
+            return f"list of {_many(args[0])}"
+        return f"{len(args)} {_many(args[0])}"
     if origin is typing.Literal:
         return ", ".join(f'"{a}"' for a in args)
     if origin in (dict, Mapping):
         return "table"
     return words.get(kind, str(kind))
+
+
+def _many(kind: Any) -> str:
+    """Several of an annotation, in words."""
+    text = _kind(kind)
+    return text if text.endswith("s") else f"{text}s"
 
 
 def _default(field: Any) -> str:

@@ -715,10 +715,10 @@ class EarthFieldSpec(Spec):
     """Field in world axes [nT]."""
 
     latitude_deg: float
-    """Geodetic latitude of the lab [deg]."""
+    """Geodetic latitude of the room, north positive [deg]."""
 
     longitude_deg: float
-    """Longitude of the lab [deg]."""
+    """Longitude of the room, east positive [deg]."""
 
     height_m: float
     """Height above the WGS 84 ellipsoid [m]."""

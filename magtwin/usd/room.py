@@ -33,7 +33,7 @@ SATURATION_A_M = 2.2e6
 
 @dataclass(frozen=True, kw_only=True)
 class FurnitureTable(Spec):
-    """[[furniture]] of a scene's TOML."""
+    """A piece of furniture or of the building; see the kinds above."""
 
     name: str
     """Name of the piece, each its own: letters, digits and _, no digit first."""
