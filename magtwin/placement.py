@@ -125,7 +125,7 @@ def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
         free = _Free(room, clear)
         for share in sizes:
             scale = whole * share
-            slack = np.maximum(room.reach_m - half * scale, 0.0)
+            slack = np.maximum(room.reach_m - half * scale - clear, 0.0)
             start = middle * scale if each_way else middle
             shifts = _shifts(np.clip(start, -slack, slack), slack) - middle * scale + 0.0
             dense = _dense(path, scale, max(free.step_m, 0.02))
