@@ -6,7 +6,8 @@ import numpy as np
 
 from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError
-from magtwin.sim.survey import field_at_rest_nt
+from magtwin.sim.interference import ambient_gradient_nt_m
+from magtwin.sim.survey import field_at_rest_nt, sensor_height_m
 from magtwin.spec import Scene
 
 MOST_NODES = 4000
@@ -45,13 +46,16 @@ class Agreement:
     def __str__(self) -> str:
         x, y, yaw = self.place
         return (
-            f"the map and the field of Earth, sources and furniture differ by {self.rms_nt:,.3g} nT rms, at "
-            f"most {self.largest_nt:,.3g} nT at ({x:.2f}, {y:.2f}) m, heading {np.degrees(yaw):.0f} deg"
+            f"the map and the field of Earth, sources and furniture differ by {self.rms_nt:,.0f} nT rms, at "
+            f"most {self.largest_nt:,.0f} nT at ({x:.2f}, {y:.2f}) m, heading {np.degrees(yaw):.0f} deg"
         )
 
 
 def check_against_sources(scene: Scene, field: AnomalyMap) -> Agreement:
     """Compare a map with what a scene's robot would read at its nodes.
+
+    Nodes at which the robot would stand in something magnetised, or at which its magnetometer would lose
+    lock, are left out: no survey has a reading there.
 
     Args:
         scene: A scene whose Earth's field is known, with sources or furniture.
@@ -69,8 +73,11 @@ def check_against_sources(scene: Scene, field: AnomalyMap) -> Agreement:
     h, j, i = h[::every], j[::every], i[::every]
     p = np.column_stack([field.origin_m[0] + field.cell_m[0] * i, field.origin_m[1] + field.cell_m[1] * j])
     yaw = field.headings_rad[h] if field.recorded_yaw is None else field.recorded_yaw[h, j, i]
+    there = _readable(scene, p, field)
+    if not there.any():
+        raise RefusedError(f"scene {scene.name!r}: no node of its map is clear of its sources and furniture")
+    p, yaw, values = p[there], yaw[there], field.values_nt[h, j, i][there]
     exact = field_at_rest_nt(scene, p, yaw, height_m=field.height_m)
-    values = field.values_nt[h, j, i]
     apart = np.abs(values - exact)
     worst = int(np.argmax(apart))
     found = Agreement(
@@ -81,8 +88,29 @@ def check_against_sources(scene: Scene, field: AnomalyMap) -> Agreement:
     )
     if found.contradicts:
         raise RefusedError(
-            f"scene {scene.name!r}: {found}; the map itself varies by {found.spread_nt:,.3g} nT, so they "
+            f"scene {scene.name!r}: {found}; the map itself varies by {found.spread_nt:,.0f} nT, so they "
             "contradict each other: leave out the map to have the scene surveyed, or leave out what was "
             "not there (magnetization = [] keeps a piece without its field)"
         )
     return found
+
+
+def _readable(scene: Scene, p: np.ndarray, field: AnomalyMap) -> np.ndarray:
+    """At which points (N, 2) of the floor a robot can stand and read its magnetometer, shape (N,)."""
+    height = sensor_height_m(scene) if field.height_m is None else field.height_m
+    radius = scene.robot.footprint_radius_m
+    clear = np.ones(len(p), bool)
+    for source in scene.magnets:
+        if source.shape == "point":
+            continue
+        body = source.body(None if scene.earth is None else scene.earth.b_world_nt)
+        reach = radius + float(np.linalg.norm(body.size_m))
+        near = np.flatnonzero(np.hypot(*(p - body.p_world[:2]).T) < reach)
+        for z in np.linspace(0.02, height, 5):
+            at = np.column_stack([p[near], np.full(len(near), z)])
+            clear[near] &= body.clearance(at) >= radius
+    steepest = scene.robot.magnetometer.gradient_max_nt_m
+    if steepest:
+        at = np.column_stack([p[clear], np.full(np.count_nonzero(clear), height)])
+        clear[clear] = ambient_gradient_nt_m(scene, at) <= steepest
+    return clear

@@ -24,6 +24,9 @@ class Surveyed:
     """Nodes that were filled from those around them, over all headings: the robot cannot stand there, or
     its magnetometer loses lock."""
 
+    magnets: int
+    """How many things are magnetised."""
+
     def __str__(self) -> str:
         field = self.field
         headings, rows, columns = field.values_nt.shape
@@ -34,6 +37,8 @@ class Surveyed:
         return (
             f"surveyed by its own robot: {columns} x {rows} nodes {field.cell_m[0]:g} m apart, {headings} "
             f"headings, {field.height_m:.3g} m above the floor, {low:.2f} to {high:.2f} uT{holes}"
+            + "; nothing is magnetised, so the field is the same everywhere"
+            * (not self.magnets)
         )
 
 
@@ -88,6 +93,7 @@ def survey_room(
     return Surveyed(
         replace(whole, values_nt=values, variance_nt2=variance, parameters=parameters),
         holes,
+        len(scene.magnets),
     )
 
 
