@@ -1,4 +1,4 @@
-"""Paths on floors of any size: they fit, they pass what stands there, and on the default floor nothing changes."""
+"""Paths on floors of any size: they fit and pass what stands there; on the default floor nothing changes."""
 
 import numpy as np
 import pytest
@@ -108,7 +108,7 @@ def test_what_the_refusal_says_is_true():
 
 
 def test_no_room_is_refused():
-    with pytest.raises(RefusedError, match="the floor of 0.3 x 3 m is no wider than a robot"):
+    with pytest.raises(RefusedError, match=r"the floor of 0\.3 x 3 m is no wider than a robot"):
         path_in(room(0.3, 3.0), "sine")
     with pytest.raises(RefusedError, match="does not fit between what stands on the floor of 2 x 2 m"):
         path_in(room(2.0, 2.0, box(0, 0, 1.6, 1.6)), "sine")

@@ -7,6 +7,7 @@ import numpy as np
 from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError
 from magtwin.sim.interference import ambient_gradient_nt_m
+from magtwin.sim.room_survey import in_steel
 from magtwin.sim.survey import field_at_rest_nt, sensor_height_m
 from magtwin.spec import Scene
 
@@ -98,17 +99,7 @@ def check_against_sources(scene: Scene, field: AnomalyMap) -> Agreement:
 def _readable(scene: Scene, p: np.ndarray, field: AnomalyMap) -> np.ndarray:
     """At which points (N, 2) of the floor a robot can stand and read its magnetometer, shape (N,)."""
     height = sensor_height_m(scene) if field.height_m is None else field.height_m
-    radius = scene.robot.footprint_radius_m
-    clear = np.ones(len(p), bool)
-    for source in scene.magnets:
-        if source.shape == "point":
-            continue
-        body = source.body(None if scene.earth is None else scene.earth.b_world_nt)
-        reach = radius + float(np.linalg.norm(body.size_m))
-        near = np.flatnonzero(np.hypot(*(p - body.p_world[:2]).T) < reach)
-        for z in np.linspace(0.02, height, 5):
-            at = np.column_stack([p[near], np.full(len(near), z)])
-            clear[near] &= body.clearance(at) >= radius
+    clear = ~in_steel(scene, p, height)
     steepest = scene.robot.magnetometer.gradient_max_nt_m
     if steepest:
         at = np.column_stack([p[clear], np.full(np.count_nonzero(clear), height)])

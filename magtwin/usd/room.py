@@ -229,10 +229,8 @@ def lab_of(
         map_layer: The map that it names; None where it names none.
 
     Raises:
-        RefusedError: The floor cannot be in metres, or there is a [survey] beside a map.
+        RefusedError: The floor cannot be in metres.
     """
-    if map_layer is not None and "survey" in table:
-        raise refused_at(path, "", "is for a scene without a map; drop it, or the map", section="survey")
     if map_layer is not None and "floor_m" not in table.get("lab", {}):
         x0, x1, y0, y1 = load_map(map_layer).extent
         floor = 2 * max(abs(x0), abs(x1)), 2 * max(abs(y0), abs(y1))
