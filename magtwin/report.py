@@ -25,6 +25,8 @@ class Report:
     title: str
     figures: tuple[Figure, ...] = ()
     facts: dict[str, Any] = field(default_factory=dict)
+    verdict: str = ""
+    """Whether what it is of is any good, in one line; see `magtwin.verdict`."""
 
     def to_json(self) -> str:
         """The report as one JSON object; a figure becomes {value, unit, spread, note}."""
@@ -32,4 +34,5 @@ class Report:
             f.name: {k: v for k, v in vars(f).items() if k != "name" and v not in ("", None)}
             for f in self.figures
         }
-        return json.dumps({"title": self.title, "figures": figures, "facts": self.facts}, indent=2)
+        told = {"title": self.title, "figures": figures, "facts": self.facts}
+        return json.dumps(told | ({"verdict": self.verdict} if self.verdict else {}), indent=2)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
 from magtwin.resample import RULES, Interpolation, bracket, check_instants, grid
+from magtwin.verdict import coverage, verdict
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -452,7 +453,26 @@ class Run(Mapping[str, NDArray[Any]]):
             Figure(n, int(self[n].sum()), "readings", None, COLUMNS[n].doc if n in COLUMNS else "")
             for n in raised
         ]
-        return Report(title, tuple(figures), dict(self.facts))
+        return Report(title, tuple(figures), dict(self.facts), self._verdict())
+
+    def _verdict(self) -> str:
+        """How well a network predicted the exact field of a simulated run; "" where none did."""
+        if "b_sd_nt" not in self or not {"b_total_nt", "b_map_nt", "b_truth_nt"} <= set(self):
+            return ""
+        error = self["b_total_nt"] - self["b_truth_nt"]
+        known = np.isfinite(error)
+        if not known.any():
+            return ""
+        mean = float(self.facts.get("network_label_mean_nt", 0.0))
+        than = "the map plus the mean training label" if mean else "the map alone"
+        naive = np.abs(self["b_map_nt"] + mean - self["b_truth_nt"])[known]
+        return verdict(
+            float(np.abs(error[known]).mean()),
+            float(naive.mean()),
+            than=than,
+            coverage=coverage(error, self["b_sd_nt"]),
+            judged_on="the exact field of this run",
+        )
 
     def _derived(self, step: str, columns: Mapping[str, NDArray[Any]] | None = None) -> "Run":
         """What a step made of this run, and the fact that it did."""

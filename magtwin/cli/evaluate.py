@@ -307,5 +307,7 @@ def _print(found: "Evaluation") -> None:
     readings = found.every.scores[0].rows
     console.print(Text(f"{readings:,} readings of {len(found.judged)} recordings", style="bold"))
     console.print(table)
+    for name, line in found.verdicts().items():
+        console.print(Text(f"{name}: {line}", style="bold"), soft_wrap=True)
     for why, count in found.left_out.items():
         console.print(Text(f"left out: {count:,} readings that {why}", style="dim"))

@@ -109,6 +109,8 @@ def print_report(report: Any, as_json: bool) -> None:
     for table in (numbers, words):
         if table.row_count:
             console.print(table)
+    if report.verdict:
+        console.print(Text(printable(report.verdict), style="bold"), soft_wrap=True)
     for name, fact in lists:
         console.print(Text(name))
         entries = fact.items() if isinstance(fact, dict) else (("", entry) for entry in fact)
