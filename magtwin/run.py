@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
 from magtwin.resample import RULES, Interpolation, bracket, check_instants, grid
-from magtwin.verdict import coverage, verdict
+from magtwin.verdict import Tally
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -457,22 +457,17 @@ class Run(Mapping[str, NDArray[Any]]):
 
     def _verdict(self) -> str:
         """How well a network predicted the exact field of a simulated run; "" where none did."""
+        tally = Tally()
+        self.add_to(tally)
+        return tally.verdict("the exact field of this run")
+
+    def add_to(self, tally: Tally) -> None:
+        """Add the errors of a simulated run's network against the exact field, where it has both."""
         if "b_sd_nt" not in self or not {"b_total_nt", "b_map_nt", "b_truth_nt"} <= set(self):
-            return ""
-        error = self["b_total_nt"] - self["b_truth_nt"]
-        known = np.isfinite(error)
-        if not known.any():
-            return ""
-        mean = float(self.facts.get("network_label_mean_nt", 0.0))
-        than = "the map plus the mean training label" if mean else "the map alone"
-        naive = np.abs(self["b_map_nt"] + mean - self["b_truth_nt"])[known]
-        return verdict(
-            float(np.abs(error[known]).mean()),
-            float(naive.mean()),
-            than=than,
-            coverage=coverage(error, self["b_sd_nt"]),
-            judged_on="the exact field of this run",
-        )
+            return
+        truth, mean = self["b_truth_nt"], float(self.facts.get("network_label_mean_nt", 0.0))
+        tally.than = "the map plus the mean training label" if mean else "the map alone"
+        tally.add(self["b_total_nt"] - truth, self["b_map_nt"] + mean - truth, self["b_sd_nt"])
 
     def _derived(self, step: str, columns: Mapping[str, NDArray[Any]] | None = None) -> "Run":
         """What a step made of this run, and the fact that it did."""

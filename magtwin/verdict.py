@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Collection
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,38 @@ def verdict(
             text += ": they are too wide"
         text += "."
     return f"{text} Judged on {judged_on}." if judged_on else text
+
+
+@dataclass
+class Tally:
+    """Errors of a model and of the naive one, summed over runs."""
+
+    than: str = "the naive mean"
+    """What to call the naive model."""
+
+    readings: int = 0
+    error_nt: float = 0.0
+    naive_nt: float = 0.0
+    within: int = 0
+    with_sd: int = 0
+
+    def add(self, error_nt: NDArray[Any], naive_error_nt: NDArray[Any], sd_nt: NDArray[Any]) -> None:
+        """Add the readings of a run, each an array of shape (N,); readings without an error are left out."""
+        known = np.isfinite(error_nt) & np.isfinite(naive_error_nt)
+        error, sd = np.abs(error_nt[known]), sd_nt[known]
+        self.readings += len(error)
+        self.error_nt += float(error.sum())
+        self.naive_nt += float(np.abs(naive_error_nt[known]).sum())
+        self.with_sd += int(np.isfinite(sd).sum())
+        self.within += int(np.count_nonzero(error <= Z_90 * sd))
+
+    def verdict(self, judged_on: str) -> str:
+        """As `verdict`; "" if no reading was added."""
+        if not self.readings:
+            return ""
+        held = self.within / self.with_sd if self.with_sd else math.nan
+        error, naive = self.error_nt / self.readings, self.naive_nt / self.readings
+        return verdict(error, naive, than=self.than, coverage=held, judged_on=judged_on)
 
 
 def recordings_text(

@@ -95,6 +95,7 @@ def runs(
     from magtwin.report import Figure, Report
     from magtwin.sim.session import draw_speed
     from magtwin.twin import in_session, open_twin, simulate_many
+    from magtwin.verdict import Tally
 
     existing(scene, "scene")
     for name, value, least in (("count", count, 1), ("sessions", sessions, 1), ("seed", seed, 0)):
@@ -131,6 +132,7 @@ def runs(
             outside=outside,
         )
         folder.mkdir()
+        tally = Tally()
         readings, seconds, start = 0, 0.0, time.monotonic()
         with (
             progress("Driving") as advance,
@@ -142,6 +144,7 @@ def runs(
                 file = f"run_{k:05d}.parquet"
                 run = run.with_facts(**of_run[k].session)
                 write_parquet(run, folder / file)
+                run.add_to(tally)
                 listed = (run.facts[name] for name in ("path", "seed", "session", "speed_m_s"))
                 table.writerow((file, *listed, run.rows))
                 readings, seconds = readings + run.rows, seconds + float(run.facts["duration_s"])
@@ -161,6 +164,7 @@ def runs(
             "paths": ", ".join(getattr(one, "name", "random") for one in paths),
             "sessions": session or len(drawn),
         },
+        tally.verdict(f"the exact field of {count} runs in {len(drawn)} sessions"),
     )
     print_report(report, json)
     if not json:
