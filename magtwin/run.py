@@ -463,7 +463,8 @@ class Run(Mapping[str, NDArray[Any]]):
 
     def add_to(self, tally: Tally) -> None:
         """Add the errors of a simulated run's network against the exact field, where it has both."""
-        if "b_sd_nt" not in self or not {"b_total_nt", "b_map_nt", "b_truth_nt"} <= set(self):
+        wanted = {"b_sd_nt", "b_total_nt", "b_map_nt", "b_truth_nt"}
+        if self.facts.get("magnetometer") != "neural" or not wanted <= set(self):
             return
         truth, mean = self["b_truth_nt"], float(self.facts.get("network_label_mean_nt", 0.0))
         tally.than = "the map plus the mean training label" if mean else "the map alone"
