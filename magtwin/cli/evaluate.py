@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, Seed, progress, say
+from magtwin.cli.terminal import Force, Json, Seed, progress, say, stdout_console
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -289,11 +289,10 @@ def _cases(given: Sequence[str] | None) -> dict[str, str]:
 
 def _print(found: "Evaluation") -> None:
     """Table 1 for people: a line a model, its error, and its ratio to the naive one by path."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(highlight=False)
+    console = stdout_console()
     shown = [*found.cases[:MOST_CASES], *(case for case in found.cases[MOST_CASES:] if case is found.every)]
     table = Table(box=None, pad_edge=False)
     table.add_column("ratio to naive", overflow="fold")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, printable, say
+from magtwin.cli.terminal import Force, Json, check_suffix, printable, say, stdout_console
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -97,12 +97,11 @@ def _announce(file: Path, *, quiet: bool) -> Any:
 
 def _print(findings: "Findings") -> None:
     """A table, a row a validator; below it what each found, errors first."""
-    from rich.console import Console
     from rich.padding import Padding
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(highlight=False)
+    console = stdout_console()
     console.print(Text(printable(str(findings.file)), style="bold"))
     for line in findings.mended:
         console.print(Padding(Text(f"mended {printable(line)}"), (0, 0, 0, 2), expand=False))
