@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, say, stdout_console
+from magtwin.cli.terminal import Force, Json, check_suffix, say, stdout_console, step
 
 if TYPE_CHECKING:
     from magtwin.compare import Comparison
@@ -46,8 +46,11 @@ def compare(
     if out is not None:
         check_suffix(out, (".html", ".md", ".json", ".png", ".svg"), "a comparison")
         check_free(out, force=force)
+    step("Reading the runs")
     runs = read_run(a), read_run(b)
+    step("Comparing the runs")
     found = compare_runs(*runs, align=align)
+    step("Writing the comparison")
     names = (a.name, b.name) if a.name != b.name else (str(a), str(b))
     if out is not None and out.suffix in (".png", ".svg"):
         from magtwin.io.charts import plot_comparison

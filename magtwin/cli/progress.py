@@ -9,7 +9,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from threading import Event, Lock, Thread
 from typing import Any, Protocol, TextIO
 
@@ -179,11 +179,15 @@ class Watch:
         step = Step(title, unit, self._clock())
         self._steps.append(step)
         try:
-            if self._terminal:
-                with self._drawn(step) as draw:
-                    yield lambda done, total, what="": (self._advance(step, done, total, what), draw())[1]
-            else:
-                yield lambda done, total, what="": self._advance(step, done, total, what)
+            with self._drawn(step) if self._terminal else nullcontext() as draw:
+
+                def advance(done: float, total: float | None, what: str = "") -> None:
+                    step.advance(self._clock(), done, total, what)
+                    if draw is not None:
+                        draw()
+                    self.tick()  # a library that keeps the interpreter to itself starves the thread
+
+                yield advance
         finally:
             self._steps.remove(step)
             self._base = Step(self._base.title, "", self._clock())
@@ -199,10 +203,6 @@ class Watch:
             step = self._steps[-1] if self._steps else self._base
             self._print(f"  {step.line(now)}")
             self._printed = self._reported = now
-
-    def _advance(self, step: Step, done: float, total: float | None, what: str) -> None:
-        step.advance(self._clock(), done, total, what)
-        self.tick()  # a library that keeps the interpreter to itself starves the thread
 
     def _run(self) -> None:
         while not self._end.wait(TICK_S):
@@ -272,6 +272,11 @@ def announcer(*, quiet: bool) -> Callable[[str], None]:
     """A function that says what is being done, on stderr; `quiet` says it only where it takes long."""
     watch = current()
     return lambda text: watch.step(text, quiet=quiet)
+
+
+def step(text: str) -> None:
+    """Name what is done next; it is printed where it takes long."""
+    current().step(text, quiet=True)
 
 
 def progress(title: str, unit: str = "") -> Any:

@@ -118,11 +118,12 @@ def runs(
         folder.mkdir()
         readings, seconds, start = 0, 0.0, time.monotonic()
         with (
-            progress("Driving") as advance,
+            progress("Driving", "runs") as advance,
             open(folder / "runs.csv", "w", encoding="utf-8", newline="") as listing,
         ):
             table: Any = csv.writer(listing, lineterminator="\n")
             table.writerow(("file", "path", "seed", "session", "speed_m_s", "readings"))
+            advance(0, count)
             for k, run in enumerate(made):
                 file = f"run_{k:05d}.parquet"
                 day: int | str = k % len(days) if sessions else ""
@@ -131,8 +132,7 @@ def runs(
                 facts = run.facts
                 table.writerow((file, facts["path"], facts["seed"], day, facts["speed_m_s"], run.rows))
                 readings, seconds = readings + run.rows, seconds + float(facts["duration_s"])
-                rate = (k + 1) / (time.monotonic() - start)
-                advance(k + 1, count, f"{rate:.3g} runs/s")
+                advance(k + 1, count)
     took = time.monotonic() - start
     report = Report(
         f"{count} runs in {scene}",

@@ -3,14 +3,19 @@
 import io
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TextIO, cast
 
 from cyclopts import Parameter
 
-from magtwin.cli.progress import announcer, progress, silence
+from magtwin.cli.progress import announcer, progress, silence, step
 from magtwin.names import RefusedError
 
-__all__ = ["announcer", "progress", "silence"]  # beside what is made here: commands have all from one place
+__all__ = [
+    "announcer",
+    "progress",
+    "silence",
+    "step",
+]  # beside what is made here: commands have all from one place
 
 WIDE = 100_000
 """Columns of output that goes to a file or another program: no line is broken."""
@@ -56,7 +61,7 @@ def stdout_console() -> Any:
     if sys.stdout.isatty():
         return Console(highlight=False)
     width = None if os.environ.get("COLUMNS") else WIDE
-    return Console(highlight=False, width=width, file=_Trimmed())
+    return Console(highlight=False, width=width, file=cast(TextIO, _Trimmed()))
 
 
 def check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:
