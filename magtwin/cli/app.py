@@ -63,7 +63,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _help_of(arguments: list[str]) -> dict[str, Any]:
     """Options that print help for a file or another program: without boxes, no line broken."""
-    if sys.stdout.isatty() or not (HELP & set(arguments) or not arguments):
+    asked = HELP & set(arguments) or len(arguments) < 2  # `magtwin map` is answered by its help too
+    if sys.stdout.isatty() or not asked:
         return {}
     from cyclopts.help import PlainFormatter
 

@@ -321,6 +321,7 @@ def map_survey(
     check_free(out, force=force)
     if seed < 0:
         raise RefusedError(f"seed must be a whole number from 0 up, got {seed}")
+    step("Reading the scene")
     twin = read_scene(scene, check_network=False)
     day = twin.earth.date if twin.earth is not None else ""
     files = [file for file in layer_files(scene) if file.resolve() != twin.map_layer.resolve()]

@@ -25,6 +25,12 @@ TICK_S = 0.1
 WINDOW_S = 30.0
 """Rates are means over this time [s]."""
 
+LATE_S = 5.0
+"""Time without a report after which the rate counts as unknown [s], at least ..."""
+
+LATE = 3.0
+"""... and so many times the usual time between reports."""
+
 
 class Advance(Protocol):
     """What commands call, and hand down to libraries as `progress`."""
@@ -66,17 +72,19 @@ class Step:
         while len(seen) > 2 and now - seen[1][0] > WINDOW_S:
             seen.popleft()
 
-    @property
-    def rate(self) -> float | None:
-        """How many are done a second, None while that is unknown."""
+    def rate(self, now: float) -> float | None:
+        """How many are done a second; None while that is unknown, or no report came for long."""
         if len(self._seen) < 2:
             return None
         (first, before), (last, after) = self._seen[0], self._seen[-1]
-        return (after - before) / (last - first) if after > before and last > first else None
+        if after <= before or last <= first:
+            return None
+        rate = (after - before) / (last - first)
+        return rate if now - last < max(LATE_S, LATE * (last - first) / (len(self._seen) - 1)) else None
 
     def left_s(self, now: float) -> float | None:
         """Time left at a time `now` [s], None while that is unknown."""
-        rate = self.rate
+        rate = self.rate(now)
         if rate is None or not self.total or self.done >= self.total:
             return None
         return max(0.0, (self.total - self.done) / rate - (now - self._seen[-1][0]))
@@ -89,15 +97,18 @@ class Step:
             parts.append(f"{counts} {self.unit}".strip())
         elif self.done:
             parts.append(f"{self.done:,.0f} {self.unit}".strip())
-        parts += [self.speed()]
-        left = self.left_s(now)
-        parts += [f"{in_words(left)} left" if left is not None else f"{in_words(now - self._began)} so far"]
-        parts += [self.what]
-        return f"{self.title}: {', '.join(part for part in parts if part)}"
+        parts.append(self.speed(now))
+        left, gone = self.left_s(now), now - self._began
+        if left is not None:
+            parts.append(f"{in_words(left)} left")
+        elif gone >= 1:
+            parts.append(f"{in_words(gone)} so far")
+        text = ", ".join(part for part in (*parts, self.what) if part)
+        return f"{self.title}: {text}" if text else f"{self.title} ..."
 
-    def speed(self) -> str:
+    def speed(self, now: float) -> str:
         """The rate in words, empty while it is unknown."""
-        rate = self.rate
+        rate = self.rate(now)
         if rate is None:
             return ""
         number = f"{rate:,.0f}" if rate >= 100 else f"{rate:.2g}"
@@ -135,7 +146,7 @@ class Watch:
         self._terminal = (sys.stderr.isatty() if stream is None else False) if terminal is None else terminal
         self._printed = clock()
         self._reported = -float("inf")
-        self._base = Step("Working", "", self._printed)
+        self._base = Step("Starting", "", self._printed)
         self._steps: list[Step] = []
         self._bar: Any = None
         self._silent = 0
@@ -190,7 +201,7 @@ class Watch:
                 yield advance
         finally:
             self._steps.remove(step)
-            self._base = Step(self._base.title, "", self._clock())
+            self._base = Step("Finishing", "", self._clock())
 
     def tick(self) -> None:
         """Print a line if one is due."""
@@ -235,7 +246,11 @@ class Watch:
         task = bar.add_task(f"  {step.title}", total=None, rate="", what="")
         try:
             yield lambda: bar.update(
-                task, completed=step.done, total=step.total or None, rate=step.speed(), what=step.what
+                task,
+                completed=step.done,
+                total=step.total or None,
+                rate=step.speed(self._clock()),
+                what=step.what,
             )
         finally:
             if mine:
