@@ -297,7 +297,8 @@ def _print(found: "Evaluation") -> None:
     from rich.text import Text
 
     console = stdout_console()
-    shown = [*found.cases[:MOST_CASES], *(case for case in found.cases[MOST_CASES:] if case is found.every)]
+    most = MOST_CASES if console.is_terminal else len(found.cases)
+    shown = [*found.cases[:most], *(case for case in found.cases[most:] if case is found.every)]
     table = Table(box=None, pad_edge=False)
     table.add_column("ratio to naive", overflow="fold")
     for column in (*(case.name for case in shown), "MAE", "90 %"):

@@ -112,6 +112,8 @@ class Step:
         if rate is None:
             return ""
         number = f"{rate:,.0f}" if rate >= 100 else f"{rate:.2g}"
+        if self.unit == "s":
+            return f"{number} x real time"
         return f"{number} {self.unit}/s" if self.unit else f"{number}/s"
 
 
