@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, print_report, progress, say
+from magtwin.cli.terminal import Force, Json, print_report, progress, say, silence, step
 from magtwin.names import RefusedError, hint
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def info(file: Path, *, json: Json = False) -> None:
     if not file.is_dir() and file.suffix not in {*FORMATS, *_STAGES, *_NETS}:
         kinds = hint(file.suffix, {*FORMATS, *_STAGES, *_NETS})
         raise RefusedError(f"{file}: no kind of file {file.suffix!r} that magtwin knows; {kinds}")
+    step(f"Reading {file.name}")
     if file.suffix in _NETS:
         report = _info_of_net(file)
     elif file.suffix in _STAGES and not file.is_dir():
@@ -128,8 +129,10 @@ def convert(
     if out.resolve() == run.resolve():
         raise RefusedError(f"{out}: is the run itself; name another file")
     named: dict[str, Any] = {"topics": _named(topic) if topic else None, "unit": field_unit}
+    step("Reading the run")
     result = read_run(run, **{name: value for name, value in named.items() if value is not None})
     twin = _twin(result, run, scene) if takes & {"twin", "scene_file"} else None
+    step(f"Writing {out.name}")
     write_run(result, out, twin, force=force, **options)
     say(f"Wrote {out}: {result.rows:,} rows, {len(result)} columns, {result.duration_s:g} s")
 
@@ -159,7 +162,7 @@ def fetch(
     from magtwin.fetch import fetch as fetch_files
 
     dest = dest or Path(what)
-    with progress(f"Fetching {what}") as advance:
+    with progress(f"Fetching {what}", "files") as advance:
         files = fetch_files(what, dest, base_url=base_url, force=force, progress=advance)
     say(f"Wrote {len(files)} files to {dest}")
 
@@ -252,17 +255,22 @@ def _view_run(file: Path, scene: Path | None) -> None:
 
     existing(file, "run")
     if file.suffix == ".rrd" and scene is None:
-        view_recording(file)
+        with silence():
+            view_recording(file)
         return
+    step("Reading the run")
     run = read_run(file)
     twin = _twin(run, file, scene)
     if twin is None:
-        view_recording(file)
+        with silence():
+            view_recording(file)
         return
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder) / f"{file.stem}.rrd"
+        step("Writing a recording for the viewer")
         write_rrd(run, rrd, twin)
-        show(rrd, shown=file)
+        with silence():
+            show(rrd, shown=file)
 
 
 def _view_together(files: tuple[Path, ...], scene: Path | None, offsets: list[float]) -> None:
@@ -280,7 +288,8 @@ def _view_together(files: tuple[Path, ...], scene: Path | None, offsets: list[fl
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder) / "runs.rrd"
         write_comparison(runs, rrd, twin, offsets_s=dict(zip(runs, offsets, strict=True)))
-        show(rrd, shown=files[0])
+        with silence():
+            show(rrd, shown=files[0])
 
 
 def _view_stage(file: Path) -> None:
@@ -292,7 +301,8 @@ def _view_stage(file: Path) -> None:
 
     existing(file, "stage")
     if usdview := shutil.which("usdview"):
-        result = subprocess.run([usdview, str(file)], check=False)
+        with silence():
+            result = subprocess.run([usdview, str(file)], check=False)
         if result.returncode:
             raise RefusedError(f"{file}: usdview ended with status {result.returncode}")
     elif file.suffix != ".usdz" and is_animation(file):
@@ -300,4 +310,5 @@ def _view_stage(file: Path) -> None:
     else:
         from magtwin.io.pictures import show_stage
 
-        show_stage(file)
+        with silence():
+            show_stage(file)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, Seed, check_suffix, print_report, progress, say
+from magtwin.cli.terminal import Force, Json, Seed, check_suffix, print_report, progress, say, step
 from magtwin.io.columns import Columns
 from magtwin.names import RefusedError
 
@@ -188,6 +188,7 @@ def map_fit(
         model = fit(readings, method, progress=advance, **options)
         named = readings.with_(name=given["name"])
         field = raster(model, named, spacing_m=spacing, headings_rad=angles, progress=advance)
+    step("Writing the map")
     save_map(field, out, force=force)
     print_report(_joined(field.report(), found), json)
     if not json:
@@ -320,6 +321,7 @@ def map_survey(
     check_free(out, force=force)
     if seed < 0:
         raise RefusedError(f"seed must be a whole number from 0 up, got {seed}")
+    step("Reading the scene")
     twin = read_scene(scene, check_network=False)
     day = twin.earth.date if twin.earth is not None else ""
     files = [file for file in layer_files(scene) if file.resolve() != twin.map_layer.resolve()]
@@ -335,7 +337,7 @@ def map_survey(
         "licence": licence,
         "created": day if created is None else created,
     }
-    with progress(f"Surveying {twin.name}") as advance:
+    with progress(f"Surveying {twin.name}", "headings") as advance:
         if out.suffix == ".parquet":
             read = survey_readings(twin, **about, progress=advance)
         else:
@@ -389,6 +391,7 @@ def map_plot(
     check_suffix(out, (".png", ".svg"), "a picture")
     check_free(out, force=force)
     angles = None if headings is None else _headings_rad(headings)
+    step("Drawing the map")
     plot_map(_open_map(file, date), out, what=what, headings=angles, force=force)
     say(f"Wrote {out}")
 
@@ -443,6 +446,7 @@ def map_diff(
     if out is not None:
         check_suffix(out, (".png", ".svg"), "a picture")
         check_free(out, force=force)
+    step("Comparing the maps")
     found = difference(_open_map(before), _open_map(after))
     if out is not None:
         from magtwin.io.plots import plot_difference
@@ -484,6 +488,7 @@ def map_continue(
 
     check_suffix(out, (".usdc", ".usd"), "a map layer")
     check_free(out, force=force)
+    step(f"Continuing the field to {height:g} m")
     field = at_height(_open_map(file, date), height)
     save_map(field, out, force=force)
     print_report(map_card(field), json)
@@ -558,6 +563,7 @@ def _read(
     from magtwin.field.latch import mask_latched
     from magtwin.io.readings import read_readings
 
+    step("Reading the survey")
     readings = read_readings(
         *sources, columns=columns, pose_topic=pose_topic, field_topic=field_topic, **{**about, "name": None}
     )  # refusals name the survey, not the file to be written

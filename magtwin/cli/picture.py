@@ -1,14 +1,13 @@
 """`magtwin picture` and `magtwin film`: a run, or a stage, to look at."""
 
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, announcer, progress, say
+from magtwin.cli.terminal import Force, announcer, progress, say, step
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -117,11 +116,10 @@ def film(
     if turned and (speed is not None or scene is not None):
         raise RefusedError("a turntable shows a stage as it stands: it takes no --speed and no --scene")
     run, stage = (None, file) if turned else _run_and_scene(file, scene)
-    start = time.monotonic()
-    with progress("Drawing frames") as advance:
+    with progress("Drawing", "frames") as advance:
 
         def told(k: int, n: int) -> None:
-            advance(k, n, f"{k / (time.monotonic() - start):.3g} frames/s")
+            advance(k, n)
 
         if run is None:
             film_of_stage(stage, out, fps=fps, size=pixels, force=force, advance=told)
@@ -146,6 +144,7 @@ def _run_and_scene(file: Path, scene: Path | None) -> "tuple[Run, Path]":
     from magtwin.twin import scene_of
     from magtwin.usd.layers import stage_sha256
 
+    step("Reading the run")
     run = read_run(file)
     stage = scene_of(run, scene, near=file)
     if "scene_sha256" in run.facts and run.facts["scene_sha256"] != stage_sha256(stage):

@@ -21,6 +21,8 @@ from magtwin.cli.terminal import (
     print_report,
     progress,
     say,
+    silence,
+    step,
 )
 from magtwin.names import RefusedError, find
 
@@ -272,6 +274,7 @@ def run(
     if not (path or commands or replay):
         way = str(robots[next(iter(robots))] or way)
     shown = _Live(window=live, address=viewer, pace=pace or 1.0) if live or viewer else None
+    step("Opening the scene")
     with ExitStack() as stack:
         written = wanted.begun() if shown else stack.enter_context(wanted.aside())
         what = _drive(scene, way, steps=announcer(quiet=json), scans=scans, **options)
@@ -364,8 +367,8 @@ def _drive(
     steps(f"Driving {planned.name if planned else path}")
     if replay is not None:
         facts = {"replay_file": replay.as_posix(), **facts}
-    slow = options.get("engine") == "newton" and sys.stderr.isatty()
-    with progress("  Newton") if slow else nullcontext() as advance:
+    slow = options.get("engine") == "newton"
+    with progress("Driving in Newton", "steps") if slow else nullcontext() as advance:
         result = simulate(twin, what, seed=seed, progress=advance, **options).with_facts(**facts)
     seen = None
     if scans:
@@ -596,16 +599,16 @@ def _show(driven: _Driven, live: _Live, outputs: _Outputs, *, quiet: bool) -> _D
             known: dict[str, Any] = {"expected": run, "planned": driven.planned, "scans": driven.scans}
             viewers.append(LiveViewer(address, driven.twin, **known))
         sinks = outputs.sinks(driven)
-        advance = stack.enter_context(progress("  Live [s]")) if not quiet and sys.stderr.isatty() else None
+        advance = stack.enter_context(progress("Live", "s"))
         with Recorder(sinks, viewers) as recorder:
             for block in in_step(run, live.pace, stop=stop):
                 recorder.append(block)
-                if advance is not None:
-                    advance(round(float(block["t"][-1])), round(float(run["t"][-1])), "Ctrl-C ends it")
+                advance(round(float(block["t"][-1])), round(float(run["t"][-1])), "Ctrl-C ends it")
         if not recorder.rows:
             raise RefusedError("ended before the first reading; nothing is written")
         if live.window and address is not None and sys.stdin.isatty():
-            _wait(address, stop)
+            with silence():
+                _wait(address, stop)
     rows, scans = recorder.rows, driven.scans
     if rows < run.rows:
         run = run.take(slice(rows))

@@ -135,11 +135,12 @@ def runs(
         tally = Tally()
         readings, seconds, start = 0, 0.0, time.monotonic()
         with (
-            progress("Driving") as advance,
+            progress("Driving", "runs") as advance,
             open(folder / "runs.csv", "w", encoding="utf-8", newline="") as listing,
         ):
             table: Any = csv.writer(listing, lineterminator="\n")
             table.writerow(("file", "path", "seed", "session", "speed_m_s", "readings"))
+            advance(0, count)
             for k, run in enumerate(made):
                 file = f"run_{k:05d}.parquet"
                 run = run.with_facts(**of_run[k].session)
@@ -148,8 +149,7 @@ def runs(
                 listed = (run.facts[name] for name in ("path", "seed", "session", "speed_m_s"))
                 table.writerow((file, *listed, run.rows))
                 readings, seconds = readings + run.rows, seconds + float(run.facts["duration_s"])
-                rate = (k + 1) / (time.monotonic() - start)
-                advance(k + 1, count, f"{rate:.3g} runs/s")
+                advance(k + 1, count)
     took = time.monotonic() - start
     report = Report(
         f"{count} runs in {scene}",

@@ -4,7 +4,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, print_report, say
+from magtwin.cli.terminal import Force, Json, print_report, say, step
 
 
 @app.command
@@ -45,7 +45,9 @@ def scene(
 
         file = find("scene", spec, {f.stem: f for f in sorted(shipped("scenes").glob("*.toml"))})
     with TemporaryDirectory() as workshop:
+        step("Reading the scene")
         scene = scene_from_toml(file, map_layer=map, network=net, workshop=workshop)
+        step("Authoring the stage")
         root = author_scene(scene, out, force=force)
     print_report(info_of_stage(root), json)
     if not json:

@@ -322,7 +322,13 @@ def build_dataset(
             tell(i, total, f"{source.name}: aligning")
             run = read(source)
             runs.append(thinned(run.select(*(c for c in _ALIGNED if c in run)), 25.0))
-        alignment = fit_alignment(runs, field)
+        alignment = fit_alignment(
+            runs,
+            field,
+            progress=lambda k, n, what: tell(
+                len(sources), total, f"lever arm and latency: {k} of {n} {what}"
+            ),
+        )
         del runs
     elif alignment is not None and not isinstance(alignment, Alignment):
         raise RefusedError(f'alignment must be "fit", an Alignment or None, got {alignment!r}')
