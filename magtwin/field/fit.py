@@ -23,6 +23,7 @@ from magtwin.field.model import FieldModel
 from magtwin.field.readings import Readings
 from magtwin.field.resolution import resolution
 from magtwin.names import RefusedError, find, hint
+from magtwin.report import Figure, Report
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
@@ -35,6 +36,9 @@ REACH = 2.0
 
 MOST_DOUBT = 0.5
 """Part of the readings' standard deviation from which a method's own counts as not knowing."""
+
+ERRORS = ("error between nodes [nT]", "error between headings [nT]")
+"""Parameters of a map: root of the mean squared error of linear interpolation."""
 
 MOST_THREADS = 4
 """Headings of a raster that are told beside each other: each holds blocks of 100 MB."""
@@ -180,6 +184,23 @@ def raster(
     )
 
 
+def grid_report(field: AnomalyMap) -> Report:
+    """How far a map's nodes and headings are apart, and the error of linear interpolation between them."""
+    dx, dy = field.cell_m
+    figures = []
+    for label, value, unit, error in (
+        ("node spacing", round(max(dx, dy), 4), "m", ERRORS[0]),
+        ("headings apart", round(360 / len(field.headings_rad), 2), "deg", ERRORS[1]),
+    ):
+        known = field.parameters.get(error)
+        note = "" if known is None else f"interpolation between them errs by {known:.3g} nT RMS"
+        figures.append(Figure(label, value, unit, note=note))
+    if field.variance_nt2 is not None and field.valid.any():
+        sd = float(np.sqrt(np.median(field.variance_nt2[field.valid])))
+        figures.append(Figure("standard deviation", round(sd, 1), "nT", note="median over the nodes"))
+    return Report("grid", tuple(figures), {})
+
+
 def _grid(
     model: FieldModel,
     readings: Readings,
@@ -211,8 +232,8 @@ def _grid(
             headings_rad=headings_rad,
             largest_m=max(min(x1 - x0, y1 - y0), 0.0),
         )
-    errors = {"error between nodes [nT]": chosen.nodes_nt, "error between headings [nT]": chosen.turn_nt}
-    known = {name: round(error, 2) for name, error in errors.items() if np.isfinite(error)}
+    errors = zip(ERRORS, (chosen.nodes_nt, chosen.turn_nt), strict=True)
+    known = {name: round(error, 2) for name, error in errors if np.isfinite(error)}
     return Grid.over(extent, chosen.spacing_m, chosen.headings_rad), known
 
 
