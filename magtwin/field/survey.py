@@ -27,6 +27,9 @@ SUFFIX = "_map.csv"
 LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
 """Bounds of a survey's mean [nT]; the Earth's field lies in 22,000..67,000 nT, a building bends it."""
 
+USUAL_NT = 50_000.0
+"""Magnitude that a refusal suggests a scale for [nT]."""
+
 NT_PER = {"nT": 1.0, "uT": 1e3, "T": 1e9, "mG": 1e2, "G": 1e5}
 """Units that a field may be in, and the nT that each is."""
 
@@ -54,6 +57,7 @@ def read_grid(
     datum: str = "",
     headings_deg: tuple[float, ...] | None = None,
     unit: str = "nT",
+    scale: float | None = None,
 ) -> Readings:
     """The readings of a survey folder, `0_map.csv`, `90_map.csv`, `180_map.csv`, `270_map.csv`.
 
@@ -72,6 +76,7 @@ def read_grid(
         headings_deg: Headings that the survey has [deg]. Unless given, the files must be evenly
             spaced on the circle and at most 90 deg apart, so that a lost file is noticed.
         unit: Unit of the field, one of `NT_PER`.
+        scale: Factor from the file's values to nT, in place of a unit.
 
     Returns:
         Readings in the order of the rows, heading after heading, one run a file, with `grid` and
@@ -81,7 +86,7 @@ def read_grid(
         RefusedError: A file or a heading is missing, a row or a value is none, the grid has a hole or
             a node two values, the headings' grids differ, or the unit cannot be; with file and line.
     """
-    readings = _readings(_read(folder, headings_deg, unit), Path(folder), name)
+    readings = _readings(_read(folder, headings_deg, unit, scale), Path(folder), name)
     return readings.with_(licence=licence, created=created, height_m=height_m, frame=frame, datum=datum)
 
 
@@ -198,6 +203,7 @@ def read_survey(
     datum: str = "",
     headings_deg: tuple[float, ...] | None = None,
     unit: str = "nT",
+    scale: float | None = None,
     keep_latched: bool = False,
 ) -> tuple[AnomalyMap, Report]:
     """The map of a survey folder's nodes, and its report.
@@ -212,6 +218,7 @@ def read_survey(
         datum: Where that frame lies, in words.
         headings_deg: Headings that the survey has [deg].
         unit: Unit of the field, one of `NT_PER`.
+        scale: Factor from the file's values to nT, in place of a unit.
         keep_latched: Whether readings of a sensor that had lost lock stay valid nodes.
 
     Returns:
@@ -225,7 +232,7 @@ def read_survey(
     """
     from magtwin.field.latch import mask_latched
 
-    layers = _read(folder, headings_deg, unit)
+    layers = _read(folder, headings_deg, unit, scale)
     readings = _readings(layers, Path(folder), name)
     readings = readings.with_(licence=licence, created=created, height_m=height_m, frame=frame, datum=datum)
     masked, found = mask_latched(readings)
@@ -257,7 +264,12 @@ class _Layer:
     sha256: str
 
 
-def _read(folder: str | os.PathLike[str], headings_deg: tuple[float, ...] | None, unit: str) -> list[_Layer]:
+def _read(
+    folder: str | os.PathLike[str],
+    headings_deg: tuple[float, ...] | None,
+    unit: str,
+    scale: float | None,
+) -> list[_Layer]:
     folder = existing(folder, "survey folder")
     if not folder.is_dir():
         raise RefusedError(f"{folder}: not a folder; give the one that holds 0{SUFFIX}, 90{SUFFIX}, ...")
@@ -270,7 +282,7 @@ def _read(folder: str | os.PathLike[str], headings_deg: tuple[float, ...] | None
             )
         files[heading] = path
     _check_headings(folder, sorted(files), headings_deg)
-    return [_read_layer(files[heading], heading, unit) for heading in sorted(files)]
+    return [_read_layer(files[heading], heading, unit, scale) for heading in sorted(files)]
 
 
 def _heading(path: Path) -> float:
@@ -315,7 +327,7 @@ def _say(headings: list[float] | tuple[float, ...]) -> str:
     return ", ".join(f"{h:g}" for h in headings)
 
 
-def _read_layer(path: Path, heading_deg: float, unit: str) -> _Layer:
+def _read_layer(path: Path, heading_deg: float, unit: str, scale: float | None) -> _Layer:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (UnicodeDecodeError, OSError) as error:
@@ -330,9 +342,9 @@ def _read_layer(path: Path, heading_deg: float, unit: str) -> _Layer:
         raise RefusedError(f"{path}: no rows below the header; expected one a node")
     table = np.array([_row(path, number, line) for number, line in lines])
     x, y, theta, field = table.T
-    field = NT_PER[unit] * field
+    field = nt_per(unit, scale) * field
     layer = _Layer(path, heading_deg, np.array([n for n, _ in lines]), x, y, theta, field, sha256(path))
-    check_unit(field, str(path), "scalar_mag", unit, lambda k: f"{path}:{layer.lines[k]}")
+    check_unit(field, str(path), "scalar_mag", unit, lambda k: f"{path}:{layer.lines[k]}", scale)
     return layer
 
 
@@ -360,8 +372,23 @@ def _row(path: Path, number: int, line: str) -> list[float]:
     return values
 
 
+def _four(value: float) -> str:
+    """A number to four digits, without an exponent where it is usual."""
+    return f"{float(f'{value:.4g}'):g}"
+
+
+def nt_per(unit: str | None, scale: float | None) -> float:
+    """Factor from a file's values to nT: `scale` if it is given, else that of the unit, nT if None."""
+    return NT_PER[unit or "nT"] if scale is None else scale
+
+
 def check_unit(
-    b_nt: Array, where: str, column: str, unit: str = "nT", row: Callable[[int], str] | None = None
+    b_nt: Array,
+    where: str,
+    column: str,
+    unit: str = "nT",
+    row: Callable[[int], str] | None = None,
+    scale: float | None = None,
 ) -> None:
     """Refuse readings whose mean cannot be the Earth's field in nT, and those of two units.
 
@@ -371,6 +398,7 @@ def check_unit(
         column: Its column.
         unit: Unit that the file was said to be in.
         row: Says where a reading stands, by its index; the file itself unless given.
+        scale: Factor that took the file's values to nT, in place of a unit.
 
     Raises:
         RefusedError: The mean lies outside 10,000..100,000 nT; the text names the unit that would fit. Or
@@ -390,15 +418,25 @@ def check_unit(
     mean = float(b_nt.mean())
     if LEAST_MEAN_NT <= mean <= GREATEST_MEAN_NT:
         return
+    if scale is not None:
+        raise RefusedError(
+            f"{where}: the mean of {column} is {mean:.6g} nT with scale {scale:g}, outside "
+            f"{LEAST_MEAN_NT:,.0f}..{GREATEST_MEAN_NT:,.0f} nT; --scale {_four(scale * USUAL_NT / mean)} would "
+            f"make it {USUAL_NT:,.0f} nT"
+        )
     number = mean / NT_PER[unit]
     fits = [
         f"were it {other}, it would be {number * factor:,.0f} nT, so say --unit {other}"
         for other, factor in NT_PER.items()
         if LEAST_MEAN_NT <= number * factor <= GREATEST_MEAN_NT
     ]
+    normalised = (
+        "no usual unit makes it the Earth's field; for a normalised sensor give --scale, the factor to nT "
+        f"({_four(USUAL_NT / number)} would make it {USUAL_NT:,.0f} nT)"
+    )
     raise RefusedError(
         f"{where}: the mean of {column} is {mean:.6g} nT, outside {LEAST_MEAN_NT:,.0f}.."
-        f"{GREATEST_MEAN_NT:,.0f} nT; " + (" or ".join(fits) or "no usual unit makes it the Earth's field")
+        f"{GREATEST_MEAN_NT:,.0f} nT; " + (" or ".join(fits) or normalised)
     )
 
 

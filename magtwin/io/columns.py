@@ -45,7 +45,10 @@ class Columns:
     """Unit of the heading: rad, which is checked unless given, or deg."""
 
     unit: Unit | None = None
-    """Unit of the field; nT unless given, or for a bag what its size tells."""
+    """Unit of the field. Default: nT; of a bag, the unit that makes it the Earth's field."""
+
+    scale: float | None = None
+    """Factor from the file's values to nT, in place of a unit, as for a normalised sensor."""
 
     time: str = ""
     """Column of time [s]."""
@@ -58,6 +61,11 @@ class Columns:
             given = getattr(self, name)
             if given and len(self.several(name)) != count:
                 raise RefusedError(f"{name} takes {count} columns with commas between, got {given!r}")
+        if self.scale is not None:
+            if self.unit is not None:
+                raise RefusedError("give the field's unit or its scale, the factor to nT, not both")
+            if not (0 < self.scale < float("inf")):
+                raise RefusedError(f"scale is a factor to nT, above 0, got {self.scale:g}")
         if self.heading and self.quaternion:
             raise RefusedError("give the heading's column or the quaternion's, not both")
 

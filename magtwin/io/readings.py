@@ -2,8 +2,9 @@
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
+from glob import has_magic
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.grid import Grid
 from magtwin.field.readings import FARTHEST_M, SHAPES, Readings
-from magtwin.field.survey import NT_PER, check_unit, read_grid
+from magtwin.field.survey import check_unit, nt_per, read_grid
 from magtwin.files import existing, output, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 from magtwin.io.columns import FIELDS, HEADINGS, Columns
@@ -60,7 +61,9 @@ def read_readings(
     A source is a folder of one CSV a heading (`magtwin.field.survey`); a table of readings, CSV or
     Parquet; several files whose rows belong together, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`;
     those after the first are looked for beside it); a Run's Parquet; Readings' own Parquet; or a
-    rosbag2, its folder or its storage file. Several sources are several runs of one survey.
+    rosbag2, its folder or its storage file. Several sources are several runs of one survey; so are the
+    files that match a pattern (`drives/*.parquet`), and the Parquet files of a folder, in the order of
+    their names.
 
     Args:
         sources: One or more of them.
@@ -80,14 +83,15 @@ def read_readings(
         left out, and `source` tells how many.
 
     Raises:
-        RefusedError: A source is missing, damaged, or of no known form; a column is not there (the
+        RefusedError: A source is missing, damaged, or of no known form; no file matches a pattern; a column
+            is not there (the
             near one is named); a cell is no number, with file and line; the unit cannot be.
     """
     columns = Columns() if columns is None else columns
     if not sources:
         raise RefusedError("no source of readings given")
     parts = []
-    for source in sources:
+    for source in _each(sources):
         path = _first(source)
         if path.is_dir() or path.suffix in BAGS:
             _only_unit(path, columns)
@@ -95,10 +99,18 @@ def read_readings(
             from magtwin.io.rosbag import read_bag_readings
 
             parts.append(
-                read_bag_readings(path, pose_topic=pose_topic, field_topic=field_topic, unit=columns.unit)
+                read_bag_readings(
+                    path,
+                    pose_topic=pose_topic,
+                    field_topic=field_topic,
+                    unit=columns.unit,
+                    scale=columns.scale,
+                )
             )
         elif path.is_dir():
-            parts.append(read_grid(path, headings_deg=headings_deg, unit=columns.unit or "nT"))
+            parts.append(
+                read_grid(path, headings_deg=headings_deg, unit=columns.unit or "nT", scale=columns.scale)
+            )
         else:
             parts.append(_of_file(str(source), path, columns))
     readings = parts[0] if len(parts) == 1 else _together(parts)
@@ -223,6 +235,36 @@ def load_readings(path: Source) -> Readings:
         raise RefusedError(f"{path}: {error}") from error
 
 
+def is_pattern(source: Source) -> bool:
+    """Whether a source is a pattern, not a file whose name has such characters."""
+    return has_magic(str(source)) and not Path(source).exists()
+
+
+def _each(sources: Sequence[Source]) -> Iterator[Source]:
+    """The sources, with the files of patterns and of folders of Parquet files in their place.
+
+    Raises:
+        RefusedError: Nothing matches a pattern.
+    """
+    for source in sources:
+        path = Path(source)
+        if is_pattern(source):
+            root = Path(path.anchor)
+            found = root.glob(str(path.relative_to(path.anchor)))
+            matches = sorted(match for match in found if not match.name.startswith("."))
+            if not matches:
+                raise RefusedError(f"no file or folder matches {str(source)!r}; check the pattern")
+            yield from matches
+        elif path.is_dir() and not (path / "metadata.yaml").is_file():
+            tables = sorted(file for file in path.iterdir() if file.suffix in PARQUET)
+            if tables:
+                yield from tables
+            else:
+                yield source
+        else:
+            yield source
+
+
 def _first(source: Source) -> Path:
     """The path of a source, or of the first of its joined files."""
     path = Path(source)
@@ -233,7 +275,7 @@ def _first(source: Source) -> Path:
 
 def _only_unit(path: Path, columns: Columns) -> None:
     """Refuse columns that are named for a source that has none to choose from."""
-    if replace(columns, unit=None) != Columns():
+    if replace(columns, unit=None, scale=None) != Columns():
         raise RefusedError(f"{path}: its columns are known; columns are named for tables of your own")
 
 
@@ -246,7 +288,9 @@ def _of_file(source: str, path: Path, columns: Columns) -> Readings:
     if path.suffix in PARQUET and path == Path(source):
         metadata = _metadata(path)
         if _SURVEY in metadata or b"magtwin_facts" in metadata:
-            _only_unit(path, replace(columns, unit=None))
+            _only_unit(path, columns)
+            if columns.scale is not None:
+                raise RefusedError(f"{path}: its field is in nT already; leave out --scale")
         if _SURVEY in metadata:
             return load_readings(path)
         if b"magtwin_facts" in metadata:
@@ -313,6 +357,7 @@ def _of_sheet(sheet: Sheet, paths: list[Path], columns: Columns) -> Readings:
         _magnitude(sheet, columns).name or columns.field or columns.vector,
         columns.unit or "nT",
         lambda k: _magnitude(sheet, columns).where(int(np.flatnonzero(known)[k])),
+        columns.scale,
     )
     if vector is not None:
         _check_sizes(vector[known], b[known], sheet, columns)
@@ -380,14 +425,12 @@ def _magnitude(sheet: Sheet, columns: Columns) -> Any:
 
 def _field(sheet: Sheet, columns: Columns) -> tuple[Array | None, Array]:
     """Vectors, where there are, and magnitudes [nT], shapes (N, 3) and (N,)."""
-    vector = None
+    vector, factor = None, nt_per(columns.unit, columns.scale)
     if columns.vector:
         names = columns.several("vector")
-        vector = NT_PER[columns.unit or "nT"] * np.column_stack([sheet.numbers(name) for name in names])
+        vector = factor * np.column_stack([sheet.numbers(name) for name in names])
     if columns.field or vector is None:
-        return vector, NT_PER[columns.unit or "nT"] * sheet.numbers(
-            _magnitude(sheet, columns).name or columns.field
-        )
+        return vector, factor * sheet.numbers(_magnitude(sheet, columns).name or columns.field)
     return vector, np.linalg.norm(vector, axis=1)
 
 
