@@ -14,11 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
 from magtwin.resample import RULES, Interpolation, bracket, check_instants, grid
+from magtwin.summary import Summarized, Summary, listed, rectangle, span
 
 if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
     import xarray as xr
+    from matplotlib.figure import Figure as Picture
 
 Facts = Mapping[str, str | int | float | bool]
 
@@ -124,8 +126,8 @@ what the map does not know, b_noise_nt the sensor's, and b_vector_measured_nt - 
 """
 
 
-@dataclass(frozen=True)
-class Run(Mapping[str, NDArray[Any]]):
+@dataclass(frozen=True, repr=False)
+class Run(Summarized, Mapping[str, NDArray[Any]]):
     """A table of equally long columns, and the facts under which it came about.
 
     A mapping from column name to array: `run["b_total_nt"]` has shape (N,), `run["p_world_base"]`
@@ -167,6 +169,10 @@ class Run(Mapping[str, NDArray[Any]]):
     def __len__(self) -> int:
         """Number of columns, as for any mapping; rows are counted by `rows`."""
         return len(self.columns)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        """Names of the columns, which IPython and Jupyter offer after `run["`."""
+        return list(self.columns)
 
     @property
     def rows(self) -> int:
@@ -385,14 +391,19 @@ class Run(Mapping[str, NDArray[Any]]):
     def to_pandas(self) -> "pd.DataFrame":
         """A DataFrame with the columns of `flat`, one row a reading.
 
-        `attrs["units"]` gives the unit of every column, `attrs["facts"]` the run's facts.
+        `attrs["units"]` and `attrs["frames"]` give the unit and the frame of every column, `attrs["facts"]`
+        the run's facts.
 
         Raises:
             RefusedError: pandas is not installed, or a column cannot stand in a table.
         """
         frame = _optional("pandas").DataFrame(self.flat())
-        units = {name: self.spec(column).unit for name, (column, _, _) in self.members().items()}
-        frame.attrs = {"units": units, "facts": dict(self.facts)}
+        specs = {name: self.spec(column) for name, (column, _, _) in self.members().items()}
+        frame.attrs = {
+            "units": {name: spec.unit for name, spec in specs.items()},
+            "frames": {name: spec.frame for name, spec in specs.items()},
+            "facts": dict(self.facts),
+        }
         return frame
 
     def to_polars(self) -> "pl.DataFrame":
@@ -427,6 +438,20 @@ class Run(Mapping[str, NDArray[Any]]):
         coords["t"] = variables.pop("t")
         return xarray.Dataset(variables, coords, dict(self.facts))
 
+    def plot(self, anomaly_map: Any = None) -> "Picture":
+        """Draw the path over the floor and the readings against time; see `magtwin.plot`.
+
+        Args:
+            anomaly_map: An `AnomalyMap` to draw below the path; None draws a bare floor.
+
+        Returns:
+            A matplotlib figure. A notebook shows it; `figure.savefig("run.png")` writes it.
+
+        Raises:
+            RefusedError: The run has no rows, or no column that can be drawn.
+        """
+        return importlib.import_module("magtwin").plot(self, anomaly_map=anomaly_map)  # loads io when called
+
     def report(self, title: str = "Run") -> Report:
         """What happened, in a few figures; columns that the run does not have are passed over."""
         figures = [Figure("duration", self.duration_s, "s"), Figure("readings", self.rows)]
@@ -459,10 +484,74 @@ class Run(Mapping[str, NDArray[Any]]):
         told = "; ".join(text for text in (str(self.facts.get("derived", "")), step) if text)
         return Run(self.columns if columns is None else columns, {**self.facts, "derived": told}, self.specs)
 
+    def _summary(self) -> Summary:
+        """Rows, duration, rate, origin, path, range of the field, and flags that are set."""
+        return Summary(
+            self._headline(),
+            (
+                ("from", _origin(self.facts)),
+                ("path", _driven(self)),
+                ("field", _field_range(self)),
+                ("flags" if _flags(self) else "columns", _flags(self) or listed(self.columns)),
+            ),
+            ("column", "unit", "frame", "what it is"),
+            [(name, *(getattr(self.spec(name), part) for part in ("unit", "frame", "doc"))) for name in self],
+        )
+
+    def _headline(self) -> str:
+        size = f"Run: {self.rows:,} rows x {len(self)} columns"
+        t = self.columns.get("t", np.array([]))
+        if t.dtype.kind not in "fiu" or t.ndim != 1 or len(t) < 2:
+            return size
+        step = float(np.median(np.diff(t)))
+        rate = f" at {1 / step:.4g} Hz" if step > 0 else ""
+        return f"{size}, {float(t[-1] - t[0]):.4g} s{rate}"
+
     def _span(self) -> str:
         """From when to when it goes, for refusals."""
         t = self["t"]
         return f"the run goes from {t[0]:g} to {t[-1]:g} s" if len(t) else "the run has no rows"
+
+
+def _origin(facts: Facts) -> str:
+    """Scene, path, robot and seed of a run, as far as its facts name them."""
+    parts = [f"scene {facts['scene']}"] if "scene" in facts else []
+    parts += [f"{name} {facts[name]}" for name in ("path", "robot", "magnetometer") if name in facts]
+    if "magnetometer" in facts and "network" in facts:
+        parts[-1] += f" ({facts['network']})"
+    parts += [f"{name} {facts[name]}" for name in ("seed", "session") if name in facts]
+    return ", ".join(parts)
+
+
+def _driven(run: Run) -> str:
+    """Length and extent of what was driven, by the best position that the run has."""
+    for name in ("p_world_base", "mocap_p", "odom_p"):
+        p = run.columns.get(name, np.array([]))
+        p = p[np.isfinite(p).all(axis=1)] if p.ndim == 2 else np.empty((0, 3))
+        if len(p):
+            length = float(np.hypot(*np.diff(p[:, :2], axis=0).T).sum())
+            (x0, y0), (x1, y1) = p[:, :2].min(axis=0), p[:, :2].max(axis=0)
+            return f"{length:.4g} m in {rectangle(x0, x1, y0, y1)} ({name})"
+    return ""
+
+
+def _field_range(run: Run) -> str:
+    """Range and mean of the reading, or of the best field that the run has."""
+    for name in ("b_measured_nt", "b_total_nt", "b_truth_nt", "b_map_nt"):
+        values = run.columns.get(name, np.array([]))
+        known = values[np.isfinite(values)]
+        if len(known):
+            lost = f", {len(values) - len(known):,} nan" if len(known) < len(values) else ""
+            return f"{span(known.min(), known.max(), 'nT')}, mean {known.mean():,.0f} nT ({name}{lost})"
+    return ""
+
+
+def _flags(run: Run) -> str:
+    """Flags that are set, and in how many rows."""
+    raised = {
+        n: int(v.sum()) for n, v in run.items() if n.startswith("flag_") and v.dtype == bool and v.any()
+    }
+    return listed([f"{name} in {count:,} rows" for name, count in raised.items()], 80)
 
 
 def check_clock(run: Run, what: str) -> None:
