@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.files import existing
 from magtwin.names import RefusedError, find, hint
 from magtwin.obstacles import Obstacles
+from magtwin.summary import Summarized, Summary, rectangle
 
 Array = NDArray[np.float64]
 
@@ -23,8 +24,8 @@ _SAME_M = 1e-6
 """Neighbours nearer than this are one point; a line whose ends are nearer than this is closed [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Path:
+@dataclass(frozen=True, eq=False, repr=False)
+class Path(Summarized):
     """A polyline in the plane of the floor, parametrised by its arc length.
 
     Neighbours that coincide are merged at birth. A closed path ends where it began: its first point
@@ -156,6 +157,19 @@ class Path:
         if self.closed:
             s = s % self.length
         return s, np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, len(self.s) - 2)
+
+    def _summary(self) -> Summary:
+        """Name, length, extent, and where it begins and ends."""
+        (x0, y0), (x1, y1) = self.p_xy.min(axis=0), self.p_xy.max(axis=0)
+        (ax, ay), (bx, by) = self.p_xy[0], self.p_xy[-1]
+        ends = f"begins and ends at ({ax:z.2f}, {ay:z.2f}) m"
+        if not self.closed:
+            ends = f"({ax:z.2f}, {ay:z.2f}) to ({bx:z.2f}, {by:z.2f}) m"
+        return Summary(
+            f"Path {self.name}: {self.length:.4g} m, {'closed' if self.closed else 'open'}, "
+            f"{len(self.p_xy):,} points",
+            (("over", rectangle(x0, x1, y0, y1)), ("ends", ends), ("file", self.file)),
+        )
 
 
 def sine(

@@ -98,7 +98,8 @@ def clipped(text: str, most: int) -> str:
 
 def listed(names: Collection[str], most: int = 60) -> str:
     """Names in a line of about so many characters, and how many are left out."""
-    shown, length = [], 0
+    shown: list[str] = []
+    length = 0
     for name in names:
         if shown and length + len(name) > most:
             return f"{', '.join(shown)} and {len(names) - len(shown):,} more"
@@ -122,8 +123,7 @@ def rectangle(x0: float, x1: float, y0: float, y1: float) -> str:
 def _short(value: Any) -> str:
     """A field's value in a few words."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
-        shape = ", ".join(map(str, value.shape))
-        return f"{value.dtype} ({shape})"
+        return f"{value.dtype} {tuple(value.shape)}"
     if isinstance(value, Summarized):
         return value._summary().title
     if isinstance(value, str):

@@ -17,7 +17,8 @@ from magtwin.names import RefusedError, find
 from magtwin.obstacles import Obstacles
 from magtwin.path import Path, resolve_path
 from magtwin.run import Run
-from magtwin.spec import MagnetometerSpec, RobotSpec, Scene
+from magtwin.spec import MagnetometerSpec, RobotSpec, Scene, spelled
+from magtwin.summary import Summarized, Summary
 
 Kind = Literal["physical", "neural", "map-only"]
 Facts = dict[str, str | int | float | bool]
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
     from magtwin.sim.simulate import Sensed
 
 
-@dataclass(frozen=True)
-class Twin:
+@dataclass(frozen=True, repr=False)
+class Twin(Summarized):
     """A scene, and what runs it."""
 
     scene: Scene
@@ -51,6 +52,23 @@ class Twin:
 
     facts: Mapping[str, str | int | float | bool] = dataclasses.field(default_factory=dict)
     """What a run is to say of the files that were opened: their names as they were given, and checksums."""
+
+    def _summary(self) -> Summary:
+        """The scene and its file, the robot, the map and the network."""
+        robot, field = self.scene.robot, self.field._summary()
+        sensor = f"{robot.name}, {robot.magnetometer.kind} magnetometer at {robot.magnetometer.rate_hz:g} Hz"
+        more = f", and {len(self.scene.others)} more robots" if self.scene.others else ""
+        width, depth = self.scene.lab.floor_m
+        network = self.magnetometer._summary().title.partition(" ")[2] if self.magnetometer else "none"
+        return Summary(
+            f"Twin {self.scene.name}: floor {width:g} x {depth:g} m, {len(self.obstacles)} obstacles",
+            (
+                ("robot", sensor + more),
+                ("map", field.title.partition(" ")[2]),
+                ("network", network),
+                ("file", str(self.scene_file)),
+            ),
+        )
 
 
 def open_twin(
@@ -693,7 +711,7 @@ def _config_sha256(scene: Scene) -> str:
     scene = dataclasses.replace(
         scene, map_layer=FilePath(), map_sha256="", robot=bare(scene.robot), path="", others=others
     )
-    return hashlib.sha256(repr(scene).encode()).hexdigest()
+    return hashlib.sha256(spelled(scene).encode()).hexdigest()
 
 
 def scan(twin: Twin, run: Run, *, seed: int = 0) -> "Scans":

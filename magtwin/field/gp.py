@@ -13,6 +13,7 @@ from magtwin.field.interpolation import check_readings, flat_poses
 from magtwin.field.readings import Readings
 from magtwin.field.roughness import local_mean, tail
 from magtwin.names import RefusedError
+from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
@@ -51,8 +52,8 @@ BLOCK = 1024
 """Poses predicted at a time."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GpModel:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class GpModel(Summarized):
     """A Gaussian process conditioned on readings."""
 
     parameters: Mapping[str, Any]

@@ -18,6 +18,7 @@ from magtwin.field.grid import TURN, Grid
 from magtwin.field.readings import Readings
 from magtwin.field.roughness import Roughness
 from magtwin.names import RefusedError
+from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -92,8 +93,8 @@ def check_readings(readings: Readings) -> None:
         raise RefusedError(f"the {count} good readings {of} lie on one line; a map needs an area")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GridInterpolation:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class GridInterpolation(Summarized):
     """Values on the nodes of a survey, and the rule between them."""
 
     method: str
@@ -164,8 +165,8 @@ class GridInterpolation:
         return [RectBivariateSpline(rows, columns, layer, kx=ky, ky=kx, s=0) for layer in self.values_nt]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ScatterInterpolation:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class ScatterInterpolation(Summarized):
     """A surface over the triangles of scattered readings, and a wave over heading."""
 
     method: str

@@ -36,6 +36,7 @@ from magtwin.field.readings import Readings, checked_earth_nt
 from magtwin.field.roughness import NINETY
 from magtwin.frames import wrap_angle
 from magtwin.names import RefusedError
+from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
@@ -176,8 +177,8 @@ class Figures:
         return np.stack([np.full_like(place, self.noise_nt**2), place, heading], axis=-1)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class HarmonicModel:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class HarmonicModel(Summarized):
     """A harmonic field fitted to readings, and how sure it is."""
 
     field: HarmonicField
