@@ -9,7 +9,7 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -124,7 +124,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         duration_s: float = 60.0,
         end_on_bump: bool = False,
         random_start: bool = False,
-        sessions: bool = True,
+        session: Literal["drawn", "survey"] = "drawn",
         render_mode: None = None,
     ) -> None:
         """Open a scene for robots.
@@ -141,9 +141,10 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             duration_s: Time after which an episode is truncated [s].
             end_on_bump: Whether touching an obstacle, or the floor's border, ends an episode.
             random_start: Whether robots begin anywhere on the path; otherwise at its first point.
-            sessions: Whether each episode is another day, as `magtwin.sim.session.draw_session` draws it:
-                charge, IMU zero, LiDAR's phase, wheels, odometry and its own field; otherwise the robot
-                is as the scene has it, as `magtwin.simulate` takes it.
+            session: "drawn": each episode is a session of its own, as `magtwin.sim.session.draw_session`
+                draws it: charge, IMU zero, LiDAR's phase, wheels, odometry and the robot's own field.
+                "survey": the robot as it was when the map was surveyed, in every episode. A Twin that is in
+                a session already stays in it.
             render_mode: None: a Run is looked at in Rerun.
 
         Raises:
@@ -180,7 +181,8 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             disturbance_nt=twin.magnetometer.disturbance_nt if twin.magnetometer else None,
         )
         self.num_envs, self.reward, self.end_on_bump = num_envs, reward, end_on_bump
-        self.random_start, self.sessions = random_start, sessions
+        find("session", session, {"drawn": None, "survey": None})
+        self.random_start, self._draws = random_start, session == "drawn" and not twin.session
         self._last_step = math.ceil(duration_s / step_s - 1e-9)
         low, high = np.repeat(np.array(bounds, np.float32).T, widths, axis=1)
         self.single_observation_space = spaces.Box(low, high, dtype=np.float32)
@@ -259,8 +261,8 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         xy, heading = self.path.at(self._s[which]), self.path.heading(self._s[which])
         poses = [(float(x), float(y), float(yaw)) for (x, y), yaw in zip(xy, heading, strict=True)]
         robot = self.fleet.scene.robot
-        days = [draw_session(robot, rng) for rng in rngs] if self.sessions else None
-        self.fleet.begin(which.tolist(), poses, rngs, days)
+        drawn = [draw_session(robot, rng) for rng in rngs] if self._draws else None
+        self.fleet.begin(which.tolist(), poses, rngs, drawn)
         self._made[which], self._over[which] = 0, False
 
     def _observations(self) -> NDArray[np.float32]:

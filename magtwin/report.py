@@ -27,6 +27,8 @@ class Report(Summarized):
     title: str
     figures: tuple[Figure, ...] = ()
     facts: dict[str, Any] = field(default_factory=dict)
+    verdict: str = ""
+    """Whether what it is of is any good, in one line; see `magtwin.verdict`."""
 
     def to_json(self) -> str:
         """The report as one JSON object; a figure becomes {value, unit, spread, note}."""
@@ -34,6 +36,7 @@ class Report(Summarized):
             f.name: {k: v for k, v in vars(f).items() if k != "name" and v not in ("", None)}
             for f in self.figures
         }
+<<<<<<< HEAD
         return json.dumps({"title": self.title, "figures": figures, "facts": self.facts}, indent=2)
 
     def _summary(self) -> Summary:
@@ -54,3 +57,7 @@ def _told(figure: Figure) -> str:
     number = f"{value:,.6g}" if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
     spread = "" if figure.spread is None else f" +- {figure.spread:.3g}"
     return f"{number}{spread} {figure.unit}".rstrip() + (f"  ({figure.note})" if figure.note else "")
+=======
+        told = {"title": self.title, "figures": figures, "facts": self.facts}
+        return json.dumps(told | ({"verdict": self.verdict} if self.verdict else {}), indent=2)
+>>>>>>> main

@@ -14,7 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
 from magtwin.resample import RULES, Interpolation, bracket, check_instants, grid
-from magtwin.summary import Summarized, Summary, listed, rectangle, span
+from magtwin.run_summary import run_summary
+from magtwin.summary import Summarized, Summary
+from magtwin.verdict import Tally
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -477,7 +479,21 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
             Figure(n, int(self[n].sum()), "readings", None, COLUMNS[n].doc if n in COLUMNS else "")
             for n in raised
         ]
-        return Report(title, tuple(figures), dict(self.facts))
+        return Report(title, tuple(figures), dict(self.facts), self._verdict())
+
+    def _verdict(self) -> str:
+        """How well a network predicted the exact field of a simulated run; "" where none did."""
+        tally = Tally()
+        self.add_to(tally)
+        return tally.verdict("the exact field of this run")
+
+    def add_to(self, tally: Tally) -> None:
+        """Add the errors of a simulated run's network against the exact field, where it has both."""
+        if "b_sd_nt" not in self or not {"b_total_nt", "b_map_nt", "b_truth_nt"} <= set(self):
+            return
+        truth, mean = self["b_truth_nt"], float(self.facts.get("network_label_mean_nt", 0.0))
+        tally.than = "the map plus the mean training label" if mean else "the map alone"
+        tally.add(self["b_total_nt"] - truth, self["b_map_nt"] + mean - truth, self["b_sd_nt"])
 
     def _derived(self, step: str, columns: Mapping[str, NDArray[Any]] | None = None) -> "Run":
         """What a step made of this run, and the fact that it did."""
@@ -485,73 +501,16 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         return Run(self.columns if columns is None else columns, {**self.facts, "derived": told}, self.specs)
 
     def _summary(self) -> Summary:
-        """Rows, duration, rate, origin, path, range of the field, and flags that are set."""
-        return Summary(
-            self._headline(),
-            (
-                ("from", _origin(self.facts)),
-                ("path", _driven(self)),
-                ("field", _field_range(self)),
-                ("flags" if _flags(self) else "columns", _flags(self) or listed(self.columns)),
-            ),
-            ("column", "unit", "frame", "what it is"),
+        return run_summary(
+            self.columns,
+            self.facts,
             [(name, *(getattr(self.spec(name), part) for part in ("unit", "frame", "doc"))) for name in self],
         )
-
-    def _headline(self) -> str:
-        size = f"Run: {self.rows:,} rows x {len(self)} columns"
-        t = self.columns.get("t", np.array([]))
-        if t.dtype.kind not in "fiu" or t.ndim != 1 or len(t) < 2:
-            return size
-        step = float(np.median(np.diff(t)))
-        rate = f" at {1 / step:.4g} Hz" if step > 0 else ""
-        return f"{size}, {float(t[-1] - t[0]):.4g} s{rate}"
 
     def _span(self) -> str:
         """From when to when it goes, for refusals."""
         t = self["t"]
         return f"the run goes from {t[0]:g} to {t[-1]:g} s" if len(t) else "the run has no rows"
-
-
-def _origin(facts: Facts) -> str:
-    """Scene, path, robot and seed of a run, as far as its facts name them."""
-    parts = [f"scene {facts['scene']}"] if "scene" in facts else []
-    parts += [f"{name} {facts[name]}" for name in ("path", "robot", "magnetometer") if name in facts]
-    if "magnetometer" in facts and "network" in facts:
-        parts[-1] += f" ({facts['network']})"
-    parts += [f"{name} {facts[name]}" for name in ("seed", "session") if name in facts]
-    return ", ".join(parts)
-
-
-def _driven(run: Run) -> str:
-    """Length and extent of what was driven, by the best position that the run has."""
-    for name in ("p_world_base", "mocap_p", "odom_p"):
-        p = run.columns.get(name, np.array([]))
-        p = p[np.isfinite(p).all(axis=1)] if p.ndim == 2 else np.empty((0, 3))
-        if len(p):
-            length = float(np.hypot(*np.diff(p[:, :2], axis=0).T).sum())
-            (x0, y0), (x1, y1) = p[:, :2].min(axis=0), p[:, :2].max(axis=0)
-            return f"{length:.4g} m in {rectangle(x0, x1, y0, y1)} ({name})"
-    return ""
-
-
-def _field_range(run: Run) -> str:
-    """Range and mean of the reading, or of the best field that the run has."""
-    for name in ("b_measured_nt", "b_total_nt", "b_truth_nt", "b_map_nt"):
-        values = run.columns.get(name, np.array([]))
-        known = values[np.isfinite(values)]
-        if len(known):
-            lost = f", {len(values) - len(known):,} nan" if len(known) < len(values) else ""
-            return f"{span(known.min(), known.max(), 'nT')}, mean {known.mean():,.0f} nT ({name}{lost})"
-    return ""
-
-
-def _flags(run: Run) -> str:
-    """Flags that are set, and in how many rows."""
-    raised = {
-        n: int(v.sum()) for n, v in run.items() if n.startswith("flag_") and v.dtype == bool and v.any()
-    }
-    return listed([f"{name} in {count:,} rows" for name, count in raised.items()], 80)
 
 
 def check_clock(run: Run, what: str) -> None:

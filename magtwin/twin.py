@@ -21,6 +21,7 @@ from magtwin.spec import MagnetometerSpec, RobotSpec, Scene, spelled
 from magtwin.summary import Summarized, Summary
 
 Kind = Literal["physical", "neural", "map-only"]
+Session = int | Literal["survey"]
 Facts = dict[str, str | int | float | bool]
 
 if TYPE_CHECKING:
@@ -53,6 +54,9 @@ class Twin(Summarized):
     facts: Mapping[str, str | int | float | bool] = dataclasses.field(default_factory=dict)
     """What a run is to say of the files that were opened: their names as they were given, and checksums."""
 
+    session: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
+    """Facts of the session that the robots are in (`session`, `session_seed`); empty before one is chosen."""
+
     def _summary(self) -> Summary:
         """The scene and its file, the robot, the map and the network."""
         robot, field = self.scene.robot, self.field._summary()
@@ -63,7 +67,7 @@ class Twin(Summarized):
         return Summary(
             f"Twin {self.scene.name}: floor {width:g} x {depth:g} m, {len(self.obstacles)} obstacles",
             (
-                ("robot", sensor + more),
+                ("robot", sensor + more + (f", session {self.session['session']}" if self.session else "")),
                 ("map", field.title.partition(" ")[2]),
                 ("network", network),
                 ("file", str(self.scene_file)),
@@ -159,33 +163,70 @@ def twin_of(
 _CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_sha256": "the scene"}
 
 
-def on_its_day(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> Twin:
-    """The twin with its robot as it was on a run's day, where `magtwin runs` dealt the run to one.
+def in_session(twin: Twin, session: Session | None = None, *, seed: int = 0) -> Twin:
+    """The twin with its robots as they are in one session, from switching on to switching off.
 
     Args:
-        twin: The twin of the run.
-        facts: Those of the run.
+        twin: What `open_twin` gave.
+        session: Number of a session to draw from the seed: battery charge, IMU zero, wheels, odometry and
+            the robot's own field differ from session to session. "survey" is the robot as it was when the
+            map was surveyed, without these changes. Default: the session that the twin is in already, or
+            else session 0.
+        seed: Seed of the draw.
+
+    Returns:
+        A twin whose `session` says which session it is. Several robots are drawn independently.
 
     Raises:
-        RefusedError: They do not say which day that was.
+        RefusedError: `session` is neither, or the twin is in a session already.
     """
     from magtwin.sim.session import session_of
 
+    if twin.session:
+        if session is None:
+            return twin
+        raise RefusedError(f"the twin is in session {twin.session['session']!r} already; open another")
+    if session == "survey":
+        return dataclasses.replace(twin, session={"session": "survey"})
+    number = 0 if session is None else session
+    if not isinstance(number, int | np.integer) or isinstance(number, bool) or number < 0:
+        raise RefusedError(f'session must be a whole number from 0 up, or "survey", got {session!r}')
+    number, seed = int(number), _seed(seed)
+    scene = dataclasses.replace(
+        twin.scene,
+        robot=session_of(twin.scene.robot, seed, number),
+        others=tuple(
+            dataclasses.replace(other, robot=session_of(other.robot, seed, number, which=k))
+            for k, other in enumerate(twin.scene.others, 1)
+        ),
+    )
+    return dataclasses.replace(twin, scene=scene, session={"session": number, "session_seed": seed})
+
+
+def in_session_of(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> Twin:
+    """The twin in the session of a run.
+
+    Args:
+        twin: The twin of the run.
+        facts: Those of the run. Without `session_seed`, the run is of the robot as it was surveyed.
+
+    Raises:
+        RefusedError: The facts do not say which session it was.
+    """
     if "session_seed" not in facts:
-        return twin
+        return in_session(twin, "survey")
     try:
-        seed, day = int(facts["session_seed"]), int(facts["session"])
+        seed, session = int(facts["session_seed"]), int(facts["session"])
     except (KeyError, ValueError) as error:
         raise RefusedError(f"the facts of the run do not say which session it was of: {error}") from error
-    robot = session_of(twin.scene.robot, seed, day)
-    return dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot))
+    return in_session(twin, session, seed=seed)
 
 
 def check_figures(scene: Scene, facts: Mapping[str, str | int | float | bool], name: str) -> None:
     """Refuse a scene that is not, figure by figure, the one that a run came from.
 
     Args:
-        scene: The scene, its robot as it was on the run's day.
+        scene: The scene, its robot as it was in the run's session.
         facts: Those of the run.
         name: What to call the run.
 
@@ -195,8 +236,8 @@ def check_figures(scene: Scene, facts: Mapping[str, str | int | float | bool], n
     found, said = _config_sha256(scene), facts.get("config_sha256", "none")
     if found != said:
         raise RefusedError(
-            f"{name}: came from a scene whose figures have the sha256 {said}, those of {scene.name!r} on its "
-            f"day have {found}; name the scene that it was made in"
+            f"{name}: came from a scene whose figures have the sha256 {said}, those of {scene.name!r} in its "
+            f"session have {found}; name the scene that it was made in"
         )
 
 
@@ -316,6 +357,7 @@ def simulate(
     path: "Path | Commands | Run | str" = "figure8",
     *,
     seed: int = 0,
+    session: Session | None = None,
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
@@ -334,7 +376,10 @@ def simulate(
         path: A path, the name of one, or a CSV file of x, y [m]; "random", for a human-like driver who goes
             where the seed takes them; Commands, to be played; or a Run, to be driven once more as it was
             recorded, with the sensors as the scene has them now.
-        seed: Seed of all noise; one seed, one Run.
+        seed: Seed of all noise. The same seed gives the same bytes.
+        session: Which session the robot is in, as for `in_session`: default, one drawn from the seed.
+            "survey" is the robot as it was when the map was surveyed, which a network that was trained on
+            later sessions does not know.
         speed: Forward speed where the path is straight [m/s].
         duration_s: How long to drive [s]; None is once along the path, longer gives further laps.
         rate_hz: Magnetometer readings a second [Hz]; None takes the scene's.
@@ -356,7 +401,8 @@ def simulate(
     """
     from magtwin.sim.simulate import simulate as run_scene
 
-    twin, seed = _opened(twin, net, magnetometer, "simulate"), _seed(seed)
+    seed = _seed(seed)
+    twin = in_session(_opened(twin, net, magnetometer, "simulate"), session, seed=seed)
     network = twin.magnetometer
     path = way_of(path)
     _check_commands(path, network)
@@ -395,6 +441,7 @@ def simulate_robots(
     robots: Iterable[str] | None = None,
     meet: Literal["refuse", "flag"] = "refuse",
     seed: int = 0,
+    session: Session | None = None,
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
@@ -418,6 +465,7 @@ def simulate_robots(
         meet: What becomes of robots whose footprints overlap: a refusal with time and place, or flag_bump in
             both while it lasts; they drive through each other.
         seed: As for `simulate`.
+        session: As for `simulate`; each robot is drawn by itself.
         speed: As for `simulate`, of each.
         duration_s: As for `simulate`, of each.
         rate_hz: As for `simulate`.
@@ -436,7 +484,8 @@ def simulate_robots(
     """
     from magtwin.sim.together import simulate_together
 
-    twin, seed = _opened(twin, net, magnetometer, "simulate_robots"), _seed(seed)
+    seed = _seed(seed)
+    twin = in_session(_opened(twin, net, magnetometer, "simulate_robots"), session, seed=seed)
     placed = {one.robot.name: one for one in twin.scene.robots}
     for name in (*(paths or {}), *(robots or ())):
         find("robot", name, placed)
@@ -505,6 +554,7 @@ def simulate_many(
     paths: "Path | Commands | Run | str | FilePath | Iterable[Path | Commands | Run | str | FilePath]",
     seeds: Iterable[int],
     *,
+    session: Session | None = None,
     speeds: float | Iterable[float] = 0.2,
     robots: RobotSpec | Iterable[RobotSpec] | None = None,
     columns: Iterable[str] | None = None,
@@ -528,9 +578,10 @@ def simulate_many(
         twin: What `open_twin` gave, or the file of a scene.
         paths: What is driven in each run, as for `simulate`, or one for all.
         seeds: A seed for each run; their number is that of the runs.
+        session: As for `simulate`, each run's drawn from its own seed.
         speeds: Forward speed of each where its path is straight [m/s], or one for all.
-        robots: What drives in each, such as `magtwin.sim.session.draw_session` gives, or one for all; None
-            takes the scene's.
+        robots: What drives in each, as it is, such as `magtwin.sim.session.draw_session` gives, or one for
+            all. Default: the scene's robot, in its session.
         columns: Columns to keep, beside t; None keeps all.
         block: Runs made at a time; None takes what fits into 0.1 GB for runs of a minute.
         duration_s: As for `simulate`, of each run.
@@ -560,8 +611,10 @@ def simulate_many(
     count = len(numbers)
     given = _each("paths", paths, count)
     resolved: dict[Any, Any] = {path: way_of(path) for path in given if isinstance(path, str | FilePath)}
-    scenes: dict[int, Scene] = {}
-    jobs = []
+    if robots is not None and session is not None:
+        raise RefusedError("robots are taken as they are; give robots or session, not both")
+    jobs, of = [], {}
+    drawn: dict[object, Scene] = {}
     for seed, path, speed, robot in zip(
         numbers,
         given,
@@ -569,16 +622,20 @@ def simulate_many(
         _each("robots", robots, count),
         strict=True,
     ):
-        if robot is not None and id(robot) not in scenes:
-            _check_magnetometer(twin, robot)
-            scenes[id(robot)] = dataclasses.replace(twin.scene, robot=robot)
-        scene = twin.scene if robot is None else scenes[id(robot)]
+        key: object = seed if robot is None else ("robot", id(robot))
+        if key not in drawn:
+            if robot is None:
+                own = in_session(twin, session, seed=seed)
+            else:
+                _check_magnetometer(twin, robot)
+                own = dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot))
+            drawn[key] = own.scene
+            of[id(own.scene)] = own, _config_sha256(own.scene)
         if isinstance(path, str | FilePath):
             path = resolved[path]
         _check_commands(path, twin.magnetometer)
-        jobs.append(Job(scene, path, seed, speed))
+        jobs.append(Job(drawn[key], path, seed, speed))
     network = twin.magnetometer
-    configs = {id(scene): _config_sha256(scene) for scene in (twin.scene, *scenes.values())}
 
     def finish(jobs: Sequence[Job], sensed: Sequence["Sensed"]) -> list[Run]:
         rows = [one.run for one in sensed]
@@ -589,8 +646,8 @@ def simulate_many(
             run = one.read(read.disturbance_nt if read else None)
             known = _known(job.scene, run, read)
             run = run.with_columns(**{name: known[name] for name in known.keys() & run.keys()})
-            config = configs[id(job.scene)]
-            runs.append(run.with_facts(**_facts(twin, job.seed, job.path, duration_s, config)))
+            own, config = of[id(job.scene)]
+            runs.append(run.with_facts(**_facts(own, job.seed, job.path, duration_s, config)))
         return runs
 
     conditions = Conditions(
@@ -674,7 +731,7 @@ def _facts(
     facts: Facts = {"magtwin": magtwin.__version__, "numpy": np.__version__, "seed": seed}
     if duration_s is not None:
         facts["asked_duration_s"] = float(duration_s)
-    return facts | path_facts(path) | dict(twin.facts) | {"config_sha256": config_sha256}
+    return facts | dict(twin.session) | path_facts(path) | dict(twin.facts) | {"config_sha256": config_sha256}
 
 
 def path_facts(path: "Path | Commands | Run | str") -> Facts:

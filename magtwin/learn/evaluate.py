@@ -31,7 +31,11 @@ from magtwin.learn.split import split
 from magtwin.names import RefusedError
 from magtwin.path import CASES
 from magtwin.run import Run
+<<<<<<< HEAD
 from magtwin.summary import Summarized, Summary, listed
+=======
+from magtwin.verdict import SEPARATOR, recordings_text, verdict
+>>>>>>> main
 
 Array = NDArray[np.float64]
 
@@ -261,6 +265,27 @@ class Evaluation(Summarized):
         """The row of all readings."""
         return next(case for case in self.cases if case.name == "all")
 
+    def verdicts(self) -> dict[str, str]:
+        """Whether each model from a weights file is better than the naive one, in one line a model."""
+        every, sessions = self.every, {one.session for one in self.judged}
+        naive, paths = every.scores[0].mae_nt, {one.path for one in self.judged}
+        found = {}
+        for one, score in zip(self.contenders[1:], every.scores[1:], strict=True):
+            if "sha256" not in one.facts:
+                continue
+            learned = [
+                None if fact not in one.facts else str(one.facts[fact]).split(SEPARATOR)
+                for fact in ("training_sessions", "training_paths")
+            ]
+            found[one.name] = verdict(
+                score.mae_nt,
+                naive,
+                interval=score.ratio_interval,
+                coverage=score.coverage,
+                judged_on=recordings_text(len(self.judged), sessions, paths, *learned),
+            )
+        return found
+
     def floor(self, chart: Chart) -> tuple[float, float]:
         """What a map's own variances say that its error is: MAE and RMS over the readings judged on [nT].
 
@@ -276,6 +301,7 @@ class Evaluation(Summarized):
     def summary(self) -> dict[str, Any]:
         """Everything in plain figures, for JSON."""
         return {
+            "verdicts": self.verdicts(),
             "errors_against": "b_truth_nt" if self.truth else "b_measured_nt",
             "models": [
                 {
