@@ -405,13 +405,36 @@ def path_named(name: str) -> Path:
     return find("path", CASES.get(name, name), PATHS)()
 
 
-def resolve_path(name_or_file: str | os.PathLike[str]) -> Path:
-    """A path from a name of `PATHS`, a case A to E of `CASES`, or else from a CSV file.
+def path_of_points(p_xy: ArrayLike, name: str = "points", file: str = "") -> Path:
+    """A polyline through points, as a CSV file of them gives it; closed where it ends where it began.
+
+    Args:
+        p_xy: Points in world [m], shape (N, 2), N >= 2. Neighbours that coincide are merged.
+        name: What to call it.
+        file: The file that they were read from.
 
     Raises:
-        RefusedError: It is neither, or the file is not a path.
+        RefusedError: They are not finite numbers of that shape, or only one point.
     """
-    text = os.fspath(name_or_file)
+    try:
+        p = np.asarray(p_xy, float)
+    except (TypeError, ValueError) as error:
+        raise RefusedError(f"path {name!r}: points must be numbers of shape (N, 2) [m] ({error})") from error
+    if p.ndim != 2 or p.shape[1] != 2 or not len(p):
+        raise RefusedError(f"path {name!r}: points must have shape (N, 2) [m], got {p.shape}")
+    line = _without_repeats(p)
+    return Path(name, p, len(line) > 2 and math.dist(line[0], line[-1]) < _SAME_M, file)
+
+
+def resolve_path(path: "str | os.PathLike[str] | ArrayLike") -> Path:
+    """A path from a name of `PATHS`, a case A to E of `CASES`, a CSV file, or points of shape (N, 2) [m].
+
+    Raises:
+        RefusedError: It is none of these, or the file is not a path.
+    """
+    if not isinstance(path, str | os.PathLike):
+        return path_of_points(path)
+    text = os.fspath(path)
     if text in PATHS or text in CASES:
         return path_named(text)
     file = FilePath(text)
@@ -455,10 +478,9 @@ def read_path_csv(file: str | os.PathLike[str]) -> Path:
         points.append(point)
     if not points:
         raise RefusedError(f"{file}: no points in it; one x,y in metres a line is wanted")
-    p = _without_repeats(np.array(points))
-    if len(p) < 2:
+    if len(_without_repeats(np.array(points))) < 2:
         raise RefusedError(f"{file}: only one point in it; a path needs two that differ")
-    return Path(file.name, p, len(p) > 2 and math.dist(p[0], p[-1]) < _SAME_M, file.as_posix())
+    return path_of_points(points, file.name, file.as_posix())
 
 
 def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> None:

@@ -36,8 +36,8 @@ class Report(Summarized):
             f.name: {k: v for k, v in vars(f).items() if k != "name" and v not in ("", None)}
             for f in self.figures
         }
-<<<<<<< HEAD
-        return json.dumps({"title": self.title, "figures": figures, "facts": self.facts}, indent=2)
+        told = {"title": self.title, "figures": figures, "facts": self.facts}
+        return json.dumps(told | ({"verdict": self.verdict} if self.verdict else {}), indent=2)
 
     def _summary(self) -> Summary:
         """The figures, of which a prompt shows the first four; a notebook shows the facts as well."""
@@ -45,7 +45,7 @@ class Report(Summarized):
         count = f" ({len(self.figures)} figures)" if len(self.figures) >= LINES else ""
         return Summary(
             f"{self.title}{count}",
-            tuple((one.name, _told(one)) for one in self.figures),
+            (("verdict", self.verdict), *((one.name, _told(one)) for one in self.figures)),
             ("fact", "value"),
             facts,
         )
@@ -57,7 +57,3 @@ def _told(figure: Figure) -> str:
     number = f"{value:,.6g}" if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
     spread = "" if figure.spread is None else f" +- {figure.spread:.3g}"
     return f"{number}{spread} {figure.unit}".rstrip() + (f"  ({figure.note})" if figure.note else "")
-=======
-        told = {"title": self.title, "figures": figures, "facts": self.facts}
-        return json.dumps(told | ({"verdict": self.verdict} if self.verdict else {}), indent=2)
->>>>>>> main

@@ -47,11 +47,13 @@ def _title(columns: Columns) -> str:
 
 def _origin(facts: Mapping[str, Any]) -> str:
     """Scene, path, robot and seed of a run, as far as its facts name them."""
-    parts = [f"scene {facts['scene']}"] if "scene" in facts else []
-    parts += [f"{name} {facts[name]}" for name in ("path", "robot", "magnetometer") if name in facts]
-    if "magnetometer" in facts and "network" in facts:
-        parts[-1] += f" ({facts['network']})"
-    parts += [f"{name} {facts[name]}" for name in ("seed", "session") if name in facts]
+    parts = [
+        f"{name} {facts[name]}" for name in ("scene", "path", "robot", "seed", "session") if name in facts
+    ]
+    if "magnetometer" in facts:
+        parts.append(f"{facts['magnetometer']} magnetometer")
+        if "network" in facts:
+            parts[-1] += f" ({facts['network']})"
     return ", ".join(parts)
 
 

@@ -37,7 +37,8 @@ class Summary:
 
     def text(self) -> str:
         """The summary in at most five lines of at most 98 characters."""
-        rows = [(printable(label), printable(text)) for label, text in self.rows if text][: LINES - 1]
+        rows = [(printable(label), printable(text)) for label, text in self.rows if text]
+        rows = rows[: LINES - 1]
         wide = max((len(label) for label, _ in rows), default=0)
         lines = [printable(self.title), *(f"  {label:<{wide}}  {text}" for label, text in rows)]
         return "\n".join(clipped(line.rstrip(), WIDTH) for line in lines)

@@ -31,11 +31,8 @@ from magtwin.learn.split import split
 from magtwin.names import RefusedError
 from magtwin.path import CASES
 from magtwin.run import Run
-<<<<<<< HEAD
 from magtwin.summary import Summarized, Summary, listed
-=======
 from magtwin.verdict import SEPARATOR, recordings_text, verdict
->>>>>>> main
 
 Array = NDArray[np.float64]
 

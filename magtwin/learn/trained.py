@@ -20,11 +20,8 @@ from magtwin.learn.recipe import Choice, device_of, make
 from magtwin.learn.split import PARTS, Part, Split
 from magtwin.learn.weights import Fact
 from magtwin.report import Figure, Report
-<<<<<<< HEAD
 from magtwin.summary import Summarized, Summary
-=======
 from magtwin.verdict import SEPARATOR, coverage, recordings_text, verdict
->>>>>>> main
 from magtwin.version import __version__
 
 Array = NDArray[np.float64]
