@@ -55,5 +55,5 @@ def _told(figure: Figure) -> str:
     """A figure in a line."""
     value = figure.value
     number = f"{value:,.6g}" if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
-    spread = "" if figure.spread is None else f" +- {figure.spread:.3g}"
+    spread = "" if figure.spread is None else f" +- {figure.spread:,.4g}"
     return f"{number}{spread} {figure.unit}".rstrip() + (f"  ({figure.note})" if figure.note else "")

@@ -51,8 +51,9 @@ class Summary:
         if self.cells:
             shown, left = self.cells[:MOST_CELLS], len(self.cells) - MOST_CELLS
             more = f"<p>and {left:,} more</p>" if left > 0 else ""
+            plural = "s" if len(self.cells) != 1 else ""
             parts.append(
-                f"<details><summary>{len(self.cells):,} {_cell(self.heads[0])}s</summary>"
+                f"<details><summary>{len(self.cells):,} {_cell(self.heads[0])}{plural}</summary>"
                 f"{_table(self.heads, shown)}{more}</details>"
             )
         return "".join([*parts, "</div>"])
@@ -129,11 +130,13 @@ def _short(value: Any) -> str:
         return value._summary().title
     if isinstance(value, str):
         return clipped(repr(value), _QUOTED)
-    if isinstance(value, Collection) and len(value) > 4:
+    if isinstance(value, Collection) and (len(value) > 4 or not isinstance(value, list | tuple)):
         return f"{len(value):,} items"
-    if is_dataclass(value) or callable(value):
-        return type(value).__name__
-    return clipped(repr(value), _QUOTED)
+    if isinstance(value, list | tuple):
+        return clipped(f"({', '.join(map(_short, value))})", _QUOTED)
+    if value is None or isinstance(value, bool | int | float | complex):
+        return repr(value)
+    return type(value).__name__
 
 
 def _cell(text: object) -> str:
@@ -141,7 +144,7 @@ def _cell(text: object) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[tuple[str, ...]]) -> str:
-    left = ' style="text-align:left"'
+    left = ' style="text-align:left;padding-right:1em"'
     lines = ["<table>"]
     if heads:
         lines.append(f"<tr>{''.join(f'<th{left}>{_cell(head)}</th>' for head in heads)}</tr>")

@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.field.bins import Bins, bin_readings, spacing_m
 from magtwin.field.errors import node_errors
 from magtwin.field.grid import TURN, Grid
+from magtwin.field.model import FittedModel
 from magtwin.field.readings import Readings
 from magtwin.field.roughness import Roughness
 from magtwin.names import RefusedError
-from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -94,7 +94,7 @@ def check_readings(readings: Readings) -> None:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class GridInterpolation(Summarized):
+class GridInterpolation(FittedModel):
     """Values on the nodes of a survey, and the rule between them."""
 
     method: str
@@ -166,7 +166,7 @@ class GridInterpolation(Summarized):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class ScatterInterpolation(Summarized):
+class ScatterInterpolation(FittedModel):
     """A surface over the triangles of scattered readings, and a wave over heading."""
 
     method: str

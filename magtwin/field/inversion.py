@@ -31,12 +31,12 @@ from magtwin.field.bins import spacing_m as survey_spacing_m
 from magtwin.field.forward import SOFT, Forward, Reading
 from magtwin.field.grid import TURN
 from magtwin.field.harmonic import HarmonicField
+from magtwin.field.model import FittedModel
 from magtwin.field.posterior import Posterior
 from magtwin.field.readings import Readings, checked_earth_nt
 from magtwin.field.roughness import NINETY
 from magtwin.frames import wrap_angle
 from magtwin.names import RefusedError
-from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
@@ -178,7 +178,7 @@ class Figures:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class HarmonicModel(Summarized):
+class HarmonicModel(FittedModel):
     """A harmonic field fitted to readings, and how sure it is."""
 
     field: HarmonicField

@@ -105,7 +105,7 @@ def draw_run(run: Run, field: AnomalyMap | None = None, planned: ArrayLike | Non
     total = "b_total_nt" if "b_total_nt" in run else field_name(run)
     panels = _panels(run, total)
     both = where is not None and bool(panels)
-    figure = new_figure(13.5 if both else 8.0, 7.0)
+    figure = new_figure(13.5 if both else 8.0, 7.0 if len(panels) > 2 or not both else 5.5)
     sides = figure.subfigures(1, 1 + both, squeeze=False, width_ratios=(1.15, 1)[: 1 + both])[0]
     if where is not None:
         p_xy = run[where][:, :2]
@@ -144,7 +144,13 @@ def _panels(run: Run, total: str | None) -> list[_Panel]:
     curves = [("map", run["b_map_nt"] / 1000, MAP_INK)] if "b_map_nt" in run and total != "b_map_nt" else []
     if total is not None:
         name = total.removeprefix("b_").removesuffix("_nt")
-        panels.append(_Panel("field\n[µT]", (*curves, (name, run[total] / 1000, INK)), 2.0))
+        panels.append(
+            _Panel(
+                "field\n[µT]" if curves else f"{name} field\n[µT]",
+                (*curves, (name, run[total] / 1000, INK)),
+                2.0,
+            )
+        )
     if "b_disturbance_nt" in run:
         curve = ("disturbance", run["b_disturbance_nt"], INK)
         panels.append(_Panel("disturbance\n[nT]", (curve,), 2.0, about_zero=True))
