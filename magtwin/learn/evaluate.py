@@ -198,7 +198,7 @@ class Judged(Summarized):
                 ("from", f"session {self.session}, path {self.path}"),
                 (
                     "MAE",
-                    listed([f"{mae:.4g}" for mae in error.mean(axis=1)]) + " nT, a model each"
+                    listed([f"{mae:.4g}" for mae in error.mean(axis=1)]) + " nT, one per model"
                     if kept
                     else "",
                 ),
@@ -222,7 +222,7 @@ class Case(Summarized):
             (
                 (
                     "MAE",
-                    listed([f"{one.mae_nt:.4g}" for one in self.scores]) + " nT, a model each, naive first",
+                    listed([f"{one.mae_nt:.4g}" for one in self.scores]) + " nT, one per model, naive first",
                 ),
                 ("of naive", listed([f"{one.ratio:.3g}" for one in self.scores])),
             ),
