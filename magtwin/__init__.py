@@ -11,6 +11,7 @@ from magtwin.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from magtwin.field.map import AnomalyMap
+    from magtwin.io.plotting import plot
     from magtwin.names import RefusedError
     from magtwin.path import Path
     from magtwin.run import COLUMNS, Run
@@ -26,6 +27,7 @@ _HOME = {
     "Scene": "magtwin.spec",
     "Twin": "magtwin.twin",
     "open_twin": "magtwin.twin",
+    "plot": "magtwin.io.plotting",
     "scene_from_toml": "magtwin.twin",
     "simulate": "magtwin.twin",
     "simulate_many": "magtwin.twin",
@@ -41,6 +43,7 @@ __all__ = [
     "Scene",
     "Twin",
     "open_twin",
+    "plot",
     "scene_from_toml",
     "simulate",
     "simulate_many",

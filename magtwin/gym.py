@@ -17,13 +17,14 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from magtwin.names import RefusedError, find
 from magtwin.path import Path, check_clear, check_on_floor, resolve_path
 from magtwin.run import COLUMNS
 from magtwin.sim.fleet import SENSED, Fleet
 from magtwin.sim.session import draw_session
+from magtwin.spec import Scene
 from magtwin.twin import Kind, Twin, open_twin
 
 if TYPE_CHECKING:
@@ -114,10 +115,10 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         self,
         num_envs: int = 1,
         *,
-        scene: Twin | str | FilePath | None = None,
+        scene: Twin | Scene | str | FilePath | None = None,
         net: str | FilePath | None = None,
         magnetometer: Kind | None = None,
-        path: Path | str = "figure8",
+        path: Path | str | FilePath | ArrayLike = "figure8",
         signals: Sequence[str] = SIGNALS,
         reward: Reward = progress,
         step_s: float = 0.1,
@@ -131,10 +132,11 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
 
         Args:
             num_envs: How many robots.
-            scene: A scene's file, or what `magtwin.open_twin` gave.
+            scene: The file of a stage, a `Scene`, or what `magtwin.open_twin` gave.
             net: As for `magtwin.open_twin`, where `scene` is a file.
             magnetometer: As for `magtwin.open_twin`, where `scene` is a file.
-            path: What the robots begin on and are rewarded by: a path, the name of one, or a CSV file.
+            path: What the robots begin on and are rewarded by: a path, its name, a CSV file, or
+                points in world [m], shape (N, 2).
             signals: Columns that are observed, of `BOUNDS`, one after the other.
             reward: From a step of N robots to N rewards.
             step_s: Time between commands [s], a multiple of 0.02.

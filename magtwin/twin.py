@@ -2,22 +2,27 @@
 
 import dataclasses
 import hashlib
+import shutil
+import tempfile
+import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import magtwin
 from magtwin.field.map import AnomalyMap
 from magtwin.files import existing, git_revision, sha256
 from magtwin.names import RefusedError, find
 from magtwin.obstacles import Obstacles
-from magtwin.path import Path, resolve_path
+from magtwin.path import Path
 from magtwin.run import Run
-from magtwin.spec import MagnetometerSpec, RobotSpec, Scene
+from magtwin.sim.way import way_of, ways_of
+from magtwin.spec import MagnetometerSpec, RobotSpec, Scene, spelled
+from magtwin.summary import Summarized, Summary
 
 Kind = Literal["physical", "neural", "map-only"]
 Session = int | Literal["survey"]
@@ -33,8 +38,8 @@ if TYPE_CHECKING:
     from magtwin.sim.simulate import Sensed
 
 
-@dataclass(frozen=True)
-class Twin:
+@dataclass(frozen=True, repr=False)
+class Twin(Summarized):
     """A scene, and what runs it."""
 
     scene: Scene
@@ -56,14 +61,59 @@ class Twin:
     session: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
     """Facts of the session that the robots are in (`session`, `session_seed`); empty before one is chosen."""
 
+    stage: object = dataclasses.field(default=None, repr=False, compare=False)
+    """Keeps the temporary stage of a `Scene` that no file holds; None where `scene_file` is a user's own."""
+
+    def _summary(self) -> Summary:
+        """The scene and its file, the robot, the map and the network."""
+        robot, field = self.scene.robot, self.field._summary()
+        sensor = f"{robot.name}, {robot.magnetometer.kind} magnetometer at {robot.magnetometer.rate_hz:g} Hz"
+        more = f", and {len(self.scene.others)} more robots" if self.scene.others else ""
+        width, depth = self.scene.lab.floor_m
+        network = self.magnetometer._summary().title.partition(" ")[2] if self.magnetometer else "none"
+        return Summary(
+            f"Twin {self.scene.name}: floor {width:g} x {depth:g} m, {len(self.obstacles)} obstacles",
+            (
+                ("robot", sensor + more + (f", session {self.session['session']}" if self.session else "")),
+                ("map", field.title.partition(" ")[2]),
+                ("network", network),
+                ("file", str(self.scene_file) if self.stage is None else "none: opened from a Scene"),
+            ),
+        )
+
+
+class _Stage:
+    """A temporary folder for the stage of a scene that no file holds; it lasts as long as its twins."""
+
+    def __init__(self) -> None:
+        self.folder = FilePath(tempfile.mkdtemp(prefix="magtwin-"))
+        weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+
+    def __reduce__(self) -> tuple[type[FilePath], tuple[str]]:
+        return FilePath, (str(self.folder),)  # a copy in another process must not end it
+
+
+def _twin_of_scene(scene: Scene, net: str | FilePath | None, magnetometer: Kind | None) -> Twin:
+    """The twin of a scene that no file holds: authored as `author_scene` does, for as long as it is used."""
+    from magtwin.usd.scene import author_scene
+
+    stage = _Stage()
+    twin = open_twin(author_scene(scene, stage.folder / "scene"), net=net, magnetometer=magnetometer)
+    facts = {name: fact for name, fact in twin.facts.items() if name != "scene_file"}
+    return dataclasses.replace(twin, facts=facts, stage=stage)
+
 
 def open_twin(
-    scene_file: str | FilePath, *, net: str | FilePath | None = None, magnetometer: Kind | None = None
+    scene_file: Scene | str | FilePath,
+    *,
+    net: str | FilePath | None = None,
+    magnetometer: Kind | None = None,
 ) -> Twin:
     """Open a stage, the map layer and the network that it names.
 
     Args:
-        scene_file: Root layer of a scene.
+        scene_file: Root layer of a scene; or a `Scene`, which is authored to a temporary folder. Only what
+            the `Scene` itself holds is in it: colliders that were added to a stage by hand are not.
         net: Weights to use in place of those that the magnetometer names (.safetensors or .pth), for a
             neural magnetometer; or "none" for a physical one.
         magnetometer: Kind of magnetometer to use in place of the scene's: "physical", "neural" or "map-only".
@@ -72,6 +122,8 @@ def open_twin(
         RefusedError: The stage, its map or its weights are missing, broken, or not what the stage's
             checksums say.
     """
+    if isinstance(scene_file, Scene):
+        return _twin_of_scene(scene_file, net, magnetometer)
     from magtwin.usd.layers import stage_sha256
     from magtwin.usd.maps import load_map
     from magtwin.usd.obstacles import read_obstacles
@@ -325,18 +377,9 @@ def engine_named(
     return Newton(twin.scene_file, twin.scene.robot, progress)
 
 
-def way_of(way: "Path | Commands | Run | str | FilePath") -> "Path | Commands | Run | str":
-    """What is to be driven: the path that a name or a CSV file stands for, all else ("random" too) as it is.
-
-    Raises:
-        RefusedError: There is no such path.
-    """
-    return resolve_path(way) if isinstance(way, str | FilePath) and way != "random" else way  # type: ignore[return-value]
-
-
 def simulate(
-    twin: Twin | str | FilePath,
-    path: "Path | Commands | Run | str" = "figure8",
+    twin: Twin | Scene | str | FilePath,
+    path: "Path | Commands | Run | str | FilePath | ArrayLike" = "figure8",
     *,
     seed: int = 0,
     session: Session | None = None,
@@ -354,8 +397,9 @@ def simulate(
     """Drive the scene's robot along a path and read every sensor.
 
     Args:
-        twin: What `open_twin` gave, or the file of a scene.
-        path: A path, the name of one, or a CSV file of x, y [m]; "random", for a human-like driver who goes
+        twin: What `open_twin` gave, a `Scene`, or the file of a stage.
+        path: A path: its name, a CSV file of x, y [m], an array or list of points in world [m], shape
+            (N, 2), or a `Path`; "random", for a human-like driver who goes
             where the seed takes them; Commands, to be played; or a Run, to be driven once more as it was
             recorded, with the sensors as the scene has them now.
         seed: Seed of all noise. The same seed gives the same bytes.
@@ -417,8 +461,8 @@ def simulate(
 
 
 def simulate_robots(
-    twin: Twin | str | FilePath,
-    paths: "Mapping[str, Path | Commands | Run | str | FilePath] | None" = None,
+    twin: Twin | Scene | str | FilePath,
+    paths: "Mapping[str, Path | Commands | Run | str | FilePath | ArrayLike] | None" = None,
     *,
     robots: Iterable[str] | None = None,
     meet: Literal["refuse", "flag"] = "refuse",
@@ -440,7 +484,7 @@ def simulate_robots(
     in the scene.
 
     Args:
-        twin: What `open_twin` gave, or the file of a scene.
+        twin: What `open_twin` gave, a `Scene`, or the file of a stage.
         paths: What robots drive, by name, as for `simulate`; who is not named drives what the scene says,
             or "figure8" where that says nothing.
         robots: Names of those whose sensors are read; all unless given. All drive nevertheless.
@@ -532,8 +576,8 @@ def led_by(twin: Twin, name: str) -> Twin:
 
 
 def simulate_many(
-    twin: Twin | str | FilePath,
-    paths: "Path | Commands | Run | str | FilePath | Iterable[Path | Commands | Run | str | FilePath]",
+    twin: Twin | Scene | str | FilePath,
+    paths: "Path | Commands | Run | str | FilePath | ArrayLike | Iterable[Any]",
     seeds: Iterable[int],
     *,
     session: Session | None = None,
@@ -557,7 +601,7 @@ def simulate_many(
     over the result to have bounded memory, `list` it to keep all.
 
     Args:
-        twin: What `open_twin` gave, or the file of a scene.
+        twin: What `open_twin` gave, a `Scene`, or the file of a stage.
         paths: What is driven in each run, as for `simulate`, or one for all.
         seeds: A seed for each run; their number is that of the runs.
         session: As for `simulate`, each run's drawn from its own seed.
@@ -591,8 +635,7 @@ def simulate_many(
             "remembers a single run: give it to simulate"
         )
     count = len(numbers)
-    given = _each("paths", paths, count)
-    resolved: dict[Any, Any] = {path: way_of(path) for path in given if isinstance(path, str | FilePath)}
+    given = _each("paths", ways_of(paths), count)
     if robots is not None and session is not None:
         raise RefusedError("robots are taken as they are; give robots or session, not both")
     jobs, of = [], {}
@@ -613,8 +656,6 @@ def simulate_many(
                 own = dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot))
             drawn[key] = own.scene
             of[id(own.scene)] = own, _config_sha256(own.scene)
-        if isinstance(path, str | FilePath):
-            path = resolved[path]
         _check_commands(path, twin.magnetometer)
         jobs.append(Job(drawn[key], path, seed, speed))
     network = twin.magnetometer
@@ -647,7 +688,7 @@ def simulate_many(
 
 
 def _opened(
-    twin: Twin | str | FilePath, net: str | FilePath | None, magnetometer: Kind | None, what: str
+    twin: Twin | Scene | str | FilePath, net: str | FilePath | None, magnetometer: Kind | None, what: str
 ) -> Twin:
     """A twin, opened if it is not."""
     if not isinstance(twin, Twin):
@@ -750,19 +791,21 @@ def _config_sha256(scene: Scene) -> str:
     scene = dataclasses.replace(
         scene, map_layer=FilePath(), map_sha256="", robot=bare(scene.robot), path="", others=others
     )
-    return hashlib.sha256(repr(scene).encode()).hexdigest()
+    return hashlib.sha256(spelled(scene).encode()).hexdigest()
 
 
-def scan(twin: Twin, run: Run, *, seed: int = 0) -> "Scans":
+def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Scans":
     """What the LiDAR of a scene's robot saw in a run, one scan a turn while it spun.
 
     Args:
-        twin: What `open_twin` gave.
+        twin: What `open_twin` gave; or a `Scene` or the file of a stage, opened in the run's session.
         run: What `simulate` gave, or any run with t, p_world_base, yaw and lidar_on.
         seed: Seed of its noise; that of the run, unless another draw is wanted.
     """
     from magtwin.sim.lidar import scans_of
     from magtwin.sim.simulate import streams
 
+    if not isinstance(twin, Twin):
+        twin = in_session_of(open_twin(twin, magnetometer="map-only"), run.facts)
     rng = streams(np.random.default_rng(seed))["lidar"]
     return scans_of(run, twin.scene.robot, twin.obstacles, rng)

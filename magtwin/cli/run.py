@@ -548,7 +548,7 @@ class _Outputs:
                         **options,
                     )
         if self.folder:
-            from magtwin.io.plots import plot_run
+            from magtwin.io.plotting import plot_run
 
             planned = driven.planned
             plot_run(

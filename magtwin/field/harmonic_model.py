@@ -11,6 +11,7 @@ from magtwin.field.figures import Figures
 from magtwin.field.forward import Forward
 from magtwin.field.harmonic import HarmonicField
 from magtwin.field.headings import between
+from magtwin.field.model import FittedModel
 from magtwin.names import RefusedError
 
 Array = NDArray[np.float64]
@@ -22,8 +23,8 @@ COARSER = 2
 """Nodes of a grid from one whose variance is evaluated to the next."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class HarmonicModel:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class HarmonicModel(FittedModel):
     """A harmonic field fitted to readings, and how sure it is."""
 
     field: HarmonicField

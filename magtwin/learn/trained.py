@@ -20,6 +20,7 @@ from magtwin.learn.recipe import Choice, device_of, make
 from magtwin.learn.split import PARTS, Part, Split
 from magtwin.learn.weights import Fact
 from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary
 from magtwin.verdict import SEPARATOR, coverage, recordings_text, verdict
 from magtwin.version import __version__
 
@@ -57,8 +58,8 @@ class Judged:
         return self.mae_nt / self.naive_mae_nt if self.naive_mae_nt else math.inf
 
 
-@dataclass(frozen=True)
-class Trained:
+@dataclass(frozen=True, repr=False)
+class Trained(Summarized):
     """A network with all that its card tells."""
 
     net: Predictor
@@ -140,6 +141,24 @@ class Trained:
     def card(self, name: str, checksum: str) -> str:
         """The model card, in Markdown; see `magtwin.learn.card`."""
         return card_of(self, name, checksum)
+
+    def _summary(self) -> Summary:
+        """The model, what it was trained on, and its errors."""
+        scores = [
+            (
+                one.name,
+                f"MAE {one.mae_nt:.4g} nT, {one.ratio:.3g} of naive, "
+                f"{100 * one.coverage:.3g} % in 90 % intervals, "
+                f"{one.rows:,} rows of {one.recordings:,} recordings",
+            )
+            for one in self.parts
+        ]
+        return Summary(
+            f"Trained: {self.net.kind}, {self.net.layers_text}, {self.rows:,} training rows",
+            (("split", f"by {self.split.by}"), *scores),
+            ("path", "MAE", "of naive", "rows"),
+            [(one.name, f"{one.mae_nt:.4g} nT", f"{one.ratio:.3g}", f"{one.rows:,}") for one in self.paths],
+        )
 
 
 def fit(
