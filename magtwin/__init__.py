@@ -16,7 +16,15 @@ if TYPE_CHECKING:
     from magtwin.path import Path
     from magtwin.run import COLUMNS, Run
     from magtwin.spec import Scene
-    from magtwin.twin import Twin, open_twin, scene_from_toml, simulate, simulate_many, simulate_robots
+    from magtwin.twin import (
+        Twin,
+        author_scene,
+        open_twin,
+        scene_from_toml,
+        simulate,
+        simulate_many,
+        simulate_robots,
+    )
 
 _HOME = {
     "AnomalyMap": "magtwin.field.map",
@@ -26,6 +34,7 @@ _HOME = {
     "Run": "magtwin.run",
     "Scene": "magtwin.spec",
     "Twin": "magtwin.twin",
+    "author_scene": "magtwin.twin",
     "open_twin": "magtwin.twin",
     "plot": "magtwin.io.plotting",
     "scene_from_toml": "magtwin.twin",
@@ -42,6 +51,7 @@ __all__ = [
     "Run",
     "Scene",
     "Twin",
+    "author_scene",
     "open_twin",
     "plot",
     "scene_from_toml",

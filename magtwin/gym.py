@@ -20,12 +20,13 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.names import RefusedError, find
-from magtwin.path import Path, check_clear, check_on_floor, resolve_path
+from magtwin.path import Path, check_clear, check_on_floor
 from magtwin.run import COLUMNS
 from magtwin.sim.fleet import SENSED, Fleet
 from magtwin.sim.session import draw_session
+from magtwin.sim.way import way_of
 from magtwin.spec import Scene
-from magtwin.twin import Kind, Twin, open_twin
+from magtwin.twin import Kind, Twin, open_twin, room_of
 
 if TYPE_CHECKING:
     from magtwin.learn.magnetometer import NeuralMagnetometer
@@ -162,7 +163,10 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         if twin.magnetometer:
             _check_network(twin.magnetometer)
         robot = twin.scene.robot
-        self.path = path if isinstance(path, Path) else resolve_path(path)
+        way = way_of(path, room_of(twin))
+        if not isinstance(way, Path):
+            raise RefusedError(f"path must be one to drive along, got {way!r}")
+        self.path = way
         check_on_floor(self.path, twin.scene.lab.floor_m, robot.footprint_radius_m)
         check_clear(self.path, twin.obstacles, robot.footprint_radius_m)
         if not callable(reward):

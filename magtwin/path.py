@@ -44,6 +44,9 @@ class Path(Summarized):
     file: str = ""
     """The file that it was read from, as that was named; "" for one that came from no file."""
 
+    placing: tuple[float, ...] = ()
+    """How a path was brought onto its floor: scale in x and y, then shift in x and y [m]; () for none."""
+
     s: Array = field(init=False, repr=False)
     """Arc length at each point, from 0 [m], shape (N,)."""
 
@@ -151,6 +154,19 @@ class Path(Summarized):
         there, back = self.p_xy[1:], (self.p_xy if self.closed else self.p_xy[::-1])[1:]
         parts = [self.p_xy[:1], *((there, back)[n % 2] for n in range(times))]
         return Path(self.name, np.vstack(parts))
+
+    def placed(self, placing: tuple[float, float, float, float]) -> "Path":
+        """This path scaled about the world's origin, then moved.
+
+        Args:
+            placing: Scale in x and in y, above 0, then shift in x and in y [m].
+        """
+        if len(placing) != 4 or not (min(placing[:2]) > 0 and all(map(math.isfinite, placing))):
+            raise RefusedError(
+                f"placing of path {self.name!r} must be two scales above 0 and two shifts, got {placing}"
+            )
+        points = self.p_xy * np.array(placing[:2]) + np.array(placing[2:])
+        return Path(self.name, points, self.closed, self.file, tuple(map(float, placing)))
 
     def _segment(self, s: ArrayLike) -> tuple[Array, NDArray[np.intp]]:
         s = np.asarray(s, float)
@@ -382,7 +398,8 @@ PATHS: Mapping[str, Callable[..., Path]] = MappingProxyType(
         "fast_sine": fast_sine,
     }
 )
-"""Functions that make paths, by name; each with defaults that fit a floor of 6 x 3.5 m."""
+"""Functions that make paths, by name; their defaults fit a floor of 6 x 3.5 m, and `magtwin.placement`
+brings them onto others."""
 
 CASES: Mapping[str, str] = MappingProxyType(
     {
@@ -499,11 +516,27 @@ def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m:
     if len(outside):
         i = int(outside[0])
         x, y = path.p_xy[i]
+        needs = np.ptp(path.p_xy, axis=0) + 2 * footprint_radius_m
         raise RefusedError(
-            f"path {path.name} leaves the floor at point {i + 1} of {len(beyond)}, ({x:.3f}, {y:.3f}) m: "
-            f"a robot of radius {footprint_radius_m:g} m is {beyond[i]:.3f} m outside the floor of "
-            f"{floor_m[0]:g} x {floor_m[1]:g} m; move or shrink the path, or enlarge the floor"
+            f"path {path.name} leaves the floor at point {i + 1} of {len(beyond)}, ({x:.3f}, {y:.3f}) m, by "
+            f"{beyond[i]:.3f} m: with a robot of radius {footprint_radius_m:g} m it needs {needs[0]:.2f} x "
+            f"{needs[1]:.2f} m, the floor is {floor_m[0]:g} x {floor_m[1]:g} m; "
+            f"{_what_fits(path, floor_m, footprint_radius_m)}"
         )
+
+
+def _what_fits(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> str:
+    """What would bring a path onto the floor, in words."""
+    room = np.array(floor_m) - 2 * footprint_radius_m
+    if min(room) <= 0:
+        return "the floor is no wider than the robot; enlarge it"
+    low, high = path.p_xy.min(axis=0), path.p_xy.max(axis=0)
+    with np.errstate(divide="ignore"):
+        scale = float(np.min(room / (high - low)))
+    if scale >= 1:
+        x, y = np.clip(0.0, high - room / 2, low + room / 2) * -1.0 + 0.0
+        return f"moved by ({x:.2f}, {y:.2f}) m it fits: give --fit, or move its points"
+    return f"scaled by {math.floor(scale * 100) / 100:g} it fits: give --fit, or enlarge the floor"
 
 
 def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> None:
@@ -527,7 +560,7 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
         raise RefusedError(
             f"path {path.name} runs into {obstacles.names[which[i]]}: {s[i]:.3f} m along it, at "
             f"({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, a robot of radius {footprint_radius_m:g} m is "
-            f"{footprint_radius_m - distance[i]:.3f} m too near; move the path, or the obstacle"
+            f"{footprint_radius_m - distance[i]:.3f} m too near; give --fit, or move the path or the obstacle"
         )
 
 

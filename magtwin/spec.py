@@ -16,7 +16,7 @@ import numpy as np
 from magtwin.field.bodies import SHAPES, Body, check_mesh, induced_magnetization
 from magtwin.field.earth import MODEL, SPAN
 from magtwin.frames import IDENTITY_XYZW, quat_multiply, rotate
-from magtwin.furniture import parts_of
+from magtwin.furniture import Part, parts_of
 from magtwin.names import RefusedError, find, hint
 from magtwin.summary import Summarized, Summary, listed
 
@@ -118,6 +118,7 @@ class MagnetometerSpec(MountSpec):
     """A scalar magnetometer, whose vector axes are measured in turn; see `magtwin.sim.magnetometer`."""
 
     link: str = "magnetometer_link"
+    """Name of the robot link that carries the sensor."""
 
     kind: Literal["physical", "neural", "map-only"] = "physical"
     """"physical": the disturbance is the exact field less the map; "neural": `network` predicts it;
@@ -448,7 +449,10 @@ class DriveSpec(Spec):
     """A differential drive: its size, its limits and its odometry."""
 
     left_wheel_joint: str = "left_wheel_joint"
+    """Name of the left wheel's joint."""
+
     right_wheel_joint: str = "right_wheel_joint"
+    """Name of the right wheel's joint."""
 
     wheel_separation_m: float = 0.233
     """Distance between the wheels' contact points [m]."""
@@ -722,7 +726,7 @@ class LabSpec(Spec):
     """A room: a floor centred on the world's origin, low walls, posts of a motion-capture frame."""
 
     floor_m: tuple[float, float] = (6.0, 3.5)
-    """Extent of the floor in x and y [m]."""
+    """Size of the floor in x and y [m]."""
 
     wall_height_m: float = 0.3
     """Height of the walls [m]; 0 for none."""
@@ -751,22 +755,22 @@ class EarthFieldSpec(Spec):
     """Field in world axes [nT]."""
 
     latitude_deg: float
-    """Geodetic latitude of the lab [deg]."""
+    """Geodetic latitude of the room, north positive [deg]."""
 
     longitude_deg: float
-    """Longitude of the lab [deg]."""
+    """Longitude of the room, east positive [deg]."""
 
     height_m: float
     """Height above the WGS 84 ellipsoid [m]."""
 
     date: str
-    """Day for which the field holds, YYYY-MM-DD."""
+    """Date of the field, YYYY-MM-DD."""
 
     north_deg: float = 0.0
-    """Where true north lies: angle from world +y about world +z, counter-clockwise from above [deg]."""
+    """Angle from the world's y to true north, counter-clockwise seen from above [deg]."""
 
     measured: bool = False
-    """Whether the field was measured; otherwise it is the IGRF's, whose span then holds the day."""
+    """Whether the field was measured, so that it may differ from the model's."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -792,7 +796,7 @@ class SourceSpec(Summarized, Spec):
     """A magnetised thing: a point dipole, or a uniformly magnetised body of some shape."""
 
     name: str
-    """Name of its prim."""
+    """Name of its prim: letters, digits and _, no digit first."""
 
     p_world: Vec3
     """Where it is: the middle of all but a mesh [m]."""
@@ -898,7 +902,7 @@ class FurnitureSpec(Spec):
     """Name of its prim."""
 
     kind: str
-    """What it is, a name of `magtwin.furniture.KINDS`."""
+    """What it is, a name of `magtwin.furniture.KINDS`, or "box", "cylinder" or "mesh"."""
 
     p_world: Vec3
     """Where it stands: the middle of its footprint, on the floor [m]."""
@@ -912,17 +916,42 @@ class FurnitureSpec(Spec):
     susceptibility: float = 0.0
     """Volume susceptibility of its steel parts [1]."""
 
+    material: str = ""
+    """What a box, cylinder or mesh is made of, a name of `magtwin.furniture.MATERIALS`."""
+
+    size_m: Vec3 = ZERO3
+    """Size of a box along its own x, y and z, or diameter, diameter and height of a cylinder [m]."""
+
+    vertices_m: tuple[Vec3, ...] = ()
+    """Vertices of a mesh about the middle of its box [m], in single precision; it stands on the floor."""
+
+    faces: tuple[tuple[int, int, int], ...] = ()
+    """Corners of a mesh's triangles, counter-clockwise from outside."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         self._unit("q_world_xyzw")
         self._not_negative("susceptibility")
-        steel = [part.name for part in parts_of(self.kind) if part.steel]
+        steel = [part.name for part in self.parts if part.steel]
         fits = len(self.magnetization) in (0, len(steel))
-        self._require(
-            "magnetization", fits, f"have one number for each of {', '.join(steel)}", self.magnetization
-        )
+        what = f"have one number for each of {', '.join(steel)}" if steel else "be left out: it has no steel"
+        self._require("magnetization", fits, what, self.magnetization)
         if not any(self.magnetization):
             object.__setattr__(self, "magnetization", ())
+        if self.faces:
+            object.__setattr__(self, "vertices_m", self.parts[0].vertices_m)
+            self.sources()  # refuses a steel mesh that is not closed
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """What it consists of."""
+        return parts_of(
+            self.kind,
+            material=self.material,
+            size_m=self.size_m,
+            vertices_m=self.vertices_m,
+            faces=self.faces,
+        )
 
     def sources(self, *, in_world: bool = True) -> tuple[SourceSpec, ...]:
         """Its steel, a source each, named after the piece and the part.
@@ -930,7 +959,7 @@ class FurnitureSpec(Spec):
         Args:
             in_world: Whether they stand where it does; otherwise they are in its own axes.
         """
-        steel = [part for part in parts_of(self.kind) if part.steel]
+        steel = [part for part in self.parts if part.steel]
         turn = self.q_world_xyzw if in_world else IDENTITY_XYZW
         sources = []
         for part, m in zip(steel, self.magnetization or (0.0,) * len(steel), strict=True):
@@ -941,7 +970,9 @@ class FurnitureSpec(Spec):
                     p_world=(float(x), float(y), float(z)),
                     shape=part.shape,
                     q_world_xyzw=turn,
-                    size_m=part.size_m,
+                    size_m=ZERO3 if part.faces else part.size_m,
+                    vertices_m=part.vertices_m,
+                    faces=part.faces,
                     magnetization=tuple(m * (k == part.along) for k in range(3)),  # type: ignore[arg-type]
                     susceptibility=self.susceptibility,
                 )
@@ -953,6 +984,40 @@ class FurnitureSpec(Spec):
 def _steel(piece: FurnitureSpec) -> tuple[SourceSpec, ...]:
     """`piece.sources()`, kept, as every run of a furnished lab asks for them."""
     return tuple(piece.sources())
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurveySpec(Spec):
+    """How the robot surveys a scene that names no map: it stands at each node of a grid in each heading."""
+
+    spacing_m: float = 0.25
+    """Distance between nodes [m]."""
+
+    headings_deg: tuple[float, ...] = (0.0, 90.0, 180.0, 270.0)
+    """Headings in which it stands at each node, ascending [deg]."""
+
+    readings: int = 135
+    """Readings whose mean a node gives."""
+
+    height_m: float | None = None
+    """Height of the sensor above the floor [m]; by default the robot's own."""
+
+    heading_error_deg: float = 0.0
+    """Standard deviation of its heading about the node's [deg]."""
+
+    position_error_m: float = 0.0
+    """Standard deviation of where it stands about the node, along x and y [m]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._above_zero("spacing_m")
+        self._require("readings", self.readings >= 1, "be at least 1", self.readings)
+        self._not_negative("heading_error_deg", "position_error_m")
+        self._require("height_m", (self.height_m or 0.0) >= 0, "not be below 0", self.height_m)
+        headings = self.headings_deg
+        rises = bool(headings) and list(headings) == sorted(set(headings))
+        within = rises and headings[0] >= 0 and headings[-1] < 360
+        self._require("headings_deg", within, "ascend from 0 to below 360", headings)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

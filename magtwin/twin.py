@@ -19,9 +19,10 @@ from magtwin.files import existing, git_revision, sha256
 from magtwin.names import RefusedError, find
 from magtwin.obstacles import Obstacles
 from magtwin.path import Path
+from magtwin.placement import Room
 from magtwin.run import Run
 from magtwin.sim.way import way_of, ways_of
-from magtwin.spec import MagnetometerSpec, RobotSpec, Scene, spelled
+from magtwin.spec import MagnetometerSpec, RobotSpec, Scene, SurveySpec, spelled
 from magtwin.summary import Summarized, Summary
 
 Kind = Literal["physical", "neural", "map-only"]
@@ -29,7 +30,10 @@ Session = int | Literal["survey"]
 Facts = dict[str, str | int | float | bool]
 
 if TYPE_CHECKING:
+    from tempfile import TemporaryDirectory
+
     from magtwin.learn.magnetometer import NeuralMagnetometer, Read
+    from magtwin.placement import Room
     from magtwin.sim.commands import Commands
     from magtwin.sim.controllers import Controller
     from magtwin.sim.engine import Engine
@@ -310,26 +314,135 @@ def scene_from_toml(
     map_layer: str | FilePath | None = None,
     network: str | FilePath | None = None,
     workshop: str | FilePath | None = None,
+    report: Callable[[str], Any] = lambda text: None,
+    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
 ) -> Scene:
     """The scene that a TOML describes, its network read and its inputs named.
+
+    A scene that names no map is surveyed by its own robot, where its Earth's field is known. The map of one
+    that names a map, sources or furniture too is compared with their field.
 
     Args:
         path: The TOML; files that it names are taken from its folder.
         map_layer: Map to use in place of the one that it names, without the TOML's Earth and sources.
         network: Weights to use in place of those that it names (.safetensors or .pth).
-        workshop: Folder to build the robot in, where the TOML names one by its URDF.
+        workshop: Folder for the robot, where the TOML names one by its URDF, and for the map of a survey.
+            Default: a temporary folder, which is deleted when Python ends; `author_scene` copies from it.
+        report: Called with a line on how the scene was surveyed, or how map and sources differ.
+        progress: Called in a survey with headings done, headings in all, and what is being done.
 
     Raises:
-        RefusedError: A key is misspelt or missing, or a file is not there, or not what it should be.
+        RefusedError: A key is misspelt or missing, a file is not there or not what it should be, there is
+            neither a map nor a field to survey, or map and sources contradict each other.
     """
     from magtwin.usd.scene import scene_from_toml as scene_of
+
+    if workshop is None:
+        import tempfile
+
+        _WORKSHOPS.append(tempfile.TemporaryDirectory(prefix="magtwin-"))
+        workshop = _WORKSHOPS[-1].name
 
     def inputs_of(weights: FilePath) -> tuple[str, ...]:
         from magtwin.learn.predictor import load_predictor
 
         return load_predictor(weights).features
 
-    return scene_of(path, map_layer=map_layer, network=network, workshop=workshop, inputs_of=inputs_of)
+    def survey_of(scene: Scene, spec: SurveySpec, seed: int, obstacles: Obstacles) -> FilePath:
+        from magtwin.sim.room_survey import survey_room
+        from magtwin.usd.maps import save_map
+
+        source = f"{FilePath(path).name} sha256:{sha256(path)}"
+        surveyed = survey_room(scene, spec, seed=seed, obstacles=obstacles, source=source, progress=progress)
+        layer = FilePath(workshop) / f"{scene.name}.map.usdc"
+        save_map(surveyed.field, layer)
+        report(f"{scene.name} names no map: {surveyed}")
+        return layer
+
+    scene = scene_of(
+        path,
+        map_layer=map_layer,
+        network=network,
+        workshop=workshop,
+        inputs_of=inputs_of,
+        survey_of=survey_of,
+    )
+    if scene.earth is not None and scene.magnets and scene.map_layer.parent != FilePath(workshop):
+        from magtwin.sim.agreement import check_against_sources
+        from magtwin.usd.maps import load_map
+
+        found = check_against_sources(scene, load_map(scene.map_layer))
+        if found.rms_nt >= NOTED_NT:
+            report(f"Note: {found}")
+    return scene
+
+
+def new_scene(file: str | FilePath, *, force: bool = False) -> FilePath:
+    """Write a TOML that describes a small furnished room, with comments; `scene_from_toml` reads it.
+
+    Args:
+        file: TOML file to write; the scene gets its name.
+        force: Whether a file that exists is replaced.
+
+    Returns:
+        The file.
+
+    Raises:
+        RefusedError: The file exists and `force` was not given, or its name cannot name a scene.
+    """
+    from magtwin.files import output, shipped
+    from magtwin.usd.room import check_name
+
+    name = FilePath(file).stem
+    check_name(name)
+    text = shipped("scenes", "starter.toml").read_text(encoding="utf-8")
+    text = text.replace('name = "room"', f'name = "{name}"', 1)
+    with output(file, force=force) as aside:
+        aside.write_text(text, encoding="utf-8")
+    return FilePath(file)
+
+
+NOTED_NT = 50.0
+"""Difference of a map from its sources that is reported [nT]: above what a careful survey errs by."""
+
+_WORKSHOPS: "list[TemporaryDirectory[str]]" = []
+"""Temporary folders of scenes, deleted when Python ends."""
+
+
+def author_scene(
+    scene: Scene | str | FilePath,
+    folder: str | FilePath,
+    *,
+    force: bool = False,
+    report: Callable[[str], Any] = lambda text: None,
+    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
+) -> FilePath:
+    """Write a scene as a folder of USD layers that needs nothing outside of it.
+
+    Args:
+        scene: A Scene, or the TOML of one; see `scene_from_toml`.
+        folder: Folder to make.
+        force: Whether a folder that exists is replaced.
+        report: As for `scene_from_toml`.
+        progress: As for `scene_from_toml`.
+
+    Returns:
+        The root layer, `folder/<name>.usda`.
+
+    Raises:
+        RefusedError: The folder exists, or as for `scene_from_toml`.
+    """
+    import tempfile
+
+    from magtwin.files import check_free
+    from magtwin.usd.scene import author_scene as author
+
+    check_free(folder, force=force)
+    if isinstance(scene, Scene):
+        return author(scene, folder, force=force)
+    with tempfile.TemporaryDirectory() as workshop:
+        read = scene_from_toml(scene, workshop=workshop, report=report, progress=progress)
+        return author(read, folder, force=force)
 
 
 def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
@@ -375,6 +488,11 @@ def engine_named(
         return Kinematic()
     check_installed()
     return Newton(twin.scene_file, twin.scene.robot, progress)
+
+
+def room_of(twin: Twin) -> Room:
+    """What a path of a twin's first robot must fit into."""
+    return Room(twin.scene.lab.floor_m, twin.scene.robot.footprint_radius_m, twin.obstacles)
 
 
 def simulate(
@@ -430,7 +548,7 @@ def simulate(
     seed = _seed(seed)
     twin = in_session(_opened(twin, net, magnetometer, "simulate"), session, seed=seed)
     network = twin.magnetometer
-    path = way_of(path)
+    path = way_of(path, room_of(twin))
     _check_commands(path, network)
     read: Read | None = None
 
@@ -515,11 +633,11 @@ def simulate_robots(
     placed = {one.robot.name: one for one in twin.scene.robots}
     for name in (*(paths or {}), *(robots or ())):
         find("robot", name, placed)
+    led = {name: led_by(twin, name) for name in placed}
     ways: dict[str, Path | Commands | Run | str] = {}
     for name, one in placed.items():
-        ways[name] = way_of((paths or {}).get(name, one.path or "figure8"))
+        ways[name] = way_of((paths or {}).get(name, one.path or "figure8"), room_of(led[name]))
     wanted = [name for name in placed if robots is None or name in set(robots)]
-    led = {name: led_by(twin, name) for name in placed}
     for name, way in ways.items():
         _check_commands(way, led[name].magnetometer)
     reads: dict[str, Read] = {}
@@ -635,7 +753,7 @@ def simulate_many(
             "remembers a single run: give it to simulate"
         )
     count = len(numbers)
-    given = _each("paths", ways_of(paths), count)
+    given = _each("paths", ways_of(paths, room_of(twin)), count)
     if robots is not None and session is not None:
         raise RefusedError("robots are taken as they are; give robots or session, not both")
     jobs, of = [], {}
@@ -769,6 +887,8 @@ def path_facts(path: "Path | Commands | Run | str") -> Facts:
     else:
         arrays, what, file = (path.rows,), "commands", path.file
     facts: Facts = {f"{what}_file": file} if file else {}
+    if isinstance(path, Path) and path.placing:
+        facts["path_placing"] = " ".join(map(repr, path.placing))
     checksum = hashlib.sha256()
     for array in arrays:
         checksum.update(np.ascontiguousarray(array).tobytes())

@@ -283,7 +283,8 @@ def map_survey(
     """Survey a scene as its robot would, from node to node, with its sensor's noise and its own errors.
 
     What the stage holds now makes the field: move a desk in it, survey again, and `magtwin map diff` finds
-    it. The map's variance is that of noise and errors; nodes where the sensor lost lock are masked.
+    it. The map's variance is that of noise and errors; nodes where the sensor lost lock or where the robot
+    cannot stand are masked.
 
     Parameters
     ----------
@@ -323,8 +324,10 @@ def map_survey(
     import numpy as np
 
     from magtwin.files import check_free, sha256
+    from magtwin.sim.room_survey import blocked_by
     from magtwin.sim.survey import survey, survey_readings
     from magtwin.usd.layers import layer_files
+    from magtwin.usd.obstacles import read_obstacles
     from magtwin.usd.scene import read_scene
 
     check_suffix(out, (".usdc", ".usd", ".parquet"), "a map layer, or a file of readings,")
@@ -351,7 +354,8 @@ def map_survey(
         if out.suffix == ".parquet":
             read = survey_readings(twin, **about, progress=advance)
         else:
-            field = survey(twin, **about, name=name or out.stem, progress=advance)
+            blocked = blocked_by(twin, read_obstacles(scene))
+            field = survey(twin, **about, name=name or out.stem, progress=advance, blocked=blocked)
     if out.suffix == ".parquet":
         from magtwin.io.readings import save_readings
 

@@ -26,6 +26,7 @@ def runs(
     out: Path = Path("runs"),
     count: Whole = 100,
     path: Names = None,
+    fit: Annotated[bool, Parameter(negative="")] = False,
     seed: Seed = 0,
     sessions: Whole | None = None,
     session: Literal["survey"] | None = None,
@@ -57,6 +58,8 @@ def runs(
     path
         Paths to drive in turn, as for `magtwin run`: names, cases A to E, random, CSV files. Default: sine,
         lawnmower, figure8, continuous_cycle and random.
+    fit
+        As for `magtwin run`.
     seed
         Seed of the first run; each next one's is one more.
     sessions
@@ -91,10 +94,10 @@ def runs(
     from magtwin.files import existing, output
     from magtwin.io.tables import write_parquet
     from magtwin.names import RefusedError
-    from magtwin.path import resolve_path
     from magtwin.report import Figure, Report
     from magtwin.sim.session import draw_speed
-    from magtwin.twin import in_session, open_twin, simulate_many
+    from magtwin.sim.way import way_of
+    from magtwin.twin import in_session, open_twin, room_of, simulate_many
     from magtwin.verdict import Tally
 
     existing(scene, "scene")
@@ -107,7 +110,7 @@ def runs(
     with output(out, force=force) as folder:
         steps("Opening the scene")
         twin = open_twin(scene, net=net, magnetometer=magnetometer)
-        paths = [name if name == "random" else resolve_path(name) for name in path or MIXTURE]
+        paths = [way_of(name, room_of(twin), fit=fit) for name in path or MIXTURE]
         robot = twin.scene.robot
         if session is not None:
             drawn = [in_session(twin, session)]
