@@ -222,13 +222,17 @@ def scene_from_toml(
 
     Args:
         path: The TOML; files that it names are taken from its folder.
-        map_layer: Map to use in place of the one that it names, without the TOML's Earth and sources.
+        map_layer: Map to use in place of the one that it names. The Earth's field, sources and furniture stay
+            as the TOML has them.
         network: Weights to use in place of those that it names (.safetensors or .pth).
         workshop: Folder to build the robot in, where the TOML names one by its URDF.
 
     Raises:
-        RefusedError: A key is misspelt or missing, or a file is not there, or not what it should be.
+        RefusedError: A key is misspelt or missing, a file is not there or not what it should be, or the map
+            contradicts the Earth's field, sources and furniture; the text says by how much.
     """
+    from magtwin.sim.contradiction import check_agrees
+    from magtwin.usd.maps import load_map
     from magtwin.usd.scene import scene_from_toml as scene_of
 
     def inputs_of(weights: FilePath) -> tuple[str, ...]:
@@ -236,7 +240,10 @@ def scene_from_toml(
 
         return load_predictor(weights).features
 
-    return scene_of(path, map_layer=map_layer, network=network, workshop=workshop, inputs_of=inputs_of)
+    scene = scene_of(path, map_layer=map_layer, network=network, workshop=workshop, inputs_of=inputs_of)
+    if scene.earth is not None and scene.magnets:
+        check_agrees(scene, load_map(scene.map_layer), f"{path} with {map_layer or scene.map_layer.name}")
+    return scene
 
 
 def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":

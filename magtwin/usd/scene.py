@@ -305,8 +305,8 @@ def scene_from_toml(
 
     Args:
         path: The TOML; files that it names are taken from its folder.
-        map_layer: Map to use in place of the one that it names. Its Earth's field and sources are
-            those of its own map, and are left out.
+        map_layer: Map to use in place of the one that it names. The Earth's field, sources and furniture stay
+            as the TOML has them; `magtwin.twin.scene_from_toml` refuses a map that contradicts them.
         network: Weights to use in place of those that it names.
         workshop: Folder in which the asset is built of a robot that the TOML names by its URDF; a
             self-contained scene copies it from there.
@@ -336,9 +336,8 @@ def scene_from_toml(
         if start is None:
             start = given.start if alone or (not robots and "start" in table) else _beginning(way)
         robots.append(PlacedRobot(robot=robot, start=start, path=way))
-    own_map = map_layer is None
     sources, furniture = given.source, tuple(table.spec for table in given.furniture)
-    if given.sources and own_map:
+    if given.sources:
         listed = read_sources(given.sources.file)
         sources, furniture = (*listed[0], *sources), (*listed[1], *furniture)
     return Scene(
@@ -347,9 +346,9 @@ def scene_from_toml(
         map_sha256=sha256(layer),
         robot=robots[0].robot,
         lab=given.lab,
-        earth=_earth(given.earth, path) if given.earth and own_map else None,
-        sources=sources if own_map else (),
-        furniture=furniture if own_map else (),
+        earth=_earth(given.earth, path) if given.earth else None,
+        sources=sources,
+        furniture=furniture,
         start=robots[0].start,
         path=robots[0].path,
         others=tuple(robots[1:]),
