@@ -341,11 +341,14 @@ def simulate(
         A Run with every column of `magtwin.COLUMNS`; its facts tell how it came about.
 
     Raises:
-        RefusedError: The path leaves the floor or touches an obstacle, or an option is out of range.
+        RefusedError: The path leaves the floor or touches an obstacle, an option is out of range, the scene's
+            field is constant, or the path leaves the map so that there is nothing to read.
     """
+    from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.simulate import simulate as run_scene
 
     twin, seed = _opened(twin, net, magnetometer, "simulate"), _seed(seed)
+    check_field(twin.scene, twin.field)
     network = twin.magnetometer
     path = way_of(path)
     _check_commands(path, network)
@@ -372,6 +375,7 @@ def simulate(
         controller=controller,
         engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
     )
+    check_read(run, twin.field)
     return run.with_columns(**_known(twin.scene, run, read)).with_facts(
         **_facts(twin, seed, path, duration_s, _config_sha256(twin.scene))
     )
@@ -423,9 +427,11 @@ def simulate_robots(
     Raises:
         RefusedError: A name is none of a robot's, robots would meet, or `simulate` would refuse one.
     """
+    from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.together import simulate_together
 
     twin, seed = _opened(twin, net, magnetometer, "simulate_robots"), _seed(seed)
+    check_field(twin.scene, twin.field)
     placed = {one.robot.name: one for one in twin.scene.robots}
     for name in (*(paths or {}), *(robots or ())):
         find("robot", name, placed)
@@ -466,6 +472,7 @@ def simulate_robots(
         lidar=lidar,
     )
     for name, run in runs.items():
+        check_read(run, twin.field)
         own = led[name]
         runs[name] = run.with_columns(**_known(own.scene, run, reads.get(name))).with_facts(
             **_facts(own, seed, ways[name], duration_s, _config_sha256(own.scene))
@@ -537,9 +544,11 @@ def simulate_many(
         RefusedError: There is no seed, numbers of paths, speeds, robots and seeds differ, a seed is no whole
             number from 0 up, a robot's magnetometer is not the twin's, or `simulate` would refuse a run.
     """
+    from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.many import BLOCK, Conditions, Job, Runs
 
     twin = _opened(twin, net, magnetometer, "simulate_many")
+    check_field(twin.scene, twin.field)
     numbers = [_seed(seed) for seed in seeds]
     if not isinstance(controller, str):
         raise RefusedError(
@@ -576,6 +585,7 @@ def simulate_many(
         runs = []
         for job, one, read in zip(jobs, sensed, told, strict=True):
             run = one.read(read.disturbance_nt if read else None)
+            check_read(run, twin.field)
             known = _known(job.scene, run, read)
             run = run.with_columns(**{name: known[name] for name in known.keys() & run.keys()})
             config = configs[id(job.scene)]

@@ -556,12 +556,16 @@ def _read(
 ) -> Any:
     """The readings of the sources, and the report of what was found latched, stuck or outlying in them."""
     from magtwin.field.latch import mask_latched
+    from magtwin.field.readings import TAKEN
     from magtwin.io.readings import read_readings
 
     readings = read_readings(
         *sources, columns=columns, pose_topic=pose_topic, field_topic=field_topic, **{**about, "name": None}
     )  # refusals name the survey, not the file to be written
     masked, found = mask_latched(readings)
+    taken = [part for part in readings.source.split("; ") if part.startswith(TAKEN)]
+    if taken:
+        found = replace(found, facts={**found.facts, "taken": [part.removeprefix(TAKEN) for part in taken]})
     if not (keep_latched or masked.good.any()):
         raise RefusedError(
             f"{sources[0]}: all {len(readings)} readings are those of a sensor that was stuck; "

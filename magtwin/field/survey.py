@@ -402,6 +402,20 @@ def check_unit(
     )
 
 
+def unit_by_size(b: Array) -> str | None:
+    """The unit in which magnitudes have the size of the Earth's field; none where none or two fit.
+
+    Args:
+        b: Magnitudes as they stand in the file, shape (N,); nan counts for nothing.
+    """
+    b = np.abs(b[np.isfinite(b)])
+    if not len(b):
+        return None
+    usual = float(np.median(b))
+    fits = [unit for unit, nt in NT_PER.items() if LEAST_MEAN_NT <= usual * nt <= GREATEST_MEAN_NT]
+    return fits[0] if len(fits) == 1 else None
+
+
 def _readings(layers: list[_Layer], folder: Path, name: str | None) -> Readings:
     axes = [(_axis(s, "x", s.x), _axis(s, "y", s.y)) for s in layers]
     for layer, own in zip(layers, axes, strict=True):
