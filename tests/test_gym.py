@@ -60,6 +60,17 @@ def test_gymnasiums_checker_passes(twin, sessions):
     check_env(gymnasium.make(NAME, scene=twin, sessions=sessions).unwrapped)
 
 
+def test_robots_on_a_survey_alone_read_its_map_and_their_own_field(twin):
+    bare = replace(twin, scene=replace(twin.scene, earth=None, sources=(), furniture=()))
+    env = vector(bare, 3, sessions=True)
+    env.reset(seed=1)
+    for _ in range(5):
+        env.step(np.tile(AHEAD, (3, 1)))
+    table = env.unwrapped.fleet.columns
+    assert np.isfinite(table["b_total_nt"]).all()
+    assert (np.abs(table["b_disturbance_nt"]) > 10).all(), "of drawn sessions, in motion"
+
+
 def test_each_episode_is_another_day_and_none_without_sessions(twin):
     names = ("battery_fraction", "imu_q_xyzw", "b_total_nt")
     for sessions in (True, False):

@@ -131,7 +131,7 @@ class ExactField:
         return own_field_nt(robot, motion, t, b_base, b_rate, true=true, lidar_on=lidar_on, supply_a=supply_a)
 
     def magnitude_nt(self, vector_nt: Array, at_rest_nt: Array) -> Array:
-        """Magnitudes of vectors (N, 3) [nT], shape (N,); the map's own, to the bit, where nothing is added."""
+        """Magnitudes of vectors (N, 3) [nT], shape (N,); the map's own to the bit if nothing is added."""
         x, y, z = vector_nt.T
         size = np.sqrt(x * x + y * y + z * z)
         if self.of != "map":
