@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.names import RefusedError, find
 from magtwin.path import Path, check_clear, check_on_floor
 from magtwin.run import COLUMNS
+from magtwin.sim.exact import check_field
 from magtwin.sim.fleet import SENSED, Fleet
 from magtwin.sim.session import draw_session
 from magtwin.sim.way import way_of
@@ -160,6 +161,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         if isinstance(scene, Twin) and (net is not None or magnetometer is not None):
             raise RefusedError("net and magnetometer go to open_twin where scene is a Twin")
         twin = scene if isinstance(scene, Twin) else open_twin(scene, net=net, magnetometer=magnetometer)
+        check_field(twin.scene, twin.field)
         if twin.magnetometer:
             _check_network(twin.magnetometer)
         robot = twin.scene.robot

@@ -614,6 +614,10 @@ class PlatformFieldSpec(Spec):
     caster_radius_m: float = 0.01
     """Radius that the caster rolls on [m]."""
 
+    hard_iron_change_nt: Vec3 = ZERO3
+    """Part of h that came after the survey of the map [nT]; 0 in the survey's session. A map that this robot
+    surveyed holds h without it."""
+
     hard_iron_drift_nt: Vec3 = ZERO3
     """Mean change of h from the day of a survey to the days of driving that follow [nT]: handling, docking
     and tools magnetise or demagnetise."""

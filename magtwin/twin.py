@@ -324,7 +324,8 @@ def scene_from_toml(
 
     Args:
         path: The TOML; files that it names are taken from its folder.
-        map_layer: Map to use in place of the one that it names, without the TOML's Earth and sources.
+        map_layer: Map to use in place of the one that it names. The Earth's field, sources and furniture stay
+            as the TOML has them.
         network: Weights to use in place of those that it names (.safetensors or .pth).
         workshop: Folder for the robot, where the TOML names one by its URDF, and for the map of a survey.
             Default: a temporary folder, which is deleted when Python ends; `author_scene` copies from it.
@@ -333,8 +334,11 @@ def scene_from_toml(
 
     Raises:
         RefusedError: A key is misspelt or missing, a file is not there or not what it should be, there is
-            neither a map nor a field to survey, or map and sources contradict each other.
+            neither a map nor a field to survey, or the map contradicts the Earth's field, sources and
+            furniture; the text says by how much.
     """
+    from magtwin.sim.contradiction import check_agrees
+    from magtwin.usd.maps import load_map
     from magtwin.usd.scene import scene_from_toml as scene_of
 
     if workshop is None:
@@ -368,12 +372,12 @@ def scene_from_toml(
         survey_of=survey_of,
     )
     if scene.earth is not None and scene.magnets and scene.map_layer.parent != FilePath(workshop):
-        from magtwin.sim.agreement import check_against_sources
-        from magtwin.usd.maps import load_map
-
-        found = check_against_sources(scene, load_map(scene.map_layer))
+        where = f"{path} with {map_layer or scene.map_layer.name}"
+        found = check_agrees(scene, load_map(scene.map_layer), where)
         if found.rms_nt >= NOTED_NT:
-            report(f"Note: {found}")
+            report(
+                f"Note: the map differs from the field of the scene's Earth, sources and furniture by {found}"
+            )
     return scene
 
 
@@ -541,12 +545,15 @@ def simulate(
         A Run with every column of `magtwin.COLUMNS`; its facts tell how it came about.
 
     Raises:
-        RefusedError: The path leaves the floor or touches an obstacle, or an option is out of range.
+        RefusedError: The path leaves the floor or touches an obstacle, an option is out of range, the scene's
+            field is constant, or the path leaves the map so that there is nothing to read.
     """
+    from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.simulate import simulate as run_scene
 
     seed = _seed(seed)
     twin = in_session(_opened(twin, net, magnetometer, "simulate"), session, seed=seed)
+    check_field(twin.scene, twin.field)
     network = twin.magnetometer
     path = way_of(path, room_of(twin))
     _check_commands(path, network)
@@ -573,6 +580,7 @@ def simulate(
         controller=controller,
         engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
     )
+    check_read(run, twin.field)
     return run.with_columns(**_known(twin.scene, run, read)).with_facts(
         **_facts(twin, seed, path, duration_s, _config_sha256(twin.scene))
     )
@@ -626,10 +634,12 @@ def simulate_robots(
     Raises:
         RefusedError: A name is none of a robot's, robots would meet, or `simulate` would refuse one.
     """
+    from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.together import simulate_together
 
     seed = _seed(seed)
     twin = in_session(_opened(twin, net, magnetometer, "simulate_robots"), session, seed=seed)
+    check_field(twin.scene, twin.field)
     placed = {one.robot.name: one for one in twin.scene.robots}
     for name in (*(paths or {}), *(robots or ())):
         find("robot", name, placed)
@@ -670,6 +680,7 @@ def simulate_robots(
         lidar=lidar,
     )
     for name, run in runs.items():
+        check_read(run, twin.field)
         own = led[name]
         runs[name] = run.with_columns(**_known(own.scene, run, reads.get(name))).with_facts(
             **_facts(own, seed, ways[name], duration_s, _config_sha256(own.scene))
@@ -743,9 +754,11 @@ def simulate_many(
         RefusedError: There is no seed, numbers of paths, speeds, robots and seeds differ, a seed is no whole
             number from 0 up, a robot's magnetometer is not the twin's, or `simulate` would refuse a run.
     """
+    from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.many import BLOCK, Conditions, Job, Runs
 
     twin = _opened(twin, net, magnetometer, "simulate_many")
+    check_field(twin.scene, twin.field)
     numbers = [_seed(seed) for seed in seeds]
     if not isinstance(controller, str):
         raise RefusedError(
@@ -785,6 +798,7 @@ def simulate_many(
         runs = []
         for job, one, read in zip(jobs, sensed, told, strict=True):
             run = one.read(read.disturbance_nt if read else None)
+            check_read(run, twin.field)
             known = _known(job.scene, run, read)
             run = run.with_columns(**{name: known[name] for name in known.keys() & run.keys()})
             own, config = of[id(job.scene)]

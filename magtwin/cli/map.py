@@ -579,6 +579,7 @@ def _read(
 ) -> Any:
     """The readings of the sources, and the report of what was found latched, stuck or outlying in them."""
     from magtwin.field.latch import mask_latched
+    from magtwin.field.readings import TAKEN
     from magtwin.io.readings import read_readings
 
     step("Reading the survey")
@@ -586,6 +587,9 @@ def _read(
         *sources, columns=columns, pose_topic=pose_topic, field_topic=field_topic, **{**about, "name": None}
     )  # refusals name the survey, not the file to be written
     masked, found = mask_latched(readings)
+    taken = [part for part in readings.source.split("; ") if part.startswith(TAKEN)]
+    if taken:
+        found = replace(found, facts={**found.facts, "taken": [part.removeprefix(TAKEN) for part in taken]})
     if not (keep_latched or masked.good.any()):
         raise RefusedError(
             f"{sources[0]}: all {len(readings)} readings are those of a sensor that was stuck; "
@@ -614,7 +618,7 @@ def _earth_nt(text: str) -> tuple[float, float, float]:
     if len(words) in (3, 4) and not Path(text).exists():
         from magtwin.field.earth import earth_field_nt
         from magtwin.field.readings import checked_earth_nt
-        from magtwin.field.survey import GREATEST_MEAN_NT, LEAST_MEAN_NT
+        from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT
 
         try:
             x, y, z = (float(word) for word in words[:3])

@@ -29,7 +29,8 @@ def scene(
     out
         Folder to make; it holds all that the stage needs and can be moved.
     map
-        Map layer to use in place of the one that the TOML names.
+        Map layer to use in place of the one that the TOML names. Earth, sources and furniture stay; a map
+        that contradicts them is refused, and the difference is told in nT.
     net
         Weights to use in place of those that the TOML names (.safetensors or .pth).
     force

@@ -26,6 +26,9 @@ TURN = 2 * np.pi
 TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")
 """What a map says of itself in words."""
 
+CONSTANT_NT = 1e-3
+"""Range of a map's values up to which it is constant [nT]."""
+
 Outside = Literal["nan", "clamp", "raise"]
 
 
@@ -306,6 +309,12 @@ class AnomalyMap(Summarized):
             _, c, s = np.linalg.lstsq(waves, means, rcond=None)[0]
             figures.append(Figure("heading amplitude", round(float(np.hypot(c, s)), 1), "nT"))
         return Report(f"map {self.name}", tuple(figures), {"method": self.method, "licence": self.licence})
+
+    @cached_property
+    def is_constant(self) -> bool:
+        """Whether all valid nodes have the same value, within 1 pT, or no node is valid."""
+        values = self.values_nt[self.valid]
+        return not values.size or float(np.ptp(values)) <= CONSTANT_NT
 
     @cached_property
     def _lookup(self) -> Lookup:

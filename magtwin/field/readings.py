@@ -167,7 +167,8 @@ class Readings(Summarized):
             Figure("least", round(float(good.b_nt.min()), 1), "nT"),
             Figure("greatest", round(float(good.b_nt.max()), 1), "nT"),
         ]
-        facts = {"source": self.source.split("; "), "licence": self.licence, "created": self.created}
+        files = [part for part in self.source.split("; ") if not part.startswith(TAKEN)]
+        facts = {"source": files, "licence": self.licence, "created": self.created}
         return Report(f"readings {self.name}", tuple(figures), {k: v for k, v in facts.items() if v})
 
     def with_(self, **changes: Any) -> "Readings":
@@ -199,6 +200,9 @@ class Readings(Summarized):
             ),
         )
 
+
+TAKEN = "taken "
+"""How a part of `source` begins that says what was found by a name or a size."""
 
 TEXTS = ("name", "source", "licence", "created", "frame", "datum")
 """What readings say of themselves in words."""

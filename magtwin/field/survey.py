@@ -2,7 +2,6 @@
 
 import math
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from magtwin.field.grid import Grid
 from magtwin.field.map import AnomalyMap
 from magtwin.field.readings import Readings
 from magtwin.field.survey_header import ERROR, MASKED, header_lines, read_header
+from magtwin.field.units import check_unit, nt_per
 from magtwin.files import existing, output, sha256
 from magtwin.frames import wrap_angle
 from magtwin.names import RefusedError
@@ -24,18 +24,6 @@ Array = NDArray[np.float64]
 
 COLUMNS = ("x", "y", "theta", "scalar_mag")
 SUFFIX = "_map.csv"
-
-LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
-"""Bounds of a survey's mean [nT]; the Earth's field lies in 22,000..67,000 nT, a building bends it."""
-
-USUAL_NT = 50_000.0
-"""Magnitude that a refusal suggests a scale for [nT]."""
-
-NT_PER = {"nT": 1.0, "uT": 1e3, "T": 1e9, "mG": 1e2, "G": 1e5}
-"""Units that a field may be in, and the nT that each is."""
-
-MIXED = 0.01
-"""Share of readings that are a unit's factor off the others, above which they are no outliers."""
 
 WIDEST_DEG = 90.0
 """Headings farther apart than this are taken for an incomplete survey unless the caller names them."""
@@ -80,7 +68,7 @@ def read_grid(
         datum: Where that frame lies, in words.
         headings_deg: Headings that the survey has [deg]. Unless given, the files must be evenly
             spaced on the circle and at most 90 deg apart, so that a lost file is noticed.
-        unit: Unit of the field, one of `NT_PER`.
+        unit: Unit of the field, one of `magtwin.field.units.NT_PER`.
         scale: Factor from the file's values to nT, in place of a unit.
 
     Returns:
@@ -224,7 +212,7 @@ def read_survey(
         frame: Axes that x, y and heading are in, in words.
         datum: Where that frame lies, in words.
         headings_deg: Headings that the survey has [deg].
-        unit: Unit of the field, one of `NT_PER`.
+        unit: Unit of the field, one of `magtwin.field.units.NT_PER`.
         scale: Factor from the file's values to nT, in place of a unit.
         keep_latched: Whether readings of a sensor that had lost lock stay valid nodes.
 
@@ -420,74 +408,6 @@ def _row(path: Path, number: int, line: str) -> list[float]:
     if values[3] <= 0:
         raise RefusedError(f"{path}:{number}: scalar_mag is a magnitude, above 0 nT, got {values[3]:g}")
     return values
-
-
-def _four(value: float) -> str:
-    """A number to four digits, without an exponent where it is usual."""
-    return f"{float(f'{value:.4g}'):g}"
-
-
-def nt_per(unit: str | None, scale: float | None) -> float:
-    """Factor from a file's values to nT: `scale` if it is given, else that of the unit, nT if None."""
-    return NT_PER[unit or "nT"] if scale is None else scale
-
-
-def check_unit(
-    b_nt: Array,
-    where: str,
-    column: str,
-    unit: str = "nT",
-    row: Callable[[int], str] | None = None,
-    scale: float | None = None,
-) -> None:
-    """Refuse readings whose mean cannot be the Earth's field in nT, and those of two units.
-
-    Args:
-        b_nt: Magnitudes of the field as taken for nT, shape (N,).
-        where: File, for the refusal.
-        column: Its column.
-        unit: Unit that the file was said to be in.
-        row: Says where a reading stands, by its index; the file itself unless given.
-        scale: Factor that took the file's values to nT, in place of a unit.
-
-    Raises:
-        RefusedError: The mean lies outside 10,000..100,000 nT; the text names the unit that would fit. Or
-            more readings than outliers would be are another unit's factor off the others.
-    """
-    usual = float(np.sort(b_nt)[len(b_nt) // 2])
-    for other, factor in NT_PER.items():
-        ratio = b_nt / usual * factor / NT_PER[unit]
-        odd = np.flatnonzero((np.abs(np.log10(np.maximum(ratio, 1e-12))) < 0.3) & (other != unit))
-        if LEAST_MEAN_NT <= usual <= GREATEST_MEAN_NT and len(odd) > max(1, MIXED * len(b_nt)):
-            first = int(odd[0])
-            raise RefusedError(
-                f"{row(first) if row else where}: {column} is {b_nt[first]:.6g} nT, where most readings are "
-                f"about {usual:,.0f} nT; it and {len(odd) - 1} more would fit in {other}: give all rows in "
-                "one unit"
-            )
-    mean = float(b_nt.mean())
-    if LEAST_MEAN_NT <= mean <= GREATEST_MEAN_NT:
-        return
-    if scale is not None:
-        raise RefusedError(
-            f"{where}: the mean of {column} is {mean:.6g} nT with scale {scale:g}, outside "
-            f"{LEAST_MEAN_NT:,.0f}..{GREATEST_MEAN_NT:,.0f} nT; --scale {_four(scale * USUAL_NT / mean)} would "
-            f"make it {USUAL_NT:,.0f} nT"
-        )
-    number = mean / NT_PER[unit]
-    fits = [
-        f"were it {other}, it would be {number * factor:,.0f} nT, so say --unit {other}"
-        for other, factor in NT_PER.items()
-        if LEAST_MEAN_NT <= number * factor <= GREATEST_MEAN_NT
-    ]
-    normalised = (
-        "no usual unit makes it the Earth's field; for a normalised sensor give --scale, the factor to nT "
-        f"({_four(USUAL_NT / number)} would make it {USUAL_NT:,.0f} nT)"
-    )
-    raise RefusedError(
-        f"{where}: the mean of {column} is {mean:.6g} nT, outside {LEAST_MEAN_NT:,.0f}.."
-        f"{GREATEST_MEAN_NT:,.0f} nT; " + (" or ".join(fits) or normalised)
-    )
 
 
 def _readings(layers: list[_Layer], folder: Path, name: str | None, about: dict[str, Any]) -> Readings:

@@ -232,6 +232,7 @@ class Runs(Summarized, Sequence[Run]):
         return check_run(
             job.scene,
             job.path,
+            anomaly_map=common.anomaly_map,
             rate_hz=common.rate_hz,
             duration_s=common.duration_s,
             lidar=common.lidar,
