@@ -14,6 +14,7 @@ from magtwin.cli import main
 from magtwin.field.epochs import at_date
 from magtwin.field.map import AnomalyMap
 from magtwin.field.survey import import_survey, write_survey
+from magtwin.io.readings import read_readings
 from magtwin.names import RefusedError
 from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
 
@@ -119,6 +120,14 @@ def test_a_header_that_cannot_be_is_refused_by_file_and_line(tmp_path, line, ext
     file.write_text("\n".join([first, line, *rest, *extra]) + "\n")
     with pytest.raises(RefusedError, match=said):
         import_survey(tmp_path / "csv")
+
+
+def test_a_single_file_of_a_map_is_read_as_a_table(tmp_path):
+    made = survey(3, **FITTED | {"valid": None})
+    write_survey(made, tmp_path / "csv")
+    readings = read_readings(tmp_path / "csv" / "90_map.csv")
+    assert np.array_equal(readings.b_nt, made.values_nt[1].ravel())
+    assert np.array_equal(readings.p_xy[:5, 0], made.x_m)
 
 
 def test_comments_of_others_are_left_alone(tmp_path):
