@@ -14,6 +14,7 @@ from magtwin.cli import main
 from magtwin.field.epochs import at_date
 from magtwin.field.map import AnomalyMap
 from magtwin.field.survey import import_survey, write_survey
+from magtwin.io.readings import read_readings
 from magtwin.names import RefusedError
 from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
 
@@ -121,6 +122,14 @@ def test_a_header_that_cannot_be_is_refused_by_file_and_line(tmp_path, line, ext
         import_survey(tmp_path / "csv")
 
 
+def test_a_single_file_of_a_map_is_read_as_a_table(tmp_path):
+    made = survey(3, **FITTED | {"valid": None})
+    write_survey(made, tmp_path / "csv")
+    readings = read_readings(tmp_path / "csv" / "90_map.csv")
+    assert np.array_equal(readings.b_nt, made.values_nt[1].ravel())
+    assert np.array_equal(readings.p_xy[:5, 0], made.x_m)
+
+
 def test_comments_of_others_are_left_alone(tmp_path):
     write_survey(survey(), tmp_path / "csv")
     file = tmp_path / "csv" / "0_map.csv"
@@ -207,3 +216,34 @@ def test_a_map_with_a_node_without_a_value_is_not_written_as_a_survey(tmp_path):
 def test_recorded_headings_of_another_shape_are_refused():
     with pytest.raises(RefusedError, match="recorded_yaw of AnomalyMap must have shape"):
         survey(recorded_yaw=np.zeros((4, 3, 4)))
+
+
+def test_info_of_a_map_and_of_its_csvs_tells_all_that_it_knows(tmp_path, capsys):
+    made = survey(3, **FITTED)
+    save_map(made, tmp_path / "a.usdc")
+    write_survey(made, tmp_path / "csv")
+    for file in ("a.usdc", "csv"):
+        main(["info", str(tmp_path / file), "--json"])
+        told = json.loads(capsys.readouterr().out)
+        figures, facts = told["figures"], told["facts"]
+        for h, heading in enumerate(("0", "90", "180", "270")):
+            values, of = made.values_nt[h][made.valid[h]], figures[f"heading {heading}"]
+            assert of["value"] == pytest.approx(values.mean(), abs=0.06)
+            assert of["spread"] == pytest.approx(values.std(), abs=0.06)
+            assert of["note"].startswith(f"{values.min():,.0f} to {values.max():,.0f} nT; ")
+        assert figures["masked nodes"]["value"] == int((~made.valid).sum())
+        assert figures["standard deviation"]["value"] == 9.0
+        assert figures["height"]["value"] == 0.3
+        assert {"median gradient", "greatest gradient", "extent"} <= figures.keys()
+        assert (facts["method"], facts["parameters"]) == ("gp", made.parameters)
+        assert (facts["frame"], facts["created"], facts["licence"]) == (made.frame, "2024-05-01", "MIT")
+        assert facts["headings deg"] == "0, 90, 180, 270"
+
+
+def test_info_of_a_heading_without_a_valid_node_says_so(tmp_path, capsys):
+    valid = np.ones((4, 3, 5), bool)
+    valid[1] = False
+    save_map(survey(valid=valid), tmp_path / "a.usdc")
+    main(["info", str(tmp_path / "a.usdc"), "--json"])
+    figures = json.loads(capsys.readouterr().out)["figures"]
+    assert figures["heading 90"]["value"] == "no valid node"

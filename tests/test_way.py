@@ -140,3 +140,16 @@ def test_ways_are_one_for_all_or_one_each(tmp_path):
 def test_what_is_no_path_is_refused(twin, way, said):
     with pytest.raises(RefusedError, match=said):
         simulate(twin, way, **SHORT)
+
+
+def test_the_gym_takes_a_scene_and_points(lab_scene):
+    gymnasium = pytest.importorskip("gymnasium")
+    import magtwin.gym  # noqa: F401
+
+    options = {"path": POINTS, "magnetometer": "map-only"}
+    envs = [
+        gymnasium.make("magtwin/MagNav-v0", scene=s, **options) for s in (lab_scene, read_scene(lab_scene))
+    ]
+    first, second = (env.reset(seed=1)[0] for env in envs)
+    assert first.size
+    assert np.array_equal(first, second, equal_nan=True)

@@ -512,7 +512,9 @@ def map_continue(
 
 @map_app.command(name="export")
 def map_export(file: Path, *, out: Path, date: str | None = None, force: Force = False) -> None:
-    """Write a map as a survey's CSVs, one a heading, as map import reads them: of a survey, the same rows.
+    """Write a map as CSVs, one per heading, as map import reads them; a survey's rows come back unchanged.
+
+    Comment lines above the rows keep the map's method, frame, height, day, licence and statistics.
 
     Parameters
     ----------
