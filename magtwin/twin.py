@@ -371,10 +371,10 @@ def scene_from_toml(
         inputs_of=inputs_of,
         survey_of=survey_of,
     )
-    if scene.earth is not None and scene.magnets and scene.map_layer.parent != FilePath(workshop):
+    if scene.map_layer.parent != FilePath(workshop):
         where = f"{path} with {map_layer or scene.map_layer.name}"
         found = check_agrees(scene, load_map(scene.map_layer), where)
-        if found.rms_nt >= NOTED_NT:
+        if found and found.rms_nt >= NOTED_NT:
             report(
                 f"Note: the map differs from the field of the scene's Earth, sources and furniture by {found}"
             )

@@ -92,20 +92,23 @@ def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
     )
 
 
-def check_agrees(scene: Scene, anomaly_map: AnomalyMap, where: str) -> Contradiction:
+def check_agrees(scene: Scene, anomaly_map: AnomalyMap, where: str) -> Contradiction | None:
     """Refuse a scene whose map is not of its Earth and sources.
 
     Args:
-        scene: The scene, with the Earth's field.
+        scene: The scene. Without the Earth's field, or without sources and furniture, it has nothing that a
+            map could contradict: there the map is the truth.
         anomaly_map: Its map.
         where: What to call the two, such as "lab.toml with the map F.usdc".
 
     Returns:
-        The difference, where it is small enough.
+        The difference, if it is small enough; None if there is nothing to contradict.
 
     Raises:
         RefusedError: They differ by more than `contradiction_nt` allows.
     """
+    if scene.earth is None or not scene.magnets:
+        return None
     found = contradiction_nt(scene, anomaly_map)
     if not found.agrees:
         raise RefusedError(
