@@ -155,12 +155,12 @@ def _visit(
     sensor, latch = scene.robot.magnetometer, rng.spawn(1)[0]
     exact, lost = np.empty(grid.shape), np.zeros(grid.shape, bool)
     for k in range(len(grid.headings_rad)):
-        progress(k, len(grid.headings_rad), "surveying")
+        progress(k, len(grid.headings_rad), "")
         exact[k] = field_at_rest_nt(scene, stands[k], yaw[k], height_m=height_m)
         if sensor.gradient_max_nt_m:
             gradient = ambient_gradient_nt_m(scene, _sensor_places(scene, stands[k], yaw[k], height))
             lost[k] = lost_in(sensor, gradient.ravel()).reshape(exact[k].shape)
-    progress(len(grid.headings_rad), len(grid.headings_rad), "surveying")
+    progress(len(grid.headings_rad), len(grid.headings_rad), "")
     total = np.zeros_like(exact)
     for _ in range(readings):
         total += _read(exact, sensor.noise_std_nt, sensor.resolution_nt, rng)
