@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from magtwin.frames import wrap_angle, yaw_from_quat
 from magtwin.names import RefusedError
 from magtwin.run import Run
+from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 Align = Literal["time", "path", "none"]
@@ -60,8 +61,8 @@ class Agreement:
     """Pearson's, of the two quantities themselves; none for what is only known as a difference."""
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Summarized):
     """Run B laid over run A, at the readings of A over which B lies."""
 
     align: Align
@@ -119,6 +120,19 @@ class Comparison:
     def to_json(self) -> str:
         """The comparison as one JSON object."""
         return json.dumps(self.summary(), indent=2)
+
+    def _summary(self) -> Summary:
+        """How B was laid over A, and how each quantity agrees."""
+        agreements = [
+            (one.name, f"mean {one.mean:.4g}, rms {one.rms:.4g}, largest {one.greatest:.4g} {one.unit}")
+            for one in self.agreements()
+        ]
+        by = (
+            "as they are"
+            if self.align == "none"
+            else f"by {self.align}, B shifted by {self.shift:.4g} {self.unit}"
+        )
+        return Summary(f"Comparison: {len(self.at):,} readings of A, aligned {by}", tuple(agreements))
 
 
 ERRORS: Mapping[str, tuple[str, str, str]] = MappingProxyType(

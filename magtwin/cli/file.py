@@ -20,14 +20,14 @@ _NETS = (".safetensors", ".pth", ".onnx")
 
 @app.command
 def info(file: Path, *, json: Json = False) -> None:
-    """Say what a run, a stage, a map or a network holds; of a run also what it came from.
+    """Tell what a run, a stage, a map or a network holds, and where it came from.
 
     Parameters
     ----------
     file
         A run (.parquet, .rrd, .mcap, .db3, .csv, .npz, .usd, a .json of the released node, or the folder of a
-        bag, of Parquet parts, or of magtwin run), a stage (.usd, .usda, .usdc, .usdz), or a network
-        (.safetensors, .pth, .onnx).
+        bag, of Parquet parts, or of magtwin run), a stage or a map (.usd, .usda, .usdc, .usdz), a folder of
+        survey CSVs (0_map.csv, ...), or a network (.safetensors, .pth, .onnx).
     json
         Print it as JSON.
     """
@@ -43,6 +43,11 @@ def info(file: Path, *, json: Json = False) -> None:
         report = _info_of_net(file)
     elif file.suffix in _STAGES and not file.is_dir():
         report = _info_of_usd(file)
+    elif file.is_dir() and any(file.glob("*_map.csv")):
+        from magtwin.field.card import map_card
+        from magtwin.field.survey import import_survey
+
+        report = map_card(import_survey(file))
     else:
         report = _info_of_run(file)
     print_report(report, json)
@@ -181,14 +186,31 @@ def _info_of_usd(file: Path) -> Any:
 
     from magtwin.usd.animation import is_animation
     from magtwin.usd.info import info_of_stage
+    from magtwin.usd.maps import is_map_layer
 
-    if file.suffix == ".usdz" or not is_animation(file):
+    if file.suffix == ".usdz":
         return info_of_stage(file)
+    if not is_animation(file):
+        return _info_of_map(file) if is_map_layer(file) else info_of_stage(file)
     run = _info_of_run(file)
     try:
         return replace(run, figures=(*run.figures, *info_of_stage(file).figures))
     except RefusedError as error:  # the run is whole without its scene
         return replace(run, facts={**run.facts, "stage": str(error)})
+
+
+def _info_of_map(file: Path) -> Any:
+    """The map's card, and below it what any stage holds."""
+    from dataclasses import replace
+
+    from magtwin.field.card import map_card
+    from magtwin.usd.info import info_of_stage
+    from magtwin.usd.maps import load_epochs
+
+    epochs = load_epochs(file)
+    card = map_card(epochs[-1], epochs)
+    stage = [figure for figure in info_of_stage(file).figures if figure.value != 0]
+    return replace(card, title=f"{card.title} ({file})", figures=(*card.figures, *stage))
 
 
 def _info_of_run(file: Path) -> Any:

@@ -15,6 +15,7 @@ from magtwin.cli.terminal import (
     Force,
     Json,
     Seed,
+    Session,
     announcer,
     check_suffix,
     print_report,
@@ -71,12 +72,7 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
             scene_file,
             "figure8",
             folder,
-            # a day as those that its network learned from: the robot as it ships is that of the survey
-            facts={
-                "scene_file": scene_file.relative_to(folder).as_posix(),
-                "session_seed": seed,
-                "session": 0,
-            },
+            facts={"scene_file": scene_file.relative_to(folder).as_posix()},
             steps=steps,
             seed=seed,
             speed=0.2,
@@ -95,6 +91,7 @@ def run(
     scene: Path,
     *,
     path: str | None = None,
+    fit: Annotated[bool, Parameter(negative="")] = False,
     commands: Path | None = None,
     robot: str | None = None,
     meet: Literal["refuse", "flag"] | None = None,
@@ -104,6 +101,7 @@ def run(
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     seed: Seed = 0,
+    session: Session = None,
     speed: float = 0.2,
     duration: float | None = None,
     rate_hz: float | None = None,
@@ -135,8 +133,10 @@ def run(
     path
         sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle,
         curvilinear, curvilinear_2; A to E, the cases of the paper's Table 1; random, a human-like driver
-        who goes where the seed takes them, for a minute or --duration; or a CSV file of x,y [m]. Unless
-        given, what the scene says, or else figure8.
+        who goes where the seed takes them, for a minute or --duration; or a CSV file of x,y [m]. Named paths
+        are scaled to the floor. Unless given, what the scene says, or else figure8.
+    fit
+        Move the path and make it smaller if it does not fit the floor or runs into something.
     commands
         CSV file of t,v,w [s, m/s, rad/s] to drive by in place of a path, as magtwin drive leaves it.
     robot
@@ -159,7 +159,11 @@ def run(
         What it reads, in place of what the scene says: the exact field (physical), the map and what a
         network predicts (neural), or the map alone (map-only).
     seed
-        Seed of all noise; one seed, one Run.
+        Seed of all noise. The same seed gives the same bytes.
+    session
+        Number of a session to draw from the seed: charge, IMU zero, wheels, odometry and the robot's own
+        field differ from session to session. "survey" takes the robot as it was when the map was surveyed.
+        Default: 0.
     speed
         Forward speed where the path is straight [m/s].
     duration
@@ -238,6 +242,8 @@ def run(
         raise RefusedError(f"--controller {controller} follows a path, and {way} is none; drop one")
     if speed != 0.2 and (commands or replay):
         raise RefusedError(f"--speed is for a path or a driver, and {way} has speeds of its own; drop one")
+    if fit and (commands or replay or path == "random"):
+        raise RefusedError(f"--fit is for a path, and {way} is none; drop it")
     if engine == "newton":
         from magtwin.sim.newton import check_installed
 
@@ -249,6 +255,7 @@ def run(
         "net": net,
         "magnetometer": magnetometer,
         "seed": seed,
+        "session": session,
         "speed": speed,
         "duration_s": duration,
         "rate_hz": rate_hz,
@@ -265,7 +272,13 @@ def run(
             raise RefusedError(f"--live and --viewer show one robot, and {scene} has {', '.join(robots)}")
         if robot is None and (path or commands or replay):
             raise RefusedError(f"which of {', '.join(robots)} is to drive {way}? say it with --robot NAME")
-        _run_together(scene, wanted, robot=robot, path=path, meet=meet, scans=scans, quiet=json, **options)
+        if fit and robot is None:
+            raise RefusedError(
+                f"whose path is to be fitted, of {', '.join(robots)}? say it with --robot NAME"
+            )
+        _run_together(
+            scene, wanted, robot=robot, path=path, fit=fit, meet=meet, scans=scans, quiet=json, **options
+        )
         return
     if meet is not None:
         raise RefusedError(f"--meet is for several robots, and {scene} has one; drop it")
@@ -275,7 +288,7 @@ def run(
     step("Opening the scene")
     with ExitStack() as stack:
         written = wanted.begun() if shown else stack.enter_context(wanted.aside())
-        what = _drive(scene, way, steps=announcer(quiet=json), scans=scans, **options)
+        what = _drive(scene, way, steps=announcer(quiet=json), scans=scans, fit=fit, **options)
         if shown:
             what = _show(what, shown, written, quiet=json)
         written.write(what, steps=announcer(quiet=json), recorded=shown is not None)
@@ -337,28 +350,31 @@ def _drive(
     replay: Path | None = None,
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    seed: int = 0,
+    session: int | Literal["survey"] | None = None,
+    fit: bool = False,
     facts: Mapping[str, str | int] = MappingProxyType({}),
     **options: Any,
 ) -> _Driven:
     """Run a scene: along `path`, unless commands or a run say otherwise.
 
-    `facts` say where files will lie as seen from the run's own, for those that move with it, and on which day
-    it drives, if on one (`session_seed`, `session`).
+    `facts` say where files will lie as seen from the run's own, for those that move with it.
     """
     from magtwin.io.formats import read_run
-    from magtwin.path import resolve_path
     from magtwin.sim.commands import read_commands
-    from magtwin.twin import on_its_day, open_twin, scan, simulate
+    from magtwin.sim.way import way_of
+    from magtwin.twin import in_session, open_twin, room_of, scan, simulate
 
-    planned = None
+    planned: Any = None
     what: Any = path
     if commands is not None:
         what = read_commands(commands)
     elif replay is not None:
         what = read_run(replay)
-    elif path != "random":
-        what = planned = resolve_path(path)
-    twin = on_its_day(open_twin(scene_file, net=net, magnetometer=magnetometer), facts)
+    twin = in_session(open_twin(scene_file, net=net, magnetometer=magnetometer), session, seed=seed)
+    if commands is None and replay is None and path != "random":
+        what = planned = way_of(path, room_of(twin), fit=fit)
+        _say_placing(planned, steps)
     if commands is not None and what.beyond(twin.scene.robot.drive):
         print(f"  {what.beyond(twin.scene.robot.drive)}", file=sys.stderr)  # noqa: T201
     steps(f"Driving {planned.name if planned else path}")
@@ -366,12 +382,21 @@ def _drive(
         facts = {"replay_file": replay.as_posix(), **facts}
     slow = options.get("engine") == "newton"
     with progress("Driving in Newton", "steps") if slow else nullcontext() as advance:
-        result = simulate(twin, what, progress=advance, **options).with_facts(**facts)
+        result = simulate(twin, what, seed=seed, progress=advance, **options).with_facts(**facts)
     seen = None
     if scans:
         steps("Casting the LiDAR's rays")
-        seen = scan(twin, result, seed=options["seed"])
+        seen = scan(twin, result, seed=seed)
     return _Driven(result, twin, planned, seen)
+
+
+def _say_placing(path: Any, steps: Any) -> None:
+    """Tell how a path was brought onto the floor, where it was."""
+    if path.placing:
+        scale_x, scale_y, x, y = path.placing
+        scale = f"by {scale_x:.2g}" if scale_x == scale_y else f"by {scale_x:.2g} in x and {scale_y:.2g} in y"
+        moved = f", moved by ({x:.2f}, {y:.2f}) m" if max(abs(x), abs(y)) >= 0.005 else ""
+        steps(f"Path {path.name} is scaled {scale}{moved} to fit the floor")
 
 
 def _run_together(
@@ -380,6 +405,7 @@ def _run_together(
     *,
     robot: str | None,
     path: str | None,
+    fit: bool,
     meet: Literal["refuse", "flag"] | None,
     scans: bool,
     quiet: bool,
@@ -390,7 +416,8 @@ def _run_together(
     from magtwin.path import Path as Planned
     from magtwin.report import Report
     from magtwin.sim.commands import read_commands
-    from magtwin.twin import led_by, open_twin, scan, simulate_robots, way_of
+    from magtwin.sim.way import way_of
+    from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots
 
     steps = announcer(quiet=quiet)
     if options.pop("engine") == "newton":
@@ -402,7 +429,10 @@ def _run_together(
     ways: dict[str, Any] = {one.robot.name: one.path or "figure8" for one in twin.scene.robots}
     if robot is not None and (commands or replay or path):
         ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path
-    ways = {name: way_of(way) for name, way in ways.items()}
+    ways = {
+        name: way_of(way, room_of(led_by(twin, name)), fit=fit and name == robot)
+        for name, way in ways.items()
+    }
     names = list(ways) if robot is None else [robot]
     with ExitStack() as stack:
         written = {}
@@ -545,7 +575,7 @@ class _Outputs:
                         **options,
                     )
         if self.folder:
-            from magtwin.io.plots import plot_run
+            from magtwin.io.plotting import plot_run
 
             planned = driven.planned
             plot_run(

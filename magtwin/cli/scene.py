@@ -4,7 +4,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, print_report, say, step
+from magtwin.cli.terminal import Force, Json, announcer, print_report, progress, say
 
 
 @app.command
@@ -17,7 +17,10 @@ def scene(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Author a scene from its TOML: the lab, its map, a robot with sensors.
+    """Author a scene from its TOML: the room, its magnetic map, a robot with sensors.
+
+    A scene that names no map is surveyed by its own robot, from the Earth's field, furniture and sources.
+    `magtwin new room.toml` writes a TOML to start from; docs/scenes.md has every key.
 
     Parameters
     ----------
@@ -26,7 +29,8 @@ def scene(
     out
         Folder to make; it holds all that the stage needs and can be moved.
     map
-        Map layer to use in place of the one that the TOML names.
+        Map layer to use in place of the one that the TOML names. Earth, sources and furniture stay; a map
+        that contradicts them is refused, and the difference is told in nT.
     net
         Weights to use in place of those that the TOML names (.safetensors or .pth).
     force
@@ -34,7 +38,7 @@ def scene(
     json
         Print the summary as JSON.
     """
-    from magtwin.files import shipped
+    from magtwin.files import check_free, shipped
     from magtwin.twin import scene_from_toml
     from magtwin.usd.info import info_of_stage
     from magtwin.usd.scene import author_scene
@@ -44,11 +48,17 @@ def scene(
         from magtwin.names import find
 
         file = find("scene", spec, {f.stem: f for f in sorted(shipped("scenes").glob("*.toml"))})
+    check_free(out, force=force)
+    told: list[str] = []
+    steps = announcer(quiet=json)
     with TemporaryDirectory() as workshop:
-        step("Reading the scene")
-        scene = scene_from_toml(file, map_layer=map, network=net, workshop=workshop)
-        step("Authoring the stage")
+        steps(f"Reading {file}")
+        with progress("Surveying", "nodes") as advance:
+            scene = scene_from_toml(
+                file, map_layer=map, network=net, workshop=workshop, report=told.append, progress=advance
+            )
+        steps("Authoring the stage")
         root = author_scene(scene, out, force=force)
     print_report(info_of_stage(root), json)
     if not json:
-        say(f"Wrote {root}")
+        say("\n".join([*told, f"Wrote {root}"]))

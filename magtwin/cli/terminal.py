@@ -3,7 +3,7 @@
 import io
 import sys
 from pathlib import Path
-from typing import Annotated, Any, TextIO, cast
+from typing import Annotated, Any, Literal, TextIO, cast
 
 from cyclopts import Parameter
 
@@ -31,6 +31,20 @@ def _whole(kind: type, tokens: Any) -> int:
 
 Whole = Annotated[int, Parameter(converter=_whole)]
 Seed = Whole
+
+
+def _session(kind: Any, tokens: Any) -> int | str:
+    """A session: its number, or "survey"."""
+    text = tokens[0].value
+    if text == "survey":
+        return "survey"
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError(f"a session is a whole number, or survey; got {text!r}") from None
+
+
+Session = Annotated[int | Literal["survey"] | None, Parameter(converter=_session)]
 Force = Annotated[bool, Parameter(name="--force", negative="")]
 Json = Annotated[bool, Parameter(name="--json", negative="")]
 
@@ -104,6 +118,8 @@ def print_report(report: Any, as_json: bool) -> None:
     for table in (numbers, words):
         if table.row_count:
             console.print(table)
+    if report.verdict:
+        console.print(Text(printable(report.verdict), style="bold"), soft_wrap=True)
     for name, fact in lists:
         console.print(Text(name))
         entries = fact.items() if isinstance(fact, dict) else (("", entry) for entry in fact)

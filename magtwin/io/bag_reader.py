@@ -15,7 +15,7 @@ import yaml
 from numpy.typing import NDArray
 
 from magtwin.arrow import spec_said
-from magtwin.field.survey import NT_PER, check_unit
+from magtwin.field.units import NT_PER, check_unit
 from magtwin.files import existing, sha256
 from magtwin.frames import canonical, quat_conjugate, rotate, yaw_from_quat
 from magtwin.io.bag import Heard

@@ -78,6 +78,7 @@ def page_of_evaluation(
         "on which every model was judged. Errors are of the total field at the sensor, predicted less "
         f"{against}."
     )
+    lead = " ".join([*(f"{name}: {line}" for name, line in found.verdicts().items()), lead])
     sections = [
         Section("Table 1", _lead_of_table(found), (), (_table(found),)),
         Section("Models and maps", "", (), (_models(found), _maps(found), _left_out(found))),

@@ -14,6 +14,7 @@ from magtwin.frames import into_base, wrap_angle, yaw_from_quat
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
 from magtwin.run import Column, Run
+from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 
@@ -53,8 +54,8 @@ LABEL_COLUMNS: Mapping[str, Column] = MappingProxyType(
 """Columns that `labelled` adds to a run beside those that `magtwin.run.COLUMNS` has."""
 
 
-@dataclass(frozen=True)
-class Alignment:
+@dataclass(frozen=True, repr=False)
+class Alignment(Summarized):
     """Where and when a reading was taken, seen from the pose that bears its stamp."""
 
     lever_arm_m: tuple[float, float] = (0.0, 0.0)
@@ -72,7 +73,7 @@ class Alignment:
     def __post_init__(self) -> None:
         figures = (*self.lever_arm_m, self.latency_s, *self.lever_arm_sd_m, self.latency_sd_s)
         if not np.all(np.isfinite(figures)):
-            raise RefusedError(f"an alignment must be finite, got {self}")
+            raise RefusedError(f"an alignment must be finite, got {figures}")
 
     def report(self, title: str = "Alignment") -> Report:
         """Lever arm and latency, with their spreads."""
@@ -82,9 +83,19 @@ class Alignment:
         ]
         return Report(title, (*arm, Figure("latency", self.latency_s, "s", self.latency_sd_s)))
 
+    def _summary(self) -> Summary:
+        (x, y), (sx, sy) = self.lever_arm_m, self.lever_arm_sd_m
+        return Summary(
+            "Alignment",
+            (
+                ("lever arm", f"{x:.4g} +- {sx:.2g} m forward, {y:.4g} +- {sy:.2g} m left"),
+                ("latency", f"{self.latency_s:.4g} +- {self.latency_sd_s:.2g} s"),
+            ),
+        )
 
-@dataclass(frozen=True)
-class Labels:
+
+@dataclass(frozen=True, repr=False)
+class Labels(Summarized):
     """What each reading of a run says of the disturbance."""
 
     value_nt: Array

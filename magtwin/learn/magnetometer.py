@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin import files
 from magtwin.learn.features import columns_of, features
 from magtwin.learn.predictor import Predictor, load_predictor
+from magtwin.learn.regressor import summary_of
 from magtwin.learn.weights import Fact
 from magtwin.names import RefusedError
 from magtwin.run import Run
+from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 
@@ -20,8 +22,8 @@ STEPS_ALIKE = 0.1
 """By what share times between rows may differ, for a network that looks back over them."""
 
 
-@dataclass(frozen=True)
-class Read:
+@dataclass(frozen=True, repr=False)
+class Read(Summarized):
     """What a predictor says of a run, row by row."""
 
     disturbance_nt: Array
@@ -34,7 +36,7 @@ class Read:
     """Whether an input left the range of the training rows, shape (N,); none where nobody asked."""
 
 
-class NeuralMagnetometer:
+class NeuralMagnetometer(Summarized):
     """Runs a predictor of any kind on runs; what one gives does not depend on the others beside it."""
 
     def __init__(self, net: Predictor, *, name: str = "", sha256: str = "") -> None:
@@ -158,3 +160,6 @@ class NeuralMagnetometer:
     def predict_with_sd(self, x: ArrayLike) -> tuple[Array, Array]:
         """Disturbances and the standard deviations of their errors [nT], each (N,); `x` as for `predict`."""
         return self.net.predict(x)
+
+    def _summary(self) -> Summary:
+        return summary_of(self.net, f"NeuralMagnetometer {self.name}".rstrip())
