@@ -193,7 +193,7 @@ def test_a_refusal_names_the_survey_not_the_file_to_be_written(tmp_path, capsys)
     (tmp_path / "hall.csv").write_text("x,y,heading,field\n0,0,0,41000\n1,0,0,42000\n")
     with pytest.raises(SystemExit):
         run("map", "fit", tmp_path / "hall.csv", "--out", tmp_path / "z.usdc")
-    assert "2 of 2 readings of 'hall' are good" in capsys.readouterr().err
+    assert "hall.csv: 2 of 2 readings are good" in capsys.readouterr().err
 
 
 def test_runs_under_several_licences_keep_all_of_them(tmp_path, capsys):

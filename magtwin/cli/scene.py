@@ -1,5 +1,6 @@
 """`magtwin scene`: a scene's TOML in, stages out."""
 
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -38,6 +39,7 @@ def scene(
     from magtwin.files import shipped
     from magtwin.twin import scene_from_toml
     from magtwin.usd.info import info_of_stage
+    from magtwin.usd.robot import notes_of
     from magtwin.usd.scene import author_scene
 
     file = Path(spec)
@@ -48,6 +50,11 @@ def scene(
     with TemporaryDirectory() as workshop:
         scene = scene_from_toml(file, map_layer=map, network=net, workshop=workshop)
         root = author_scene(scene, out, force=force)
-    print_report(info_of_stage(root), json)
+        built = [
+            one.robot for one in scene.robots if one.robot.asset.is_relative_to(Path(workshop).resolve())
+        ]
+        notes = {f"notes on {robot.name}": notes_of(robot.asset) for robot in built}
+    report = info_of_stage(root)
+    print_report(replace(report, facts={**report.facts, **notes}), json)
     if not json:
         say(f"Wrote {root}")

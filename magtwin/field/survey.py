@@ -27,6 +27,9 @@ SUFFIX = "_map.csv"
 LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
 """Bounds of a survey's mean [nT]; the Earth's field lies in 22,000..67,000 nT, a building bends it."""
 
+USUAL_NT = 18_000.0, 75_000.0
+"""Median of readings from which their unit follows [nT]: the Earth's 22,000 to 67,000, and some steel."""
+
 NT_PER = {"nT": 1.0, "uT": 1e3, "T": 1e9, "mG": 1e2, "G": 1e5}
 """Units that a field may be in, and the nT that each is."""
 
@@ -403,7 +406,7 @@ def check_unit(
 
 
 def unit_by_size(b: Array) -> str | None:
-    """The unit in which magnitudes have the size of the Earth's field; none where none or two fit.
+    """The unit in which magnitudes have the size of the Earth's field indoors; none where none has.
 
     Args:
         b: Magnitudes as they stand in the file, shape (N,); nan counts for nothing.
@@ -412,8 +415,8 @@ def unit_by_size(b: Array) -> str | None:
     if not len(b):
         return None
     usual = float(np.median(b))
-    fits = [unit for unit, nt in NT_PER.items() if LEAST_MEAN_NT <= usual * nt <= GREATEST_MEAN_NT]
-    return fits[0] if len(fits) == 1 else None
+    low, high = USUAL_NT
+    return next((unit for unit, nt in NT_PER.items() if low <= usual * nt <= high), None)
 
 
 def _readings(layers: list[_Layer], folder: Path, name: str | None) -> Readings:
