@@ -74,3 +74,11 @@ def test_another_map_keeps_earth_sources_and_furniture_or_is_refused(lab, field,
     save_map(replace(field, values_nt=field.values_nt[:, ::-1, :], name="far"), far)
     with pytest.raises(RefusedError, match=r"lab\.toml with .*far\.usdc: the map differs .* nT rms"):
         magtwin.scene_from_toml(toml, map_layer=far)
+
+
+def test_a_survey_in_place_of_a_map_is_refused_with_the_command_that_fits_it(tmp_path):
+    (tmp_path / "drive.csv").write_text("x,y,yaw,field\n0,0,0,41000\n")
+    with pytest.raises(
+        RefusedError, match=r"drive\.csv: .*not a map; .*magtwin map fit drive\.csv --out drive\.usdc"
+    ):
+        magtwin.scene_from_toml(shipped("scenes", "lab.toml"), map_layer=tmp_path / "drive.csv")

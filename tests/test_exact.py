@@ -135,9 +135,16 @@ def test_without_earth_and_fit_the_field_dips_by_60_deg_towards_y():
     assert "assumed 60 deg down towards +y" in str(run.facts["truth"])
 
 
-def test_a_map_of_one_heading_is_the_lab_at_the_sensor_and_the_whole_platform_is_added():
+@pytest.mark.parametrize("layers", [1, 6])
+def test_a_map_without_headings_is_the_lab_at_the_sensor_and_the_whole_platform_is_added(layers):
     iron = PlatformFieldSpec(hard_iron_nt=(620.0, -430.0, 900.0), soft_iron=PLATFORM.soft_iron)
-    run = drive(replace(SURVEYED, earth=EARTH, robot=replace(ROBOT, platform=iron)), ONE)
+    same = replace(
+        ONE,
+        values_nt=np.repeat(ONE.values_nt, layers, axis=0),
+        headings_rad=np.arange(layers) / 1.0,
+        valid=np.ones((layers, 15, 25), bool),
+    )
+    run = drive(replace(SURVEYED, earth=EARTH, robot=replace(ROBOT, platform=iron)), same)
     at = run["p_world_base"] + rotate(quat_from_yaw(run["yaw"]), np.array(ARM))
     unit = into_base(run, EARTH.b_world_nt) / np.linalg.norm(EARTH.b_world_nt)
     b = ONE.lookup(at[:, :2], 0.0)[:, None] * unit

@@ -194,6 +194,8 @@ def map_fit(
     readings, found = _read(sources, columns, given, keep_latched, pose_topic, field_topic)
     from magtwin.field.fit import fit, grid_report, raster
 
+    found = _worth_a_map(readings, found, sources[0])
+
     with progress(f"Fitting {method}") as advance:
         model = fit(readings, method, progress=advance, **options)
         named = readings.with_(name=given["name"])
@@ -598,6 +600,36 @@ def _read(
             "survey again, or give --keep-latched to take them as they are"
         )
     return (readings if keep_latched else masked), found
+
+
+LEAST_READINGS = 8
+"""Good readings of a drive that a map needs at least."""
+
+USUAL_READINGS = 100
+"""Good readings of a drive below which the summary says that a map of them tells little."""
+
+
+def _worth_a_map(readings: Any, found: Any, source: Path) -> Any:
+    """The report with what makes a map of these readings doubtful; refused where they are too few."""
+    import numpy as np
+
+    from magtwin.field.inversion import ONE_HEADING
+
+    count, yaw, notes = int(readings.good.sum()), readings.yaw[readings.good], list[str]()
+    if readings.grid is None and count < LEAST_READINGS:
+        raise RefusedError(
+            f"{source}: {count} of {len(readings)} readings are good; a map needs {LEAST_READINGS} at least, "
+            "and some hundred to be of use"
+        )
+    if readings.grid is None and count < USUAL_READINGS:
+        notes.append(f"only {count} good readings: the map holds next to them alone")
+    way = np.exp(1j * yaw).mean()
+    if np.abs(way) >= ONE_HEADING:
+        notes.append(
+            f"one heading only, {np.degrees(np.angle(way)):.0f} deg: nothing tells the robot's own field "
+            "from the room's, and a simulated robot adds its whole platform field; survey in all headings"
+        )
+    return replace(found, facts={**found.facts, "doubts": notes}) if notes else found
 
 
 def _options(methods: list[str], kernel: str | None, earth: str | None) -> dict[str, dict[str, Any]]:

@@ -1,5 +1,6 @@
 """`magtwin scene`: a scene's TOML in, stages out."""
 
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -41,6 +42,7 @@ def scene(
     from magtwin.files import check_free, shipped
     from magtwin.twin import scene_from_toml
     from magtwin.usd.info import info_of_stage
+    from magtwin.usd.robot import notes_of
     from magtwin.usd.scene import author_scene
 
     file = Path(spec)
@@ -59,6 +61,11 @@ def scene(
             )
         steps("Authoring the stage")
         root = author_scene(scene, out, force=force)
-    print_report(info_of_stage(root), json)
+        built = [
+            one.robot for one in scene.robots if one.robot.asset.is_relative_to(Path(workshop).resolve())
+        ]
+        notes = {f"notes on {robot.name}": notes_of(robot.asset) for robot in built}
+    report = info_of_stage(root)
+    print_report(replace(report, facts={**report.facts, **notes}), json)
     if not json:
         say("\n".join([*told, f"Wrote {root}"]))

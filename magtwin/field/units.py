@@ -14,6 +14,9 @@ Unit = Literal["nT", "uT", "T", "mG", "G"]
 LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
 """Bounds of a survey's mean [nT]; the Earth's field lies in 22,000..67,000 nT, a building bends it."""
 
+INDOORS_NT = 18_000.0, 75_000.0
+"""Median of readings from which their unit follows [nT]: the Earth's 22,000 to 67,000, and some steel."""
+
 USUAL_NT = 50_000.0
 """Magnitude that a refusal suggests a scale for [nT]."""
 
@@ -93,7 +96,7 @@ def check_unit(
 
 
 def unit_by_size(b: Array) -> Unit | None:
-    """The unit in which magnitudes have the size of the Earth's field; none where none or two fit.
+    """The unit in which magnitudes have the size of the Earth's field indoors; None where none has.
 
     Args:
         b: Magnitudes as they stand in the file, shape (N,); nan counts for nothing.
@@ -102,5 +105,6 @@ def unit_by_size(b: Array) -> Unit | None:
     if not len(b):
         return None
     usual = float(np.median(b))
-    fits = [unit for unit, nt in NT_PER.items() if LEAST_MEAN_NT <= usual * nt <= GREATEST_MEAN_NT]
-    return cast(Unit, fits[0]) if len(fits) == 1 else None
+    low, high = INDOORS_NT
+    fits = (unit for unit, nt in NT_PER.items() if low <= usual * nt <= high)
+    return cast(Unit | None, next(fits, None))

@@ -4,14 +4,14 @@ Where a scene has the Earth's field and magnetised things, these make the field.
 the fitted map is the field. A map is a magnitude, so the direction of the field comes from the harmonic fit,
 else from the scene's [earth], else it is assumed: `DIP` below the horizon, towards world +y.
 
-A map of several headings was read by a robot that turned: it holds the permanent and induced field of that
-robot, as it was in the session of the survey. The robot of the scene is taken to be that robot. It adds what
-was not there when it stood and surveyed: the change of its permanent field since
+A map that depends on the heading was read by a robot that turned: it holds the permanent and induced field
+of that robot, as it was in the session of the survey. The robot of the scene is taken to be that robot. It
+adds what was not there when it stood and surveyed: the change of its permanent field since
 (`PlatformFieldSpec.hard_iron_change_nt`), eddy currents, motors, LiDAR, supply current and the iron in its
 wheels. So at rest, in the session of the survey, it reads exactly the map.
 
-A map of one heading cannot tell the robot from the lab. It is taken to be the field of the lab at the
-sensor, and the robot adds its whole platform field.
+A map that is alike in all headings, or has one, cannot tell the robot from the lab. It is taken to be the
+field of the lab at the sensor, and the robot adds its whole platform field.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.field.map import AnomalyMap, Outside
+from magtwin.field.map import CONSTANT_NT, AnomalyMap, Outside
 from magtwin.names import RefusedError
 from magtwin.run import Run
 from magtwin.sim.drive import Moment
@@ -66,10 +66,11 @@ class ExactField:
             return "map"
         return "none" if self.scene.earth is None else "sources"
 
-    @property
+    @cached_property
     def holds_robot(self) -> bool:
-        """Whether the map holds the robot as it surveyed: it has several headings."""
-        return len(self.anomaly_map.headings_rad) > 1
+        """Whether the map holds the robot as it surveyed: its values depend on the heading."""
+        values = np.where(self.anomaly_map.valid, self.anomaly_map.values_nt, np.nan)
+        return bool(np.any(np.abs(values - values[:1]) > CONSTANT_NT))
 
     @property
     def facts(self) -> Mapping[str, str]:
@@ -81,7 +82,7 @@ class ExactField:
                 "platform field from the robot's spec, without the part that the map holds from its survey"
             )
         else:
-            added = "the whole platform field from the robot's spec, as a map of one heading holds none"
+            added = "the whole platform field from the robot's spec, as a map without headings holds none"
         if self.anomaly_map.harmonic is not None:
             way = "from the harmonic fit"
         elif self.scene.earth is not None:

@@ -100,6 +100,12 @@ def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = No
             together, or they are not what the checksum was taken of; or the day is none, or before the
             first or after the last epoch.
     """
+    if Path(path).suffix in (".csv", ".txt", ".parquet", ".pq", ".mcap", ".db3"):
+        fitted = Path(path).with_suffix(".usdc").name
+        raise RefusedError(
+            f"{path}: a table of readings or a recording, not a map; fit a map to it first: "
+            f"magtwin map fit {Path(path).name} --out {fitted}"
+        )
     if date is not None:
         return at_date(load_epochs(path), date)
     stage = open_stage(path)
