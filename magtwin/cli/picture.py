@@ -1,4 +1,4 @@
-"""`magtwin picture` and `magtwin film`: a run, or a stage, to look at."""
+"""`magtwin picture` and `magtwin film`: a run, a stage or a recording, to look at."""
 
 import sys
 import time
@@ -28,33 +28,43 @@ def picture(
     scene: Path | None = None,
     force: Force = False,
 ) -> None:
-    """Draw a moment of a run in its lab, or a stage as it stands.
+    """Draw a moment of a run in its lab, a stage as it stands, or a recording as the Rerun viewer shows it.
+
+    In pictures of a lab, what stands between the camera and the map or the robot is drawn as a veil.
+    Recordings (.rrd) are drawn by the viewer, without a window; it needs Vulkan, in software if there is no
+    graphics card. With --camera or --scene, the run in a recording is drawn in its lab.
 
     Parameters
     ----------
     file
-        A run, in any format that magtwin reads, or a stage.
+        A run, in any format that magtwin reads; a stage; or a Rerun recording.
     out
         PNG to write.
     camera
         orbit, from above at a slant; top, straight from above; chase, from behind the robot; or
-        x,y,z:x,y,z, from where to where in metres. orbit unless given.
+        x,y,z:x,y,z, the camera's place and its target in metres. Default: orbit.
     at
-        Moment of a run [s]; its end unless given.
+        Moment of a run or recording [s]. Default: the end of a run; where the viewer starts in a recording.
     size
         Width and height in pixels.
     scene
-        Where the scene of a run lies; looked for where the run says unless given.
+        The scene of a run. Default: where the run's metadata has it.
     force
         Replace what exists.
     """
     from magtwin.files import check_free, existing
     from magtwin.io.pictures import check_png
 
-    existing(file, "run or stage")
+    existing(file, "run, stage or recording")
     check_free(check_png(out), force=force)
     pixels, steps = _size(size), announcer(quiet=False)
-    if file.suffix in STAGES and at is None and scene is None:
+    if file.suffix == ".rrd" and camera is None and scene is None:
+        from magtwin.io.viewer import screenshot
+
+        steps("Drawing the recording in the Rerun viewer")
+        for complaint in screenshot(file, out, time_s=at, size=pixels, force=force):
+            print(f"  the viewer reports: {complaint}", file=sys.stderr)  # noqa: T201
+    elif file.suffix in STAGES and at is None and scene is None:
         from magtwin.io.pictures import picture_of_stage
         from magtwin.io.scenery import View
 
