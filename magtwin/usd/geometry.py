@@ -200,8 +200,8 @@ def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
     for prim in _prims(stage):
         facts = prim.GetCustomDataByKey("magtwin") or {}
         if "colourMap" in facts and UsdGeom.Imageable(prim).ComputeVisibility() != "invisible":
-            values = (facts[name] for name in ("colourMap", "least", "greatest", "unit"))
-            return ColourScale(*values, prim=str(prim.GetPath()))
+            name, least, greatest, unit = (facts[key] for key in ("colourMap", "least", "greatest", "unit"))
+            return ColourScale(name, least, greatest, unit, str(prim.GetPath()))
     return None
 
 
