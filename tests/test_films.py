@@ -1,5 +1,6 @@
 """Pictures and films of runs in their lab."""
 
+import itertools
 import re
 import stat
 from dataclasses import replace
@@ -12,8 +13,8 @@ from pxr import Usd, UsdGeom
 
 from magtwin.cli import main
 from magtwin.files import shipped
-from magtwin.io.films import LONGEST_S, film_of_run, frame_times
 from magtwin.io.cutaway import VEIL
+from magtwin.io.films import LONGEST_S, film_of_run, frame_times
 from magtwin.io.pictures import Camera, turntable
 from magtwin.io.scenery import WALL_M, Scenery, View, _free_share, picture_of_run
 from magtwin.io.tables import write_parquet
@@ -78,39 +79,43 @@ def test_the_trail_grows_behind_the_robot(scenery):
 
 def test_the_trail_stands_out_from_the_map_by_a_light_and_a_dark_edge(scenery, run):
     frame = scenery.frame(5)
-    p = run["p_world_base"][:: run.rows // 40, :2]
+    p = run["p_world_base"][run["t"] < 5][::3, :2]
     ahead = np.gradient(p, axis=0)
     left = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1, keepdims=True)
     far = np.linalg.norm(p - p[-1], axis=1) > 0.3  # not below the robot
     for place, side in zip(p[far], left[far], strict=True):
         spots = [pixel(scenery, (*(place + at * side), 0.01)) for at in np.linspace(-0.07, 0.07, 29)]
         seen = np.array([frame[y, x] for x, y in spots]).astype(int)
-        assert seen.min(axis=-1).max() > 200  # nearly white
-        assert seen.max(axis=-1).min() < 120  # nearly black
+        assert np.ptp(seen @ (0.2126, 0.7152, 0.0722)) > 110, place  # of 255, in luminance
 
 
 def test_the_robot_is_seen_behind_a_column_in_every_frame(run, lab_scene):
-    column, robot = np.array([-4.6, -3.2]), run["p_world_base"][:, :2].mean(axis=0)
-    place = column + 1.2 * (column - robot) / np.linalg.norm(column - robot)
-    view = View.of(f"{place[0]},{place[1]},1.2:{robot[0]},{robot[1]},0.2")
-    hidden = 0
-    with Scenery(run, lab_scene, np.arange(6.0), view=view, size=(320, 180)) as scenery:
-        for k in range(6):
-            seen, solid = (scenery.frame(k, whole=whole).astype(int) for whole in (False, True))
-            screens = [(actor, actor.visibility) for actor in scenery._screens]
-            for actor, _ in screens:
+    column, robot = np.array([-4.6, -3.2]), run.resample(np.arange(6.0))["p_world_base"][:, :2]
+    with Scenery(run, lab_scene, np.arange(6.0), view=View.of("top"), size=(480, 270)) as scenery:
+
+        def drawn_without(actors, k):
+            shown = [actor.visibility for actor in actors]
+            for actor in actors:
                 actor.visibility = False
-            bare = scenery.frame(k, whole=True).astype(int)
-            for actor in scenery._actors.values():
-                actor.visibility = False
-            empty = scenery.frame(k, whole=True).astype(int)
-            for actor, visible in [*screens, *((actor, True) for actor in scenery._actors.values())]:
+            image = scenery.frame(k, whole=True).astype(int)
+            for actor, visible in zip(actors, shown, strict=True):
                 actor.visibility = visible
+            return image
+
+        for k, (x, y) in enumerate(robot):
+            place = column + 1.2 * (column - (x, y)) / np.linalg.norm(column - (x, y))
+            scenery._view = View.of(f"{place[0]},{place[1]},1.2:{x},{y},0.2")
+            seen, solid = (scenery.frame(k, whole=whole).astype(int) for whole in (False, True))
+            bare = drawn_without(scenery._screens, k)
+            empty = drawn_without([*scenery._screens, *scenery._actors.values()], k)
             on_robot = (np.abs(bare - empty) > 30).any(axis=-1)
-            assert on_robot.sum() > 100
-            hidden += int((np.abs(solid - bare)[on_robot] > 0.5 * 255).any(axis=-1).sum())
-            assert np.abs(seen - bare)[on_robot].max() <= VEIL * 255 + 6  # edges are smoothed twice
-    assert hidden > 100  # without the cutaway, the column hides it
+            for axis, step in itertools.product((0, 1), (-1, 1)):  # edges are smoothed in both pictures
+                on_robot = on_robot & np.roll(on_robot, step, axis)
+            assert on_robot.sum() > 50
+            assert np.mean(np.ptp(solid[on_robot], axis=0)) < 30  # one plain face of the column
+            veiled = np.abs(seen - bare)[on_robot].max(axis=-1)
+            assert np.mean(veiled <= VEIL * 255 + 3) > 0.95  # but for edges within the robot
+            assert np.corrcoef(seen[on_robot].ravel(), bare[on_robot].ravel())[0, 1] > 0.8
 
 
 def test_the_camera_that_follows_stays_on_the_robots_side_of_a_wall():
@@ -119,7 +124,7 @@ def test_the_camera_that_follows_stays_on_the_robots_side_of_a_wall():
     share = _free_share(p, np.array([-1.3, 0.0, 0.0]), wall)
     assert 1.3 * share == pytest.approx(0.9 - WALL_M)
     assert _free_share(p, np.array([1.3, 0.0, 0.0]), wall) == 1
-    assert _free_share(p + (0, 0, 2), np.array([-1.3, 0.0, 0.0]), wall) == 1  # above it
+    assert _free_share(p + np.array([0.0, 0.0, 2.0]), np.array([-1.3, 0.0, 0.0]), wall) == 1  # above it
     assert _free_share(p, np.array([-1.3, 0.0, 0.0]), np.empty((0, 2, 3))) == 1
 
 

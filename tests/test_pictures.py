@@ -11,6 +11,7 @@ from magtwin.files import shipped
 from magtwin.io.cutaway import VEIL
 from magtwin.io.pictures import BACKGROUND, BAR_SHARE, Camera, picture_of_stage, view_distance
 from magtwin.names import RefusedError
+from magtwin.usd.geometry import srgb_from_linear
 
 SIZE = (240, 160)
 BEHIND = np.array([int(BACKGROUND[i : i + 2], 16) for i in (1, 3, 5)])
@@ -118,13 +119,14 @@ def test_no_wall_or_column_hides_the_map_from_any_side(
     veiled = draw(stage, tmp_path, camera=camera, legend=False)
     monkeypatch.setattr("magtwin.io.cutaway.VEIL", 1.0)
     solid = draw(stage, tmp_path, camera=camera, legend=False)
-    on_map = drawn(bare)
+    inks = 255 * srgb_from_linear([(0.9, 0.05, 0.0), (0.0, 0.05, 0.9)])  # edges are mixed with what is beside
+    on_map = np.any([np.abs(bare - ink).max(axis=-1) <= 2 for ink in inks], axis=0)
     assert on_map.sum() > 500
     changed = np.abs(veiled - bare)[on_map].max(axis=-1), np.abs(solid - bare)[on_map].max(axis=-1)
     assert np.mean(changed[1] > 100) > 0.2  # without the cutaway, they do
     assert changed[0].max() <= VEIL * 255 + 3
-    there = drawn(solid) & ~on_map
-    np.testing.assert_allclose(veiled[there], solid[there], atol=3)  # solid where they hide nothing
+    there = ~drawn(bare)
+    np.testing.assert_allclose(veiled[there], solid[there], atol=8)  # solid elsewhere; drawn() sees from 8 on
 
 
 def test_a_camera_that_fits_a_map_keeps_it_clear_of_the_colour_bar(stage, tmp_path):

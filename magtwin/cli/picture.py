@@ -96,6 +96,8 @@ def film(
 ) -> None:
     """Draw a run in its lab as a film, or a stage on a turntable.
 
+    What stands between the camera and the map or the robot is drawn as a veil.
+
     Parameters
     ----------
     file
@@ -103,17 +105,16 @@ def film(
     out
         MP4 or GIF to write.
     camera
-        orbit, going slowly round the lab; top, straight from above; chase, from behind the robot;
-        x,y,z:x,y,z, from where to where in metres; or turntable, once round a stage as it stands, in 10 s.
+        orbit, slowly round the lab; top, straight from above; chase, from behind the robot; x,y,z:x,y,z, the
+        camera's place and its target in metres; or turntable, once round a stage as it stands, in 10 s.
     fps
-        Frames a second.
+        Frames per second.
     speed
-        How many times faster it is shown than it happened; as it happened unless given, and what lasts longer
-        than 30 s in 30 s.
+        Playback speed, relative to the run. Default: 1, or more for a film of at most 30 s.
     size
-        Width and height in pixels; 1280x720, of a GIF 640x360, unless given.
+        Width and height in pixels. Default: 1280x720, or 640x360 for a GIF.
     scene
-        Where the scene of the run lies; looked for where the run says unless given.
+        The scene of the run. Default: where the run's metadata has it.
     force
         Replace what exists.
     """
@@ -128,7 +129,7 @@ def film(
         raise RefusedError("a turntable shows a stage as it stands: it takes no --speed and no --scene")
     run, stage = (None, file) if turned else _run_and_scene(file, scene)
     start = time.monotonic()
-    with progress("Drawing frames") as advance:
+    with progress("Filming") as advance:
 
         def told(k: int, n: int) -> None:
             advance(k, n, f"{k / (time.monotonic() - start):.3g} frames/s")

@@ -24,6 +24,9 @@ from magtwin.names import RefusedError
 
 LOCALHOST = "127.0.0.1"
 
+MAGIC = b"RRF"
+"""First bytes of a recording, before the number of its format."""
+
 LEAST_SIZE, MOST_SIZE = 200, 8000
 """Sides of a picture between which the viewer still lays out its views, and fits in a texture [pixels]."""
 
@@ -221,6 +224,9 @@ def check_decodes(rrd: Path, said: str | os.PathLike[str]) -> None:
     Raises:
         RefusedError: It is no recording, was cut short, or its bytes were changed.
     """
+    with rrd.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise RefusedError(f"{said}: not a Rerun recording: it does not start as one")
     done = subprocess.run([_binary(), "rrd", "verify", str(rrd)], capture_output=True, text=True, check=False)
     told = [line for line in done.stderr.splitlines() if "Missing RRD footer" not in line and line.strip()]
     endless = done.returncode == 1 and [line.rpartition(" with ")[2] for line in told] == ["1 errors"]
