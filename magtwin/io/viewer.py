@@ -226,7 +226,9 @@ def check_decodes(rrd: Path, said: str | os.PathLike[str]) -> None:
     """
     with rrd.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise RefusedError(f"{said}: not a Rerun recording: it does not start as one")
+            raise RefusedError(
+                f"{said}: not a Rerun recording that can be read (it does not start with RRF); write it again"
+            )
     done = subprocess.run([_binary(), "rrd", "verify", str(rrd)], capture_output=True, text=True, check=False)
     told = [line for line in done.stderr.splitlines() if "Missing RRD footer" not in line and line.strip()]
     endless = done.returncode == 1 and [line.rpartition(" with ")[2] for line in told] == ["1 errors"]
