@@ -137,13 +137,13 @@ class Comparison(Summarized):
 
 ERRORS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
     {
-        "map": ("b_map_nt", "b_truth_nt", "what the map does not know of the field at the sensor"),
-        "disturbance": ("b_total_nt", "b_truth_nt", "what the model of the disturbance misses"),
-        "noise": ("b_measured_nt", "b_total_nt", "the sensor's own error"),
-        "total": ("b_measured_nt", "b_truth_nt", "the reading's error, all of these together"),
+        "map": ("b_map_nt", "b_truth_nt", "error of the map at the sensor"),
+        "disturbance": ("b_total_nt", "b_truth_nt", "error of the prediction, map plus disturbance"),
+        "noise": ("b_measured_nt", "b_total_nt", "noise of the sensor"),
+        "total": ("b_measured_nt", "b_truth_nt", "error of the reading"),
     }
 )
-"""Errors of a run by their address: the two columns whose difference each is, and what it means."""
+"""Errors of a run by source: the two columns whose difference each is, and what it means."""
 
 
 def errors_of(run: Run) -> dict[str, Agreement]:

@@ -613,7 +613,7 @@ def _worth_a_map(readings: Any, found: Any, source: Path) -> Any:
     """The report with what makes a map of these readings doubtful; refused where they are too few."""
     import numpy as np
 
-    from magtwin.field.inversion import ONE_HEADING
+    from magtwin.field.problem import ONE_HEADING
 
     count, yaw, notes = int(readings.good.sum()), readings.yaw[readings.good], list[str]()
     if readings.grid is None and count < LEAST_READINGS:

@@ -22,7 +22,7 @@ def report(
 ) -> None:
     """Write what happened in a run, or in a set of runs, as one page with its pictures inside.
 
-    What was run, the map with the path, time series, errors by their address, events, and provenance.
+    What was run, the map with the path, time series, errors by source, events, and provenance.
     Several runs get an overview first.
 
     Parameters

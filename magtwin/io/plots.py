@@ -203,7 +203,8 @@ def draw_path(
         _flat_bar(ax, mesh, "map, mean over headings [µT]")
     keep = np.unique(np.linspace(0, len(p_xy) - 1, PATH_SEGMENTS + 1).astype(int))
     points, colour = p_xy[keep], total[keep]
-    ax.plot(*points.T, color="white", lw=4.5, solid_capstyle="round")
+    for colour_of_edge, width in ((INK, 5.4), ("white", 4.5)):  # one of the two differs from the map
+        ax.plot(*points.T, color=colour_of_edge, lw=width, solid_capstyle="round")
     low, high = colour_limits(total, 0)
     driven = LineCollection(
         list(np.stack([points[:-1], points[1:]], axis=1)),
