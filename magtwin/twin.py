@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 import magtwin
 from magtwin.field.map import AnomalyMap
 from magtwin.files import existing, git_revision, sha256
-from magtwin.names import RefusedError, find
+from magtwin.names import MismatchWarning, RefusedError, find
 from magtwin.obstacles import Obstacles
 from magtwin.path import Path, resolve_path
 from magtwin.run import Run
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from magtwin.sim.engine import Engine
     from magtwin.sim.lidar import Scans
     from magtwin.sim.many import Runs
+    from magtwin.sim.model_error import ModelError
     from magtwin.sim.simulate import Sensed
 
 
@@ -52,17 +54,33 @@ class Twin:
     facts: Mapping[str, str | int | float | bool] = dataclasses.field(default_factory=dict)
     """What a run is to say of the files that were opened: their names as they were given, and checksums."""
 
+    platforms: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Checksum of what makes each robot's own field, as its asset has it, by the robot's name."""
+
+    model_error: "ModelError | None" = None
+    """Statistics of the error that a neural magnetometer's readings have about what the network predicts; None
+    draws no error."""
+
 
 def open_twin(
-    scene_file: str | FilePath, *, net: str | FilePath | None = None, magnetometer: Kind | None = None
+    scene_file: str | FilePath,
+    *,
+    net: str | FilePath | None = None,
+    magnetometer: Kind | None = None,
+    model_error: bool = True,
 ) -> Twin:
     """Open a stage, the map layer and the network that it names.
+
+    Warns (`magtwin.MismatchWarning`) where the network learned on another map or another robot, or at another
+    place than the robot's own, with the expected effect. Runs keep the text as the fact `network_mismatch`.
 
     Args:
         scene_file: Root layer of a scene.
         net: Weights to use in place of those that the magnetometer names (.safetensors or .pth), for a
             neural magnetometer; or "none" for a physical one.
         magnetometer: Kind of magnetometer to use in place of the scene's: "physical", "neural" or "map-only".
+        model_error: Whether the readings of a neural magnetometer are off what the network predicts, as they
+            were on recordings that it never saw; see `magtwin.sim.model_error`.
 
     Raises:
         RefusedError: The stage, its map or its weights are missing, broken, or not what the stage's
@@ -88,10 +106,49 @@ def open_twin(
     if revision := git_revision(scene_file.parent):
         facts["git_revision"] = revision
     facts |= {"map": field.name, "map_sha256": sha256(scene.map_layer)}
-    facts |= network.facts if network else {}
+    platforms = {one.robot.name: _platform_sha256(one.robot) for one in scene.robots}
+    facts["platform_sha256"] = platforms[scene.robot.name]
+    twin = _with_network(Twin(scene, scene_file, field, network, obstacles, facts, platforms), model_error)
     if network and net is not None:
-        facts["network_file"] = FilePath(net).as_posix()
-    return Twin(scene, scene_file, field, network, obstacles, facts)
+        return dataclasses.replace(twin, facts={**twin.facts, "network_file": FilePath(net).as_posix()})
+    return twin
+
+
+def _platform_sha256(robot: RobotSpec) -> str:
+    """Checksum of what makes a robot's own field."""
+    return hashlib.sha256(repr(robot.platform).encode()).hexdigest()
+
+
+def _with_network(twin: Twin, model_error: bool) -> Twin:
+    """The twin with what its network tells: facts of runs, warnings, and the statistics of its error."""
+    network, robot = twin.magnetometer, twin.scene.robot
+    if network is None:
+        return twin
+    from magtwin.learn.origin import mismatches
+
+    found = mismatches(
+        network.net.facts,
+        network.name,
+        residual_sd_nt=network.residual_sd_nt,
+        field=twin.field,
+        map_sha256=str(twin.facts["map_sha256"]),
+        robot=robot,
+        platform_sha256=twin.platforms[robot.name],
+    )
+    facts = {**twin.facts, **network.facts}
+    texts = [one.text for one in found]
+    statistics = network.model_error() if model_error else None
+    if model_error and statistics is None:
+        texts.append(
+            f"{network.name} does not say how its error varies in time, so that readings have none about what "
+            "it predicts; train it again to have them vary as they did on recordings that it never saw"
+        )
+    for text in texts:
+        warnings.warn(text, MismatchWarning, stacklevel=3)
+    if found:
+        facts["network_mismatch"] = "; ".join(one.text for one in found)
+    facts["model_error"] = statistics is not None
+    return dataclasses.replace(twin, facts=facts, model_error=statistics)
 
 
 def _with_magnetometer(robot: RobotSpec, net: str | FilePath | None, kind: Kind | None) -> RobotSpec:
@@ -128,6 +185,7 @@ def twin_of(
         scene,
         net=network if network is None else locate(network, near) or network,
         magnetometer=kind if network is None else None,
+        model_error=bool(facts.get("model_error", False)),
     )
     for name, what in _CHECKSUMS.items() if check else ():
         if facts.get(name, "") != twin.facts.get(name, ""):
@@ -475,11 +533,16 @@ def led_by(twin: Twin, name: str) -> Twin:
     scene = twin.scene.led_by(name)
     ours, its = twin.scene.robot.magnetometer, scene.robot.magnetometer
     if (its.kind, its.network, its.network_sha256) == (ours.kind, ours.network, ours.network_sha256):
-        return dataclasses.replace(twin, scene=scene)
-    network = _magnetometer(scene)
-    facts = {k: v for k, v in twin.facts.items() if not (twin.magnetometer and k in twin.magnetometer.facts)}
-    facts |= network.facts if network else {}
-    return dataclasses.replace(twin, scene=scene, magnetometer=network, facts=facts)
+        network = twin.magnetometer
+    else:
+        network = _magnetometer(scene)
+    if name == twin.scene.robot.name:
+        return twin
+    own = {"model_error", "network_mismatch", *(twin.magnetometer.facts if twin.magnetometer else ())}
+    facts: Facts = {key: fact for key, fact in twin.facts.items() if key not in own}
+    facts["platform_sha256"] = twin.platforms[name]
+    led = dataclasses.replace(twin, scene=scene, magnetometer=network, facts=facts, model_error=None)
+    return _with_network(led, bool(twin.facts.get("model_error", True)))
 
 
 def simulate_many(

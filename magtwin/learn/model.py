@@ -16,7 +16,7 @@ from magtwin.learn.checkpoint import read_checkpoint
 from magtwin.learn.features import FULL, feature_names
 from magtwin.learn.inputs import Inputs, inputs_of
 from magtwin.learn.perceptron import outputs
-from magtwin.learn.weights import Fact, Weights, is_checkpoint, read_weights, say, write_weights
+from magtwin.learn.weights import Fact, Weights, is_checkpoint, read_weights, say, shown, write_weights
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
 
@@ -201,7 +201,7 @@ class FieldNet(torch.nn.Module):
         ]
         if not math.isnan(self.residual_sd_nt):
             figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out runs"))
-        return Report(title, tuple(figures), dict(self.facts))
+        return Report(title, tuple(figures), shown(self.facts))
 
 
 def load_net(path: str | os.PathLike[str]) -> FieldNet:

@@ -31,7 +31,7 @@ from magtwin.sim.mocap import sense_mocap
 from magtwin.sim.odometry import sense_odometry
 from magtwin.sim.replay import replayed
 from magtwin.sim.sensors import Moving, into_sensor
-from magtwin.spec import Scene
+from magtwin.spec import RobotSpec, Scene
 
 Array = NDArray[np.float64]
 
@@ -350,6 +350,7 @@ def sense(
     told: dict[str, str | int | float | bool] = {
         "scene": scene.name,
         **facts,
+        **robot_facts(robot),
         "rate_hz": float(rate_hz),
         "duration_s": round(float(end), 9),
         "outside": outside,
@@ -365,6 +366,24 @@ def sense(
         wanted=wanted,
         beside_nt=beside,
     )
+
+
+def robot_facts(robot: RobotSpec) -> dict[str, str | int | float | bool]:
+    """What a run tells of its robot, for a network that learns from it: name, sensor, motion capture.
+
+    `mocap_latency_s` is the mean age of motion capture's pose: latency, mean jitter and half a period.
+    """
+    mocap = robot.mocap
+    return {
+        "robot_name": robot.name,
+        "sensor_m": _listed(robot.p_base_magnetometer),
+        "mocap_offset_m": _listed(mocap.offset_m),
+        "mocap_latency_s": round(mocap.latency_s + mocap.jitter_s + 0.5 / mocap.rate_hz, 6),
+    }
+
+
+def _listed(values: Iterable[float]) -> str:
+    return ", ".join(f"{value:.6g}" for value in values)
 
 
 def _check_kind(scene: Scene) -> None:
