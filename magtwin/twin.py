@@ -57,9 +57,11 @@ class Twin:
     platforms: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """Checksum of what makes each robot's own field, as its asset has it, by the robot's name."""
 
+    errors: bool = True
+    """Whether readings of a neural magnetometer are to have an error about what the network predicts."""
+
     model_error: "ModelError | None" = None
-    """Statistics of the error that a neural magnetometer's readings have about what the network predicts; None
-    draws no error."""
+    """Statistics of that error; None draws none."""
 
 
 def open_twin(
@@ -108,7 +110,7 @@ def open_twin(
     facts |= {"map": field.name, "map_sha256": sha256(scene.map_layer)}
     platforms = {one.robot.name: _platform_sha256(one.robot) for one in scene.robots}
     facts["platform_sha256"] = platforms[scene.robot.name]
-    twin = _with_network(Twin(scene, scene_file, field, network, obstacles, facts, platforms), model_error)
+    twin = _with_network(Twin(scene, scene_file, field, network, obstacles, facts, platforms, model_error))
     if network and net is not None:
         return dataclasses.replace(twin, facts={**twin.facts, "network_file": FilePath(net).as_posix()})
     return twin
@@ -119,7 +121,7 @@ def _platform_sha256(robot: RobotSpec) -> str:
     return hashlib.sha256(repr(robot.platform).encode()).hexdigest()
 
 
-def _with_network(twin: Twin, model_error: bool) -> Twin:
+def _with_network(twin: Twin) -> Twin:
     """The twin with what its network tells: facts of runs, warnings, and the statistics of its error."""
     network, robot = twin.magnetometer, twin.scene.robot
     if network is None:
@@ -137,8 +139,8 @@ def _with_network(twin: Twin, model_error: bool) -> Twin:
     )
     facts = {**twin.facts, **network.facts}
     texts = [one.text for one in found]
-    statistics = network.model_error() if model_error else None
-    if model_error and statistics is None:
+    statistics = network.model_error() if twin.errors else None
+    if twin.errors and statistics is None:
         texts.append(
             f"{network.name} does not say how its error varies in time, so that readings have none about what "
             "it predicts; train it again to have them vary as they did on recordings that it never saw"
@@ -542,7 +544,7 @@ def led_by(twin: Twin, name: str) -> Twin:
     facts: Facts = {key: fact for key, fact in twin.facts.items() if key not in own}
     facts["platform_sha256"] = twin.platforms[name]
     led = dataclasses.replace(twin, scene=scene, magnetometer=network, facts=facts, model_error=None)
-    return _with_network(led, bool(twin.facts.get("model_error", True)))
+    return _with_network(led)
 
 
 def simulate_many(

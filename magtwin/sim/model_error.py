@@ -6,7 +6,7 @@ seconds, as on recordings that the network never saw.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,7 +26,14 @@ class ModelError:
     time_s: float
     """Correlation time of the rest [s]."""
 
-    def error_nt(self, sd_nt: ArrayLike, offset: float, process: ArrayLike) -> Array:
+    offset: float = 0.0
+    """The session's own number, standard normal; see `in_session`."""
+
+    def in_session(self, rng: np.random.Generator) -> "ModelError":
+        """The same statistics with the number of one session drawn."""
+        return replace(self, offset=float(rng.standard_normal()))
+
+    def error_nt(self, sd_nt: ArrayLike, process: ArrayLike, offset: ArrayLike | None = None) -> Array:
         """Errors of readings from normal numbers of unit variance.
 
             e_t = c_t o + sqrt(sd_t^2 - c_t^2) u_t,   c_t = min(offset_sd, sd_t)
@@ -36,17 +43,18 @@ class ModelError:
 
         Args:
             sd_nt: Predicted standard deviations [nT], shape (N,); where unknown (nan) the error is 0.
-            offset: o, one number for a session; or one for each reading, shape (N,).
             process: u at each reading, shape (N,).
+            offset: o of each reading, shape (N,), where readings are of several sessions; default: the
+                session's own.
 
         Returns:
             Errors [nT], shape (N,).
         """
         sd = np.nan_to_num(np.asarray(sd_nt, float))
         constant = np.minimum(self.offset_sd_nt, sd)
-        return np.asarray(
-            constant * offset + np.sqrt(np.maximum(sd * sd - constant * constant, 0.0)) * process
-        )
+        rest = np.sqrt(np.maximum(sd * sd - constant * constant, 0.0))
+        o = self.offset if offset is None else np.asarray(offset, float)
+        return np.asarray(constant * o + rest * np.asarray(process, float))
 
     def process(self, white: ArrayLike, rate_hz: float) -> Array:
         """u of successive readings, a Gauss-Markov process of correlation time `time_s`.

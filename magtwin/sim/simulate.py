@@ -28,6 +28,7 @@ from magtwin.sim.interference import field_at_sensor_nt, level_gradient_nt_m, se
 from magtwin.sim.lidar import lidar_on
 from magtwin.sim.magnetometer import LOCK_RATE_HZ, feels_direction, lost_in, sense_axes, sense_magnetometer
 from magtwin.sim.mocap import sense_mocap
+from magtwin.sim.model_error import ModelError
 from magtwin.sim.odometry import sense_odometry
 from magtwin.sim.replay import replayed
 from magtwin.sim.sensors import Moving, into_sensor
@@ -35,13 +36,19 @@ from magtwin.spec import RobotSpec, Scene
 
 Array = NDArray[np.float64]
 
+Predict = Callable[[Run], tuple[NDArray[Any], NDArray[Any]]]
+"""From a Run to the disturbance of each reading and the standard deviation of its error [nT], each (N,)."""
+
 RANDOM_S = 60.0
 """How long a driver drives about unless told otherwise [s]."""
 
 MOST_READINGS = 20_000_000
 """Most readings of a run: about 8 GB of columns."""
 
-_STREAMS = ("odometry", "imu", "battery", "magnetometer", "mocap", "lidar", "drive", "driver")
+_STREAMS = (
+    *("odometry", "imu", "battery", "magnetometer", "mocap", "lidar", "drive", "driver"),
+    "model_error",
+)
 """Who draws random numbers, each from a child generator of its own; append only: the order is the seed."""
 
 
@@ -50,7 +57,9 @@ _IMU = frozenset(("imu_q_xyzw", "imu_w", "imu_a"))
 _MOCAP = frozenset(("mocap_p", "mocap_q_xyzw", "flag_pose_lost"))
 _BATTERY = frozenset(("battery_v", "battery_a", "battery_fraction"))
 _EXACT = frozenset(("b_vector_nt", "b_truth_nt", "b_vector_measured_nt"))
-_READ = frozenset(("b_measured_nt", "b_noise_nt", "b_vector_measured_nt", "flag_lost_lock"))
+_READ = frozenset(
+    ("b_measured_nt", "b_model_error_nt", "b_noise_nt", "b_vector_measured_nt", "flag_lost_lock")
+)
 """Columns that are made together."""
 
 
@@ -70,14 +79,16 @@ def simulate(
     rate_hz: float | None = None,
     obstacles: Obstacles | None = None,
     controller: str | Controller = "follower",
-    disturbance_nt: Callable[[Run], NDArray[Any]] | None = None,
+    disturbance_nt: Predict | None = None,
+    model_error: ModelError | None = None,
     outside: Literal["nan", "clamp", "raise"] = "nan",
     lidar: Literal["schedule", "on", "off"] = "schedule",
     engine: Engine | None = None,
 ) -> Run:
     """Drive a scene's robot along a path and read its sensors.
 
-    b_total = b_map + b_disturbance, b_map at base_link's pose, and b_measured = b_total + b_noise. The
+    b_total = b_map + b_disturbance, b_map at base_link's pose, and b_measured = b_total + b_noise, and of a
+    neural magnetometer b_model_error besides. The
     disturbance is what `disturbance_nt` predicts, for a neural magnetometer; without it, for a physical
     one, b_truth - b_map: the exact field of the Earth, the scene's sources and the robot itself at the
     magnetometer, less the map; for one of the kind "map-only" it is 0. Where the scene's Earth field is
@@ -97,7 +108,8 @@ def simulate(
         obstacles: What the path must be clear of, and what stops the robot if it leaves its path.
         controller: A name of `magtwin.sim.controllers.CONTROLLERS`, or a controller of one's own.
         disturbance_nt: From a Run in which every other sensor has been read, the vector axes too, to the
-            disturbance of each reading [nT], shape (N,). Called once.
+            disturbance of each reading and the standard deviation of its error [nT], each (N,). Called once.
+        model_error: Statistics of that error, which is drawn then; None draws none.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
         engine: What moves the robot; None is the kinematic one. A Run is not moved anew.
@@ -129,7 +141,7 @@ def simulate(
         facts=facts,
         network=disturbance_nt is not None,
     )
-    return sensed.read(None if disturbance_nt is None else disturbance_nt(sensed.run))
+    return sensed.read(None if disturbance_nt is None else disturbance_nt(sensed.run), model_error)
 
 
 def travel(
@@ -227,35 +239,48 @@ class Sensed:
     rng: np.random.Generator
     """Source of the magnetometer's noise; spent by one reading."""
 
+    error_rng: np.random.Generator
+    """Source of the error of a network's predictions; spent by one reading."""
+
     wanted: frozenset[str]
     """Columns of `COLUMNS` that the whole run is to have."""
 
     beside_nt: Array | float = 0.0
     """What other robots add to the field's magnitude at each reading [nT], shape (N,); 0 without others."""
 
-    def read(self, disturbance_nt: NDArray[Any] | None = None) -> Run:
+    def read(
+        self,
+        predicted: tuple[NDArray[Any], NDArray[Any]] | None = None,
+        model_error: ModelError | None = None,
+    ) -> Run:
         """The whole run, of the columns that are wanted.
 
         Args:
-            disturbance_nt: What a network predicts for each reading [nT], shape (N,); none for a magnetometer
-                without one.
+            predicted: Disturbance of each reading by a network, and the standard deviation of its error [nT],
+                each (N,); None for a magnetometer without a network.
+            model_error: Statistics of that error; None draws none.
         """
         columns, spec = dict(self.run.columns), self.scene.robot.magnetometer
         rows = len(columns["t"])
-        if disturbance_nt is None:
+        error = np.zeros(rows)
+        if predicted is None:
             exact = columns["b_truth_nt"] - columns["b_map_nt"]
             disturbance = exact if spec.kind == "physical" else np.zeros(rows)
         else:
-            disturbance = np.asarray(disturbance_nt, float)
+            disturbance = np.asarray(predicted[0], float)
+            if model_error is not None:
+                white = self.error_rng.standard_normal(rows)
+                error = model_error.error_nt(predicted[1], model_error.process(white, self.rate_hz))
             if disturbance.shape != (rows,):
                 raise RefusedError(f"disturbance_nt must give shape {(rows,)}, got {disturbance.shape}")
             disturbance = disturbance + self.beside_nt
         columns["b_disturbance_nt"] = disturbance
         columns["b_total_nt"] = columns["b_map_nt"] + disturbance
+        columns["b_model_error_nt"] = error
         if self.wanted & _READ:
             columns |= sense_magnetometer(
                 spec,
-                columns["b_total_nt"],
+                columns["b_total_nt"] + error,
                 columns["b_vector_nt"] if "b_vector_nt" in columns else np.full((rows, 3), np.nan),
                 self.rng,
                 rate_hz=self.rate_hz,
@@ -363,6 +388,7 @@ def sense(
         rate_hz=rate_hz,
         steep=steep,
         rng=draws["magnetometer"],
+        error_rng=draws["model_error"],
         wanted=wanted,
         beside_nt=beside,
     )
