@@ -21,6 +21,7 @@ from magtwin.run import Run
 from magtwin.spec import MagnetometerSpec, RobotSpec, Scene
 
 Kind = Literal["physical", "neural", "map-only"]
+Session = int | Literal["survey"]
 Facts = dict[str, str | int | float | bool]
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from magtwin.sim.lidar import Scans
     from magtwin.sim.many import Runs
     from magtwin.sim.model_error import ModelError
-    from magtwin.sim.simulate import Sensed
+    from magtwin.sim.simulate import Predict, Sensed
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,9 @@ class Twin:
 
     model_error: "ModelError | None" = None
     """Statistics of that error; None draws none."""
+
+    session: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
+    """Facts of the session that the robots are in (`session`, `session_seed`); empty before one is chosen."""
 
 
 def open_twin(
@@ -201,33 +205,70 @@ def twin_of(
 _CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_sha256": "the scene"}
 
 
-def on_its_day(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> Twin:
-    """The twin with its robot as it was on a run's day, where `magtwin runs` dealt the run to one.
+def in_session(twin: Twin, session: Session | None = None, *, seed: int = 0) -> Twin:
+    """The twin with its robots as they are in one session, from switching on to switching off.
 
     Args:
-        twin: The twin of the run.
-        facts: Those of the run.
+        twin: What `open_twin` gave.
+        session: Number of a session to draw from the seed: battery charge, IMU zero, wheels, odometry and
+            the robot's own field differ from session to session. "survey" is the robot as it was when the
+            map was surveyed, without these changes. Default: the session that the twin is in already, or
+            else session 0.
+        seed: Seed of the draw.
+
+    Returns:
+        A twin whose `session` says which session it is. Several robots are drawn independently.
 
     Raises:
-        RefusedError: They do not say which day that was.
+        RefusedError: `session` is neither, or the twin is in a session already.
     """
     from magtwin.sim.session import session_of
 
+    if twin.session:
+        if session is None:
+            return twin
+        raise RefusedError(f"the twin is in session {twin.session['session']!r} already; open another")
+    if session == "survey":
+        return dataclasses.replace(twin, session={"session": "survey"})
+    number = 0 if session is None else session
+    if not isinstance(number, int | np.integer) or isinstance(number, bool) or number < 0:
+        raise RefusedError(f'session must be a whole number from 0 up, or "survey", got {session!r}')
+    number, seed = int(number), _seed(seed)
+    scene = dataclasses.replace(
+        twin.scene,
+        robot=session_of(twin.scene.robot, seed, number),
+        others=tuple(
+            dataclasses.replace(other, robot=session_of(other.robot, seed, number, which=k))
+            for k, other in enumerate(twin.scene.others, 1)
+        ),
+    )
+    return dataclasses.replace(twin, scene=scene, session={"session": number, "session_seed": seed})
+
+
+def in_session_of(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> Twin:
+    """The twin in the session of a run.
+
+    Args:
+        twin: The twin of the run.
+        facts: Those of the run. Without `session_seed`, the run is of the robot as it was surveyed.
+
+    Raises:
+        RefusedError: The facts do not say which session it was.
+    """
     if "session_seed" not in facts:
-        return twin
+        return in_session(twin, "survey")
     try:
-        seed, day = int(facts["session_seed"]), int(facts["session"])
+        seed, session = int(facts["session_seed"]), int(facts["session"])
     except (KeyError, ValueError) as error:
         raise RefusedError(f"the facts of the run do not say which session it was of: {error}") from error
-    robot = session_of(twin.scene.robot, seed, day)
-    return dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot))
+    return in_session(twin, session, seed=seed)
 
 
 def check_figures(scene: Scene, facts: Mapping[str, str | int | float | bool], name: str) -> None:
     """Refuse a scene that is not, figure by figure, the one that a run came from.
 
     Args:
-        scene: The scene, its robot as it was on the run's day.
+        scene: The scene, its robot as it was in the run's session.
         facts: Those of the run.
         name: What to call the run.
 
@@ -237,8 +278,8 @@ def check_figures(scene: Scene, facts: Mapping[str, str | int | float | bool], n
     found, said = _config_sha256(scene), facts.get("config_sha256", "none")
     if found != said:
         raise RefusedError(
-            f"{name}: came from a scene whose figures have the sha256 {said}, those of {scene.name!r} on its "
-            f"day have {found}; name the scene that it was made in"
+            f"{name}: came from a scene whose figures have the sha256 {said}, those of {scene.name!r} in its "
+            f"session have {found}; name the scene that it was made in"
         )
 
 
@@ -358,11 +399,13 @@ def simulate(
     path: "Path | Commands | Run | str" = "figure8",
     *,
     seed: int = 0,
+    session: Session | None = None,
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
     net: str | FilePath | None = None,
     magnetometer: Kind | None = None,
+    model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: "str | Controller" = "follower",
@@ -376,12 +419,17 @@ def simulate(
         path: A path, the name of one, or a CSV file of x, y [m]; "random", for a human-like driver who goes
             where the seed takes them; Commands, to be played; or a Run, to be driven once more as it was
             recorded, with the sensors as the scene has them now.
-        seed: Seed of all noise; one seed, one Run.
+        seed: Seed of all noise. The same seed gives the same bytes.
+        session: Which session the robot is in, as for `in_session`: default, one drawn from the seed.
+            "survey" is the robot as it was when the map was surveyed, which a network that was trained on
+            later sessions does not know.
         speed: Forward speed where the path is straight [m/s].
         duration_s: How long to drive [s]; None is once along the path, longer gives further laps.
         rate_hz: Magnetometer readings a second [Hz]; None takes the scene's.
         net: As for `open_twin`, where `twin` is a file.
         magnetometer: As for `open_twin`, where `twin` is a file.
+        model_error: Whether readings of a neural magnetometer have an error about what the network predicts;
+            see `open_twin`.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
         controller: What drives: "follower", "release", "stanley" or "pure_pursuit", or a
@@ -398,17 +446,18 @@ def simulate(
     """
     from magtwin.sim.simulate import simulate as run_scene
 
-    twin, seed = _opened(twin, net, magnetometer, "simulate"), _seed(seed)
+    seed = _seed(seed)
+    twin = in_session(_opened(twin, net, magnetometer, model_error, "simulate"), session, seed=seed)
     network = twin.magnetometer
     path = way_of(path)
     _check_commands(path, network)
     read: Read | None = None
 
-    def disturbance_nt(run: Run) -> NDArray[Any]:
+    def disturbance_nt(run: Run) -> tuple[NDArray[Any], NDArray[Any]]:
         nonlocal read
         assert network is not None
         (read,) = network.read([run])
-        return read.disturbance_nt
+        return read.disturbance_nt, read.sd_nt
 
     run = run_scene(
         twin.scene,
@@ -419,6 +468,7 @@ def simulate(
         duration_s=duration_s,
         rate_hz=rate_hz,
         disturbance_nt=disturbance_nt if network else None,
+        model_error=model_error_of(twin, seed),
         outside=outside,
         lidar=lidar,
         obstacles=twin.obstacles,
@@ -430,6 +480,21 @@ def simulate(
     )
 
 
+def model_error_of(twin: Twin, seed: int, *, which: int = 0) -> "ModelError | None":
+    """Statistics of the model error of a twin in its session; None where none is to be drawn.
+
+    Args:
+        twin: What `in_session` gave.
+        seed: Seed of the run.
+        which: Place of the robot in a scene of several, from 0.
+    """
+    from magtwin.sim.session import offset_generator
+
+    if twin.model_error is None:
+        return None
+    return twin.model_error.in_session(offset_generator(twin.session, seed, which=which))
+
+
 def simulate_robots(
     twin: Twin | str | FilePath,
     paths: "Mapping[str, Path | Commands | Run | str | FilePath] | None" = None,
@@ -437,11 +502,13 @@ def simulate_robots(
     robots: Iterable[str] | None = None,
     meet: Literal["refuse", "flag"] = "refuse",
     seed: int = 0,
+    session: Session | None = None,
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
     net: str | FilePath | None = None,
     magnetometer: Kind | None = None,
+    model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: str = "follower",
@@ -460,11 +527,13 @@ def simulate_robots(
         meet: What becomes of robots whose footprints overlap: a refusal with time and place, or flag_bump in
             both while it lasts; they drive through each other.
         seed: As for `simulate`.
+        session: As for `simulate`; each robot is drawn by itself.
         speed: As for `simulate`, of each.
         duration_s: As for `simulate`, of each.
         rate_hz: As for `simulate`.
         net: As for `open_twin`, where `twin` is a file; of each robot.
         magnetometer: As for `open_twin`, where `twin` is a file; of each robot.
+        model_error: As for `simulate`.
         lidar: As for `simulate`.
         outside: As for `simulate`.
         controller: A name of `magtwin.sim.controllers.CONTROLLERS`.
@@ -478,7 +547,8 @@ def simulate_robots(
     """
     from magtwin.sim.together import simulate_together
 
-    twin, seed = _opened(twin, net, magnetometer, "simulate_robots"), _seed(seed)
+    seed = _seed(seed)
+    twin = in_session(_opened(twin, net, magnetometer, model_error, "simulate_robots"), session, seed=seed)
     placed = {one.robot.name: one for one in twin.scene.robots}
     for name in (*(paths or {}), *(robots or ())):
         find("robot", name, placed)
@@ -491,10 +561,10 @@ def simulate_robots(
         _check_commands(way, led[name].magnetometer)
     reads: dict[str, Read] = {}
 
-    def disturbance_of(name: str, network: "NeuralMagnetometer") -> Callable[[Run], NDArray[Any]]:
-        def disturbance_nt(run: Run) -> NDArray[Any]:
+    def disturbance_of(name: str, network: "NeuralMagnetometer") -> "Predict":
+        def disturbance_nt(run: Run) -> tuple[NDArray[Any], NDArray[Any]]:
             (reads[name],) = network.read([run])
-            return reads[name].disturbance_nt
+            return reads[name].disturbance_nt, reads[name].sd_nt
 
         return disturbance_nt
 
@@ -515,6 +585,7 @@ def simulate_robots(
         obstacles=twin.obstacles,
         controller=controller,
         disturbances_nt=disturbances,
+        model_errors={name: model_error_of(led[name], seed, which=k) for k, name in enumerate(placed)},
         outside=outside,
         lidar=lidar,
     )
@@ -552,14 +623,16 @@ def simulate_many(
     paths: "Path | Commands | Run | str | FilePath | Iterable[Path | Commands | Run | str | FilePath]",
     seeds: Iterable[int],
     *,
+    session: Session | None = None,
     speeds: float | Iterable[float] = 0.2,
-    robots: RobotSpec | Iterable[RobotSpec] | None = None,
+    robots: RobotSpec | Twin | Iterable[RobotSpec | Twin] | None = None,
     columns: Iterable[str] | None = None,
     block: int | None = None,
     duration_s: float | None = None,
     rate_hz: float | None = None,
     net: str | FilePath | None = None,
     magnetometer: Kind | None = None,
+    model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: str = "follower",
@@ -575,15 +648,18 @@ def simulate_many(
         twin: What `open_twin` gave, or the file of a scene.
         paths: What is driven in each run, as for `simulate`, or one for all.
         seeds: A seed for each run; their number is that of the runs.
+        session: As for `simulate`, each run's drawn from its own seed.
         speeds: Forward speed of each where its path is straight [m/s], or one for all.
-        robots: What drives in each, such as `magtwin.sim.session.draw_session` gives, or one for all; None
-            takes the scene's.
+        robots: What drives in each, as it is, such as `magtwin.sim.session.draw_session` gives, or one for
+            all; or the twin in a session, as `in_session` gives it. Default: the scene's robot, in its
+            session.
         columns: Columns to keep, beside t; None keeps all.
         block: Runs made at a time; None takes what fits into 0.1 GB for runs of a minute.
         duration_s: As for `simulate`, of each run.
         rate_hz: As for `simulate`.
         net: As for `simulate`.
         magnetometer: As for `simulate`.
+        model_error: As for `simulate`.
         lidar: As for `simulate`.
         outside: As for `simulate`.
         controller: A name of `magtwin.sim.controllers.CONTROLLERS`.
@@ -597,7 +673,7 @@ def simulate_many(
     """
     from magtwin.sim.many import BLOCK, Conditions, Job, Runs
 
-    twin = _opened(twin, net, magnetometer, "simulate_many")
+    twin = _opened(twin, net, magnetometer, model_error, "simulate_many")
     numbers = [_seed(seed) for seed in seeds]
     if not isinstance(controller, str):
         raise RefusedError(
@@ -607,8 +683,10 @@ def simulate_many(
     count = len(numbers)
     given = _each("paths", paths, count)
     resolved: dict[Any, Any] = {path: way_of(path) for path in given if isinstance(path, str | FilePath)}
-    scenes: dict[int, Scene] = {}
-    jobs = []
+    if robots is not None and session is not None:
+        raise RefusedError("robots are taken as they are; give robots or session, not both")
+    jobs, of = [], {}
+    drawn: dict[object, Scene] = {}
     for seed, path, speed, robot in zip(
         numbers,
         given,
@@ -616,16 +694,23 @@ def simulate_many(
         _each("robots", robots, count),
         strict=True,
     ):
-        if robot is not None and id(robot) not in scenes:
-            _check_magnetometer(twin, robot)
-            scenes[id(robot)] = dataclasses.replace(twin.scene, robot=robot)
-        scene = twin.scene if robot is None else scenes[id(robot)]
+        key: object = seed if robot is None else ("robot", id(robot))
+        if key not in drawn:
+            if robot is None:
+                own = in_session(twin, session, seed=seed)
+            elif isinstance(robot, Twin):
+                _check_magnetometer(twin, robot.scene.robot)
+                own = robot if model_error else without_model_error(robot)
+            else:
+                _check_magnetometer(twin, robot)
+                own = dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot))
+            drawn[key] = own.scene
+            of[id(own.scene)] = own, _config_sha256(own.scene)
         if isinstance(path, str | FilePath):
             path = resolved[path]
         _check_commands(path, twin.magnetometer)
-        jobs.append(Job(scene, path, seed, speed))
+        jobs.append(Job(drawn[key], path, seed, speed))
     network = twin.magnetometer
-    configs = {id(scene): _config_sha256(scene) for scene in (twin.scene, *scenes.values())}
 
     def finish(jobs: Sequence[Job], sensed: Sequence["Sensed"]) -> list[Run]:
         rows = [one.run for one in sensed]
@@ -633,11 +718,12 @@ def simulate_many(
         told = network.read(rows, outside=flagged) if network else [None] * len(rows)
         runs = []
         for job, one, read in zip(jobs, sensed, told, strict=True):
-            run = one.read(read.disturbance_nt if read else None)
+            own, config = of[id(job.scene)]
+            predicted = (read.disturbance_nt, read.sd_nt) if read else None
+            run = one.read(predicted, model_error_of(own, job.seed))
             known = _known(job.scene, run, read)
             run = run.with_columns(**{name: known[name] for name in known.keys() & run.keys()})
-            config = configs[id(job.scene)]
-            runs.append(run.with_facts(**_facts(twin, job.seed, job.path, duration_s, config)))
+            runs.append(run.with_facts(**_facts(own, job.seed, job.path, duration_s, config)))
         return runs
 
     conditions = Conditions(
@@ -655,14 +741,24 @@ def simulate_many(
 
 
 def _opened(
-    twin: Twin | str | FilePath, net: str | FilePath | None, magnetometer: Kind | None, what: str
+    twin: Twin | str | FilePath,
+    net: str | FilePath | None,
+    magnetometer: Kind | None,
+    model_error: bool,
+    what: str,
 ) -> Twin:
     """A twin, opened if it is not."""
     if not isinstance(twin, Twin):
-        return open_twin(twin, net=net, magnetometer=magnetometer)
+        return open_twin(twin, net=net, magnetometer=magnetometer, model_error=model_error)
     if net is not None or magnetometer is not None:
         raise RefusedError(f"net and magnetometer go to open_twin where a Twin is given to {what}")
-    return twin
+    return twin if model_error else without_model_error(twin)
+
+
+def without_model_error(twin: Twin) -> Twin:
+    """The twin, with readings of a neural magnetometer that are what its network predicts."""
+    facts = twin.facts if twin.magnetometer is None else {**twin.facts, "model_error": False}
+    return dataclasses.replace(twin, errors=False, model_error=None, facts=facts)
 
 
 def _seed(seed: object) -> int:
@@ -721,7 +817,7 @@ def _facts(
     facts: Facts = {"magtwin": magtwin.__version__, "numpy": np.__version__, "seed": seed}
     if duration_s is not None:
         facts["asked_duration_s"] = float(duration_s)
-    return facts | path_facts(path) | dict(twin.facts) | {"config_sha256": config_sha256}
+    return facts | dict(twin.session) | path_facts(path) | dict(twin.facts) | {"config_sha256": config_sha256}
 
 
 def path_facts(path: "Path | Commands | Run | str") -> Facts:

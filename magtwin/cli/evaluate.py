@@ -221,7 +221,7 @@ def _budget(
     """The error budget of a twin, as a section and in figures."""
     from magtwin.io.budgets import section_of_budget
     from magtwin.learn.budget import Truth, budgets, steps, true_errors
-    from magtwin.twin import Twin, check_figures, on_its_day, open_twin
+    from magtwin.twin import Twin, check_figures, in_session_of, open_twin
 
     twins: dict[Any, Twin] = {}
 
@@ -231,7 +231,7 @@ def _budget(
         return twins[kind]
 
     def day_of(name: str, run: "Run") -> "Scene":
-        day = on_its_day(opened(run.facts.get("magnetometer")), run.facts).scene
+        day = in_session_of(opened(run.facts.get("magnetometer")), run.facts).scene
         check_figures(day, run.facts, name)
         return day
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Seed, Whole, announcer, say
+from magtwin.cli.terminal import Force, Seed, Session, Whole, announcer, say
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ def sim(
     speed: float = 1.0,
     duration: float | None = None,
     seed: Seed = 0,
+    session: Session = None,
     net: Path | None = None,
     rate_hz: float | None = None,
     profile: Profile = "ros",
@@ -110,6 +111,8 @@ def sim(
         How long, in sim time [s]; without an end unless given.
     seed
         Seed of all noise.
+    session
+        As for `magtwin run`.
     net
         Weights to use in place of the scene's; "none" for a physical magnetometer.
     rate_hz
@@ -138,6 +141,7 @@ def sim(
             twin,
             bus,
             seed=seed,
+            session=session,
             speed=speed,
             rate_hz=rate_hz,
             units=units or UNITS[profile],

@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, Seed, announcer, check_suffix, print_report, progress, say
+from magtwin.cli.terminal import (
+    Force,
+    Json,
+    Seed,
+    Session,
+    announcer,
+    check_suffix,
+    print_report,
+    progress,
+    say,
+)
 from magtwin.names import RefusedError, find
 
 if TYPE_CHECKING:
@@ -60,12 +70,7 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
             scene_file,
             "figure8",
             folder,
-            # a day as those that its network learned from: the robot as it ships is that of the survey
-            facts={
-                "scene_file": scene_file.relative_to(folder).as_posix(),
-                "session_seed": seed,
-                "session": 0,
-            },
+            facts={"scene_file": scene_file.relative_to(folder).as_posix()},
             steps=steps,
             seed=seed,
             speed=0.2,
@@ -93,6 +98,7 @@ def run(
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     seed: Seed = 0,
+    session: Session = None,
     speed: float = 0.2,
     duration: float | None = None,
     rate_hz: float | None = None,
@@ -148,7 +154,11 @@ def run(
         What it reads, in place of what the scene says: the exact field (physical), the map and what a
         network predicts (neural), or the map alone (map-only).
     seed
-        Seed of all noise; one seed, one Run.
+        Seed of all noise. The same seed gives the same bytes.
+    session
+        Number of a session to draw from the seed: charge, IMU zero, wheels, odometry and the robot's own
+        field differ from session to session. "survey" takes the robot as it was when the map was surveyed.
+        Default: 0.
     speed
         Forward speed where the path is straight [m/s].
     duration
@@ -238,6 +248,7 @@ def run(
         "net": net,
         "magnetometer": magnetometer,
         "seed": seed,
+        "session": session,
         "speed": speed,
         "duration_s": duration,
         "rate_hz": rate_hz,
@@ -325,18 +336,19 @@ def _drive(
     replay: Path | None = None,
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    seed: int = 0,
+    session: int | Literal["survey"] | None = None,
     facts: Mapping[str, str | int] = MappingProxyType({}),
     **options: Any,
 ) -> _Driven:
     """Run a scene: along `path`, unless commands or a run say otherwise.
 
-    `facts` say where files will lie as seen from the run's own, for those that move with it, and on which day
-    it drives, if on one (`session_seed`, `session`).
+    `facts` say where files will lie as seen from the run's own, for those that move with it.
     """
     from magtwin.io.formats import read_run
     from magtwin.path import resolve_path
     from magtwin.sim.commands import read_commands
-    from magtwin.twin import on_its_day, open_twin, scan, simulate
+    from magtwin.twin import in_session, open_twin, scan, simulate
 
     planned = None
     what: Any = path
@@ -346,7 +358,7 @@ def _drive(
         what = read_run(replay)
     elif path != "random":
         what = planned = resolve_path(path)
-    twin = on_its_day(open_twin(scene_file, net=net, magnetometer=magnetometer), facts)
+    twin = in_session(open_twin(scene_file, net=net, magnetometer=magnetometer), session, seed=seed)
     if commands is not None and what.beyond(twin.scene.robot.drive):
         print(f"  {what.beyond(twin.scene.robot.drive)}", file=sys.stderr)  # noqa: T201
     steps(f"Driving {planned.name if planned else path}")
@@ -354,11 +366,11 @@ def _drive(
         facts = {"replay_file": replay.as_posix(), **facts}
     slow = options.get("engine") == "newton" and sys.stderr.isatty()
     with progress("  Newton") if slow else nullcontext() as advance:
-        result = simulate(twin, what, progress=advance, **options).with_facts(**facts)
+        result = simulate(twin, what, seed=seed, progress=advance, **options).with_facts(**facts)
     seen = None
     if scans:
         steps("Casting the LiDAR's rays")
-        seen = scan(twin, result, seed=options["seed"])
+        seen = scan(twin, result, seed=seed)
     return _Driven(result, twin, planned, seen)
 
 

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -21,6 +21,20 @@ def _whole(kind: type, tokens: Any) -> int:
 
 Whole = Annotated[int, Parameter(converter=_whole)]
 Seed = Whole
+
+
+def _session(kind: Any, tokens: Any) -> int | str:
+    """A session: its number, or "survey"."""
+    text = tokens[0].value
+    if text == "survey":
+        return "survey"
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError(f"a session is a whole number, or survey; got {text!r}") from None
+
+
+Session = Annotated[int | Literal["survey"] | None, Parameter(converter=_session)]
 Force = Annotated[bool, Parameter(name="--force", negative="")]
 Json = Annotated[bool, Parameter(name="--json", negative="")]
 

@@ -87,16 +87,18 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
     )
 
 
-def session_of(robot: RobotSpec, seed: int, day: int) -> RobotSpec:
-    """The robot as it is on one of the days of a data set, which its seed and the day's number decide.
+def session_of(robot: RobotSpec, seed: int, session: int, *, which: int = 0) -> RobotSpec:
+    """The robot as it is in one session of a data set, which a seed and the session's number decide.
 
     Args:
         robot: The robot as its asset has it.
         seed: Seed of the data set.
-        day: Number of the day, from 0.
+        session: Number of the session, from 0.
+        which: Place of the robot in a scene of several, from 0.
     """
+    key = (0, session, which) if which else (0, session)
     return draw_session(
-        robot, np.random.default_rng(np.random.SeedSequence((seed, 1), spawn_key=(0, day)))
+        robot, np.random.default_rng(np.random.SeedSequence((seed, 1), spawn_key=key))
     )  # a child that no run draws from
 
 
