@@ -122,8 +122,8 @@ def residuals(held: Sequence[Held]) -> Residuals | None:
             found = crossed
         else:
             x = np.divide(time_s, lengths, out=np.full(len(lengths), np.inf), where=lengths > 0)
-            g = np.where(x < 1e3, 2 * x - 2 * x**2 * -np.expm1(-1 / np.minimum(x, 1e3)), 1.0)
-            g = float(np.mean(g))
+            x = np.clip(x, 1e-9, 1e3)  # at 1e3 the mean of a recording is as good as its every row
+            g = float(np.mean(2 * x - 2 * x**2 * -np.expm1(-1 / x)))
             found = (float(np.mean(means**2)) - variance * g) / max(1 - g, 1e-3)
         share = min(max(found / variance, 0.0), 1.0)
         count = len(sessions)
@@ -177,4 +177,4 @@ def _autocovariance(held: Sequence[Held]) -> tuple[Array, Array]:
             pairs[k] += float(known[: len(e) - k] @ known[k:])
     with np.errstate(invalid="ignore", divide="ignore"):
         products = sums / pairs
-    return np.arange(count) * step, products
+    return np.asarray(np.arange(count) * step, np.float64), np.asarray(products, np.float64)

@@ -113,10 +113,9 @@ def offset_generator(
         seed: Seed of the run.
         which: Place of the robot in a scene of several, from 0.
     """
+    entropy, key = seed, (3, 0, which)
     if "session_seed" in session:
         entropy, key = int(session["session_seed"]), (2, int(session["session"]), which)
-    else:
-        entropy, key = seed, (3, which)
     return np.random.default_rng(np.random.SeedSequence((entropy, 1), spawn_key=key))
 
 
