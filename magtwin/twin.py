@@ -146,8 +146,8 @@ def _with_network(twin: Twin) -> Twin:
     statistics = network.model_error() if twin.errors else None
     if twin.errors and statistics is None:
         texts.append(
-            f"{network.name} does not say how its error varies in time, so that readings have none about what "
-            "it predicts; train it again to have them vary as they did on recordings that it never saw"
+            f"{network.name} does not say how its error varies in time, so none is drawn and readings are as "
+            "near to its predictions as the sensor's noise; train it again to change that"
         )
     for text in texts:
         warnings.warn(text, MismatchWarning, stacklevel=3)

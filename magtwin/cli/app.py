@@ -2,13 +2,17 @@
 
 import signal
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 from cyclopts import App
 from cyclopts.config import Env, Toml
 from cyclopts.exceptions import CycloptsError
 
 import magtwin
-from magtwin.names import RefusedError
+from magtwin.names import MismatchWarning, RefusedError
 
 app = App(
     name="magtwin",
@@ -27,7 +31,8 @@ def main(arguments: list[str] | None = None) -> None:
     debug = "--debug" in arguments
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what is half-written goes
     try:
-        app([a for a in arguments if a != "--debug"], exit_on_error=False, result_action="return_value")
+        with _warnings_in_lines():
+            app([a for a in arguments if a != "--debug"], exit_on_error=False, result_action="return_value")
     except CycloptsError:
         sys.exit(2)
     except KeyboardInterrupt:
@@ -43,6 +48,27 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(error, OSError | MemoryError):
             _fail(f"{error} ({type(error).__name__})")
         _fail(f"a fault of magtwin's own, {type(error).__name__}: {error}; --debug shows where, do report it")
+
+
+@contextmanager
+def _warnings_in_lines() -> Iterator[None]:
+    """Show a MismatchWarning as one line on stderr, each text once in a command; other warnings as ever."""
+    told: set[str] = set()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", MismatchWarning)
+        show = warnings.showwarning
+
+        def line(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if not issubclass(category, MismatchWarning):
+                show(message, category, *where, **more)
+            elif str(message) not in told:
+                told.add(str(message))
+                text = f"magtwin: warning: {' '.join(str(message).split())}"
+                loud = sys.stderr.isatty()  # yellow and bold
+                print(f"\033[1;33m{text}\033[0m" if loud else text, file=sys.stderr)  # noqa: T201
+
+        warnings.showwarning = line
+        yield
 
 
 def _fail(text: str) -> None:

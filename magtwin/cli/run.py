@@ -35,7 +35,14 @@ if TYPE_CHECKING:
 
 
 @app.command
-def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json: Json = False) -> None:
+def demo(
+    *,
+    out: Path = Path("demo"),
+    seed: Seed = 0,
+    model_error: bool = True,
+    force: Force = False,
+    json: Json = False,
+) -> None:
     """Author a lab and a TurtleBot 4, drive a figure of eight, log what the magnetometer reads.
 
     Writes the stages, run.rrd (opens in Rerun), run.parquet and pictures. Takes under a minute.
@@ -46,6 +53,8 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
         Folder to make.
     seed
         Seed of all noise.
+    model_error
+        As for `magtwin run`.
     force
         Replace the folder if it exists.
     json
@@ -73,6 +82,7 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
             facts={"scene_file": scene_file.relative_to(folder).as_posix()},
             steps=steps,
             seed=seed,
+            model_error=model_error,
             speed=0.2,
             title=f"Demo in {out}",
         )
@@ -97,6 +107,7 @@ def run(
     controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    model_error: bool = True,
     seed: Seed = 0,
     session: Session = None,
     speed: float = 0.2,
@@ -153,6 +164,9 @@ def run(
     magnetometer
         What it reads, in place of what the scene says: the exact field (physical), the map and what a
         network predicts (neural), or the map alone (map-only).
+    model_error
+        Let readings of a neural magnetometer be off what its network predicts, as they were on recordings
+        that it never saw. --no-model-error: they are the prediction and the sensor's own noise.
     seed
         Seed of all noise. The same seed gives the same bytes.
     session
@@ -247,6 +261,7 @@ def run(
         "engine": "newton" if engine == "newton" else "kinematic",
         "net": net,
         "magnetometer": magnetometer,
+        "model_error": model_error,
         "seed": seed,
         "session": session,
         "speed": speed,
@@ -336,6 +351,7 @@ def _drive(
     replay: Path | None = None,
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    model_error: bool = True,
     seed: int = 0,
     session: int | Literal["survey"] | None = None,
     facts: Mapping[str, str | int] = MappingProxyType({}),
@@ -358,7 +374,8 @@ def _drive(
         what = read_run(replay)
     elif path != "random":
         what = planned = resolve_path(path)
-    twin = in_session(open_twin(scene_file, net=net, magnetometer=magnetometer), session, seed=seed)
+    twin = open_twin(scene_file, net=net, magnetometer=magnetometer, model_error=model_error)
+    twin = in_session(twin, session, seed=seed)
     if commands is not None and what.beyond(twin.scene.robot.drive):
         print(f"  {what.beyond(twin.scene.robot.drive)}", file=sys.stderr)  # noqa: T201
     steps(f"Driving {planned.name if planned else path}")
@@ -398,7 +415,8 @@ def _run_together(
             f"--engine newton drives one robot by itself, and {scene_file} has several; drop it"
         )
     commands, replay = options.pop("commands"), options.pop("replay")
-    twin = open_twin(scene_file, net=options.pop("net"), magnetometer=options.pop("magnetometer"))
+    opening = {name: options.pop(name) for name in ("net", "magnetometer", "model_error")}
+    twin = open_twin(scene_file, **opening)
     ways: dict[str, Any] = {one.robot.name: one.path or "figure8" for one in twin.scene.robots}
     if robot is not None and (commands or replay or path):
         ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path

@@ -35,6 +35,7 @@ def runs(
     columns: Names = None,
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     force: Force = False,
@@ -77,6 +78,8 @@ def runs(
         As for `magtwin run`.
     magnetometer
         As for `magtwin run`.
+    model_error
+        As for `magtwin run`.
     lidar
         Whether the LiDAR follows its schedule, or stays on or off.
     outside
@@ -105,7 +108,7 @@ def runs(
     steps = announcer(quiet=json)
     with output(out, force=force) as folder:
         steps("Opening the scene")
-        twin = open_twin(scene, net=net, magnetometer=magnetometer)
+        twin = open_twin(scene, net=net, magnetometer=magnetometer, model_error=model_error)
         paths = [name if name == "random" else resolve_path(name) for name in path or MIXTURE]
         robot = twin.scene.robot
         if session is not None:

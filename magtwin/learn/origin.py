@@ -1,7 +1,7 @@
 """Origin: the map and the robot that a network learned on, and whether it is used with others.
 
-A network predicts what a robot reads beyond one map, at the place where its labels took that map. With another
-map, at another place or on another robot its prediction is off, by an amount that can often be computed.
+A network predicts what a robot reads beyond one map, at the place where its labels took that map. With
+another map, at another place or on another robot its prediction is off, often by an amount that can be computed.
 """
 
 import math
@@ -65,7 +65,7 @@ def shared_facts(runs: Iterable[Mapping[str, Any]]) -> dict[str, str]:
 
 
 def map_facts(field: AnomalyMap) -> dict[str, str]:
-    """What is kept of a map to compare another with it: how it was made, and its values at `SAMPLES` poses."""
+    """What is kept of a map to compare others with it: its method, and its values at `SAMPLES` poses."""
     p, yaw = _poses(field.extent)
     values = field.lookup(p, yaw)
     facts = {
@@ -154,8 +154,8 @@ def displacement_nt(field: AnomalyMap, forward_m: float, left_m: float, late_s: 
 def _map_mismatch(facts: Facts, name: str, field: AnomalyMap, map_sha256: str) -> Mismatch | None:
     if "map_sha256" not in facts:
         return Mismatch(
-            f"{name} does not say which map it was trained on; if that was not {field.name!r}, its field errs "
-            "by the difference of the two"
+            f"{name} does not say which map it was trained on; if that was not {field.name!r}, its field "
+            "errs by the difference of the two"
         )
     if facts["map_sha256"] == map_sha256:
         return None
@@ -177,14 +177,12 @@ def _map_mismatch(facts: Facts, name: str, field: AnomalyMap, map_sha256: str) -
                 return None
             effect = f"the two differ by {rms:.0f} nT RMS over the floor, by which its field errs"
     return Mismatch(
-        f"{name} learned on the map {learned}, and the scene's map is {here}: {effect}; use that map, or train "
-        "on this one"
+        f"{name} learned on the map {learned}, and the scene's map is {here}: {effect}; use that map, or "
+        "train on this one"
     )
 
 
-def _frame_mismatch(
-    facts: Facts, name: str, field: AnomalyMap, residual_sd_nt: float
-) -> Mismatch | None:
+def _frame_mismatch(facts: Facts, name: str, field: AnomalyMap, residual_sd_nt: float) -> Mismatch | None:
     frame = label_frame(facts, name)
     if frame is None:
         return None
@@ -194,7 +192,7 @@ def _frame_mismatch(
     away, late = 100 * math.hypot(frame[0], frame[1]), 1000 * frame[2]
     return Mismatch(
         f"{name} learned from labels that took the map {away:.1f} cm and {late:.0f} ms off the robot's true "
-        f"pose, and a run takes it there: about {effect:.0f} nT RMS at {TYPICAL_M_S:g} m/s; train on labels "
+        f"pose, and a simulated run takes it there: about {effect:.0f} nT RMS at {TYPICAL_M_S:g} m/s; train on labels "
         "with lever arm and latency fitted (magtwin dataset build --align fit)"
     )
 
@@ -215,17 +213,18 @@ def _robot_mismatch(
         if {"label_mean_nt", "label_sd_nt"} <= set(facts):
             size = f" ({float(facts['label_mean_nt']):.0f} ± {float(facts['label_sd_nt']):.0f} nT)"
         return Mismatch(
-            f"WRONG ROBOT: {name} learned the robot {learned!r} with its sensor at ({facts['sensor_m']}) m, and "
-            f"this is {robot.name!r} with its sensor at ({here}) m. The disturbance that it predicts{size} is "
-            "not this robot's, and readings are meaningless; train a network on this robot, or use a physical "
-            "magnetometer",
+            f"WRONG ROBOT: {name} learned the robot {learned!r} with its sensor at ({facts['sensor_m']}) m, "
+            f"and this is {robot.name!r} with its sensor at ({here}) m. The disturbance that it predicts{size} "
+            "is not this robot's, and readings are meaningless; train a network on this robot, or use a "
+            "physical magnetometer",
             grave=True,
         )
     if away > 1e-3 and moved is not None:
         effect = displacement_nt(field, float(moved[0]), float(moved[1]), 0.0)
         return Mismatch(
-            f"{name} learned {learned!r} with its sensor at ({facts['sensor_m']}) m, and now it is at ({here}) "
-            f"m: at least {effect:.0f} nT RMS, by the map's gradient alone; train a network on this robot"
+            f"{name} learned {learned!r} with its sensor at ({facts['sensor_m']}) m, and now it is at "
+            f"({here}) m: at least {effect:.0f} nT RMS, by the map's gradient alone; train a network on this "
+            "robot"
         )
     told = facts.get("platform_sha256", UNKNOWN)
     if told not in (UNKNOWN, SEVERAL, platform_sha256):

@@ -210,7 +210,8 @@ def fit(
 
 def _held_out(of: Material, made: Made) -> list[Held]:
     """Errors on recordings that the model was not fitted to: those of validation and test, and those of
-    training where it was fitted without each of them in turn."""
+    training where it was fitted without each of them in turn.
+    """
     found = []
     for part in PARTS:
         rows = of.rows[part]

@@ -184,7 +184,7 @@ class Fleet:
         self._sense(np.asarray(which), moved=False)
 
     def _begin_error(self, i: int, rng: np.random.Generator) -> None:
-        """A session of a robot's model error, from a generator of its own: `rng` draws what it would without."""
+        """A session of a robot's model error, from a generator of its own: `rng` is left as it is."""
         if self._model_error is None:
             return
         parent: Any = rng.bit_generator.seed_seq

@@ -1,8 +1,8 @@
 """Model error: how a neural magnetometer's reading is off what its network predicts.
 
-A network gives the mean of the disturbance and the standard deviation of its error. A reading is one draw from
-that distribution, not its mean: the error has a part that stays for a session and a part that changes over
-seconds, as on recordings that the network never saw.
+A network gives the mean of the disturbance and the standard deviation of its error. A reading is one draw
+from that distribution, not its mean. The error has a part that stays for a session and a part that changes
+over seconds, as on recordings that the network never saw.
 """
 
 import math
@@ -57,7 +57,7 @@ class ModelError:
         return np.asarray(constant * o + rest * np.asarray(process, float))
 
     def process(self, white: ArrayLike, rate_hz: float) -> Array:
-        """u of successive readings, a Gauss-Markov process of correlation time `time_s`.
+        """U of successive readings, a Gauss-Markov process of correlation time `time_s`.
 
         Args:
             white: Standard normal numbers, shape (N,).

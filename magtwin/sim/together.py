@@ -123,9 +123,7 @@ def simulate_together(
             companions=[other for key, other in robots.items() if key != name],
         )
         predict = predicts[name]
-        run = sensed.read(
-            None if predict is None else predict(sensed.run), (model_errors or {}).get(name)
-        )
+        run = sensed.read(None if predict is None else predict(sensed.run), (model_errors or {}).get(name))
         runs[name] = run.with_facts(robot=name, **_nearest(name, near))
     return runs
 

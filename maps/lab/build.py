@@ -1,7 +1,7 @@
 """Build the default map: furnish a lab, lay steel about and below it, survey it with the robot, fit a map.
 
-`python maps/lab/build.py` writes sources.toml, lab.usdc and map.toml beside this file. The same seed gives the
-same lab: a test compares a fresh build with the committed files.
+`python maps/lab/build.py` writes sources.toml, lab.usdc and map.toml beside this file. The same seed gives
+the same lab: a test compares a fresh build with the committed files.
 
 The robot surveys as it would in a real lab: it stands a little beside each node and looks a little past each
 heading. So the map errs as a fitted map does. It is the map that the shipped hybrid network learned on.
