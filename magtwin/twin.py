@@ -125,6 +125,11 @@ def _platform_sha256(robot: RobotSpec) -> str:
     return hashlib.sha256(repr(robot.platform).encode()).hexdigest()
 
 
+def _platform_of(twin: Twin, robot: RobotSpec) -> str:
+    """Checksum of the platform of a twin's robot, before a session is drawn where that is known."""
+    return twin.platforms.get(robot.name) or _platform_sha256(robot)
+
+
 def _with_network(twin: Twin) -> Twin:
     """The twin with what its network tells: facts of runs, warnings, and the statistics of its error."""
     network, robot = twin.magnetometer, twin.scene.robot
@@ -139,7 +144,7 @@ def _with_network(twin: Twin) -> Twin:
         field=twin.field,
         map_sha256=str(twin.facts["map_sha256"]),
         robot=robot,
-        platform_sha256=twin.platforms[robot.name],
+        platform_sha256=_platform_of(twin, robot),
     )
     facts = {**twin.facts, **network.facts}
     texts = [one.text for one in found]
@@ -613,7 +618,7 @@ def led_by(twin: Twin, name: str) -> Twin:
         return twin
     own = {"model_error", "network_mismatch", *(twin.magnetometer.facts if twin.magnetometer else ())}
     facts: Facts = {key: fact for key, fact in twin.facts.items() if key not in own}
-    facts["platform_sha256"] = twin.platforms[name]
+    facts["platform_sha256"] = _platform_of(twin, scene.robot)
     led = dataclasses.replace(twin, scene=scene, magnetometer=network, facts=facts, model_error=None)
     return _with_network(led)
 

@@ -1,7 +1,8 @@
 """Origin: the map and the robot that a network learned on, and whether it is used with others.
 
 A network predicts what a robot reads beyond one map, at the place where its labels took that map. With
-another map, at another place or on another robot its prediction is off, often by an amount that can be computed.
+another map, at another place or on another robot its prediction is off, often by an amount that can be
+computed.
 """
 
 import math
@@ -192,8 +193,8 @@ def _frame_mismatch(facts: Facts, name: str, field: AnomalyMap, residual_sd_nt: 
     away, late = 100 * math.hypot(frame[0], frame[1]), 1000 * frame[2]
     return Mismatch(
         f"{name} learned from labels that took the map {away:.1f} cm and {late:.0f} ms off the robot's true "
-        f"pose, and a simulated run takes it there: about {effect:.0f} nT RMS at {TYPICAL_M_S:g} m/s; train on labels "
-        "with lever arm and latency fitted (magtwin dataset build --align fit)"
+        f"pose, where a simulated run takes it: about {effect:.0f} nT RMS at {TYPICAL_M_S:g} m/s; train on "
+        "labels with lever arm and latency fitted (magtwin dataset build --align fit)"
     )
 
 
@@ -214,8 +215,8 @@ def _robot_mismatch(
             size = f" ({float(facts['label_mean_nt']):.0f} ± {float(facts['label_sd_nt']):.0f} nT)"
         return Mismatch(
             f"WRONG ROBOT: {name} learned the robot {learned!r} with its sensor at ({facts['sensor_m']}) m, "
-            f"and this is {robot.name!r} with its sensor at ({here}) m. The disturbance that it predicts{size} "
-            "is not this robot's, and readings are meaningless; train a network on this robot, or use a "
+            f"and this is {robot.name!r} with its sensor at ({here}) m. The disturbance it predicts{size} is "
+            "not this robot's, and readings are meaningless; train a network on this robot, or use a "
             "physical magnetometer",
             grave=True,
         )

@@ -383,8 +383,9 @@ class Fleet:
             slopes = self._map.gradient(now.pose[:, :2], table["yaw"], outside="clamp")[:, :2]
             sloped = into_base(np.nan_to_num(slopes), table["yaw"])
             known = {"b_map_nt": b_map, "b_map_gradient_nt_m": sloped}
-            disturbance, sd = self._disturbance_nt(Run(table | known))
-            error = self._error_nt(which, sd, moved=moved)
+            found = self._disturbance_nt(Run(table | known))
+            mean, sd = found if isinstance(found, tuple) else (found, np.zeros(len(which)))
+            disturbance, error = mean, self._error_nt(which, sd, moved=moved)
         elif spec.kind == "physical":
             early = max(self._steps - 1 - round(TORQUE_S * CONTROL_RATE_HZ), 0)
             field = field_at_sensor_nt(

@@ -36,8 +36,11 @@ from magtwin.spec import RobotSpec, Scene
 
 Array = NDArray[np.float64]
 
-Predict = Callable[[Run], tuple[NDArray[Any], NDArray[Any]]]
-"""From a Run to the disturbance of each reading and the standard deviation of its error [nT], each (N,)."""
+Predicted = NDArray[Any] | tuple[NDArray[Any], NDArray[Any]]
+"""Disturbance of each reading [nT], shape (N,), and the standard deviation of its error where it is known."""
+
+Predict = Callable[[Run], Predicted]
+"""From a Run to what a network predicts of it."""
 
 RANDOM_S = 60.0
 """How long a driver drives about unless told otherwise [s]."""
@@ -108,7 +111,8 @@ def simulate(
         obstacles: What the path must be clear of, and what stops the robot if it leaves its path.
         controller: A name of `magtwin.sim.controllers.CONTROLLERS`, or a controller of one's own.
         disturbance_nt: From a Run in which every other sensor has been read, the vector axes too, to the
-            disturbance of each reading and the standard deviation of its error [nT], each (N,). Called once.
+            disturbance of each reading [nT], shape (N,), or that and the standard deviation of its error.
+            Called once.
         model_error: Statistics of that error, which is drawn then; None draws none.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
@@ -250,15 +254,15 @@ class Sensed:
 
     def read(
         self,
-        predicted: tuple[NDArray[Any], NDArray[Any]] | None = None,
+        predicted: Predicted | None = None,
         model_error: ModelError | None = None,
     ) -> Run:
         """The whole run, of the columns that are wanted.
 
         Args:
-            predicted: Disturbance of each reading by a network, and the standard deviation of its error [nT],
-                each (N,); None for a magnetometer without a network.
-            model_error: Statistics of that error; None draws none.
+            predicted: What a network predicts; None for a magnetometer without one.
+            model_error: Statistics of the error of that; None draws none, nor does a prediction without a
+                standard deviation.
         """
         columns, spec = dict(self.run.columns), self.scene.robot.magnetometer
         rows = len(columns["t"])
@@ -267,10 +271,11 @@ class Sensed:
             exact = columns["b_truth_nt"] - columns["b_map_nt"]
             disturbance = exact if spec.kind == "physical" else np.zeros(rows)
         else:
-            disturbance = np.asarray(predicted[0], float)
-            if model_error is not None:
+            mean, sd = predicted if isinstance(predicted, tuple) else (predicted, None)
+            disturbance = np.asarray(mean, float)
+            if model_error is not None and sd is not None:
                 white = self.error_rng.standard_normal(rows)
-                error = model_error.error_nt(predicted[1], model_error.process(white, self.rate_hz))
+                error = model_error.error_nt(sd, model_error.process(white, self.rate_hz))
             if disturbance.shape != (rows,):
                 raise RefusedError(f"disturbance_nt must give shape {(rows,)}, got {disturbance.shape}")
             disturbance = disturbance + self.beside_nt
