@@ -106,7 +106,7 @@ def test_labels_that_were_aligned_or_took_true_poses_lie_in_the_frame_of_a_run()
 
 
 def test_a_real_robot_does_not_tell_its_frame_and_nothing_is_said_of_it():
-    unknown = {name: "unknown" for name in ("robot_name", "sensor_m", "mocap_offset_m", "mocap_latency_s")}
+    unknown = dict.fromkeys(("robot_name", "sensor_m", "mocap_offset_m", "mocap_latency_s"), "unknown")
     assert label_frame(learned(poses="mocap") | unknown) is None
     assert found(learned(poses="mocap") | unknown) == ()
 

@@ -96,7 +96,8 @@ def residuals(held: Sequence[Held]) -> Residuals | None:
     g = 2 x - 2 x^2 (1 - exp(-1 / x)), x = time / duration (Priestley 1981, eq. 5.3.5, for an exponential).
     Errors are not centred: a bias that all sessions have is part of what the next one can have. The share of
     offset^2 in C(0) is drawn towards `PRIOR_SHARE`, the more the fewer sessions there are. The time is fitted
-    to C by least squares, all lags alike.
+    to C by least squares, all lags alike, with the level that C falls to left free: it is the offset of these
+    few sessions.
 
     Args:
         held: Errors on recordings that the model was not fitted to.
@@ -133,13 +134,16 @@ def residuals(held: Sequence[Held]) -> Residuals | None:
     if not step_s > 0:
         offset = offset_nt2(0.0)
         return Residuals(offset**0.5, (variance - offset) ** 0.5, 0.0, len(sessions))
-    longest = max(float(lengths.max()), 2 * step_s)
+    longest = max(float(lags[-1]), 2 * step_s)  # a slower process looks like an offset
+
+    known = np.isfinite(products)
 
     def cost(log_time: float) -> float:
-        time_s = float(np.exp(log_time))
-        offset = offset_nt2(time_s)
-        model = offset + (variance - offset) * np.exp(-lags / time_s)
-        return float(np.nanmean((products - model) ** 2)) / variance**2
+        """Mean square that C leaves about the exponential, from C(0) to the level that fits best."""
+        fallen = -np.expm1(-lags[known] / np.exp(log_time))
+        drop = variance - products[known]
+        depth = float(drop @ fallen) / max(float(fallen @ fallen), 1e-300)
+        return float(np.mean((drop - depth * fallen) ** 2)) / variance**2
 
     best = minimize_scalar(cost, bounds=(np.log(step_s / 10), np.log(longest)), method="bounded")
     time_s = float(np.exp(best.x))
