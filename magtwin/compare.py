@@ -121,25 +121,31 @@ class Comparison:
         return json.dumps(self.summary(), indent=2)
 
 
-ERRORS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
+DRAWN = "b_model_error_nt"
+
+ERRORS: Mapping[str, tuple[str, tuple[str, ...], str]] = MappingProxyType(
     {
-        "map": ("b_map_nt", "b_truth_nt", "what the map does not know of the field at the sensor"),
-        "disturbance": ("b_total_nt", "b_truth_nt", "what the model of the disturbance misses"),
-        "noise": ("b_measured_nt", "b_total_nt", "the sensor's own error"),
-        "total": ("b_measured_nt", "b_truth_nt", "the reading's error, all of these together"),
+        "map": ("b_map_nt", ("b_truth_nt",), "what the map does not know of the field at the sensor"),
+        "disturbance": ("b_total_nt", ("b_truth_nt",), "what the model of the disturbance misses"),
+        "model error": (DRAWN, (), "error drawn for the network's prediction"),
+        "noise": ("b_measured_nt", ("b_total_nt", DRAWN), "the sensor's own error"),
+        "total": ("b_measured_nt", ("b_truth_nt",), "the reading's error, all of these together"),
     }
 )
-"""Errors of a run by their address: the two columns whose difference each is, and what it means."""
+"""Errors of a run by their address: a column, those that are subtracted from it, and what it means. A run
+without `b_model_error_nt` has none."""
 
 
 def errors_of(run: Run) -> dict[str, Agreement]:
     """The errors of a run in figures, by the names of `ERRORS`; those that are nowhere known are left out."""
     found = {}
-    for name, (seen, true, _) in ERRORS.items():
-        if seen in run and true in run:
-            one = agreement(name, "nT", run[seen] - run[true])
-            if one is not None:
-                found[name] = one
+    for name, (seen, others, _) in ERRORS.items():
+        others = tuple(other for other in others if other != DRAWN or DRAWN in run)
+        if not {seen, *others} <= set(run) or (seen == DRAWN and not run[DRAWN].any()):
+            continue
+        one = agreement(name, "nT", sum((-run[other] for other in others), run[seen]))
+        if one is not None:
+            found[name] = one
     return found
 
 
