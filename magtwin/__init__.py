@@ -12,7 +12,7 @@ from magtwin.version import __version__ as __version__
 if TYPE_CHECKING:
     from magtwin.field.map import AnomalyMap
     from magtwin.io.plotting import plot
-    from magtwin.names import RefusedError
+    from magtwin.names import MismatchWarning, RefusedError
     from magtwin.path import Path
     from magtwin.run import COLUMNS, Run
     from magtwin.spec import Scene
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 _HOME = {
     "AnomalyMap": "magtwin.field.map",
     "COLUMNS": "magtwin.run",
+    "MismatchWarning": "magtwin.names",
     "Path": "magtwin.path",
     "RefusedError": "magtwin.names",
     "Run": "magtwin.run",
@@ -46,6 +47,7 @@ _HOME = {
 __all__ = [
     "COLUMNS",
     "AnomalyMap",
+    "MismatchWarning",
     "Path",
     "RefusedError",
     "Run",

@@ -135,25 +135,31 @@ class Comparison(Summarized):
         return Summary(f"Comparison: {len(self.at):,} readings of A, aligned {by}", tuple(agreements))
 
 
-ERRORS: Mapping[str, tuple[str, str, str]] = MappingProxyType(
+DRAWN = "b_model_error_nt"
+
+ERRORS: Mapping[str, tuple[str, tuple[str, ...], str]] = MappingProxyType(
     {
-        "map": ("b_map_nt", "b_truth_nt", "error of the map at the sensor"),
-        "disturbance": ("b_total_nt", "b_truth_nt", "error of the prediction, map plus disturbance"),
-        "noise": ("b_measured_nt", "b_total_nt", "noise of the sensor"),
-        "total": ("b_measured_nt", "b_truth_nt", "error of the reading"),
+        "map": ("b_map_nt", ("b_truth_nt",), "error of the map at the sensor"),
+        "disturbance": ("b_total_nt", ("b_truth_nt",), "error of the prediction, map plus disturbance"),
+        "model error": (DRAWN, (), "error drawn for the network's prediction"),
+        "noise": ("b_measured_nt", ("b_total_nt", DRAWN), "noise of the sensor"),
+        "total": ("b_measured_nt", ("b_truth_nt",), "error of the reading"),
     }
 )
-"""Errors of a run by source: the two columns whose difference each is, and what it means."""
+"""Errors of a run by source: a column, those that are subtracted from it, and what it means. Runs without
+`b_model_error_nt` have none."""
 
 
 def errors_of(run: Run) -> dict[str, Agreement]:
     """The errors of a run in figures, by the names of `ERRORS`; those that are nowhere known are left out."""
     found = {}
-    for name, (seen, true, _) in ERRORS.items():
-        if seen in run and true in run:
-            one = agreement(name, "nT", run[seen] - run[true])
-            if one is not None:
-                found[name] = one
+    for name, (seen, others, _) in ERRORS.items():
+        others = tuple(other for other in others if other != DRAWN or DRAWN in run)
+        if not {seen, *others} <= set(run) or (seen == DRAWN and not run[DRAWN].any()):
+            continue
+        one = agreement(name, "nT", sum((-run[other] for other in others), run[seen]))
+        if one is not None:
+            found[name] = one
     return found
 
 

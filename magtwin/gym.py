@@ -21,13 +21,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.names import RefusedError, find
 from magtwin.path import Path, check_clear, check_on_floor
-from magtwin.run import COLUMNS
+from magtwin.run import COLUMNS, Run
 from magtwin.sim.exact import check_field
 from magtwin.sim.fleet import SENSED, Fleet
 from magtwin.sim.session import draw_session
+from magtwin.sim.simulate import Predict
 from magtwin.sim.way import way_of
 from magtwin.spec import Scene
-from magtwin.twin import Kind, Twin, open_twin, room_of
+from magtwin.twin import Kind, Twin, open_twin, room_of, without_model_error
 
 if TYPE_CHECKING:
     from magtwin.learn.magnetometer import NeuralMagnetometer
@@ -120,6 +121,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         scene: Twin | Scene | str | FilePath | None = None,
         net: str | FilePath | None = None,
         magnetometer: Kind | None = None,
+        model_error: bool = True,
         path: Path | str | FilePath | ArrayLike = "figure8",
         signals: Sequence[str] = SIGNALS,
         reward: Reward = progress,
@@ -137,6 +139,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             scene: The file of a stage, a `Scene`, or what `magtwin.open_twin` gave.
             net: As for `magtwin.open_twin`, where `scene` is a file.
             magnetometer: As for `magtwin.open_twin`, where `scene` is a file.
+            model_error: As for `magtwin.simulate`; each episode is a session of its own to it.
             path: What the robots begin on and are rewarded by: a path, its name, a CSV file, or
                 points in world [m], shape (N, 2).
             signals: Columns that are observed, of `BOUNDS`, one after the other.
@@ -160,7 +163,10 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             raise RefusedError(f"MagNav has no render_mode, got {render_mode!r}; write a Run and view that")
         if isinstance(scene, Twin) and (net is not None or magnetometer is not None):
             raise RefusedError("net and magnetometer go to open_twin where scene is a Twin")
-        twin = scene if isinstance(scene, Twin) else open_twin(scene, net=net, magnetometer=magnetometer)
+        if isinstance(scene, Twin):
+            twin = scene if model_error else without_model_error(scene)
+        else:
+            twin = open_twin(scene, net=net, magnetometer=magnetometer, model_error=model_error)
         check_field(twin.scene, twin.field)
         if twin.magnetometer:
             _check_network(twin.magnetometer)
@@ -186,7 +192,8 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             anomaly_map=twin.field,
             obstacles=twin.obstacles,
             step_s=step_s,
-            disturbance_nt=twin.magnetometer.disturbance_nt if twin.magnetometer else None,
+            disturbance_nt=_predictions(twin.magnetometer) if twin.magnetometer else None,
+            model_error=twin.model_error,
         )
         self.num_envs, self.reward, self.end_on_bump = num_envs, reward, end_on_bump
         find("session", session, {"drawn": None, "survey": None})
@@ -318,6 +325,16 @@ class MagNavEnv(gymnasium.Env[Any, Any]):
         one = np.asarray(action, float)[None]
         observations, rewards, ended, truncated, infos = self.robots.step(one)
         return observations[0], float(rewards[0]), bool(ended[0]), bool(truncated[0]), _first(infos)
+
+
+def _predictions(network: "NeuralMagnetometer") -> Predict:
+    """What a network predicts of a table of robots, and the standard deviations of its errors."""
+
+    def predictions(table: Run) -> tuple[Array, Array]:
+        (read,) = network.read([table], outside=False)
+        return read.disturbance_nt, read.sd_nt
+
+    return predictions
 
 
 def _check_network(network: "NeuralMagnetometer") -> None:

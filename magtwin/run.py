@@ -89,8 +89,13 @@ COLUMNS: Mapping[str, Column] = MappingProxyType(
         ),
         "b_disturbance_nt": Column("nT", "", "disturbance by the network, by physics, or none"),
         "b_total_nt": Column("nT", "", "b_map_nt + b_disturbance_nt"),
+        "b_model_error_nt": Column(
+            "nT", "", "error drawn for a network's prediction; 0 without a network, or where none is drawn"
+        ),
         "b_noise_nt": Column("nT", "", "the sensor's own error; nan where it gave no reading"),
-        "b_measured_nt": Column("nT", "", "b_total_nt + b_noise_nt, in steps of the sensor's resolution"),
+        "b_measured_nt": Column(
+            "nT", "", "b_total_nt + b_model_error_nt + b_noise_nt, in steps of the sensor's resolution"
+        ),
         "b_sd_nt": Column("nT", "", "predicted standard deviation of b_measured_nt; nan where unknown"),
         "b_vector_nt": Column("nT", "magnetometer", "exact field vector; nan where unknown", 3, _XYZ),
         "b_vector_measured_nt": Column(
@@ -120,11 +125,13 @@ COLUMNS: Mapping[str, Column] = MappingProxyType(
 Every error has an address, as where all are known
 
     b_total_nt = b_map_nt + b_disturbance_nt
-    b_measured_nt = b_total_nt + b_noise_nt
+    b_measured_nt = b_total_nt + b_model_error_nt + b_noise_nt
     b_truth_nt = |b_vector_nt|, and = b_total_nt of a physical magnetometer
 
 So b_total_nt - b_truth_nt is the error of a neural or a map-only magnetometer's model, b_truth_nt - b_map_nt
 what the map does not know, b_noise_nt the sensor's, and b_vector_measured_nt - b_vector_nt its vector axes'.
+b_model_error_nt is a draw of such an error, with the standard deviation that the network gives: a reading is
+as far from the mean as the network was from recordings that it never saw.
 """
 
 

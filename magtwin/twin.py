@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import shutil
 import tempfile
+import warnings
 import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 import magtwin
 from magtwin.field.map import AnomalyMap
 from magtwin.files import existing, git_revision, sha256
-from magtwin.names import RefusedError, find
+from magtwin.names import MismatchWarning, RefusedError, find
 from magtwin.obstacles import Obstacles
 from magtwin.path import Path
 from magtwin.placement import Room
@@ -39,7 +40,8 @@ if TYPE_CHECKING:
     from magtwin.sim.engine import Engine
     from magtwin.sim.lidar import Scans
     from magtwin.sim.many import Runs
-    from magtwin.sim.simulate import Sensed
+    from magtwin.sim.model_error import ModelError
+    from magtwin.sim.simulate import Predict, Sensed
 
 
 @dataclass(frozen=True, repr=False)
@@ -61,6 +63,15 @@ class Twin(Summarized):
 
     facts: Mapping[str, str | int | float | bool] = dataclasses.field(default_factory=dict)
     """What a run is to say of the files that were opened: their names as they were given, and checksums."""
+
+    platforms: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Checksum of what makes each robot's own field, as its asset has it, by the robot's name."""
+
+    errors: bool = True
+    """Whether readings of a neural magnetometer are to have an error about what the network predicts."""
+
+    model_error: "ModelError | None" = None
+    """Statistics of that error; None draws none."""
 
     session: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
     """Facts of the session that the robots are in (`session`, `session_seed`); empty before one is chosen."""
@@ -97,12 +108,19 @@ class _Stage:
         return FilePath, (str(self.folder),)  # a copy in another process must not end it
 
 
-def _twin_of_scene(scene: Scene, net: str | FilePath | None, magnetometer: Kind | None) -> Twin:
+def _twin_of_scene(
+    scene: Scene, net: str | FilePath | None, magnetometer: Kind | None, model_error: bool
+) -> Twin:
     """The twin of a scene that no file holds: authored as `author_scene` does, for as long as it is used."""
     from magtwin.usd.scene import author_scene
 
     stage = _Stage()
-    twin = open_twin(author_scene(scene, stage.folder / "scene"), net=net, magnetometer=magnetometer)
+    twin = open_twin(
+        author_scene(scene, stage.folder / "scene"),
+        net=net,
+        magnetometer=magnetometer,
+        model_error=model_error,
+    )
     facts = {name: fact for name, fact in twin.facts.items() if name != "scene_file"}
     return dataclasses.replace(twin, facts=facts, stage=stage)
 
@@ -112,8 +130,12 @@ def open_twin(
     *,
     net: str | FilePath | None = None,
     magnetometer: Kind | None = None,
+    model_error: bool = True,
 ) -> Twin:
     """Open a stage, the map layer and the network that it names.
+
+    Warns (`magtwin.MismatchWarning`) where the network learned on another map or another robot, or at another
+    place than the robot's own, with the expected effect. Runs keep the text as the fact `network_mismatch`.
 
     Args:
         scene_file: Root layer of a scene; or a `Scene`, which is authored to a temporary folder. Only what
@@ -121,13 +143,15 @@ def open_twin(
         net: Weights to use in place of those that the magnetometer names (.safetensors or .pth), for a
             neural magnetometer; or "none" for a physical one.
         magnetometer: Kind of magnetometer to use in place of the scene's: "physical", "neural" or "map-only".
+        model_error: Whether the readings of a neural magnetometer are off what the network predicts, as they
+            were on recordings that it never saw; see `magtwin.sim.model_error`.
 
     Raises:
         RefusedError: The stage, its map or its weights are missing, broken, or not what the stage's
             checksums say.
     """
     if isinstance(scene_file, Scene):
-        return _twin_of_scene(scene_file, net, magnetometer)
+        return _twin_of_scene(scene_file, net, magnetometer, model_error)
     from magtwin.usd.layers import stage_sha256
     from magtwin.usd.maps import load_map
     from magtwin.usd.obstacles import read_obstacles
@@ -148,10 +172,54 @@ def open_twin(
     if revision := git_revision(scene_file.parent):
         facts["git_revision"] = revision
     facts |= {"map": field.name, "map_sha256": sha256(scene.map_layer)}
-    facts |= network.facts if network else {}
+    platforms = {one.robot.name: _platform_sha256(one.robot) for one in scene.robots}
+    facts["platform_sha256"] = platforms[scene.robot.name]
+    twin = _with_network(Twin(scene, scene_file, field, network, obstacles, facts, platforms, model_error))
     if network and net is not None:
-        facts["network_file"] = FilePath(net).as_posix()
-    return Twin(scene, scene_file, field, network, obstacles, facts)
+        return dataclasses.replace(twin, facts={**twin.facts, "network_file": FilePath(net).as_posix()})
+    return twin
+
+
+def _platform_sha256(robot: RobotSpec) -> str:
+    """Checksum of what makes a robot's own field."""
+    return hashlib.sha256(spelled(robot.platform).encode()).hexdigest()
+
+
+def _platform_of(twin: Twin, robot: RobotSpec) -> str:
+    """Checksum of the platform of a twin's robot, before a session is drawn where that is known."""
+    return twin.platforms.get(robot.name) or _platform_sha256(robot)
+
+
+def _with_network(twin: Twin) -> Twin:
+    """The twin with what its network tells: facts of runs, warnings, and the statistics of its error."""
+    network, robot = twin.magnetometer, twin.scene.robot
+    if network is None:
+        return twin
+    from magtwin.learn.origin import mismatches
+
+    found = mismatches(
+        network.net.facts,
+        network.name,
+        residual_sd_nt=network.residual_sd_nt,
+        field=twin.field,
+        map_sha256=str(twin.facts["map_sha256"]),
+        robot=robot,
+        platform_sha256=_platform_of(twin, robot),
+    )
+    facts = {**twin.facts, **network.facts}
+    texts = [one.text for one in found]
+    statistics = network.model_error() if twin.errors else None
+    if twin.errors and statistics is None:
+        texts.append(
+            f"{network.name} does not say how its error varies in time, so none is drawn and readings are as "
+            "near to its predictions as the sensor's noise; train it again to change that"
+        )
+    for text in texts:
+        warnings.warn(text, MismatchWarning, stacklevel=3)
+    if found:
+        facts["network_mismatch"] = "; ".join(one.text for one in found)
+    facts["model_error"] = statistics is not None
+    return dataclasses.replace(twin, facts=facts, model_error=statistics)
 
 
 def _with_magnetometer(robot: RobotSpec, net: str | FilePath | None, kind: Kind | None) -> RobotSpec:
@@ -188,6 +256,7 @@ def twin_of(
         scene,
         net=network if network is None else locate(network, near) or network,
         magnetometer=kind if network is None else None,
+        model_error=bool(facts.get("model_error", False)),
     )
     for name, what in _CHECKSUMS.items() if check else ():
         if facts.get(name, "") != twin.facts.get(name, ""):
@@ -510,6 +579,7 @@ def simulate(
     rate_hz: float | None = None,
     net: str | FilePath | None = None,
     magnetometer: Kind | None = None,
+    model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: "str | Controller" = "follower",
@@ -533,6 +603,8 @@ def simulate(
         rate_hz: Magnetometer readings a second [Hz]; None takes the scene's.
         net: As for `open_twin`, where `twin` is a file.
         magnetometer: As for `open_twin`, where `twin` is a file.
+        model_error: Whether readings of a neural magnetometer have an error about what the network predicts;
+            see `open_twin`.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
         controller: What drives: "follower", "release", "stanley" or "pure_pursuit", or a
@@ -552,18 +624,18 @@ def simulate(
     from magtwin.sim.simulate import simulate as run_scene
 
     seed = _seed(seed)
-    twin = in_session(_opened(twin, net, magnetometer, "simulate"), session, seed=seed)
+    twin = in_session(_opened(twin, net, magnetometer, model_error, "simulate"), session, seed=seed)
     check_field(twin.scene, twin.field)
     network = twin.magnetometer
     path = way_of(path, room_of(twin))
     _check_commands(path, network)
     read: Read | None = None
 
-    def disturbance_nt(run: Run) -> NDArray[Any]:
+    def disturbance_nt(run: Run) -> tuple[NDArray[Any], NDArray[Any]]:
         nonlocal read
         assert network is not None
         (read,) = network.read([run])
-        return read.disturbance_nt
+        return read.disturbance_nt, read.sd_nt
 
     run = run_scene(
         twin.scene,
@@ -574,6 +646,7 @@ def simulate(
         duration_s=duration_s,
         rate_hz=rate_hz,
         disturbance_nt=disturbance_nt if network else None,
+        model_error=model_error_of(twin, seed),
         outside=outside,
         lidar=lidar,
         obstacles=twin.obstacles,
@@ -584,6 +657,21 @@ def simulate(
     return run.with_columns(**_known(twin.scene, run, read)).with_facts(
         **_facts(twin, seed, path, duration_s, _config_sha256(twin.scene))
     )
+
+
+def model_error_of(twin: Twin, seed: int, *, which: int = 0) -> "ModelError | None":
+    """Statistics of the model error of a twin in its session; None where none is to be drawn.
+
+    Args:
+        twin: What `in_session` gave.
+        seed: Seed of the run.
+        which: Place of the robot in a scene of several, from 0.
+    """
+    from magtwin.sim.session import offset_generator
+
+    if twin.model_error is None:
+        return None
+    return twin.model_error.in_session(offset_generator(twin.session, seed, which=which))
 
 
 def simulate_robots(
@@ -599,6 +687,7 @@ def simulate_robots(
     rate_hz: float | None = None,
     net: str | FilePath | None = None,
     magnetometer: Kind | None = None,
+    model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: str = "follower",
@@ -623,6 +712,7 @@ def simulate_robots(
         rate_hz: As for `simulate`.
         net: As for `open_twin`, where `twin` is a file; of each robot.
         magnetometer: As for `open_twin`, where `twin` is a file; of each robot.
+        model_error: As for `simulate`.
         lidar: As for `simulate`.
         outside: As for `simulate`.
         controller: A name of `magtwin.sim.controllers.CONTROLLERS`.
@@ -638,7 +728,7 @@ def simulate_robots(
     from magtwin.sim.together import simulate_together
 
     seed = _seed(seed)
-    twin = in_session(_opened(twin, net, magnetometer, "simulate_robots"), session, seed=seed)
+    twin = in_session(_opened(twin, net, magnetometer, model_error, "simulate_robots"), session, seed=seed)
     check_field(twin.scene, twin.field)
     placed = {one.robot.name: one for one in twin.scene.robots}
     for name in (*(paths or {}), *(robots or ())):
@@ -652,10 +742,10 @@ def simulate_robots(
         _check_commands(way, led[name].magnetometer)
     reads: dict[str, Read] = {}
 
-    def disturbance_of(name: str, network: "NeuralMagnetometer") -> Callable[[Run], NDArray[Any]]:
-        def disturbance_nt(run: Run) -> NDArray[Any]:
+    def disturbance_of(name: str, network: "NeuralMagnetometer") -> "Predict":
+        def disturbance_nt(run: Run) -> tuple[NDArray[Any], NDArray[Any]]:
             (reads[name],) = network.read([run])
-            return reads[name].disturbance_nt
+            return reads[name].disturbance_nt, reads[name].sd_nt
 
         return disturbance_nt
 
@@ -676,6 +766,7 @@ def simulate_robots(
         obstacles=twin.obstacles,
         controller=controller,
         disturbances_nt=disturbances,
+        model_errors={name: model_error_of(led[name], seed, which=k) for k, name in enumerate(placed)},
         outside=outside,
         lidar=lidar,
     )
@@ -697,11 +788,16 @@ def led_by(twin: Twin, name: str) -> Twin:
     scene = twin.scene.led_by(name)
     ours, its = twin.scene.robot.magnetometer, scene.robot.magnetometer
     if (its.kind, its.network, its.network_sha256) == (ours.kind, ours.network, ours.network_sha256):
-        return dataclasses.replace(twin, scene=scene)
-    network = _magnetometer(scene)
-    facts = {k: v for k, v in twin.facts.items() if not (twin.magnetometer and k in twin.magnetometer.facts)}
-    facts |= network.facts if network else {}
-    return dataclasses.replace(twin, scene=scene, magnetometer=network, facts=facts)
+        network = twin.magnetometer
+    else:
+        network = _magnetometer(scene)
+    if name == twin.scene.robot.name:
+        return twin
+    own = {"model_error", "network_mismatch", *(twin.magnetometer.facts if twin.magnetometer else ())}
+    facts: Facts = {key: fact for key, fact in twin.facts.items() if key not in own}
+    facts["platform_sha256"] = _platform_of(twin, scene.robot)
+    led = dataclasses.replace(twin, scene=scene, magnetometer=network, facts=facts, model_error=None)
+    return _with_network(led)
 
 
 def simulate_many(
@@ -711,13 +807,14 @@ def simulate_many(
     *,
     session: Session | None = None,
     speeds: float | Iterable[float] = 0.2,
-    robots: RobotSpec | Iterable[RobotSpec] | None = None,
+    robots: RobotSpec | Twin | Iterable[RobotSpec | Twin] | None = None,
     columns: Iterable[str] | None = None,
     block: int | None = None,
     duration_s: float | None = None,
     rate_hz: float | None = None,
     net: str | FilePath | None = None,
     magnetometer: Kind | None = None,
+    model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: str = "follower",
@@ -736,13 +833,15 @@ def simulate_many(
         session: As for `simulate`, each run's drawn from its own seed.
         speeds: Forward speed of each where its path is straight [m/s], or one for all.
         robots: What drives in each, as it is, such as `magtwin.sim.session.draw_session` gives, or one for
-            all. Default: the scene's robot, in its session.
+            all; or the twin in a session, as `in_session` gives it. Default: the scene's robot, in its
+            session.
         columns: Columns to keep, beside t; None keeps all.
         block: Runs made at a time; None takes what fits into 0.1 GB for runs of a minute.
         duration_s: As for `simulate`, of each run.
         rate_hz: As for `simulate`.
         net: As for `simulate`.
         magnetometer: As for `simulate`.
+        model_error: As for `simulate`.
         lidar: As for `simulate`.
         outside: As for `simulate`.
         controller: A name of `magtwin.sim.controllers.CONTROLLERS`.
@@ -757,7 +856,7 @@ def simulate_many(
     from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.many import BLOCK, Conditions, Job, Runs
 
-    twin = _opened(twin, net, magnetometer, "simulate_many")
+    twin = _opened(twin, net, magnetometer, model_error, "simulate_many")
     check_field(twin.scene, twin.field)
     numbers = [_seed(seed) for seed in seeds]
     if not isinstance(controller, str):
@@ -782,6 +881,9 @@ def simulate_many(
         if key not in drawn:
             if robot is None:
                 own = in_session(twin, session, seed=seed)
+            elif isinstance(robot, Twin):
+                _check_magnetometer(twin, robot.scene.robot)
+                own = robot if model_error else without_model_error(robot)
             else:
                 _check_magnetometer(twin, robot)
                 own = dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot))
@@ -797,11 +899,12 @@ def simulate_many(
         told = network.read(rows, outside=flagged) if network else [None] * len(rows)
         runs = []
         for job, one, read in zip(jobs, sensed, told, strict=True):
-            run = one.read(read.disturbance_nt if read else None)
+            own, config = of[id(job.scene)]
+            predicted = (read.disturbance_nt, read.sd_nt) if read else None
+            run = one.read(predicted, model_error_of(own, job.seed))
             check_read(run, twin.field)
             known = _known(job.scene, run, read)
             run = run.with_columns(**{name: known[name] for name in known.keys() & run.keys()})
-            own, config = of[id(job.scene)]
             runs.append(run.with_facts(**_facts(own, job.seed, job.path, duration_s, config)))
         return runs
 
@@ -820,14 +923,24 @@ def simulate_many(
 
 
 def _opened(
-    twin: Twin | Scene | str | FilePath, net: str | FilePath | None, magnetometer: Kind | None, what: str
+    twin: Twin | Scene | str | FilePath,
+    net: str | FilePath | None,
+    magnetometer: Kind | None,
+    model_error: bool,
+    what: str,
 ) -> Twin:
     """A twin, opened if it is not."""
     if not isinstance(twin, Twin):
-        return open_twin(twin, net=net, magnetometer=magnetometer)
+        return open_twin(twin, net=net, magnetometer=magnetometer, model_error=model_error)
     if net is not None or magnetometer is not None:
         raise RefusedError(f"net and magnetometer go to open_twin where a Twin is given to {what}")
-    return twin
+    return twin if model_error else without_model_error(twin)
+
+
+def without_model_error(twin: Twin) -> Twin:
+    """The twin, with readings of a neural magnetometer that are what its network predicts."""
+    facts = twin.facts if twin.magnetometer is None else {**twin.facts, "model_error": False}
+    return dataclasses.replace(twin, errors=False, model_error=None, facts=facts)
 
 
 def _seed(seed: object) -> int:

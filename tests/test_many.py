@@ -27,7 +27,8 @@ def neural(lab_scene, tmp_path_factory) -> Twin:
     """The lab with a small network of random weights, as bits do not depend on what it has learnt."""
     torch.manual_seed(0)
     file = tmp_path_factory.mktemp("net") / "small.safetensors"
-    FieldNet("full", (48, 48)).save(file)
+    error = {"residual_offset_sd_nt": 60.0, "residual_time_s": 2.0}
+    FieldNet("full", (48, 48), residual_sd_nt=100.0, facts=error).save(file)
     return open_twin(lab_scene, net=file)
 
 

@@ -88,6 +88,10 @@ def test_facts_tell_how_the_run_came_about():
         "path": "line",
         "controller": "follower",
         "speed_m_s": 0.3,
+        "robot_name": "robot",
+        "sensor_m": "0.05, 0, 0.36",
+        "mocap_offset_m": "0, 0",
+        "mocap_latency_s": 0.015167,  # 10 ms, a mean jitter of 1 ms, half a period at 120 Hz
         "rate_hz": 135.0,
         "duration_s": 2.0,
         "outside": "nan",
@@ -287,7 +291,7 @@ def test_a_network_gives_the_disturbance_from_columns_that_are_filled():
     run = drive(SURVEYED, disturbance_nt=network)
     assert len(seen) == 1
     late = {"b_disturbance_nt", "b_total_nt", "b_noise_nt", "b_measured_nt"}
-    late |= {"flag_lost_lock"}
+    late |= {"b_model_error_nt", "flag_lost_lock"}
     assert set(seen[0]) == set(COLUMNS) - late
     for name in set(COLUMNS) - late:
         assert_array_equal(seen[0][name], run[name])

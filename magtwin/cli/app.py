@@ -2,6 +2,9 @@
 
 import signal
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from cyclopts import App
@@ -10,7 +13,7 @@ from cyclopts.exceptions import CycloptsError
 
 import magtwin
 from magtwin.cli.progress import watched
-from magtwin.names import RefusedError
+from magtwin.names import MismatchWarning, RefusedError
 
 app = App(
     name="magtwin",
@@ -34,7 +37,7 @@ def main(arguments: list[str] | None = None) -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what is half-written goes
     plain = not sys.stderr.isatty()
     try:
-        with watched():
+        with watched(), _warnings_in_lines():
             app(
                 [a for a in arguments if a != "--debug"],
                 exit_on_error=False,
@@ -72,6 +75,27 @@ def _help_of(arguments: list[str]) -> dict[str, Any]:
 
     app.help_formatter = PlainFormatter()
     return {"console": stdout_console()}
+
+
+@contextmanager
+def _warnings_in_lines() -> Iterator[None]:
+    """Show a MismatchWarning as one line on stderr, each text once in a command; other warnings as ever."""
+    told: set[str] = set()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", MismatchWarning)
+        show = warnings.showwarning
+
+        def line(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if not issubclass(category, MismatchWarning):
+                show(message, category, *where, **more)
+            elif str(message) not in told:
+                told.add(str(message))
+                text = f"magtwin: warning: {' '.join(str(message).split())}"
+                loud = sys.stderr.isatty()  # yellow and bold
+                print(f"\033[1;33m{text}\033[0m" if loud else text, file=sys.stderr)  # noqa: T201
+
+        warnings.showwarning = line
+        yield
 
 
 def _fail(text: str) -> None:

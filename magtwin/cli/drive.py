@@ -28,6 +28,7 @@ def drive(
     out: Path = Path("drive"),
     gamepad: Path | None = None,
     net: Path | None = None,
+    model_error: bool = True,
     seed: Seed = 0,
     session: Session = None,
     view: bool = True,
@@ -51,6 +52,8 @@ def drive(
         drives, Start ends.
     net
         Weights to use in place of the scene's; "none" for a physical magnetometer.
+    model_error
+        As for `magtwin run`.
     seed
         Seed of all noise, and of the wheels' errors.
     session
@@ -76,7 +79,7 @@ def drive(
     if gamepad is not None and existing(gamepad, "gamepad").is_dir():
         raise RefusedError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
     with output(out, force=force) as folder:
-        twin = in_session(open_twin(scene, net=net), session, seed=seed)
+        twin = in_session(open_twin(scene, net=net, model_error=model_error), session, seed=seed)
         robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
         errors = draw_wheel_errors(robot.drive, streams(np.random.default_rng(seed))["drive"])
         chassis = at_start(
@@ -107,6 +110,7 @@ def drive(
             facts={"commands_file": "commands.csv"},
             steps=announcer(quiet=json),
             net=net,
+            model_error=model_error,
             seed=seed,
             session=session,
             title=f"Manual drive in {scene}",

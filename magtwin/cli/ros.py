@@ -86,6 +86,7 @@ def sim(
     seed: Seed = 0,
     session: Session = None,
     net: Path | None = None,
+    model_error: bool = True,
     rate_hz: float | None = None,
     profile: Profile = "ros",
     units: Literal["T", "nT"] | None = None,
@@ -115,6 +116,8 @@ def sim(
         As for `magtwin run`.
     net
         Weights to use in place of the scene's; "none" for a physical magnetometer.
+    model_error
+        As for `magtwin run`.
     rate_hz
         Readings of the magnetometer a second [Hz]; the scene's unless given.
     profile
@@ -135,7 +138,7 @@ def sim(
 
     tell = announcer(quiet=False)
     tell(f"opening {scene}")
-    twin = open_twin(scene, net=net)
+    twin = open_twin(scene, net=net, model_error=model_error)
     with where.bus("magtwin_sim", duration=duration) as bus:
         node = Simulator(
             twin,
@@ -201,7 +204,7 @@ def magnetometer(
     values = settings_of(PARAMETERS, (f"units:={UNITS[profile]}", *settings))
     tell = announcer(quiet=False)
     tell(f"opening {scene}")
-    twin = open_twin(scene, net=net)
+    twin = open_twin(scene, net=net, model_error=False)  # it predicts, for a robot that reads
     sim_time = values["use_sim_time"]
     with where.bus("magtwin_magnetometer", sim_time=sim_time, duration=duration) as bus:
         Magnetometer(twin, bus, values, say=tell)
@@ -435,7 +438,7 @@ def replay(
     if not speed > 0:
         raise RefusedError(f"speed must be above 0, got {speed!r}")
     whole = read_run(run)
-    twin = None if scene is None else open_twin(scene)
+    twin = None if scene is None else open_twin(scene, model_error=False)
     with where.bus("magtwin_replay") as bus:
         player = Player(whole, bus, twin, units=units, topics=topic)
         announcer(quiet=False)(

@@ -37,7 +37,14 @@ if TYPE_CHECKING:
 
 
 @app.command
-def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json: Json = False) -> None:
+def demo(
+    *,
+    out: Path = Path("demo"),
+    seed: Seed = 0,
+    model_error: bool = True,
+    force: Force = False,
+    json: Json = False,
+) -> None:
     """Author a lab and a TurtleBot 4, drive a figure of eight, log what the magnetometer reads.
 
     Writes the stages, run.rrd (opens in Rerun), run.parquet and pictures. Takes under a minute.
@@ -48,6 +55,8 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
         Folder to make.
     seed
         Seed of all noise.
+    model_error
+        As for `magtwin run`.
     force
         Replace the folder if it exists.
     json
@@ -75,6 +84,7 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
             facts={"scene_file": scene_file.relative_to(folder).as_posix()},
             steps=steps,
             seed=seed,
+            model_error=model_error,
             speed=0.2,
             title=f"Demo in {out}",
         )
@@ -100,6 +110,7 @@ def run(
     controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    model_error: bool = True,
     seed: Seed = 0,
     session: Session = None,
     speed: float = 0.2,
@@ -158,6 +169,9 @@ def run(
     magnetometer
         What it reads, in place of what the scene says: the exact field (physical), the map and what a
         network predicts (neural), or the map alone (map-only).
+    model_error
+        Let readings of a neural magnetometer be off what its network predicts, as they were on recordings
+        that it never saw. --no-model-error: they are the prediction and the sensor's own noise.
     seed
         Seed of all noise. The same seed gives the same bytes.
     session
@@ -254,6 +268,7 @@ def run(
         "engine": "newton" if engine == "newton" else "kinematic",
         "net": net,
         "magnetometer": magnetometer,
+        "model_error": model_error,
         "seed": seed,
         "session": session,
         "speed": speed,
@@ -350,6 +365,7 @@ def _drive(
     replay: Path | None = None,
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    model_error: bool = True,
     seed: int = 0,
     session: int | Literal["survey"] | None = None,
     fit: bool = False,
@@ -371,7 +387,8 @@ def _drive(
         what = read_commands(commands)
     elif replay is not None:
         what = read_run(replay)
-    twin = in_session(open_twin(scene_file, net=net, magnetometer=magnetometer), session, seed=seed)
+    twin = open_twin(scene_file, net=net, magnetometer=magnetometer, model_error=model_error)
+    twin = in_session(twin, session, seed=seed)
     if commands is None and replay is None and path != "random":
         what = planned = way_of(path, room_of(twin), fit=fit)
         _say_placing(planned, steps)
@@ -425,7 +442,8 @@ def _run_together(
             f"--engine newton drives one robot by itself, and {scene_file} has several; drop it"
         )
     commands, replay = options.pop("commands"), options.pop("replay")
-    twin = open_twin(scene_file, net=options.pop("net"), magnetometer=options.pop("magnetometer"))
+    opening = {name: options.pop(name) for name in ("net", "magnetometer", "model_error")}
+    twin = open_twin(scene_file, **opening)
     ways: dict[str, Any] = {one.robot.name: one.path or "figure8" for one in twin.scene.robots}
     if robot is not None and (commands or replay or path):
         ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path

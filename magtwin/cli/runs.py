@@ -36,6 +36,7 @@ def runs(
     columns: Names = None,
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     force: Force = False,
@@ -80,6 +81,8 @@ def runs(
         As for `magtwin run`.
     magnetometer
         As for `magtwin run`.
+    model_error
+        As for `magtwin run`.
     lidar
         Whether the LiDAR follows its schedule, or stays on or off.
     outside
@@ -109,7 +112,7 @@ def runs(
     steps = announcer(quiet=json)
     with output(out, force=force) as folder:
         steps("Opening the scene")
-        twin = open_twin(scene, net=net, magnetometer=magnetometer)
+        twin = open_twin(scene, net=net, magnetometer=magnetometer, model_error=model_error)
         paths = [way_of(name, room_of(twin), fit=fit) for name in path or MIXTURE]
         robot = twin.scene.robot
         if session is not None:
@@ -127,7 +130,7 @@ def runs(
             [paths[k % len(paths)] for k in range(count)],
             range(seed, seed + count),
             speeds=speeds,
-            robots=[one.scene.robot for one in of_run],
+            robots=of_run,
             columns=columns,
             duration_s=duration,
             rate_hz=rate_hz,
@@ -146,7 +149,6 @@ def runs(
             advance(0, count)
             for k, run in enumerate(made):
                 file = f"run_{k:05d}.parquet"
-                run = run.with_facts(**of_run[k].session)
                 write_parquet(run, folder / file)
                 run.add_to(tally)
                 listed = (run.facts[name] for name in ("path", "seed", "session", "speed_m_s"))

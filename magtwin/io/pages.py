@@ -221,8 +221,8 @@ def _section(one: Told, pictures: bool) -> Section:
     errors = errors_of(run)
     if errors:
         rows = tuple((name, ERRORS[name][2], *_agreement(errors[name])) for name in errors)
-        note = "Each error is the difference of two columns: " + "; ".join(
-            f"{name} = {ERRORS[name][0]} - {ERRORS[name][1]}" for name in errors
+        note = "Each error is the difference of columns: " + "; ".join(
+            f"{name} = {' - '.join((ERRORS[name][0], *ERRORS[name][1]))}" for name in errors
         )
         coverage = _coverage(run)
         if coverage is not None:
@@ -290,10 +290,10 @@ def _distance_m(run: Run) -> float | None:
 
 
 def _coverage(run: Run) -> float | None:
-    """Share of the readings whose error lies within twice its predicted standard deviation."""
-    if not {"b_sd_nt", "b_measured_nt", "b_truth_nt"} <= set(run):
+    """Share of the predictions whose error lies within twice its predicted standard deviation."""
+    if not {"b_sd_nt", "b_total_nt", "b_truth_nt"} <= set(run):
         return None
-    error, sd = run["b_measured_nt"] - run["b_truth_nt"], run["b_sd_nt"]
+    error, sd = run["b_total_nt"] - run["b_truth_nt"], run["b_sd_nt"]
     known = np.isfinite(error) & np.isfinite(sd)
     return float(np.mean(np.abs(error[known]) <= 2 * sd[known])) if known.any() else None
 

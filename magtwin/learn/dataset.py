@@ -27,6 +27,7 @@ from magtwin.files import existing, output, sha256
 from magtwin.learn.features import FEATURES, SETS, columns_of, feature_names
 from magtwin.learn.features import features as features_of
 from magtwin.learn.labels import Alignment, fit_alignment, labelled
+from magtwin.learn.origin import map_facts, shared_facts
 from magtwin.learn.recording import Recording, Rows, Source, read, sources_of, thinned
 from magtwin.learn.split import Part, Split
 from magtwin.names import RefusedError, find
@@ -83,7 +84,8 @@ class Dataset(Summarized):
     """Lever arm and latency that they were made with."""
 
     facts: Facts
-    """Version of magtwin, map's method, how the alignment came about."""
+    """Version of magtwin, the map's method and values, how the alignment came about, and the robot that
+    drove, where the recordings tell; see `magtwin.learn.origin`."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -244,7 +246,7 @@ class Dataset(Summarized):
         facts = {
             "map": self.map_name,
             "map_sha256": self.map_sha256,
-            **self.facts,
+            **{name: fact for name, fact in self.facts.items() if name != "map_samples_nt"},
             "feature sets": ", ".join(sets),
         }
         return Report(f"Data set {self.folder}", tuple(figures), facts)
@@ -368,6 +370,7 @@ def build_dataset(
         raise RefusedError(f'alignment must be "fit", an Alignment or None, got {alignment!r}')
     done: list[Recording] = []
     columns: list[set[str]] = []
+    told: list[Facts] = []
     with output(folder, force=force) as aside:
         (aside / RUNS).mkdir(parents=True)
         for i, source in enumerate(sources):
@@ -380,10 +383,12 @@ def build_dataset(
             run = run.select(*(column for column in KEPT if column in run))
             done.append(_write(run, source, aside / RUNS / f"{source.name}.parquet"))
             columns.append(set(run))
+            told.append(run.facts)
         _check_labels(done, field)
-        facts: dict[str, Any] = {"alignment": how, "magtwin": __version__}
-        facts |= {"map_method": field.method, "map_source": field.source, "map_licence": field.licence}
         shared = [c for c in KEPT if all(c in one for one in columns)]
+        facts: dict[str, Any] = {"alignment": how, "magtwin": __version__}
+        facts |= {"map_source": field.source, "map_licence": field.licence, **map_facts(field)}
+        facts |= {"poses": "mocap" if "mocap_p" in shared else "true", **shared_facts(told)}
         manifest = {
             "kind": KIND,
             "version": VERSION,

@@ -1,5 +1,6 @@
 """NeuralMagnetometer: a predictor that gives a Run its disturbance."""
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from magtwin.learn.regressor import summary_of
 from magtwin.learn.weights import Fact
 from magtwin.names import RefusedError
 from magtwin.run import Run
+from magtwin.sim.model_error import ModelError
 from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
@@ -82,6 +84,23 @@ class NeuralMagnetometer(Summarized):
     def residual_sd_nt(self) -> float:
         """Root mean square of label minus prediction on held-out recordings [nT]; nan where unknown."""
         return self.net.residual_sd_nt
+
+    def model_error(self) -> ModelError | None:
+        """Statistics of the error of its predictions; None where its file does not tell them.
+
+        Raises:
+            RefusedError: Its file tells figures that cannot be.
+        """
+        told = [self.net.facts.get(name) for name in ("residual_offset_sd_nt", "residual_time_s")]
+        if None in told or (self.net.kind == "mlp" and math.isnan(self.residual_sd_nt)):
+            return None
+        figures = [float(one) if isinstance(one, int | float) else math.nan for one in told]
+        if not all(0 <= one < math.inf for one in figures):
+            raise RefusedError(
+                f"{self.name}: residual_offset_sd_nt and residual_time_s of its facts must be finite and not "
+                f"below 0, got {told[0]!r} and {told[1]!r}"
+            )
+        return ModelError(*figures)
 
     @property
     def facts(self) -> Mapping[str, Fact]:

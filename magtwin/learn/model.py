@@ -17,7 +17,7 @@ from magtwin.learn.features import FULL, feature_names
 from magtwin.learn.inputs import Inputs, inputs_of
 from magtwin.learn.perceptron import outputs
 from magtwin.learn.regressor import summary_of
-from magtwin.learn.weights import Fact, Weights, is_checkpoint, read_weights, say, write_weights
+from magtwin.learn.weights import Fact, Weights, is_checkpoint, read_weights, say, shown, write_weights
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary
@@ -203,7 +203,7 @@ class FieldNet(Summarized, torch.nn.Module):
         ]
         if not math.isnan(self.residual_sd_nt):
             figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out runs"))
-        return Report(title, tuple(figures), dict(self.facts))
+        return Report(title, tuple(figures), shown(self.facts))
 
     def _summary(self) -> Summary:
         return summary_of(self, "FieldNet")

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.learn.inputs import Inputs
-from magtwin.learn.weights import Fact, write_weights
+from magtwin.learn.weights import Fact, shown, write_weights
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary, listed
 
@@ -69,7 +69,7 @@ class Regressor(Summarized, ABC):
         figures = [Figure("kind", self.kind), *self.figures()]
         if not math.isnan(self.residual_sd_nt):
             figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out recordings"))
-        return Report(title, tuple(figures), dict(self.facts))
+        return Report(title, tuple(figures), shown(self.facts))
 
     def _summary(self) -> Summary:
         return summary_of(self, type(self).__name__)

@@ -15,16 +15,24 @@ from magtwin.learn.config import TrainConfig
 from magtwin.learn.dataset import MANIFEST, Dataset
 from magtwin.learn.descent import Epoch
 from magtwin.learn.material import Material, material
+from magtwin.learn.origin import ROBOT_FACTS
 from magtwin.learn.predictor import Predictor, load_predictor
-from magtwin.learn.recipe import Choice, device_of, make
+from magtwin.learn.recipe import Choice, Made, device_of, make
+from magtwin.learn.residuals import Held, held_of, residuals
 from magtwin.learn.split import PARTS, Part, Split
-from magtwin.learn.weights import Fact
+from magtwin.learn.weights import Fact, shown
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary
 from magtwin.verdict import SEPARATOR, coverage, recordings_text, verdict
 from magtwin.version import __version__
 
 Array = NDArray[np.float64]
+
+ORIGIN = (
+    *("map_method", "map_height_m", "map_extent_m", "map_samples_nt", "alignment", "poses"),
+    *ROBOT_FACTS,
+)
+"""Facts of a data set that weights keep."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +136,7 @@ class Trained(Summarized):
             ]
             if not math.isnan(one.before_mae_nt):
                 figures.append(Figure(f"{one.name} MAE before", one.before_mae_nt, "nT"))
-        facts = {name: fact for name, fact in self.net.facts.items() if name != "config"}
+        facts = {name: fact for name, fact in shown(self.net.facts).items() if name != "config"}
         return Report(title, tuple(figures), facts, self.verdict())
 
     def verdict(self) -> str:
@@ -222,6 +230,8 @@ def fit(
         net.facts.update({f"{one.name}_{key}": value for key, value in told.items()})
         if math.isfinite(one.coverage):
             net.facts[f"{one.name}_coverage_90"] = one.coverage
+    if (found := residuals(_held_out(of, made))) is not None:
+        net.facts.update(found.facts())
     known = {one.name: one for one in dataset.recordings}
     mine, tested = ([known[name] for name in split.names(part)] for part in ("train", "test"))
     sessions, driven = ({one.session: None for one in mine}, {one.path: None for one in mine})
@@ -242,6 +252,23 @@ def fit(
         len(learned.y),
         judged_on,
     )
+
+
+def _held_out(of: Material, made: Made) -> list[Held]:
+    """Errors on recordings that the model was not fitted to: those of validation and test, and those of
+    training where it was fitted without each of them in turn.
+    """
+    found = []
+    for part in PARTS:
+        rows = of.rows[part]
+        if part != "train":
+            told = of.told(made.model, part)[0]
+        elif made.held_out_nt is not None:
+            told = made.held_out_nt
+        else:
+            continue
+        found += held_of(rows, told - rows.y, of.dataset.recordings)
+    return found
 
 
 def _judged(
@@ -288,6 +315,7 @@ def _facts(config: TrainConfig, dataset: Dataset, split: Split, rows: int, devic
         "map_sha256": dataset.map_sha256,
         "lever_arm_m": ", ".join(f"{c:g}" for c in lever.lever_arm_m),
         "latency_s": lever.latency_s,
+        **{name: dataset.facts[name] for name in ORIGIN if name in dataset.facts},
         "config": told.to_toml(),
         "seed": config.seed,
         "split": split.by,

@@ -22,7 +22,7 @@ from magtwin.run import Run
 from magtwin.sim.exact import check_field
 from magtwin.sim.online import Online
 from magtwin.sim.online_sensors import Samples
-from magtwin.twin import Session, Twin, in_session
+from magtwin.twin import Session, Twin, in_session, model_error_of
 
 RESET = "/robot/reset"
 """Topic (std_msgs/Empty), and with rclpy service (std_srvs/Empty), that puts the robot back to its start and
@@ -184,6 +184,7 @@ class Simulator:
             obstacles=twin.obstacles,
             rate_hz=self._rate,
             network=Following(twin.magnetometer) if twin.magnetometer else None,
+            model_error=model_error_of(twin, self._seed),
             lidar=self._lidar,
         )
 

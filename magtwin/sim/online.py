@@ -25,7 +25,8 @@ from magtwin.sim.interference import level_gradient_nt_m, sensor_places
 from magtwin.sim.lidar import Scans, lidar_on, scan
 from magtwin.sim.magnetometer import LOCK_RATE_HZ
 from magtwin.sim.manual import at_start
-from magtwin.sim.online_sensors import Battery, Imu, Magnetometer, Mocap, Odometry, Samples
+from magtwin.sim.model_error import ModelError
+from magtwin.sim.online_sensors import Battery, Imu, Magnetometer, Markov, Mocap, Odometry, Samples
 from magtwin.sim.sensors import into_sensor
 from magtwin.sim.simulate import check_run, flags, mapped, streams, truth
 from magtwin.spec import DriveSpec, Scene
@@ -103,6 +104,7 @@ class Online:
         obstacles: Obstacles | None = None,
         rate_hz: float | None = None,
         network: Network | None = None,
+        model_error: ModelError | None = None,
         outside: Literal["nan", "clamp"] = "nan",
         lidar: Literal["schedule", "on", "off"] = "schedule",
     ) -> None:
@@ -115,6 +117,7 @@ class Online:
             obstacles: What stops it, and what its LiDAR sees.
             rate_hz: Magnetometer readings a second [Hz]; None takes the scene's.
             network: What predicts the disturbance of a neural magnetometer.
+            model_error: Statistics of the error of these predictions; None draws none.
             outside: What the map reads outside its extent.
             lidar: Whether the LiDAR follows its schedule, or stays on or off.
 
@@ -145,6 +148,8 @@ class Online:
         self._mocap = Mocap(robot.mocap, robot.base_height_m, draws["mocap"])
         self._battery = Battery(robot.battery, robot.drive, self._lidar_on, draws["battery"])
         self._magnetometer = Magnetometer(robot.magnetometer, self.rate_hz, draws["magnetometer"])
+        self._model_error, self._error_rng = model_error, draws["model_error"]
+        self._wandering = Markov(model_error.time_s if model_error else 0.0, self.rate_hz)
         self._scanner = Scanner(scene, obstacles, self._lidar_on, draws["lidar"])
         self._readings, self._looks, self._steep = 0, 0, False
         self._rows: list[tuple[float, float, float]] = []
@@ -244,9 +249,12 @@ class Online:
         dropped = self._magnetometer.dropped(count)
         columns["b_vector_measured_nt"][dropped] = np.nan
         columns |= flags(scene, true)
-        columns["b_sd_nt"] = np.full(count, np.nan)
+        columns["b_sd_nt"], error = np.full(count, np.nan), np.zeros(count)
         if self._network is not None:
             disturbance, sd, beyond = self._network(Run(columns, self._facts))
+            if self._model_error is not None:
+                process = self._wandering.next(self._error_rng.standard_normal(count))
+                error = self._model_error.error_nt(sd, process)
             density = robot.magnetometer.noise_density_nt
             columns["b_sd_nt"] = np.hypot(sd, density * np.sqrt(self.rate_hz / 2))
             if beyond is not None:
@@ -257,9 +265,10 @@ class Online:
             disturbance = np.zeros(count)
         columns["b_disturbance_nt"] = np.asarray(disturbance, float)
         columns["b_total_nt"] = columns["b_map_nt"] + columns["b_disturbance_nt"]
-        columns |= self._magnetometer.read(columns["b_total_nt"], vector, lost)
+        columns["b_model_error_nt"] = error
+        columns |= self._magnetometer.read(columns["b_total_nt"] + error, vector, lost)
         columns["b_measured_nt"][dropped] = np.nan
-        columns["b_noise_nt"] = columns["b_measured_nt"] - columns["b_total_nt"]
+        columns["b_noise_nt"] = columns["b_measured_nt"] - (columns["b_total_nt"] + error)
         return Run({name: columns[name] for name in COLUMNS if name in columns}, self._facts)
 
     def _steepness(self, t: Array) -> NDArray[np.bool_]:

@@ -29,12 +29,19 @@ from magtwin.sim.interference import level_gradient_nt_m, sensor_places
 from magtwin.sim.lidar import lidar_on
 from magtwin.sim.magnetometer import LOCK_RATE_HZ, feels_direction, lost_in, sense_axes, sense_magnetometer
 from magtwin.sim.mocap import sense_mocap
+from magtwin.sim.model_error import ModelError
 from magtwin.sim.odometry import sense_odometry
 from magtwin.sim.replay import replayed
 from magtwin.sim.sensors import Moving, into_sensor
-from magtwin.spec import Scene
+from magtwin.spec import RobotSpec, Scene
 
 Array = NDArray[np.float64]
+
+Predicted = NDArray[Any] | tuple[NDArray[Any], NDArray[Any]]
+"""Disturbance of each reading [nT], shape (N,), and the standard deviation of its error where it is known."""
+
+Predict = Callable[[Run], Predicted]
+"""From a Run to what a network predicts of it."""
 
 RANDOM_S = 60.0
 """How long a driver drives about unless told otherwise [s]."""
@@ -42,7 +49,10 @@ RANDOM_S = 60.0
 MOST_READINGS = 20_000_000
 """Most readings of a run: about 8 GB of columns."""
 
-_STREAMS = ("odometry", "imu", "battery", "magnetometer", "mocap", "lidar", "drive", "driver")
+_STREAMS = (
+    *("odometry", "imu", "battery", "magnetometer", "mocap", "lidar", "drive", "driver"),
+    "model_error",
+)
 """Who draws random numbers, each from a child generator of its own; append only: the order is the seed."""
 
 
@@ -51,7 +61,9 @@ _IMU = frozenset(("imu_q_xyzw", "imu_w", "imu_a"))
 _MOCAP = frozenset(("mocap_p", "mocap_q_xyzw", "flag_pose_lost"))
 _BATTERY = frozenset(("battery_v", "battery_a", "battery_fraction"))
 _EXACT = frozenset(("b_vector_nt", "b_truth_nt", "b_vector_measured_nt"))
-_READ = frozenset(("b_measured_nt", "b_noise_nt", "b_vector_measured_nt", "flag_lost_lock"))
+_READ = frozenset(
+    ("b_measured_nt", "b_model_error_nt", "b_noise_nt", "b_vector_measured_nt", "flag_lost_lock")
+)
 """Columns that are made together."""
 
 
@@ -71,14 +83,16 @@ def simulate(
     rate_hz: float | None = None,
     obstacles: Obstacles | None = None,
     controller: str | Controller = "follower",
-    disturbance_nt: Callable[[Run], NDArray[Any]] | None = None,
+    disturbance_nt: Predict | None = None,
+    model_error: ModelError | None = None,
     outside: Literal["nan", "clamp", "raise"] = "nan",
     lidar: Literal["schedule", "on", "off"] = "schedule",
     engine: Engine | None = None,
 ) -> Run:
     """Drive a scene's robot along a path and read its sensors.
 
-    b_total = b_map + b_disturbance, b_map at base_link's pose, and b_measured = b_total + b_noise. The
+    b_total = b_map + b_disturbance, b_map at base_link's pose, and b_measured = b_total + b_noise, and of a
+    neural magnetometer b_model_error besides. The
     disturbance is what `disturbance_nt` predicts, for a neural magnetometer; without it, for a physical
     one, b_truth - b_map: the exact field of the lab and of the robot itself at the magnetometer, less the
     map; for one of the kind "map-only" it is 0. `magtwin.sim.exact` says what makes the exact field. Where
@@ -99,7 +113,9 @@ def simulate(
         obstacles: What the path must be clear of, and what stops the robot if it leaves its path.
         controller: A name of `magtwin.sim.controllers.CONTROLLERS`, or a controller of one's own.
         disturbance_nt: From a Run in which every other sensor has been read, the vector axes too, to the
-            disturbance of each reading [nT], shape (N,). Called once.
+            disturbance of each reading [nT], shape (N,), or that and the standard deviation of its error.
+            Called once.
+        model_error: Statistics of that error, which is drawn then; None draws none.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
         engine: What moves the robot; None is the kinematic one. A Run is not moved anew.
@@ -137,7 +153,7 @@ def simulate(
         facts=facts,
         network=disturbance_nt is not None,
     )
-    return sensed.read(None if disturbance_nt is None else disturbance_nt(sensed.run))
+    return sensed.read(None if disturbance_nt is None else disturbance_nt(sensed.run), model_error)
 
 
 def travel(
@@ -237,35 +253,49 @@ class Sensed:
     rng: np.random.Generator
     """Source of the magnetometer's noise; spent by one reading."""
 
+    error_rng: np.random.Generator
+    """Source of the error of a network's predictions; spent by one reading."""
+
     wanted: frozenset[str]
     """Columns of `COLUMNS` that the whole run is to have."""
 
     beside_nt: Array | float = 0.0
     """What other robots add to the field's magnitude at each reading [nT], shape (N,); 0 without others."""
 
-    def read(self, disturbance_nt: NDArray[Any] | None = None) -> Run:
+    def read(
+        self,
+        predicted: Predicted | None = None,
+        model_error: ModelError | None = None,
+    ) -> Run:
         """The whole run, of the columns that are wanted.
 
         Args:
-            disturbance_nt: What a network predicts for each reading [nT], shape (N,); none for a magnetometer
-                without one.
+            predicted: What a network predicts; None for a magnetometer without one.
+            model_error: Statistics of the error of that; None draws none, nor does a prediction without a
+                standard deviation.
         """
         columns, spec = dict(self.run.columns), self.scene.robot.magnetometer
         rows = len(columns["t"])
-        if disturbance_nt is None:
+        error = np.zeros(rows)
+        if predicted is None:
             exact = columns["b_truth_nt"] - columns["b_map_nt"]
             disturbance = exact if spec.kind == "physical" else np.zeros(rows)
         else:
-            disturbance = np.asarray(disturbance_nt, float)
+            mean, sd = predicted if isinstance(predicted, tuple) else (predicted, None)
+            disturbance = np.asarray(mean, float)
+            if model_error is not None and sd is not None:
+                white = self.error_rng.standard_normal(rows)
+                error = model_error.error_nt(sd, model_error.process(white, self.rate_hz))
             if disturbance.shape != (rows,):
                 raise RefusedError(f"disturbance_nt must give shape {(rows,)}, got {disturbance.shape}")
             disturbance = disturbance + self.beside_nt
         columns["b_disturbance_nt"] = disturbance
         columns["b_total_nt"] = columns["b_map_nt"] + disturbance
+        columns["b_model_error_nt"] = error
         if self.wanted & _READ:
             columns |= sense_magnetometer(
                 spec,
-                columns["b_total_nt"],
+                columns["b_total_nt"] + error,
                 columns["b_vector_nt"] if "b_vector_nt" in columns else np.full((rows, 3), np.nan),
                 self.rng,
                 rate_hz=self.rate_hz,
@@ -366,6 +396,7 @@ def sense(
     told: dict[str, str | int | float | bool] = {
         "scene": scene.name,
         **facts,
+        **robot_facts(robot),
         "rate_hz": float(rate_hz),
         "duration_s": round(float(end), 9),
         "outside": outside,
@@ -379,9 +410,28 @@ def sense(
         rate_hz=rate_hz,
         steep=steep,
         rng=draws["magnetometer"],
+        error_rng=draws["model_error"],
         wanted=wanted,
         beside_nt=beside,
     )
+
+
+def robot_facts(robot: RobotSpec) -> dict[str, str | int | float | bool]:
+    """What a run tells of its robot, for a network that learns from it: name, sensor, motion capture.
+
+    `mocap_latency_s` is the mean age of motion capture's pose: latency, mean jitter and half a period.
+    """
+    mocap = robot.mocap
+    return {
+        "robot_name": robot.name,
+        "sensor_m": _listed(robot.p_base_magnetometer),
+        "mocap_offset_m": _listed(mocap.offset_m),
+        "mocap_latency_s": round(mocap.latency_s + mocap.jitter_s + 0.5 / mocap.rate_hz, 6),
+    }
+
+
+def _listed(values: Iterable[float]) -> str:
+    return ", ".join(f"{value:.6g}" for value in values)
 
 
 def _check_kind(scene: Scene) -> None:
