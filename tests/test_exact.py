@@ -190,6 +190,12 @@ def test_a_run_says_that_the_map_is_its_truth_and_where_sources_are_it_does_not(
     assert "truth" not in drive(KNOWN).facts
 
 
+@pytest.mark.parametrize(("height", "says"), [(None, False), (0.34, False), (0.2, True)])
+def test_a_run_says_that_its_sensor_is_not_at_the_height_of_the_map(height, says):
+    run = drive(field=replace(MAP, height_m=height))
+    assert ("it holds 0.2 m above the floor, and the sensor is at 0.36 m" in str(run.facts["truth"])) == says
+
+
 def test_a_reading_off_the_map_is_nan():
     small = replace(MAP, origin_m=(-0.5, -0.3), cell_m=(1 / 24, 0.6 / 14))
     run = drive(field=small)

@@ -416,7 +416,7 @@ def _told(sheet: Sheet, columns: Columns) -> tuple[Columns, list[str]]:
         _, b = _field(sheet, replace(columns, unit="nT"))
         unit = unit_by_size(b)
         if unit not in (None, "nT"):
-            columns = replace(columns, unit=unit)
+            columns = replace(columns, unit=unit)  # type: ignore[arg-type]
             taken.append(f"{columns.field or columns.vector} in {unit}, as its size tells (--unit)")
     return columns, taken
 

@@ -204,9 +204,9 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
         notes.append(f"footprint_radius_m not given: {radius:g} m, from the robot's shape")
     define_footprint(robot, radius)
     if settings.drive is not None or not prims_with(robot, "drive"):
-        drive, told = drive_of(robot, settings.drive or DriveSpec())
+        drive, found = drive_of(robot, settings.drive or DriveSpec())
         define_drive(robot, drive)
-        notes += told
+        notes += found
     notes += stand_on_floor(robot, read_drive(robot))
     define_platform(robot, settings.platform)
     define_mocap(robot, settings.mocap)

@@ -63,7 +63,7 @@ def drive_of(robot: Usd.Prim, given: DriveSpec) -> tuple[DriveSpec, list[str]]:
     for name, value in seen.items():
         default = getattr(_DEFAULTS, name)
         if value > 0 and getattr(given, name) == default and abs(value / default - 1) > OFF:
-            drive = replace(drive, **{name: round(value, 5)})
+            drive = replace(drive, **{name: round(value, 5)})  # type: ignore[arg-type]
             notes.append(f"{name} not given: {value:.5g} m, from the robot's shape")
     return drive, notes
 
@@ -97,9 +97,9 @@ def wheels_of(robot: Usd.Prim) -> list[Wheel]:
         box = _box(robot, prim.GetStage().GetPrimAtPath(bodies[0])) if bodies else None
         if box is None or box.IsEmpty():
             continue
-        middle, size = box.GetMidpoint(), box.GetSize()
+        (x, y, z), size = box.GetMidpoint(), box.GetSize()
         name = prim.GetDisplayName() or prim.GetName()
-        found.append(Wheel(name, *middle, radius_m=max(size[0], size[2]) / 2))
+        found.append(Wheel(name, x, y, z, max(size[0], size[2]) / 2))
     return found
 
 
