@@ -27,6 +27,9 @@ SUFFIX = "_map.csv"
 LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
 """Bounds of a survey's mean [nT]; the Earth's field lies in 22,000..67,000 nT, a building bends it."""
 
+EARTH_NT = 20_000.0, 70_000.0
+"""The Earth's field, with some room [nT]: a unit that makes a mean lie outside is only a guess."""
+
 USUAL_NT = 50_000.0
 """Magnitude that a refusal suggests a scale for [nT]."""
 
@@ -421,22 +424,25 @@ def check_unit(
     if scale is not None:
         raise RefusedError(
             f"{where}: the mean of {column} is {mean:.6g} nT with scale {scale:g}, outside "
-            f"{LEAST_MEAN_NT:,.0f}..{GREATEST_MEAN_NT:,.0f} nT; --scale {_four(scale * USUAL_NT / mean)} would "
-            f"make it {USUAL_NT:,.0f} nT"
+            f"{LEAST_MEAN_NT:,.0f}..{GREATEST_MEAN_NT:,.0f} nT; --scale {_four(scale * USUAL_NT / mean)} "
+            f"would make it {USUAL_NT:,.0f} nT"
         )
     number = mean / NT_PER[unit]
-    fits = [
-        f"were it {other}, it would be {number * factor:,.0f} nT, so say --unit {other}"
-        for other, factor in NT_PER.items()
-        if LEAST_MEAN_NT <= number * factor <= GREATEST_MEAN_NT
-    ]
-    normalised = (
-        "no usual unit makes it the Earth's field; for a normalised sensor give --scale, the factor to nT "
-        f"({_four(USUAL_NT / number)} would make it {USUAL_NT:,.0f} nT)"
+    could = {other: number * factor for other, factor in NT_PER.items()}
+    could = {other: value for other, value in could.items() if LEAST_MEAN_NT <= value <= GREATEST_MEAN_NT}
+    advice = " or ".join(
+        f"were it {other}, it would be {value:,.0f} nT, so say --unit {other}"
+        for other, value in could.items()
     )
+    no_unit = "no usual unit makes it the Earth's field"
+    if not any(EARTH_NT[0] <= value <= EARTH_NT[1] for value in could.values()):
+        advice = (
+            f"{advice or no_unit}; for a normalised sensor "
+            f"give --scale, the factor to nT ({_four(USUAL_NT / number)} would make it {USUAL_NT:,.0f} nT)"
+        )
     raise RefusedError(
         f"{where}: the mean of {column} is {mean:.6g} nT, outside {LEAST_MEAN_NT:,.0f}.."
-        f"{GREATEST_MEAN_NT:,.0f} nT; " + (" or ".join(fits) or normalised)
+        f"{GREATEST_MEAN_NT:,.0f} nT; {advice}"
     )
 
 
