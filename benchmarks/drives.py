@@ -3,10 +3,10 @@
     python benchmarks/drives.py [--minutes 10] [--drives 1] [--method trilinear harmonic]
 
 Each drive is a random one of the default lab, at 17 Hz, with a physical magnetometer: seed 0, 1, ....
-Of each, 15 % is left out in pieces of 10 s, and then a tenth of the floor in blocks of 0.6 m. Printed are the
-processor time of the whole command `magtwin map fit` on the whole drive, its peak memory, the root of the mean
-squared error on both kinds of readings left out, and the share of them in the 90 % intervals, noise included.
-The ratio is that of the time to the first method's, so that it carries over to other machines.
+Of each, 15 % is left out in pieces of 10 s, and then a tenth of the floor in blocks of 0.6 m. Printed are
+the processor time of the whole command `magtwin map fit` on the whole drive, its peak memory, the root of the
+mean squared error on both kinds of readings left out, and the share of them in the 90 % intervals, noise
+included. The ratio is that of the time to the first method's, so that it carries over to other machines.
 """
 
 import argparse

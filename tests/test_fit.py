@@ -54,16 +54,20 @@ def test_a_smooth_raster_is_as_fine_as_its_fit_needs(method):
     assert "errs by" in figures["headings apart"].note
 
 
-def test_a_harmonic_raster_is_the_fit_at_its_nodes_and_its_sd_to_a_twentieth():
+def test_a_harmonic_raster_is_the_fit_at_its_nodes_and_on_fine_grids_nearly_its_sd():
     readings = drive()
     model = fit(readings, "harmonic")
-    field = raster(model, readings, spacing_m=0.075, headings_rad=[0.0, 1.0])
-    p, yaw = field.grid.poses()
-    value, variance = model.predict(p, yaw)
-    assert_allclose(field.values_nt, value, rtol=1e-9)
-    ratio = np.sqrt(field.variance_nt2 / variance)[field.valid]
-    assert np.quantile(ratio, 0.01) > 0.95
-    assert np.quantile(ratio, 0.99) < 1.05
+    ratio = []
+    for spacing in (0.075, 0.05):
+        field = raster(model, readings, spacing_m=spacing, headings_rad=[0.0, 1.0])
+        p, yaw = field.grid.poses()
+        value, variance = model.predict(p, yaw)
+        assert_allclose(field.values_nt, value, rtol=1e-9)
+        ratio.append(np.sqrt(field.variance_nt2 / variance)[field.valid])
+    assert_allclose(ratio[0], 1, rtol=1e-9)
+    # scattered readings 6 cm apart: as rough a variance as there is; between means of a drive it is smoother
+    assert np.all(np.quantile(ratio[1], (0.1, 0.01)) > (0.95, 0.9))
+    assert np.all(np.quantile(ratio[1], (0.9, 0.99)) < (1.07, 1.2))
 
 
 @pytest.mark.parametrize("method", QUICK)
