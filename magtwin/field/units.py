@@ -80,18 +80,21 @@ def check_unit(
             f"would give {USUAL_NT:,.0f} nT"
         )
     number = mean / NT_PER[unit]
-    fits = [
-        f"were it {other}, it would be {number * factor:,.0f} nT, so say --unit {other}"
-        for other, factor in NT_PER.items()
-        if LEAST_MEAN_NT <= number * factor <= GREATEST_MEAN_NT
-    ]
-    normalised = (
-        "no usual unit makes it the Earth's field; for a normalised sensor give --scale, the factor to nT "
-        f"({_four(USUAL_NT / number)} would make it {USUAL_NT:,.0f} nT)"
+    could = {other: number * factor for other, factor in NT_PER.items()}
+    could = {other: value for other, value in could.items() if LEAST_MEAN_NT <= value <= GREATEST_MEAN_NT}
+    advice = " or ".join(
+        f"were it {other}, it would be {value:,.0f} nT, so say --unit {other}"
+        for other, value in could.items()
     )
+    low, high = INDOORS_NT
+    if not any(low <= value <= high for value in could.values()):
+        advice = (
+            f"{advice or 'no usual unit makes it the field of the Earth'}; for a normalised sensor give "
+            f"--scale, the factor to nT ({_four(USUAL_NT / number)} would make it {USUAL_NT:,.0f} nT)"
+        )
     raise RefusedError(
         f"{where}: the mean of {column} is {mean:.6g} nT, outside {LEAST_MEAN_NT:,.0f}.."
-        f"{GREATEST_MEAN_NT:,.0f} nT; " + (" or ".join(fits) or normalised)
+        f"{GREATEST_MEAN_NT:,.0f} nT; {advice}"
     )
 
 
