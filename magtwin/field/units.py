@@ -77,7 +77,7 @@ def check_unit(
         raise RefusedError(
             f"{where}: the mean of {column} is {mean:.6g} nT with scale {scale:g}, outside "
             f"{LEAST_MEAN_NT:,.0f}..{GREATEST_MEAN_NT:,.0f} nT; --scale {_four(scale * USUAL_NT / mean)} "
-            f"would give {USUAL_NT:,.0f} nT"
+            f"would make it {USUAL_NT:,.0f} nT"
         )
     number = mean / NT_PER[unit]
     could = {other: number * factor for other, factor in NT_PER.items()}
