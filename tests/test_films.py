@@ -114,8 +114,9 @@ def test_the_robot_is_seen_behind_a_column_in_every_frame(run, lab_scene):
             assert on_robot.sum() > 50
             assert np.mean(np.ptp(solid[on_robot], axis=0)) < 30  # one plain face of the column
             veiled = np.abs(seen - bare)[on_robot].max(axis=-1)
-            assert np.mean(veiled <= VEIL * 255 + 3) > 0.9  # but for thin posts, all edge: 0.94 and more seen
-            assert np.corrcoef(seen[on_robot].ravel(), bare[on_robot].ravel())[0, 1] > 0.8
+            assert np.mean(veiled <= VEIL * 255 + 3) > 0.9  # but for thin posts, all edge
+            far, near = (np.abs(image - bare)[on_robot].mean() for image in (solid, seen))
+            assert near < 0.6 * far  # 0.30 to 0.48 seen: 0.3 but for the posts
 
 
 def test_the_camera_that_follows_stays_on_the_robots_side_of_a_wall():
