@@ -11,7 +11,8 @@ from magtwin.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from magtwin.field.map import AnomalyMap
-    from magtwin.names import RefusedError
+    from magtwin.io.plotting import plot
+    from magtwin.names import MismatchWarning, RefusedError
     from magtwin.path import Path
     from magtwin.run import COLUMNS, Run
     from magtwin.spec import Scene
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 _HOME = {
     "AnomalyMap": "magtwin.field.map",
     "COLUMNS": "magtwin.run",
+    "MismatchWarning": "magtwin.names",
     "Path": "magtwin.path",
     "RefusedError": "magtwin.names",
     "Run": "magtwin.run",
@@ -35,6 +37,7 @@ _HOME = {
     "Twin": "magtwin.twin",
     "author_scene": "magtwin.twin",
     "open_twin": "magtwin.twin",
+    "plot": "magtwin.io.plotting",
     "scene_from_toml": "magtwin.twin",
     "simulate": "magtwin.twin",
     "simulate_many": "magtwin.twin",
@@ -44,6 +47,7 @@ _HOME = {
 __all__ = [
     "COLUMNS",
     "AnomalyMap",
+    "MismatchWarning",
     "Path",
     "RefusedError",
     "Run",
@@ -51,6 +55,7 @@ __all__ = [
     "Twin",
     "author_scene",
     "open_twin",
+    "plot",
     "scene_from_toml",
     "simulate",
     "simulate_many",

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.files import existing
 from magtwin.names import RefusedError, find, hint
 from magtwin.obstacles import Obstacles
+from magtwin.summary import Summarized, Summary, rectangle
 
 Array = NDArray[np.float64]
 
@@ -23,8 +24,8 @@ _SAME_M = 1e-6
 """Neighbours nearer than this are one point; a line whose ends are nearer than this is closed [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Path:
+@dataclass(frozen=True, eq=False, repr=False)
+class Path(Summarized):
     """A polyline in the plane of the floor, parametrised by its arc length.
 
     Neighbours that coincide are merged at birth. A closed path ends where it began: its first point
@@ -172,6 +173,19 @@ class Path:
         if self.closed:
             s = s % self.length
         return s, np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, len(self.s) - 2)
+
+    def _summary(self) -> Summary:
+        """Name, length, extent, and where it begins and ends."""
+        (x0, y0), (x1, y1) = self.p_xy.min(axis=0), self.p_xy.max(axis=0)
+        (ax, ay), (bx, by) = self.p_xy[0], self.p_xy[-1]
+        ends = f"begins and ends at ({ax:z.2f}, {ay:z.2f}) m"
+        if not self.closed:
+            ends = f"({ax:z.2f}, {ay:z.2f}) to ({bx:z.2f}, {by:z.2f}) m"
+        return Summary(
+            f"Path {self.name}: {self.length:.4g} m, {'closed' if self.closed else 'open'}, "
+            f"{len(self.p_xy):,} points",
+            (("over", rectangle(x0, x1, y0, y1)), ("ends", ends), ("file", self.file)),
+        )
 
 
 def sine(
@@ -408,13 +422,36 @@ def path_named(name: str) -> Path:
     return find("path", CASES.get(name, name), PATHS)()
 
 
-def resolve_path(name_or_file: str | os.PathLike[str]) -> Path:
-    """A path from a name of `PATHS`, a case A to E of `CASES`, or else from a CSV file.
+def path_of_points(p_xy: ArrayLike, name: str = "points", file: str = "") -> Path:
+    """A polyline through points, as a CSV file of them gives it; closed where it ends where it began.
+
+    Args:
+        p_xy: Points in world [m], shape (N, 2), N >= 2. Neighbours that coincide are merged.
+        name: What to call it.
+        file: The file that they were read from.
 
     Raises:
-        RefusedError: It is neither, or the file is not a path.
+        RefusedError: They are not finite numbers of that shape, or only one point.
     """
-    text = os.fspath(name_or_file)
+    try:
+        p = np.asarray(p_xy, float)
+    except (TypeError, ValueError) as error:
+        raise RefusedError(f"path {name!r}: points must be numbers of shape (N, 2) [m] ({error})") from error
+    if p.ndim != 2 or p.shape[1] != 2 or not len(p):
+        raise RefusedError(f"path {name!r}: points must have shape (N, 2) [m], got {p.shape}")
+    line = _without_repeats(p)
+    return Path(name, p, len(line) > 2 and math.dist(line[0], line[-1]) < _SAME_M, file)
+
+
+def resolve_path(path: "str | os.PathLike[str] | ArrayLike") -> Path:
+    """A path from a name of `PATHS`, a case A to E of `CASES`, a CSV file, or points of shape (N, 2) [m].
+
+    Raises:
+        RefusedError: It is none of these, or the file is not a path.
+    """
+    if not isinstance(path, str | os.PathLike):
+        return path_of_points(path)
+    text = os.fspath(path)
     if text in PATHS or text in CASES:
         return path_named(text)
     file = FilePath(text)
@@ -458,10 +495,9 @@ def read_path_csv(file: str | os.PathLike[str]) -> Path:
         points.append(point)
     if not points:
         raise RefusedError(f"{file}: no points in it; one x,y in metres a line is wanted")
-    p = _without_repeats(np.array(points))
-    if len(p) < 2:
+    if len(_without_repeats(np.array(points))) < 2:
         raise RefusedError(f"{file}: only one point in it; a path needs two that differ")
-    return Path(file.name, p, len(p) > 2 and math.dist(p[0], p[-1]) < _SAME_M, file.as_posix())
+    return path_of_points(points, file.name, file.as_posix())
 
 
 def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> None:

@@ -6,7 +6,7 @@ for one attribute of a prim. Lengths are metres, angles radians, fields nT. A sp
 
 import datetime
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +18,7 @@ from magtwin.field.earth import MODEL, SPAN
 from magtwin.frames import IDENTITY_XYZW, quat_multiply, rotate
 from magtwin.furniture import Part, parts_of
 from magtwin.names import RefusedError, find, hint
+from magtwin.summary import Summarized, Summary, listed
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -74,6 +75,20 @@ class Spec:
 
 def _least(value: float | tuple[float, ...]) -> float:
     return min(value) if isinstance(value, tuple) else value
+
+
+def spelled(value: Any) -> str:
+    """Every figure of a spec as text, of which checksums are taken.
+
+    It is what `repr` of a plain dataclass gives, whatever a class shows of itself at a prompt; runs keep its
+    checksum, so it must not change.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        figures = ", ".join(f"{f.name}={spelled(getattr(value, f.name))}" for f in fields(value) if f.repr)
+        return f"{type(value).__qualname__}({figures})"
+    if type(value) is tuple:
+        return f"({', '.join(map(spelled, value))}{',' * (len(value) == 1)})"
+    return repr(value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -599,6 +614,10 @@ class PlatformFieldSpec(Spec):
     caster_radius_m: float = 0.01
     """Radius that the caster rolls on [m]."""
 
+    hard_iron_change_nt: Vec3 = ZERO3
+    """Part of h that came after the survey of the map [nT]; 0 in the survey's session. A map that this robot
+    surveyed holds h without it."""
+
     hard_iron_drift_nt: Vec3 = ZERO3
     """Mean change of h from the day of a survey to the days of driving that follow [nT]: handling, docking
     and tools magnetise or demagnetise."""
@@ -616,8 +635,8 @@ class PlatformFieldSpec(Spec):
         self._not_negative("hard_iron_std_nt", "current_std")
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobotSpec(Spec):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class RobotSpec(Summarized, Spec):
     """A robot: the USD asset that shows it, and what the simulator needs to drive it."""
 
     name: str
@@ -674,6 +693,31 @@ class RobotSpec(Spec):
     def q_base_lidar_xyzw(self) -> Quat:
         """LiDAR's axes in base_link."""
         return _product(self.q_base_lidar_link_xyzw, self.lidar.q_link_sensor_xyzw)
+
+    def _summary(self) -> Summary:
+        """Name and magnetometer; drive; other sensors; the field that it makes itself."""
+        sensor, drive = self.magnetometer, self.drive
+        network = "" if sensor.network is None else f" ({sensor.network.name})"
+        x, y, z = self.p_base_magnetometer
+        return Summary(
+            f"RobotSpec {self.name}: {sensor.kind} magnetometer{network} at {sensor.rate_hz:g} Hz",
+            (
+                (
+                    "sensor",
+                    f"({x:.3g}, {y:.3g}, {z:.3g}) m in base_link, {sensor.noise_density_nt:.3g} nT/sqrt(Hz)",
+                ),
+                (
+                    "drive",
+                    f"{drive.v_max:.3g} m/s, {drive.w_max:.3g} rad/s, radius {self.footprint_radius_m:.3g} m",
+                ),
+                (
+                    "others",
+                    f"LiDAR {self.lidar.rays} rays, IMU {self.imu.rate_hz:g} Hz, "
+                    f"battery {self.battery.capacity_wh:g} Wh",
+                ),
+                ("asset", str(self.asset)),
+            ),
+        )
 
 
 def _product(a: Quat, b: Quat) -> Quat:
@@ -751,8 +795,8 @@ def _is_day(text: str) -> bool:
         return False
 
 
-@dataclass(frozen=True, kw_only=True)
-class SourceSpec(Spec):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class SourceSpec(Summarized, Spec):
     """A magnetised thing: a point dipole, or a uniformly magnetised body of some shape."""
 
     name: str
@@ -980,8 +1024,8 @@ class SurveySpec(Spec):
         self._require("headings_deg", within, "ascend from 0 to below 360", headings)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlacedRobot(Spec):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class PlacedRobot(Summarized, Spec):
     """A robot in a scene: what it is, where it begins, and what it drives."""
 
     robot: RobotSpec
@@ -994,8 +1038,8 @@ class PlacedRobot(Spec):
     what whoever runs the scene takes."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Scene(Spec):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Scene(Summarized, Spec):
     """A lab, its magnetic map, and a robot in it, or several.
 
     What is asked of a scene is asked of its first robot, `robot`; `led_by` makes another one the first.
@@ -1050,6 +1094,25 @@ class Scene(Spec):
         placed = find("robot", name, {placed.robot.name: placed for placed in self.robots})
         rest = tuple(other for other in self.robots if other.robot.name != name)
         return replace(self, robot=placed.robot, start=placed.start, path=placed.path, others=rest)
+
+    def _summary(self) -> Summary:
+        """Name and floor; robots; map; what makes the field; what is driven."""
+        width, depth = self.lab.floor_m
+        robots = [f"{one.robot.name} ({one.robot.magnetometer.kind} magnetometer)" for one in self.robots]
+        field = "no Earth's field" if self.earth is None else f"Earth's field of {self.earth.date}"
+        return Summary(
+            f"Scene {self.name}: floor {width:g} x {depth:g} m",
+            (
+                ("robots" if self.others else "robot", listed(robots, 80)),
+                ("map", str(self.map_layer)),
+                (
+                    "field",
+                    f"{field}, {len(self.sources):,} sources, {len(self.furniture):,} pieces of furniture",
+                ),
+                ("path", listed([str(one.path) or "not set" for one in self.robots])),
+                ("furniture", listed([one.name for one in self.furniture], 200)),
+            ),
+        )
 
     @property
     def magnets(self) -> tuple[SourceSpec, ...]:

@@ -1,5 +1,6 @@
 """`magtwin scene`: a scene's TOML in, stages out."""
 
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -29,7 +30,8 @@ def scene(
     out
         Folder to make; it holds all that the stage needs and can be moved.
     map
-        Map layer to use in place of the one that the TOML names.
+        Map layer to use in place of the one that the TOML names. Earth, sources and furniture stay; a map
+        that contradicts them is refused, and the difference is told in nT.
     net
         Weights to use in place of those that the TOML names (.safetensors or .pth).
     force
@@ -40,6 +42,7 @@ def scene(
     from magtwin.files import check_free, shipped
     from magtwin.twin import scene_from_toml
     from magtwin.usd.info import info_of_stage
+    from magtwin.usd.robot import notes_of
     from magtwin.usd.scene import author_scene
 
     file = Path(spec)
@@ -52,12 +55,17 @@ def scene(
     steps = announcer(quiet=json)
     with TemporaryDirectory() as workshop:
         steps(f"Reading {file}")
-        with progress("  Surveying") as advance:
+        with progress("Surveying", "nodes") as advance:
             scene = scene_from_toml(
                 file, map_layer=map, network=net, workshop=workshop, report=told.append, progress=advance
             )
         steps("Authoring the stage")
         root = author_scene(scene, out, force=force)
-    print_report(info_of_stage(root), json)
+        built = [
+            one.robot for one in scene.robots if one.robot.asset.is_relative_to(Path(workshop).resolve())
+        ]
+        notes = {f"notes on {robot.name}": notes_of(robot.asset) for robot in built}
+    report = info_of_stage(root)
+    print_report(replace(report, facts={**report.facts, **notes}), json)
     if not json:
         say("\n".join([*told, f"Wrote {root}"]))

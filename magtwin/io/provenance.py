@@ -13,7 +13,7 @@ from magtwin.names import RefusedError
 from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
 from magtwin.report import Figure, Report
 from magtwin.run import COLUMNS, Run
-from magtwin.twin import locate, on_its_day, path_facts, scene_of, simulate, simulate_robots, twin_of
+from magtwin.twin import in_session_of, locate, path_facts, scene_of, simulate, simulate_robots, twin_of
 
 CAUSES: Mapping[str, str] = {
     "magtwin": "another version of magtwin",
@@ -130,7 +130,7 @@ def made_again(
             "the run does not say its seed, so it cannot be repeated; was it recorded elsewhere?"
         )
     twin = twin_of(run, scene, near=near, check=False)
-    twin = on_its_day(twin, facts)
+    twin = in_session_of(twin, facts)
     what = _driven(run, near)
     try:
         seed, rate = int(facts["seed"]) if seed is None else seed, float(facts["rate_hz"])

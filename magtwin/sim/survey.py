@@ -156,7 +156,7 @@ def _visit(
     sensor, latch = scene.robot.magnetometer, rng.spawn(1)[0]
     exact, lost = np.zeros(grid.shape), np.zeros(grid.shape, bool)
     for k in range(len(grid.headings_rad)):
-        progress(k, len(grid.headings_rad), "surveying")
+        progress(k, len(grid.headings_rad), "")
         closed = np.zeros(grid.shape[1:], bool) if blocked is None else blocked(node[k])
         here = (slice(None), slice(None)) if not closed.any() else np.nonzero(~closed)
         lost[k] = closed
@@ -166,7 +166,7 @@ def _visit(
                 scene, _sensor_places(scene, stands[k][here], yaw[k][here], height)
             )
             lost[k][here] = lost_in(sensor, gradient.ravel()).reshape(gradient.shape)
-    progress(len(grid.headings_rad), len(grid.headings_rad), "surveying")
+    progress(len(grid.headings_rad), len(grid.headings_rad), "")
     total = np.zeros_like(exact)
     for _ in range(readings):
         total += _read(exact, sensor.noise_std_nt, sensor.resolution_nt, rng)

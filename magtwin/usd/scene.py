@@ -332,8 +332,8 @@ def scene_from_toml(
 
     Args:
         path: The TOML; files that it names are taken from its folder.
-        map_layer: Map to use in place of the one that it names. Its Earth's field and sources are
-            those of its own map, and are left out.
+        map_layer: Map to use in place of the one that it names. The Earth's field, sources and furniture stay
+            as the TOML has them; `magtwin.twin.scene_from_toml` refuses a map that contradicts them.
         network: Weights to use in place of those that it names.
         workshop: Folder in which the asset is built of a robot that the TOML names by its URDF; a
             self-contained scene copies it from there.
@@ -357,11 +357,10 @@ def scene_from_toml(
     except RefusedError as error:
         raise refused_at(path, "name", str(error)) from error
     layer = Path(map_layer).resolve() if map_layer is not None else given.map
-    own_map = map_layer is None
     lab = lab_of(given.lab, table, path, None if layer is None else existing(layer, "map layer"))
-    pieces = placed_furniture(given.furniture, lab, path, seed=given.seed) if own_map else ()
+    pieces = placed_furniture(given.furniture, lab, path, seed=given.seed)
     sources = given.source
-    if given.sources and own_map:
+    if given.sources:
         listed = read_sources(given.sources.file, seed=given.seed, lab=lab)
         sources, pieces = (*listed[0], *sources), (*listed[1], *pieces)
     if layer is None and (given.earth is None or survey_of is None):
@@ -391,8 +390,8 @@ def scene_from_toml(
         map_sha256="" if layer is None else sha256(layer),
         robot=robots[0].robot,
         lab=lab,
-        earth=_earth(given.earth, path) if given.earth and own_map else None,
-        sources=sources if own_map else (),
+        earth=_earth(given.earth, path) if given.earth else None,
+        sources=sources,
         furniture=pieces,
         start=robots[0].start,
         path=robots[0].path,
