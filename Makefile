@@ -62,6 +62,7 @@ schema: $(VENV)/.dev  ## Generate the schema library anew from schema.usda
 assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
 	$(BIN)/python robots/turtlebot4/build.py
 	$(BIN)/python maps/lab/build.py
+	$(BIN)/python scenes/build.py  # names the new map; its network is the old one until the last line
 	rm -rf build/protocol && $(BIN)/python weights/protocol.py --out build/protocol --ship
 	$(BIN)/python scenes/build.py
 
