@@ -104,8 +104,9 @@ class NeuralMagnetometer(Summarized):
 
     @property
     def facts(self) -> Mapping[str, Fact]:
-        """What a run says of its network: file, checksum, layers, parameters and the mean training label, where
-        that is known; its kind if no perceptron.
+        """Facts of a run about its network: file, checksum, layers, parameters; its kind if no perceptron.
+
+        The mean training label too, where the weights have it.
         """
         facts: dict[str, Fact] = {
             "network": self.name,
