@@ -195,8 +195,8 @@ def _frame_mismatch(facts: Facts, name: str, field: AnomalyMap, residual_sd_nt: 
         return None
     away, late = 100 * math.hypot(frame[0], frame[1]), 1000 * frame[2]
     return Mismatch(
-        f"{name} was trained on labels that took the map {away:.1f} cm and {late:.0f} ms off the robot's true "
-        f"pose, an error of about {effect:.0f} nT RMS at {TYPICAL_M_S:g} m/s. Its stated error includes this. "
+        f"{name} was trained on labels that took the map {away:.1f} cm and {late:.0f} ms off the robot's "
+        f"pose, an error of about {effect:.0f} nT RMS at {TYPICAL_M_S:g} m/s; its stated error includes it. "
         "To avoid it, train on labels with fitted lever arm and latency (magtwin dataset build --align fit)"
     )
 
