@@ -65,12 +65,13 @@ assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
 	rm -rf build/protocol && $(BIN)/python weights/protocol.py --out build/protocol --ship
 	$(BIN)/python scenes/build.py
 
-pictures: $(VENV)/.installed  ## Take the README's pictures anew, but for the viewer's
+pictures: $(VENV)/.installed  ## Draw the README's pictures again
 	$(BIN)/magtwin picture scenes/lab/lab.usda --out docs/lab.png --force
 	$(BIN)/magtwin picture robots/turtlebot4/turtlebot4.usda --size 1100x900 --out docs/robot.png --force
 	$(BIN)/magtwin map plot maps/lab/lab.usdc --out docs/map.png --force
 	$(BIN)/magtwin run scenes/lab/lab.usda --seed 1 --out build/pictures --force
-	$(BIN)/magtwin film build/pictures/run.parquet --camera 0,-1.6,5.6:0,-0.2,0 --size 560x350 --speed 10 --fps 8 --out docs/run.gif --force
+	$(BIN)/magtwin picture build/pictures/run.rrd --time 35 --size 1600x900 --out docs/recording.png --force
+	$(BIN)/magtwin film build/pictures/run.parquet --camera 0.4,-1.6,6.1:0.4,-0.2,0 --size 560x350 --speed 10 --fps 8 --out docs/run.gif --force
 
 clean:  ## Remove the environment and what was built
 	rm -rf $(VENV) build demo

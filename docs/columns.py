@@ -40,7 +40,7 @@ def page() -> str:
 ERRORS = """Every error has an address, where all are known:
 
     b_total_nt = b_map_nt + b_disturbance_nt
-    b_measured_nt = b_total_nt + b_noise_nt
+    b_measured_nt = b_total_nt + b_model_error_nt + b_noise_nt
     b_truth_nt = |b_vector_nt|, and = b_total_nt of a physical magnetometer
 """
 

@@ -11,21 +11,33 @@ from magtwin.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from magtwin.field.map import AnomalyMap
-    from magtwin.names import RefusedError
+    from magtwin.io.plotting import plot
+    from magtwin.names import MismatchWarning, RefusedError
     from magtwin.path import Path
     from magtwin.run import COLUMNS, Run
     from magtwin.spec import Scene
-    from magtwin.twin import Twin, open_twin, scene_from_toml, simulate, simulate_many, simulate_robots
+    from magtwin.twin import (
+        Twin,
+        author_scene,
+        open_twin,
+        scene_from_toml,
+        simulate,
+        simulate_many,
+        simulate_robots,
+    )
 
 _HOME = {
     "AnomalyMap": "magtwin.field.map",
     "COLUMNS": "magtwin.run",
+    "MismatchWarning": "magtwin.names",
     "Path": "magtwin.path",
     "RefusedError": "magtwin.names",
     "Run": "magtwin.run",
     "Scene": "magtwin.spec",
     "Twin": "magtwin.twin",
+    "author_scene": "magtwin.twin",
     "open_twin": "magtwin.twin",
+    "plot": "magtwin.io.plotting",
     "scene_from_toml": "magtwin.twin",
     "simulate": "magtwin.twin",
     "simulate_many": "magtwin.twin",
@@ -35,12 +47,15 @@ _HOME = {
 __all__ = [
     "COLUMNS",
     "AnomalyMap",
+    "MismatchWarning",
     "Path",
     "RefusedError",
     "Run",
     "Scene",
     "Twin",
+    "author_scene",
     "open_twin",
+    "plot",
     "scene_from_toml",
     "simulate",
     "simulate_many",

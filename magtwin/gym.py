@@ -9,7 +9,7 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -17,14 +17,18 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from magtwin.names import RefusedError, find
-from magtwin.path import Path, check_clear, check_on_floor, resolve_path
-from magtwin.run import COLUMNS
+from magtwin.path import Path, check_clear, check_on_floor
+from magtwin.run import COLUMNS, Run
+from magtwin.sim.exact import check_field
 from magtwin.sim.fleet import SENSED, Fleet
 from magtwin.sim.session import draw_session
-from magtwin.twin import Kind, Twin, open_twin
+from magtwin.sim.simulate import Predict
+from magtwin.sim.way import way_of
+from magtwin.spec import Scene
+from magtwin.twin import Kind, Twin, open_twin, room_of, without_model_error
 
 if TYPE_CHECKING:
     from magtwin.learn.magnetometer import NeuralMagnetometer
@@ -114,36 +118,40 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         self,
         num_envs: int = 1,
         *,
-        scene: Twin | str | FilePath | None = None,
+        scene: Twin | Scene | str | FilePath | None = None,
         net: str | FilePath | None = None,
         magnetometer: Kind | None = None,
-        path: Path | str = "figure8",
+        model_error: bool = True,
+        path: Path | str | FilePath | ArrayLike = "figure8",
         signals: Sequence[str] = SIGNALS,
         reward: Reward = progress,
         step_s: float = 0.1,
         duration_s: float = 60.0,
         end_on_bump: bool = False,
         random_start: bool = False,
-        sessions: bool = True,
+        session: Literal["drawn", "survey"] = "drawn",
         render_mode: None = None,
     ) -> None:
         """Open a scene for robots.
 
         Args:
             num_envs: How many robots.
-            scene: A scene's file, or what `magtwin.open_twin` gave.
+            scene: The file of a stage, a `Scene`, or what `magtwin.open_twin` gave.
             net: As for `magtwin.open_twin`, where `scene` is a file.
             magnetometer: As for `magtwin.open_twin`, where `scene` is a file.
-            path: What the robots begin on and are rewarded by: a path, the name of one, or a CSV file.
+            model_error: As for `magtwin.simulate`; each episode is a session of its own to it.
+            path: What the robots begin on and are rewarded by: a path, its name, a CSV file, or
+                points in world [m], shape (N, 2).
             signals: Columns that are observed, of `BOUNDS`, one after the other.
             reward: From a step of N robots to N rewards.
             step_s: Time between commands [s], a multiple of 0.02.
             duration_s: Time after which an episode is truncated [s].
             end_on_bump: Whether touching an obstacle, or the floor's border, ends an episode.
             random_start: Whether robots begin anywhere on the path; otherwise at its first point.
-            sessions: Whether each episode is another day, as `magtwin.sim.session.draw_session` draws it:
-                charge, IMU zero, LiDAR's phase, wheels, odometry and its own field; otherwise the robot
-                is as the scene has it, as `magtwin.simulate` takes it.
+            session: "drawn": each episode is a session of its own, as `magtwin.sim.session.draw_session`
+                draws it: charge, IMU zero, LiDAR's phase, wheels, odometry and the robot's own field.
+                "survey": the robot as it was when the map was surveyed, in every episode. A Twin that is in
+                a session already stays in it.
             render_mode: None: a Run is looked at in Rerun.
 
         Raises:
@@ -155,11 +163,18 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             raise RefusedError(f"MagNav has no render_mode, got {render_mode!r}; write a Run and view that")
         if isinstance(scene, Twin) and (net is not None or magnetometer is not None):
             raise RefusedError("net and magnetometer go to open_twin where scene is a Twin")
-        twin = scene if isinstance(scene, Twin) else open_twin(scene, net=net, magnetometer=magnetometer)
+        if isinstance(scene, Twin):
+            twin = scene if model_error else without_model_error(scene)
+        else:
+            twin = open_twin(scene, net=net, magnetometer=magnetometer, model_error=model_error)
+        check_field(twin.scene, twin.field)
         if twin.magnetometer:
             _check_network(twin.magnetometer)
         robot = twin.scene.robot
-        self.path = path if isinstance(path, Path) else resolve_path(path)
+        way = way_of(path, room_of(twin))
+        if not isinstance(way, Path):
+            raise RefusedError(f"path must be one to drive along, got {way!r}")
+        self.path = way
         check_on_floor(self.path, twin.scene.lab.floor_m, robot.footprint_radius_m)
         check_clear(self.path, twin.obstacles, robot.footprint_radius_m)
         if not callable(reward):
@@ -177,10 +192,12 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             anomaly_map=twin.field,
             obstacles=twin.obstacles,
             step_s=step_s,
-            disturbance_nt=twin.magnetometer.disturbance_nt if twin.magnetometer else None,
+            disturbance_nt=_predictions(twin.magnetometer) if twin.magnetometer else None,
+            model_error=twin.model_error,
         )
         self.num_envs, self.reward, self.end_on_bump = num_envs, reward, end_on_bump
-        self.random_start, self.sessions = random_start, sessions
+        find("session", session, {"drawn": None, "survey": None})
+        self.random_start, self._draws = random_start, session == "drawn" and not twin.session
         self._last_step = math.ceil(duration_s / step_s - 1e-9)
         low, high = np.repeat(np.array(bounds, np.float32).T, widths, axis=1)
         self.single_observation_space = spaces.Box(low, high, dtype=np.float32)
@@ -259,8 +276,8 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         xy, heading = self.path.at(self._s[which]), self.path.heading(self._s[which])
         poses = [(float(x), float(y), float(yaw)) for (x, y), yaw in zip(xy, heading, strict=True)]
         robot = self.fleet.scene.robot
-        days = [draw_session(robot, rng) for rng in rngs] if self.sessions else None
-        self.fleet.begin(which.tolist(), poses, rngs, days)
+        drawn = [draw_session(robot, rng) for rng in rngs] if self._draws else None
+        self.fleet.begin(which.tolist(), poses, rngs, drawn)
         self._made[which], self._over[which] = 0, False
 
     def _observations(self) -> NDArray[np.float32]:
@@ -308,6 +325,16 @@ class MagNavEnv(gymnasium.Env[Any, Any]):
         one = np.asarray(action, float)[None]
         observations, rewards, ended, truncated, infos = self.robots.step(one)
         return observations[0], float(rewards[0]), bool(ended[0]), bool(truncated[0]), _first(infos)
+
+
+def _predictions(network: "NeuralMagnetometer") -> Predict:
+    """What a network predicts of a table of robots, and the standard deviations of its errors."""
+
+    def predictions(table: Run) -> tuple[Array, Array]:
+        (read,) = network.read([table], outside=False)
+        return read.disturbance_nt, read.sd_nt
+
+    return predictions
 
 
 def _check_network(network: "NeuralMagnetometer") -> None:

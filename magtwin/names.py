@@ -15,6 +15,10 @@ class RefusedError(ValueError):
     """
 
 
+class MismatchWarning(UserWarning):
+    """A network is used with a map, at a place or on a robot that it did not learn on."""
+
+
 class UnknownNameError(RefusedError, KeyError):
     """A name that is not in a table; also a KeyError, so that mappings behave as Python's do."""
 

@@ -2,38 +2,50 @@
 
 import dataclasses
 import hashlib
+import shutil
+import tempfile
+import warnings
+import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import magtwin
 from magtwin.field.map import AnomalyMap
 from magtwin.files import existing, git_revision, sha256
-from magtwin.names import RefusedError, find
+from magtwin.names import MismatchWarning, RefusedError, find
 from magtwin.obstacles import Obstacles
-from magtwin.path import Path, resolve_path
+from magtwin.path import Path
+from magtwin.placement import Room
 from magtwin.run import Run
-from magtwin.spec import MagnetometerSpec, RobotSpec, Scene
+from magtwin.sim.way import way_of, ways_of
+from magtwin.spec import MagnetometerSpec, RobotSpec, Scene, SurveySpec, spelled
+from magtwin.summary import Summarized, Summary
 
 Kind = Literal["physical", "neural", "map-only"]
+Session = int | Literal["survey"]
 Facts = dict[str, str | int | float | bool]
 
 if TYPE_CHECKING:
+    from tempfile import TemporaryDirectory
+
     from magtwin.learn.magnetometer import NeuralMagnetometer, Read
+    from magtwin.placement import Room
     from magtwin.sim.commands import Commands
     from magtwin.sim.controllers import Controller
     from magtwin.sim.engine import Engine
     from magtwin.sim.lidar import Scans
     from magtwin.sim.many import Runs
-    from magtwin.sim.simulate import Sensed
+    from magtwin.sim.model_error import ModelError
+    from magtwin.sim.simulate import Predict, Sensed
 
 
-@dataclass(frozen=True)
-class Twin:
+@dataclass(frozen=True, repr=False)
+class Twin(Summarized):
     """A scene, and what runs it."""
 
     scene: Scene
@@ -52,22 +64,94 @@ class Twin:
     facts: Mapping[str, str | int | float | bool] = dataclasses.field(default_factory=dict)
     """What a run is to say of the files that were opened: their names as they were given, and checksums."""
 
+    platforms: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Checksum of what makes each robot's own field, as its asset has it, by the robot's name."""
+
+    errors: bool = True
+    """Whether readings of a neural magnetometer are to have an error about what the network predicts."""
+
+    model_error: "ModelError | None" = None
+    """Statistics of that error; None draws none."""
+
+    session: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
+    """Facts of the session that the robots are in (`session`, `session_seed`); empty before one is chosen."""
+
+    stage: object = dataclasses.field(default=None, repr=False, compare=False)
+    """Keeps the temporary stage of a `Scene` that no file holds; None where `scene_file` is a user's own."""
+
+    def _summary(self) -> Summary:
+        """The scene and its file, the robot, the map and the network."""
+        robot, field = self.scene.robot, self.field._summary()
+        sensor = f"{robot.name}, {robot.magnetometer.kind} magnetometer at {robot.magnetometer.rate_hz:g} Hz"
+        more = f", and {len(self.scene.others)} more robots" if self.scene.others else ""
+        width, depth = self.scene.lab.floor_m
+        network = self.magnetometer._summary().title.partition(" ")[2] if self.magnetometer else "none"
+        return Summary(
+            f"Twin {self.scene.name}: floor {width:g} x {depth:g} m, {len(self.obstacles)} obstacles",
+            (
+                ("robot", sensor + more + (f", session {self.session['session']}" if self.session else "")),
+                ("map", field.title.partition(" ")[2]),
+                ("network", network),
+                ("file", str(self.scene_file) if self.stage is None else "none: opened from a Scene"),
+            ),
+        )
+
+
+class _Stage:
+    """A temporary folder for the stage of a scene that no file holds; it lasts as long as its twins."""
+
+    def __init__(self) -> None:
+        self.folder = FilePath(tempfile.mkdtemp(prefix="magtwin-"))
+        weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+
+    def __reduce__(self) -> tuple[type[FilePath], tuple[str]]:
+        return FilePath, (str(self.folder),)  # a copy in another process must not end it
+
+
+def _twin_of_scene(
+    scene: Scene, net: str | FilePath | None, magnetometer: Kind | None, model_error: bool
+) -> Twin:
+    """The twin of a scene that no file holds: authored as `author_scene` does, for as long as it is used."""
+    from magtwin.usd.scene import author_scene
+
+    stage = _Stage()
+    twin = open_twin(
+        author_scene(scene, stage.folder / "scene"),
+        net=net,
+        magnetometer=magnetometer,
+        model_error=model_error,
+    )
+    facts = {name: fact for name, fact in twin.facts.items() if name != "scene_file"}
+    return dataclasses.replace(twin, facts=facts, stage=stage)
+
 
 def open_twin(
-    scene_file: str | FilePath, *, net: str | FilePath | None = None, magnetometer: Kind | None = None
+    scene_file: Scene | str | FilePath,
+    *,
+    net: str | FilePath | None = None,
+    magnetometer: Kind | None = None,
+    model_error: bool = True,
 ) -> Twin:
     """Open a stage, the map layer and the network that it names.
 
+    Warns (`magtwin.MismatchWarning`) where the network learned on another map or another robot, or at another
+    place than the robot's own, with the expected effect. Runs keep the text as the fact `network_mismatch`.
+
     Args:
-        scene_file: Root layer of a scene.
+        scene_file: Root layer of a scene; or a `Scene`, which is authored to a temporary folder. Only what
+            the `Scene` itself holds is in it: colliders that were added to a stage by hand are not.
         net: Weights to use in place of those that the magnetometer names (.safetensors or .pth), for a
             neural magnetometer; or "none" for a physical one.
         magnetometer: Kind of magnetometer to use in place of the scene's: "physical", "neural" or "map-only".
+        model_error: Whether the readings of a neural magnetometer are off what the network predicts, as they
+            were on recordings that it never saw; see `magtwin.sim.model_error`.
 
     Raises:
         RefusedError: The stage, its map or its weights are missing, broken, or not what the stage's
             checksums say.
     """
+    if isinstance(scene_file, Scene):
+        return _twin_of_scene(scene_file, net, magnetometer, model_error)
     from magtwin.usd.layers import stage_sha256
     from magtwin.usd.maps import load_map
     from magtwin.usd.obstacles import read_obstacles
@@ -88,10 +172,54 @@ def open_twin(
     if revision := git_revision(scene_file.parent):
         facts["git_revision"] = revision
     facts |= {"map": field.name, "map_sha256": sha256(scene.map_layer)}
-    facts |= network.facts if network else {}
+    platforms = {one.robot.name: _platform_sha256(one.robot) for one in scene.robots}
+    facts["platform_sha256"] = platforms[scene.robot.name]
+    twin = _with_network(Twin(scene, scene_file, field, network, obstacles, facts, platforms, model_error))
     if network and net is not None:
-        facts["network_file"] = FilePath(net).as_posix()
-    return Twin(scene, scene_file, field, network, obstacles, facts)
+        return dataclasses.replace(twin, facts={**twin.facts, "network_file": FilePath(net).as_posix()})
+    return twin
+
+
+def _platform_sha256(robot: RobotSpec) -> str:
+    """Checksum of what makes a robot's own field."""
+    return hashlib.sha256(spelled(robot.platform).encode()).hexdigest()
+
+
+def _platform_of(twin: Twin, robot: RobotSpec) -> str:
+    """Checksum of the platform of a twin's robot, before a session is drawn where that is known."""
+    return twin.platforms.get(robot.name) or _platform_sha256(robot)
+
+
+def _with_network(twin: Twin) -> Twin:
+    """The twin with what its network tells: facts of runs, warnings, and the statistics of its error."""
+    network, robot = twin.magnetometer, twin.scene.robot
+    if network is None:
+        return twin
+    from magtwin.learn.origin import mismatches
+
+    found = mismatches(
+        network.net.facts,
+        network.name,
+        residual_sd_nt=network.residual_sd_nt,
+        field=twin.field,
+        map_sha256=str(twin.facts["map_sha256"]),
+        robot=robot,
+        platform_sha256=_platform_of(twin, robot),
+    )
+    facts = {**twin.facts, **network.facts}
+    texts = [one.text for one in found]
+    statistics = network.model_error() if twin.errors else None
+    if twin.errors and statistics is None:
+        texts.append(
+            f"{network.name} does not say how its error varies in time, so none is drawn and readings are as "
+            "near to its predictions as the sensor's noise; train it again to change that"
+        )
+    for text in texts:
+        warnings.warn(text, MismatchWarning, stacklevel=3)
+    if found:
+        facts["network_mismatch"] = "; ".join(one.text for one in found)
+    facts["model_error"] = statistics is not None
+    return dataclasses.replace(twin, facts=facts, model_error=statistics)
 
 
 def _with_magnetometer(robot: RobotSpec, net: str | FilePath | None, kind: Kind | None) -> RobotSpec:
@@ -128,6 +256,7 @@ def twin_of(
         scene,
         net=network if network is None else locate(network, near) or network,
         magnetometer=kind if network is None else None,
+        model_error=bool(facts.get("model_error", False)),
     )
     for name, what in _CHECKSUMS.items() if check else ():
         if facts.get(name, "") != twin.facts.get(name, ""):
@@ -141,33 +270,70 @@ def twin_of(
 _CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_sha256": "the scene"}
 
 
-def on_its_day(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> Twin:
-    """The twin with its robot as it was on a run's day, where `magtwin runs` dealt the run to one.
+def in_session(twin: Twin, session: Session | None = None, *, seed: int = 0) -> Twin:
+    """The twin with its robots as they are in one session, from switching on to switching off.
 
     Args:
-        twin: The twin of the run.
-        facts: Those of the run.
+        twin: What `open_twin` gave.
+        session: Number of a session to draw from the seed: battery charge, IMU zero, wheels, odometry and
+            the robot's own field differ from session to session. "survey" is the robot as it was when the
+            map was surveyed, without these changes. Default: the session that the twin is in already, or
+            else session 0.
+        seed: Seed of the draw.
+
+    Returns:
+        A twin whose `session` says which session it is. Several robots are drawn independently.
 
     Raises:
-        RefusedError: They do not say which day that was.
+        RefusedError: `session` is neither, or the twin is in a session already.
     """
     from magtwin.sim.session import session_of
 
+    if twin.session:
+        if session is None:
+            return twin
+        raise RefusedError(f"the twin is in session {twin.session['session']!r} already; open another")
+    if session == "survey":
+        return dataclasses.replace(twin, session={"session": "survey"})
+    number = 0 if session is None else session
+    if not isinstance(number, int | np.integer) or isinstance(number, bool) or number < 0:
+        raise RefusedError(f'session must be a whole number from 0 up, or "survey", got {session!r}')
+    number, seed = int(number), _seed(seed)
+    scene = dataclasses.replace(
+        twin.scene,
+        robot=session_of(twin.scene.robot, seed, number),
+        others=tuple(
+            dataclasses.replace(other, robot=session_of(other.robot, seed, number, which=k))
+            for k, other in enumerate(twin.scene.others, 1)
+        ),
+    )
+    return dataclasses.replace(twin, scene=scene, session={"session": number, "session_seed": seed})
+
+
+def in_session_of(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> Twin:
+    """The twin in the session of a run.
+
+    Args:
+        twin: The twin of the run.
+        facts: Those of the run. Without `session_seed`, the run is of the robot as it was surveyed.
+
+    Raises:
+        RefusedError: The facts do not say which session it was.
+    """
     if "session_seed" not in facts:
-        return twin
+        return in_session(twin, "survey")
     try:
-        seed, day = int(facts["session_seed"]), int(facts["session"])
+        seed, session = int(facts["session_seed"]), int(facts["session"])
     except (KeyError, ValueError) as error:
         raise RefusedError(f"the facts of the run do not say which session it was of: {error}") from error
-    robot = session_of(twin.scene.robot, seed, day)
-    return dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot))
+    return in_session(twin, session, seed=seed)
 
 
 def check_figures(scene: Scene, facts: Mapping[str, str | int | float | bool], name: str) -> None:
     """Refuse a scene that is not, figure by figure, the one that a run came from.
 
     Args:
-        scene: The scene, its robot as it was on the run's day.
+        scene: The scene, its robot as it was in the run's session.
         facts: Those of the run.
         name: What to call the run.
 
@@ -177,8 +343,8 @@ def check_figures(scene: Scene, facts: Mapping[str, str | int | float | bool], n
     found, said = _config_sha256(scene), facts.get("config_sha256", "none")
     if found != said:
         raise RefusedError(
-            f"{name}: came from a scene whose figures have the sha256 {said}, those of {scene.name!r} on its "
-            f"day have {found}; name the scene that it was made in"
+            f"{name}: came from a scene whose figures have the sha256 {said}, those of {scene.name!r} in its "
+            f"session have {found}; name the scene that it was made in"
         )
 
 
@@ -217,26 +383,139 @@ def scene_from_toml(
     map_layer: str | FilePath | None = None,
     network: str | FilePath | None = None,
     workshop: str | FilePath | None = None,
+    report: Callable[[str], Any] = lambda text: None,
+    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
 ) -> Scene:
     """The scene that a TOML describes, its network read and its inputs named.
 
+    A scene that names no map is surveyed by its own robot, where its Earth's field is known. The map of one
+    that names a map, sources or furniture too is compared with their field.
+
     Args:
         path: The TOML; files that it names are taken from its folder.
-        map_layer: Map to use in place of the one that it names, without the TOML's Earth and sources.
+        map_layer: Map to use in place of the one that it names. The Earth's field, sources and furniture stay
+            as the TOML has them.
         network: Weights to use in place of those that it names (.safetensors or .pth).
-        workshop: Folder to build the robot in, where the TOML names one by its URDF.
+        workshop: Folder for the robot, where the TOML names one by its URDF, and for the map of a survey.
+            Default: a temporary folder, which is deleted when Python ends; `author_scene` copies from it.
+        report: Called with a line on how the scene was surveyed, or how map and sources differ.
+        progress: Called in a survey with headings done, headings in all, and what is being done.
 
     Raises:
-        RefusedError: A key is misspelt or missing, or a file is not there, or not what it should be.
+        RefusedError: A key is misspelt or missing, a file is not there or not what it should be, there is
+            neither a map nor a field to survey, or the map contradicts the Earth's field, sources and
+            furniture; the text says by how much.
     """
+    from magtwin.sim.contradiction import check_agrees
+    from magtwin.usd.maps import load_map
     from magtwin.usd.scene import scene_from_toml as scene_of
+
+    if workshop is None:
+        import tempfile
+
+        _WORKSHOPS.append(tempfile.TemporaryDirectory(prefix="magtwin-"))
+        workshop = _WORKSHOPS[-1].name
 
     def inputs_of(weights: FilePath) -> tuple[str, ...]:
         from magtwin.learn.predictor import load_predictor
 
         return load_predictor(weights).features
 
-    return scene_of(path, map_layer=map_layer, network=network, workshop=workshop, inputs_of=inputs_of)
+    def survey_of(scene: Scene, spec: SurveySpec, seed: int, obstacles: Obstacles) -> FilePath:
+        from magtwin.sim.room_survey import survey_room
+        from magtwin.usd.maps import save_map
+
+        source = f"{FilePath(path).name} sha256:{sha256(path)}"
+        surveyed = survey_room(scene, spec, seed=seed, obstacles=obstacles, source=source, progress=progress)
+        layer = FilePath(workshop) / f"{scene.name}.map.usdc"
+        save_map(surveyed.field, layer)
+        report(f"{scene.name} names no map: {surveyed}")
+        return layer
+
+    scene = scene_of(
+        path,
+        map_layer=map_layer,
+        network=network,
+        workshop=workshop,
+        inputs_of=inputs_of,
+        survey_of=survey_of,
+    )
+    if scene.map_layer.parent != FilePath(workshop):
+        where = f"{path} with {map_layer or scene.map_layer.name}"
+        found = check_agrees(scene, load_map(scene.map_layer), where)
+        if found and found.rms_nt >= NOTED_NT:
+            report(
+                f"Note: the map differs from the field of the scene's Earth, sources and furniture by {found}"
+            )
+    return scene
+
+
+def new_scene(file: str | FilePath, *, force: bool = False) -> FilePath:
+    """Write a TOML that describes a small furnished room, with comments; `scene_from_toml` reads it.
+
+    Args:
+        file: TOML file to write; the scene gets its name.
+        force: Whether a file that exists is replaced.
+
+    Returns:
+        The file.
+
+    Raises:
+        RefusedError: The file exists and `force` was not given, or its name cannot name a scene.
+    """
+    from magtwin.files import output, shipped
+    from magtwin.usd.room import check_name
+
+    name = FilePath(file).stem
+    check_name(name)
+    text = shipped("scenes", "starter.toml").read_text(encoding="utf-8")
+    text = text.replace('name = "room"', f'name = "{name}"', 1)
+    with output(file, force=force) as aside:
+        aside.write_text(text, encoding="utf-8")
+    return FilePath(file)
+
+
+NOTED_NT = 50.0
+"""Difference of a map from its sources that is reported [nT]: above what a careful survey errs by."""
+
+_WORKSHOPS: "list[TemporaryDirectory[str]]" = []
+"""Temporary folders of scenes, deleted when Python ends."""
+
+
+def author_scene(
+    scene: Scene | str | FilePath,
+    folder: str | FilePath,
+    *,
+    force: bool = False,
+    report: Callable[[str], Any] = lambda text: None,
+    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
+) -> FilePath:
+    """Write a scene as a folder of USD layers that needs nothing outside of it.
+
+    Args:
+        scene: A Scene, or the TOML of one; see `scene_from_toml`.
+        folder: Folder to make.
+        force: Whether a folder that exists is replaced.
+        report: As for `scene_from_toml`.
+        progress: As for `scene_from_toml`.
+
+    Returns:
+        The root layer, `folder/<name>.usda`.
+
+    Raises:
+        RefusedError: The folder exists, or as for `scene_from_toml`.
+    """
+    import tempfile
+
+    from magtwin.files import check_free
+    from magtwin.usd.scene import author_scene as author
+
+    check_free(folder, force=force)
+    if isinstance(scene, Scene):
+        return author(scene, folder, force=force)
+    with tempfile.TemporaryDirectory() as workshop:
+        read = scene_from_toml(scene, workshop=workshop, report=report, progress=progress)
+        return author(read, folder, force=force)
 
 
 def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
@@ -284,25 +563,23 @@ def engine_named(
     return Newton(twin.scene_file, twin.scene.robot, progress)
 
 
-def way_of(way: "Path | Commands | Run | str | FilePath") -> "Path | Commands | Run | str":
-    """What is to be driven: the path that a name or a CSV file stands for, all else ("random" too) as it is.
-
-    Raises:
-        RefusedError: There is no such path.
-    """
-    return resolve_path(way) if isinstance(way, str | FilePath) and way != "random" else way  # type: ignore[return-value]
+def room_of(twin: Twin) -> Room:
+    """What a path of a twin's first robot must fit into."""
+    return Room(twin.scene.lab.floor_m, twin.scene.robot.footprint_radius_m, twin.obstacles)
 
 
 def simulate(
-    twin: Twin | str | FilePath,
-    path: "Path | Commands | Run | str" = "figure8",
+    twin: Twin | Scene | str | FilePath,
+    path: "Path | Commands | Run | str | FilePath | ArrayLike" = "figure8",
     *,
     seed: int = 0,
+    session: Session | None = None,
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
     net: str | FilePath | None = None,
     magnetometer: Kind | None = None,
+    model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: "str | Controller" = "follower",
@@ -312,16 +589,22 @@ def simulate(
     """Drive the scene's robot along a path and read every sensor.
 
     Args:
-        twin: What `open_twin` gave, or the file of a scene.
-        path: A path, the name of one, or a CSV file of x, y [m]; "random", for a human-like driver who goes
+        twin: What `open_twin` gave, a `Scene`, or the file of a stage.
+        path: A path: its name, a CSV file of x, y [m], an array or list of points in world [m], shape
+            (N, 2), or a `Path`; "random", for a human-like driver who goes
             where the seed takes them; Commands, to be played; or a Run, to be driven once more as it was
             recorded, with the sensors as the scene has them now.
-        seed: Seed of all noise; one seed, one Run.
+        seed: Seed of all noise. The same seed gives the same bytes.
+        session: Which session the robot is in, as for `in_session`: default, one drawn from the seed.
+            "survey" is the robot as it was when the map was surveyed, which a network that was trained on
+            later sessions does not know.
         speed: Forward speed where the path is straight [m/s].
         duration_s: How long to drive [s]; None is once along the path, longer gives further laps.
         rate_hz: Magnetometer readings a second [Hz]; None takes the scene's.
         net: As for `open_twin`, where `twin` is a file.
         magnetometer: As for `open_twin`, where `twin` is a file.
+        model_error: Whether readings of a neural magnetometer have an error about what the network predicts;
+            see `open_twin`.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
         controller: What drives: "follower", "release", "stanley" or "pure_pursuit", or a
@@ -334,21 +617,25 @@ def simulate(
         A Run with every column of `magtwin.COLUMNS`; its facts tell how it came about.
 
     Raises:
-        RefusedError: The path leaves the floor or touches an obstacle, or an option is out of range.
+        RefusedError: The path leaves the floor or touches an obstacle, an option is out of range, the scene's
+            field is constant, or the path leaves the map so that there is nothing to read.
     """
+    from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.simulate import simulate as run_scene
 
-    twin, seed = _opened(twin, net, magnetometer, "simulate"), _seed(seed)
+    seed = _seed(seed)
+    twin = in_session(_opened(twin, net, magnetometer, model_error, "simulate"), session, seed=seed)
+    check_field(twin.scene, twin.field)
     network = twin.magnetometer
-    path = way_of(path)
+    path = way_of(path, room_of(twin))
     _check_commands(path, network)
     read: Read | None = None
 
-    def disturbance_nt(run: Run) -> NDArray[Any]:
+    def disturbance_nt(run: Run) -> tuple[NDArray[Any], NDArray[Any]]:
         nonlocal read
         assert network is not None
         (read,) = network.read([run])
-        return read.disturbance_nt
+        return read.disturbance_nt, read.sd_nt
 
     run = run_scene(
         twin.scene,
@@ -359,29 +646,48 @@ def simulate(
         duration_s=duration_s,
         rate_hz=rate_hz,
         disturbance_nt=disturbance_nt if network else None,
+        model_error=model_error_of(twin, seed),
         outside=outside,
         lidar=lidar,
         obstacles=twin.obstacles,
         controller=controller,
         engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
     )
+    check_read(run, twin.field)
     return run.with_columns(**_known(twin.scene, run, read)).with_facts(
         **_facts(twin, seed, path, duration_s, _config_sha256(twin.scene))
     )
 
 
+def model_error_of(twin: Twin, seed: int, *, which: int = 0) -> "ModelError | None":
+    """Statistics of the model error of a twin in its session; None where none is to be drawn.
+
+    Args:
+        twin: What `in_session` gave.
+        seed: Seed of the run.
+        which: Place of the robot in a scene of several, from 0.
+    """
+    from magtwin.sim.session import offset_generator
+
+    if twin.model_error is None:
+        return None
+    return twin.model_error.in_session(offset_generator(twin.session, seed, which=which))
+
+
 def simulate_robots(
-    twin: Twin | str | FilePath,
-    paths: "Mapping[str, Path | Commands | Run | str | FilePath] | None" = None,
+    twin: Twin | Scene | str | FilePath,
+    paths: "Mapping[str, Path | Commands | Run | str | FilePath | ArrayLike] | None" = None,
     *,
     robots: Iterable[str] | None = None,
     meet: Literal["refuse", "flag"] = "refuse",
     seed: int = 0,
+    session: Session | None = None,
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
     net: str | FilePath | None = None,
     magnetometer: Kind | None = None,
+    model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: str = "follower",
@@ -393,18 +699,20 @@ def simulate_robots(
     in the scene.
 
     Args:
-        twin: What `open_twin` gave, or the file of a scene.
+        twin: What `open_twin` gave, a `Scene`, or the file of a stage.
         paths: What robots drive, by name, as for `simulate`; who is not named drives what the scene says,
             or "figure8" where that says nothing.
         robots: Names of those whose sensors are read; all unless given. All drive nevertheless.
         meet: What becomes of robots whose footprints overlap: a refusal with time and place, or flag_bump in
             both while it lasts; they drive through each other.
         seed: As for `simulate`.
+        session: As for `simulate`; each robot is drawn by itself.
         speed: As for `simulate`, of each.
         duration_s: As for `simulate`, of each.
         rate_hz: As for `simulate`.
         net: As for `open_twin`, where `twin` is a file; of each robot.
         magnetometer: As for `open_twin`, where `twin` is a file; of each robot.
+        model_error: As for `simulate`.
         lidar: As for `simulate`.
         outside: As for `simulate`.
         controller: A name of `magtwin.sim.controllers.CONTROLLERS`.
@@ -416,25 +724,28 @@ def simulate_robots(
     Raises:
         RefusedError: A name is none of a robot's, robots would meet, or `simulate` would refuse one.
     """
+    from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.together import simulate_together
 
-    twin, seed = _opened(twin, net, magnetometer, "simulate_robots"), _seed(seed)
+    seed = _seed(seed)
+    twin = in_session(_opened(twin, net, magnetometer, model_error, "simulate_robots"), session, seed=seed)
+    check_field(twin.scene, twin.field)
     placed = {one.robot.name: one for one in twin.scene.robots}
     for name in (*(paths or {}), *(robots or ())):
         find("robot", name, placed)
+    led = {name: led_by(twin, name) for name in placed}
     ways: dict[str, Path | Commands | Run | str] = {}
     for name, one in placed.items():
-        ways[name] = way_of((paths or {}).get(name, one.path or "figure8"))
+        ways[name] = way_of((paths or {}).get(name, one.path or "figure8"), room_of(led[name]))
     wanted = [name for name in placed if robots is None or name in set(robots)]
-    led = {name: led_by(twin, name) for name in placed}
     for name, way in ways.items():
         _check_commands(way, led[name].magnetometer)
     reads: dict[str, Read] = {}
 
-    def disturbance_of(name: str, network: "NeuralMagnetometer") -> Callable[[Run], NDArray[Any]]:
-        def disturbance_nt(run: Run) -> NDArray[Any]:
+    def disturbance_of(name: str, network: "NeuralMagnetometer") -> "Predict":
+        def disturbance_nt(run: Run) -> tuple[NDArray[Any], NDArray[Any]]:
             (reads[name],) = network.read([run])
-            return reads[name].disturbance_nt
+            return reads[name].disturbance_nt, reads[name].sd_nt
 
         return disturbance_nt
 
@@ -455,10 +766,12 @@ def simulate_robots(
         obstacles=twin.obstacles,
         controller=controller,
         disturbances_nt=disturbances,
+        model_errors={name: model_error_of(led[name], seed, which=k) for k, name in enumerate(placed)},
         outside=outside,
         lidar=lidar,
     )
     for name, run in runs.items():
+        check_read(run, twin.field)
         own = led[name]
         runs[name] = run.with_columns(**_known(own.scene, run, reads.get(name))).with_facts(
             **_facts(own, seed, ways[name], duration_s, _config_sha256(own.scene))
@@ -475,26 +788,33 @@ def led_by(twin: Twin, name: str) -> Twin:
     scene = twin.scene.led_by(name)
     ours, its = twin.scene.robot.magnetometer, scene.robot.magnetometer
     if (its.kind, its.network, its.network_sha256) == (ours.kind, ours.network, ours.network_sha256):
-        return dataclasses.replace(twin, scene=scene)
-    network = _magnetometer(scene)
-    facts = {k: v for k, v in twin.facts.items() if not (twin.magnetometer and k in twin.magnetometer.facts)}
-    facts |= network.facts if network else {}
-    return dataclasses.replace(twin, scene=scene, magnetometer=network, facts=facts)
+        network = twin.magnetometer
+    else:
+        network = _magnetometer(scene)
+    if name == twin.scene.robot.name:
+        return twin
+    own = {"model_error", "network_mismatch", *(twin.magnetometer.facts if twin.magnetometer else ())}
+    facts: Facts = {key: fact for key, fact in twin.facts.items() if key not in own}
+    facts["platform_sha256"] = _platform_of(twin, scene.robot)
+    led = dataclasses.replace(twin, scene=scene, magnetometer=network, facts=facts, model_error=None)
+    return _with_network(led)
 
 
 def simulate_many(
-    twin: Twin | str | FilePath,
-    paths: "Path | Commands | Run | str | FilePath | Iterable[Path | Commands | Run | str | FilePath]",
+    twin: Twin | Scene | str | FilePath,
+    paths: "Path | Commands | Run | str | FilePath | ArrayLike | Iterable[Any]",
     seeds: Iterable[int],
     *,
+    session: Session | None = None,
     speeds: float | Iterable[float] = 0.2,
-    robots: RobotSpec | Iterable[RobotSpec] | None = None,
+    robots: RobotSpec | Twin | Iterable[RobotSpec | Twin] | None = None,
     columns: Iterable[str] | None = None,
     block: int | None = None,
     duration_s: float | None = None,
     rate_hz: float | None = None,
     net: str | FilePath | None = None,
     magnetometer: Kind | None = None,
+    model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: str = "follower",
@@ -507,18 +827,21 @@ def simulate_many(
     over the result to have bounded memory, `list` it to keep all.
 
     Args:
-        twin: What `open_twin` gave, or the file of a scene.
+        twin: What `open_twin` gave, a `Scene`, or the file of a stage.
         paths: What is driven in each run, as for `simulate`, or one for all.
         seeds: A seed for each run; their number is that of the runs.
+        session: As for `simulate`, each run's drawn from its own seed.
         speeds: Forward speed of each where its path is straight [m/s], or one for all.
-        robots: What drives in each, such as `magtwin.sim.session.draw_session` gives, or one for all; None
-            takes the scene's.
+        robots: What drives in each, as it is, such as `magtwin.sim.session.draw_session` gives, or one for
+            all; or the twin in a session, as `in_session` gives it. Default: the scene's robot, in its
+            session.
         columns: Columns to keep, beside t; None keeps all.
         block: Runs made at a time; None takes what fits into 0.1 GB for runs of a minute.
         duration_s: As for `simulate`, of each run.
         rate_hz: As for `simulate`.
         net: As for `simulate`.
         magnetometer: As for `simulate`.
+        model_error: As for `simulate`.
         lidar: As for `simulate`.
         outside: As for `simulate`.
         controller: A name of `magtwin.sim.controllers.CONTROLLERS`.
@@ -530,9 +853,11 @@ def simulate_many(
         RefusedError: There is no seed, numbers of paths, speeds, robots and seeds differ, a seed is no whole
             number from 0 up, a robot's magnetometer is not the twin's, or `simulate` would refuse a run.
     """
+    from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.many import BLOCK, Conditions, Job, Runs
 
-    twin = _opened(twin, net, magnetometer, "simulate_many")
+    twin = _opened(twin, net, magnetometer, model_error, "simulate_many")
+    check_field(twin.scene, twin.field)
     numbers = [_seed(seed) for seed in seeds]
     if not isinstance(controller, str):
         raise RefusedError(
@@ -540,10 +865,11 @@ def simulate_many(
             "remembers a single run: give it to simulate"
         )
     count = len(numbers)
-    given = _each("paths", paths, count)
-    resolved: dict[Any, Any] = {path: way_of(path) for path in given if isinstance(path, str | FilePath)}
-    scenes: dict[int, Scene] = {}
-    jobs = []
+    given = _each("paths", ways_of(paths, room_of(twin)), count)
+    if robots is not None and session is not None:
+        raise RefusedError("robots are taken as they are; give robots or session, not both")
+    jobs, of = [], {}
+    drawn: dict[object, Scene] = {}
     for seed, path, speed, robot in zip(
         numbers,
         given,
@@ -551,16 +877,21 @@ def simulate_many(
         _each("robots", robots, count),
         strict=True,
     ):
-        if robot is not None and id(robot) not in scenes:
-            _check_magnetometer(twin, robot)
-            scenes[id(robot)] = dataclasses.replace(twin.scene, robot=robot)
-        scene = twin.scene if robot is None else scenes[id(robot)]
-        if isinstance(path, str | FilePath):
-            path = resolved[path]
+        key: object = seed if robot is None else ("robot", id(robot))
+        if key not in drawn:
+            if robot is None:
+                own = in_session(twin, session, seed=seed)
+            elif isinstance(robot, Twin):
+                _check_magnetometer(twin, robot.scene.robot)
+                own = robot if model_error else without_model_error(robot)
+            else:
+                _check_magnetometer(twin, robot)
+                own = dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot))
+            drawn[key] = own.scene
+            of[id(own.scene)] = own, _config_sha256(own.scene)
         _check_commands(path, twin.magnetometer)
-        jobs.append(Job(scene, path, seed, speed))
+        jobs.append(Job(drawn[key], path, seed, speed))
     network = twin.magnetometer
-    configs = {id(scene): _config_sha256(scene) for scene in (twin.scene, *scenes.values())}
 
     def finish(jobs: Sequence[Job], sensed: Sequence["Sensed"]) -> list[Run]:
         rows = [one.run for one in sensed]
@@ -568,11 +899,13 @@ def simulate_many(
         told = network.read(rows, outside=flagged) if network else [None] * len(rows)
         runs = []
         for job, one, read in zip(jobs, sensed, told, strict=True):
-            run = one.read(read.disturbance_nt if read else None)
+            own, config = of[id(job.scene)]
+            predicted = (read.disturbance_nt, read.sd_nt) if read else None
+            run = one.read(predicted, model_error_of(own, job.seed))
+            check_read(run, twin.field)
             known = _known(job.scene, run, read)
             run = run.with_columns(**{name: known[name] for name in known.keys() & run.keys()})
-            config = configs[id(job.scene)]
-            runs.append(run.with_facts(**_facts(twin, job.seed, job.path, duration_s, config)))
+            runs.append(run.with_facts(**_facts(own, job.seed, job.path, duration_s, config)))
         return runs
 
     conditions = Conditions(
@@ -590,14 +923,24 @@ def simulate_many(
 
 
 def _opened(
-    twin: Twin | str | FilePath, net: str | FilePath | None, magnetometer: Kind | None, what: str
+    twin: Twin | Scene | str | FilePath,
+    net: str | FilePath | None,
+    magnetometer: Kind | None,
+    model_error: bool,
+    what: str,
 ) -> Twin:
     """A twin, opened if it is not."""
     if not isinstance(twin, Twin):
-        return open_twin(twin, net=net, magnetometer=magnetometer)
+        return open_twin(twin, net=net, magnetometer=magnetometer, model_error=model_error)
     if net is not None or magnetometer is not None:
         raise RefusedError(f"net and magnetometer go to open_twin where a Twin is given to {what}")
-    return twin
+    return twin if model_error else without_model_error(twin)
+
+
+def without_model_error(twin: Twin) -> Twin:
+    """The twin, with readings of a neural magnetometer that are what its network predicts."""
+    facts = twin.facts if twin.magnetometer is None else {**twin.facts, "model_error": False}
+    return dataclasses.replace(twin, errors=False, model_error=None, facts=facts)
 
 
 def _seed(seed: object) -> int:
@@ -656,7 +999,7 @@ def _facts(
     facts: Facts = {"magtwin": magtwin.__version__, "numpy": np.__version__, "seed": seed}
     if duration_s is not None:
         facts["asked_duration_s"] = float(duration_s)
-    return facts | path_facts(path) | dict(twin.facts) | {"config_sha256": config_sha256}
+    return facts | dict(twin.session) | path_facts(path) | dict(twin.facts) | {"config_sha256": config_sha256}
 
 
 def path_facts(path: "Path | Commands | Run | str") -> Facts:
@@ -671,6 +1014,8 @@ def path_facts(path: "Path | Commands | Run | str") -> Facts:
     else:
         arrays, what, file = (path.rows,), "commands", path.file
     facts: Facts = {f"{what}_file": file} if file else {}
+    if isinstance(path, Path) and path.placing:
+        facts["path_placing"] = " ".join(map(repr, path.placing))
     checksum = hashlib.sha256()
     for array in arrays:
         checksum.update(np.ascontiguousarray(array).tobytes())
@@ -693,19 +1038,21 @@ def _config_sha256(scene: Scene) -> str:
     scene = dataclasses.replace(
         scene, map_layer=FilePath(), map_sha256="", robot=bare(scene.robot), path="", others=others
     )
-    return hashlib.sha256(repr(scene).encode()).hexdigest()
+    return hashlib.sha256(spelled(scene).encode()).hexdigest()
 
 
-def scan(twin: Twin, run: Run, *, seed: int = 0) -> "Scans":
+def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Scans":
     """What the LiDAR of a scene's robot saw in a run, one scan a turn while it spun.
 
     Args:
-        twin: What `open_twin` gave.
+        twin: What `open_twin` gave; or a `Scene` or the file of a stage, opened in the run's session.
         run: What `simulate` gave, or any run with t, p_world_base, yaw and lidar_on.
         seed: Seed of its noise; that of the run, unless another draw is wanted.
     """
     from magtwin.sim.lidar import scans_of
     from magtwin.sim.simulate import streams
 
+    if not isinstance(twin, Twin):
+        twin = in_session_of(open_twin(twin, magnetometer="map-only"), run.facts)
     rng = streams(np.random.default_rng(seed))["lidar"]
     return scans_of(run, twin.scene.robot, twin.obstacles, rng)

@@ -13,7 +13,7 @@ from magtwin.learn.labels import Alignment, labels
 from magtwin.names import RefusedError
 from magtwin.run import Run
 from magtwin.sim.survey import field_at_rest_nt
-from magtwin.twin import check_figures, on_its_day, open_twin, simulate
+from magtwin.twin import check_figures, in_session_of, open_twin, simulate
 
 SEED = 11
 
@@ -29,7 +29,7 @@ def drives(twin):
 
     def drive(day, path):
         facts = {"session_seed": SEED, "session": day}
-        run = simulate(on_its_day(twin, facts), path, seed=day, duration_s=25.0, rate_hz=10.0)
+        run = simulate(in_session_of(twin, facts), path, seed=day, duration_s=25.0, rate_hz=10.0)
         return run.with_facts(**facts)
 
     return {f"d{day}": drive(day, path) for day, path in enumerate(("figure8", "sine", "figure8"))}
@@ -38,7 +38,7 @@ def drives(twin):
 @pytest.fixture(scope="module")
 def truth(twin):
     def day_of(name, run):
-        scene = on_its_day(twin, run.facts).scene
+        scene = in_session_of(twin, run.facts).scene
         check_figures(scene, run.facts, name)
         return scene
 
@@ -155,7 +155,7 @@ def test_a_run_of_another_scene_is_refused(drives, truth, found, train):
 
 def test_a_run_of_no_known_session_is_refused(twin):
     with pytest.raises(RefusedError, match="do not say which session it was of"):
-        on_its_day(twin, {"session_seed": 1, "session": "monday"})
+        in_session_of(twin, {"session_seed": 1, "session": "monday"})
 
 
 def test_a_run_without_the_truth_is_refused(drives, truth, found, train):

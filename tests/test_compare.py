@@ -158,4 +158,8 @@ def test_each_error_of_a_run_has_its_address():
     assert errors["disturbance"].mae == 2
     assert (errors["noise"].greatest, errors["noise"].count) == (1, 2)
     assert errors["total"].rms == pytest.approx(math.sqrt((16 + 1) / 2))
+    assert "model error" not in errors
+    drawn = errors_of(run.with_columns(b_model_error_nt=np.array([0.5, 0.0, -2.0])))
+    assert drawn["noise"].greatest == 0.5
+    assert drawn["model error"].greatest == 2
     assert errors_of(Run({"t": np.arange(3.0)})) == {}

@@ -17,7 +17,7 @@ from magtwin.io.provenance import made_again
 from magtwin.learn.dataset import build_dataset
 from magtwin.names import RefusedError
 from magtwin.run import COLUMNS, Run
-from magtwin.twin import on_its_day, open_twin, simulate
+from magtwin.twin import in_session_of, open_twin, simulate
 from magtwin.usd.maps import save_map
 
 
@@ -181,7 +181,7 @@ def test_a_budget_is_made_where_the_scene_is_at_hand(room, lab_scene, tmp_path, 
     twin = open_twin(lab_scene, magnetometer="physical")
     for day in range(3):
         facts = {"session_seed": 1, "session": day}
-        run = simulate(on_its_day(twin, facts), "figure8", seed=day, duration_s=20.0, rate_hz=10.0)
+        run = simulate(in_session_of(twin, facts), "figure8", seed=day, duration_s=20.0, rate_hz=10.0)
         write_run(run.with_facts(**facts), tmp_path / f"d{day}.parquet")
     layer = twin.scene.map_layer
     drives = [str(tmp_path / f"d{day}.parquet") for day in range(3)]

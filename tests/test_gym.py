@@ -55,24 +55,35 @@ def column(env, observations, name):
 
 
 @pytest.mark.filterwarnings("ignore:.*symmetric and normalized space")  # ours is in m/s and rad/s
-@pytest.mark.parametrize("sessions", [True, False])
-def test_gymnasiums_checker_passes(twin, sessions):
-    check_env(gymnasium.make(NAME, scene=twin, sessions=sessions).unwrapped)
+@pytest.mark.parametrize("session", ["drawn", "survey"])
+def test_gymnasiums_checker_passes(twin, session):
+    check_env(gymnasium.make(NAME, scene=twin, session=session).unwrapped)
 
 
-def test_each_episode_is_another_day_and_none_without_sessions(twin):
+def test_robots_on_a_survey_alone_read_its_map_and_their_own_field(twin):
+    bare = replace(twin, scene=replace(twin.scene, earth=None, sources=(), furniture=()))
+    env = vector(bare, 3)
+    env.reset(seed=1)
+    for _ in range(5):
+        env.step(np.tile(AHEAD, (3, 1)))
+    table = env.unwrapped.fleet.columns
+    assert np.isfinite(table["b_total_nt"]).all()
+    assert (np.abs(table["b_disturbance_nt"]) > 10).all(), "of drawn sessions, in motion"
+
+
+def test_each_episode_is_a_session_of_its_own_unless_that_of_the_survey_is_wanted(twin):
     names = ("battery_fraction", "imu_q_xyzw", "b_total_nt")
-    for sessions in (True, False):
-        env = vector(twin, 2, signals=names, sessions=sessions)
+    for session in ("drawn", "survey"):
+        env = vector(twin, 2, signals=names, session=session)
         first, _ = env.reset(seed=4)
         again, _ = env.reset()
         charges = np.concatenate([column(env, o, "battery_fraction").ravel() for o in (first, again)])
-        assert len(set(charges.tolist())) == (4 if sessions else 1)
+        assert len(set(charges.tolist())) == (4 if session == "drawn" else 1)
         yaw = np.concatenate([column(env, o, "imu_q_xyzw")[:, 2:] for o in (first, again)])
         apart = np.abs(yaw - yaw[0]).max()
-        assert apart > 0.02 if sessions else apart < 0.01
+        assert apart > 0.02 if session == "drawn" else apart < 0.01
         field = np.concatenate([column(env, o, "b_total_nt").ravel() for o in (first, again)])
-        assert np.ptp(field) > 50 if sessions else np.ptp(field) < 1
+        assert np.ptp(field) > 50 if session == "drawn" else np.ptp(field) < 1
 
 
 def test_robots_of_many_days_do_together_what_each_does_in_a_scene_of_its_day(twin):
@@ -171,8 +182,10 @@ def test_the_field_is_the_exact_one_of_a_run_at_the_same_pose(twin, line):
     robot = twin.scene.robot
     still = replace(robot.platform, left_motor_nt_nm=(0.0, 0.0, 0.0), right_motor_nt_nm=(0.0, 0.0, 0.0))
     twin = replace(twin, scene=replace(twin.scene, robot=replace(robot, platform=still)))
-    run = magtwin.simulate(twin, line, seed=0, duration_s=0.1, rate_hz=135.0)  # its motors start at once
-    env = gymnasium.make(NAME, scene=twin, path=line, signals=("b_total_nt", "b_map_nt"), sessions=False)
+    run = magtwin.simulate(
+        twin, line, seed=0, session="survey", duration_s=0.1, rate_hz=135.0
+    )  # its motors start at once
+    env = gymnasium.make(NAME, scene=twin, path=line, signals=("b_total_nt", "b_map_nt"), session="survey")
     observation, _ = env.reset(seed=0)
     assert_allclose(observation[1], run["b_map_nt"][0], rtol=1e-6)
     assert_allclose(observation[0], run["b_total_nt"][0], atol=5.0)  # electronics

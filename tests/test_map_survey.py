@@ -32,13 +32,16 @@ def test_a_survey_becomes_a_map_that_knows_where_it_comes_from(lab_scene, tmp_pa
     assert json.loads(capsys.readouterr().out)["figures"]["nodes"]["value"] == 104
 
 
-def test_the_shipped_map_is_what_a_survey_of_the_shipped_scene_finds(lab_scene, tmp_path):
+def test_a_survey_of_the_shipped_scene_finds_the_shipped_map_but_for_its_error(lab_scene, tmp_path):
     out = tmp_path / "again.usdc"
     run(lab_scene, "--out", out, "--position-error", 0, "--heading-error", 0)
     again, shipped = load_map(out), load_map(lab_scene.parent / "map" / "lab.usdc")
-    # noise of 0.02 nT over 135 readings, and single precision of 0.004 nT
-    assert np.abs(again.values_nt - shipped.values_nt).max() < 0.03
-    assert again.values_nt.shape == shipped.values_nt.shape
+    _, rows, columns = again.values_nt.shape
+    x, y = (again.origin_m[k] + again.cell_m[k] * np.arange(count) for k, count in ((0, columns), (1, rows)))
+    yaw, y, x = np.meshgrid(again.headings_rad, y, x, indexing="ij")
+    off = shipped.lookup(np.stack([x, y], axis=-1), yaw, outside="clamp") - again.values_nt
+    # the shipped map is fitted to a survey of which each node is read 1.5 cm and 7 deg off
+    assert 5 < np.sqrt(np.mean(off**2)) < 80
 
 
 def test_one_seed_gives_one_file_and_another_another(lab_scene, tmp_path):

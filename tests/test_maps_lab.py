@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from magtwin.field.map import AnomalyMap
 from magtwin.files import from_table, read_toml, shipped
 from magtwin.path import path_named
 from magtwin.sim.simulate import simulate
+from magtwin.sim.survey import field_at_rest_nt
 from magtwin.spec import EarthFieldSpec
 from magtwin.usd.maps import load_map
 from magtwin.usd.scene import read_sources
@@ -28,10 +30,8 @@ def script():
 
 
 @pytest.fixture(scope="module")
-def fresh(script, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("lab")
-    script.build(folder)
-    return folder
+def lab(script):
+    return script.scene(script.robot())
 
 
 @pytest.fixture(scope="module")
@@ -44,29 +44,43 @@ def figures(committed):
     return {f.name: f for f in committed.report().figures}
 
 
-@pytest.mark.parametrize("name", ["sources.toml", "map.toml"])
-def test_a_fresh_build_equals_the_committed_texts(fresh, name):
-    assert (fresh / name).read_text() == (LAB / name).read_text()
+def test_fresh_sources_equal_the_committed_ones(script, lab):
+    assert script.sources_toml(lab.sources, lab.furniture) == (LAB / "sources.toml").read_text()
 
 
-def test_a_fresh_build_equals_the_committed_map(fresh, committed):
-    assert load_map(fresh / "lab.usdc") == committed
-
-
-def test_the_layer_holds_the_map_to_the_last_digit(script, committed):
-    assert script.lab_map(script.scene(script.robot())) == committed
+@pytest.mark.slow
+def test_a_fresh_build_equals_the_committed_map(script, committed, tmp_path):
+    script.build(tmp_path)
+    fresh = load_map(tmp_path / "lab.usdc")
+    assert fresh.values_nt.shape == committed.values_nt.shape
+    # a fit's sums depend on the machine's linear algebra; the map's own error is 40 nT
+    assert_allclose(fresh.values_nt, committed.values_nt, rtol=0, atol=0.5)
+    texts = [(folder / "map.toml").read_text().split("[statistics]")[0] for folder in (tmp_path, LAB)]
+    assert texts[0] == texts[1]
 
 
 def test_the_map_has_the_extent_of_the_published_survey(committed):
-    assert committed.values_nt.shape == (4, 15, 25)
-    assert committed.extent == (-3.0, 3.0, -1.75, 1.75)
+    assert_allclose(committed.extent, (-3.0, 3.0, -1.75, 1.75), atol=1e-9)
     assert committed.valid.all()
     assert committed.licence == "Apache-2.0"
+    assert committed.method == "harmonic"
+    assert (LAB / "lab.usdc").stat().st_size < 3_000_000
+
+
+def test_the_map_errs_as_a_fitted_one_does_and_says_by_how_much(lab, committed):
+    rng = np.random.default_rng(0)
+    p = rng.uniform((-2.95, -1.7), (2.95, 1.7), (3000, 2))
+    yaw = rng.uniform(0, 2 * np.pi, len(p))
+    error = committed.lookup(p, yaw) - field_at_rest_nt(lab, p, yaw)
+    variances = replace(committed, values_nt=committed.variance_nt2, variance_nt2=None, harmonic=None)
+    within = np.abs(error) <= 1.6449 * np.sqrt(variances.lookup(p, yaw))
+    assert 10 < np.sqrt(np.mean(error**2)) < 60
+    assert 0.84 < within.mean() < 0.96
 
 
 def test_the_map_has_the_statistics_of_the_published_survey(figures):
     # the published: mean 40.9 uT, sd 3.0, gradient 4.1-4.4 (median) and 5.7 uT/m (mean), amplitude 482 nT
-    assert figures["mean"].value == pytest.approx(41_000, abs=300)
+    assert figures["mean"].value == pytest.approx(41_000, abs=350)
     assert figures["mean"].spread == pytest.approx(3_000, abs=150)
     assert figures["median gradient"].value == pytest.approx(4.3, abs=0.4)
     assert 5 < figures["mean gradient"].value < 6
@@ -123,8 +137,7 @@ def test_no_steel_lies_where_the_robot_drives(script):
         assert beside or world[:, 2].max() < -0.1, source.name
 
 
-def test_the_committed_sources_and_no_others_make_the_map(script):
-    lab = script.scene(script.robot())
+def test_the_committed_sources_and_no_others_make_the_map(lab):
     assert (lab.sources, lab.furniture) == read_sources(LAB / "sources.toml")
 
 
@@ -152,8 +165,20 @@ def test_a_moving_robot_differs_from_the_map_as_much_as_real_labels_do(script, c
     assert 30_000 < run["b_truth_nt"].min() < run["b_truth_nt"].max() < 55_000
 
 
-def test_another_seed_makes_another_lab(script):
-    lab = script.scene(script.robot())
+def test_another_seed_makes_another_lab(script, lab):
     other = script.sources(np.random.default_rng(script.SEED + 1), script.earth())
     assert other != lab.sources
-    assert script.lab_map(replace(lab, sources=other)) != script.lab_map(lab)
+    ours, theirs = (script.survey(one).b_nt for one in (lab, replace(lab, sources=other)))
+    assert np.abs(ours - theirs).max() > 1000
+
+
+def test_the_protocol_surveys_as_the_shipped_map_was_surveyed(script):
+    spec = importlib.util.spec_from_file_location("protocol", shipped("weights", "protocol.py"))
+    protocol = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(protocol)
+    options = dict(zip(protocol.SURVEY[::2], map(float, protocol.SURVEY[1::2]), strict=True))
+    assert options == {
+        "--heading-error": script.HEADING_ERROR_DEG,
+        "--position-error": script.POSITION_ERROR_M,
+        "--readings": script.READINGS,
+    }

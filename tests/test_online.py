@@ -10,6 +10,7 @@ from magtwin.names import RefusedError
 from magtwin.run import Run
 from magtwin.sim.lidar import scans_of
 from magtwin.sim.magnetometer import sense_magnetometer
+from magtwin.sim.model_error import ModelError
 from magtwin.sim.noise import gauss_markov
 from magtwin.sim.online import STANDS_S, Online
 from magtwin.sim.online_sensors import Held, Magnetometer, Markov
@@ -21,11 +22,15 @@ from magtwin.twin import Twin, open_twin
 
 SEED = 3
 DURATION_S = 8.0
+ERROR = ModelError(60.0, 2.0, offset=0.7)
 
 
-@pytest.fixture(scope="module", params=["physical", "neural"])
+@pytest.fixture(scope="module", params=["physical", "surveyed", "neural"])
 def twin(request: pytest.FixtureRequest, lab_scene: Path) -> Twin:
-    twin = open_twin(lab_scene, magnetometer=request.param)
+    surveyed = request.param == "surveyed"  # only a map, without Earth and sources
+    twin = open_twin(lab_scene, magnetometer="physical" if surveyed else request.param)
+    if surveyed:
+        twin = replace(twin, scene=replace(twin.scene, earth=None, sources=(), furniture=()))
     robot = twin.scene.robot  # on a day of its own: markers that are off, wheels and IMU with their errors
     robot = replace(draw_session(robot, np.random.default_rng(9)), magnetometer=robot.magnetometer)
     robot = replace(robot, mocap=replace(robot.mocap, offset_m=(0.02, -0.01), dropout_every_s=2.0))
@@ -46,6 +51,7 @@ def online_of(twin: Twin) -> Online:
         rng=np.random.default_rng(SEED),
         obstacles=twin.obstacles,
         network=network if net else None,
+        model_error=ERROR,
         lidar="on",
     )
 
@@ -59,9 +65,10 @@ def test_commands_that_come_one_by_one_give_the_columns_of_a_run_of_them(twin: T
         scans.append(robot.scans())
     online = Run.concat(blocks)
 
-    def disturbance_nt(run: Run) -> np.ndarray:
+    def disturbance_nt(run: Run) -> tuple[np.ndarray, np.ndarray]:
         assert twin.magnetometer is not None
-        return twin.magnetometer.read([run])[0].disturbance_nt
+        (read,) = twin.magnetometer.read([run])
+        return read.disturbance_nt, read.sd_nt
 
     run = simulate(
         twin.scene,
@@ -72,9 +79,11 @@ def test_commands_that_come_one_by_one_give_the_columns_of_a_run_of_them(twin: T
         duration_s=DURATION_S,
         lidar="on",
         disturbance_nt=disturbance_nt if twin.magnetometer else None,
+        model_error=ERROR,
     )
     assert np.ptp(run["p_world_base"][:, 0]) > 0.3
     assert (run["v_base"][:, 0] == 0).sum() > 50
+    assert np.ptp(run["b_model_error_nt"]) > 10 if twin.magnetometer else not run["b_model_error_nt"].any()
     step = twin.scene.robot.magnetometer.resolution_nt
     for name in run.keys() - {"b_sd_nt", "flag_out_of_distribution"}:  # of a network only its caller knows
         # Sums in another order may bring a reading to the next multiple of the resolution.

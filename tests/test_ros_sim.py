@@ -25,7 +25,7 @@ from magtwin.ros.record import Player, Recorder
 from magtwin.ros.simulate import RESET, Simulator
 from magtwin.run import Run
 from magtwin.sim.simulate import simulate
-from magtwin.twin import Twin, open_twin
+from magtwin.twin import Twin, in_session, open_twin
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")
 
@@ -113,6 +113,7 @@ def _driven(twin: Twin, bag: Path, patch: pytest.MonkeyPatch) -> Iterator[Driven
 def test_what_is_recorded_over_ros_is_the_direct_run_of_its_commands(driven: Driven, twin: Twin) -> None:
     net = twin.magnetometer
     assert net is not None
+    twin = in_session(twin, seed=SEED)
     direct = simulate(
         twin.scene,
         driven.node.online.commands,

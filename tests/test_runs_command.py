@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from magtwin.cli import main
+from magtwin.cli.runs import MIXTURE
 from magtwin.io.tables import read_parquet
 from magtwin.path import path_named
-from magtwin.twin import open_twin, simulate
+from magtwin.twin import in_session, open_twin, simulate
 
 SHORT = ("--duration", "1", "--magnetometer", "physical")
 
@@ -34,6 +35,8 @@ def test_each_file_is_the_run_of_its_seed_and_path_to_the_last_bit(lab_scene, tm
             "B",
             "--seed",
             "7",
+            "--session",
+            "survey",
             *SHORT,
         ]
     )
@@ -41,38 +44,61 @@ def test_each_file_is_the_run_of_its_seed_and_path_to_the_last_bit(lab_scene, tm
     assert sorted(p.name for p in out.iterdir()) == [f"run_0000{k}.parquet" for k in range(5)] + ["runs.csv"]
     twin = open_twin(lab_scene, magnetometer="physical")
     for k, row in enumerate(rows):
-        own = simulate(twin, path_named(("figure8", "B")[k % 2]), seed=7 + k, duration_s=1.0)
+        own = simulate(
+            twin, path_named(("figure8", "B")[k % 2]), seed=7 + k, session="survey", duration_s=1.0
+        )
         run = read_parquet(out / row["file"])
         assert dict(run.facts) == dict(own.facts)
         assert list(run) == list(own)
         assert all(run[name].tobytes() == own[name].tobytes() for name in own)
         assert row["path"] == own.facts["path"]
-        assert (int(row["seed"]), int(row["readings"]), row["session"]) == (7 + k, own.rows, "")
+        assert (int(row["seed"]), int(row["readings"]), row["session"]) == (7 + k, own.rows, "survey")
 
 
 def test_a_random_driver_is_dealt_like_a_path(lab_scene, tmp_path):
     out = tmp_path / "set"
-    options = ["--out", str(out), "--count", "3", "--path", "random", "figure8", "--json", *SHORT]
+    options = ["--out", str(out), "--count", "3", "--path", "random", "figure8", "--session", "survey"]
+    options += ["--json", *SHORT]
     main(["runs", str(lab_scene), *options])
     assert [row["path"] for row in listed(out)] == ["random", "figure8", "random"]
-    own = simulate(open_twin(lab_scene, magnetometer="physical"), "random", seed=2, duration_s=1.0)
+    own = simulate(
+        open_twin(lab_scene, magnetometer="physical"), "random", seed=2, session="survey", duration_s=1.0
+    )
     run = read_parquet(out / "run_00002.parquet")
     assert all(run[name].tobytes() == own[name].tobytes() for name in own)
 
 
-def test_sessions_differ_and_their_runs_share_what_a_day_has(lab_scene, tmp_path):
+def test_sessions_differ_and_their_runs_share_what_a_session_has(lab_scene, tmp_path):
     options = ["--count", "4", "--sessions", "2", "--columns", "battery_fraction", "b_measured_nt", *SHORT]
     for name in ("a", "b"):
         main(["runs", str(lab_scene), "--out", str(tmp_path / name), *options])
     runs = [read_parquet(tmp_path / "a" / row["file"]) for row in listed(tmp_path / "a")]
     charges = [run["battery_fraction"][0] for run in runs]
-    assert charges[0] == charges[2] != charges[1] == charges[3]
-    assert [run.facts["session"] for run in runs] == [0, 1, 0, 1]
+    assert charges[0] == charges[1] != charges[2] == charges[3]
+    assert [run.facts["session"] for run in runs] == [0, 0, 1, 1]
     assert len({run.facts["speed_m_s"] for run in runs}) == 4
     assert list(runs[0]) == ["t", "battery_fraction", "b_measured_nt"]
-    assert not np.array_equal(runs[0]["b_measured_nt"], runs[2]["b_measured_nt"])
+    assert not np.array_equal(runs[0]["b_measured_nt"], runs[1]["b_measured_nt"])
     for file in (tmp_path / "a").iterdir():
         assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes()
+
+
+def test_the_default_is_a_mixture_of_paths_in_sessions_that_each_drive_all_of_them(lab_scene, tmp_path):
+    out = tmp_path / "set"
+    main(["runs", str(lab_scene), "--out", str(out), "--count", "10", *SHORT])
+    rows = listed(out)
+    driven = {s: {row["path"] for row in rows if row["session"] == s} for s in ("0", "1")}
+    assert driven["0"] == driven["1"] == set(MIXTURE)
+    own = simulate(
+        in_session(open_twin(lab_scene, magnetometer="physical"), 1),
+        "sine",
+        seed=5,
+        speed=float(rows[5]["speed_m_s"]),
+        duration_s=1.0,
+    )
+    run = read_parquet(out / "run_00005.parquet")
+    assert dict(run.facts) == dict(own.facts)
+    assert all(run[name].tobytes() == own[name].tobytes() for name in own)
 
 
 def test_the_summary_is_json_where_that_is_asked_for(lab_scene, tmp_path, capsys):
@@ -86,7 +112,8 @@ def test_the_summary_is_json_where_that_is_asked_for(lab_scene, tmp_path, capsys
     ("options", "text"),
     [
         (("--count", "0"), "--count must be a whole number from 1 up"),
-        (("--sessions", "-1"), "--sessions must be a whole number from 0 up"),
+        (("--sessions", "0"), "--sessions must be a whole number from 1 up"),
+        (("--sessions", "2", "--session", "survey"), "--session survey is one session; drop --sessions"),
         (("--seed", "-1"), "--seed must be a whole number from 0 up"),
         (("--path", "figure9"), "did you mean 'figure8'"),
         (("--columns", "yaww"), "did you mean 'yaw'"),

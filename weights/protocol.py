@@ -4,9 +4,10 @@
 
 Every step is a command of magtwin's, and is printed. Nothing under test looks at the truth: maps are fitted
 to a survey that the twin's robot makes, labels are what it measured less these maps, where motion capture
-saw it, and the robot is drawn anew for each day of training and each day of test. FOLDER gets maps,
-recordings, data sets, weights with their cards, and the report. --ship puts the weights of the default lab
-beside this file.
+saw it, and the robot is drawn anew for each day of training and each day of test. The hybrid network of the
+default lab learns on the lab's own map, maps/lab/lab.usdc, which maps/lab/build.py fitted to such a survey.
+FOLDER gets maps, recordings, data sets, weights with their cards, and the report. --ship puts the weights of
+the default lab beside this file.
 
 aprilab is the published survey's laboratory as a twin, for which the survey is needed (`magtwin fetch
 aprilab`): dipoles that explain the survey, and small iron below the floor that no survey of 0.25 m resolves.
@@ -121,22 +122,30 @@ def aprilab(surveys: Path, out: Path) -> Path:
     return author_scene(scene, out / "scene", force=True)
 
 
-def protocol(stage: Path, out: Path, *, released: Path | None = None, shorter: int = 1) -> None:
+def protocol(
+    stage: Path,
+    out: Path,
+    *,
+    harmonic: Path | None = None,
+    released: Path | None = None,
+    shorter: int = 1,
+) -> None:
     """Survey, drive, train and judge.
 
     Args:
         stage: The twin.
         out: Folder of all that is made.
+        harmonic: Harmonic map for the hybrid to learn on; default: one fitted to the survey.
         released: The released network, to judge it too.
         shorter: Part of the drives and of the epochs that is left out: 1 for none.
     """
     by_physics = ("--magnetometer", "physical", "--rate-hz", RATE_HZ)
-    survey, trilinear, harmonic = (
-        out / name for name in ("survey.parquet", "trilinear.usdc", "harmonic.usdc")
-    )
+    survey, trilinear = out / "survey.parquet", out / "trilinear.usdc"
     do("map", "survey", stage, "--out", survey, *SURVEY, "--seed", 7)
     do("map", "fit", survey, "--method", "trilinear", "--out", trilinear)
-    do("map", "fit", survey, "--method", "harmonic", "--out", harmonic)
+    if harmonic is None:
+        harmonic = out / "harmonic.usdc"
+        do("map", "fit", survey, "--method", "harmonic", "--out", harmonic)
     do(
         *("runs", stage, "--out", out / "train", "--count", RUNS // shorter, "--sessions", DAYS),
         *("--duration", SECONDS, "--seed", 1000, *by_physics, "--path", *TRAINING),
@@ -182,7 +191,8 @@ def main() -> None:
     started = time.perf_counter()
     own = given.surveys is not None
     stage = aprilab(given.surveys, given.out) if own else shipped("scenes", "lab", "lab.usda")
-    protocol(stage, given.out, released=given.released, shorter=given.shorter)
+    shipped_map = None if own else shipped("maps", "lab", "lab.usdc")
+    protocol(stage, given.out, harmonic=shipped_map, released=given.released, shorter=given.shorter)
     if given.ship:
         for name in SHIPPED:
             for end in (".safetensors", ".md"):

@@ -2,13 +2,18 @@
 
 import signal
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 from cyclopts import App
 from cyclopts.config import Env, Toml
 from cyclopts.exceptions import CycloptsError
 
 import magtwin
-from magtwin.names import RefusedError
+from magtwin.cli.progress import watched
+from magtwin.names import MismatchWarning, RefusedError
 
 app = App(
     name="magtwin",
@@ -21,14 +26,28 @@ app = App(
 )
 
 
+HELP = {"--help", "-h"}
+"""Options that ask for help."""
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `magtwin` command; `arguments` are those of the command line unless given."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what is half-written goes
+    plain = not sys.stderr.isatty()
     try:
-        app([a for a in arguments if a != "--debug"], exit_on_error=False, result_action="return_value")
-    except CycloptsError:
+        with watched(), _warnings_in_lines():
+            app(
+                [a for a in arguments if a != "--debug"],
+                exit_on_error=False,
+                print_error=not plain,
+                result_action="return_value",
+                **_help_of(arguments),
+            )
+    except CycloptsError as error:
+        if plain:
+            print("magtwin: " + " ".join(str(error).split()), file=sys.stderr)  # noqa: T201
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
@@ -43,6 +62,40 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(error, OSError | MemoryError):
             _fail(f"{error} ({type(error).__name__})")
         _fail(f"a fault of magtwin's own, {type(error).__name__}: {error}; --debug shows where, do report it")
+
+
+def _help_of(arguments: list[str]) -> dict[str, Any]:
+    """Options that print help for a file or another program: without boxes, no line broken."""
+    asked = HELP & set(arguments) or len(arguments) < 2  # `magtwin map` is answered by its help too
+    if sys.stdout.isatty() or not asked:
+        return {}
+    from cyclopts.help import PlainFormatter
+
+    from magtwin.cli.terminal import stdout_console
+
+    app.help_formatter = PlainFormatter()
+    return {"console": stdout_console()}
+
+
+@contextmanager
+def _warnings_in_lines() -> Iterator[None]:
+    """Show a MismatchWarning as one line on stderr, each text once in a command; other warnings as ever."""
+    told: set[str] = set()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", MismatchWarning)
+        show = warnings.showwarning
+
+        def line(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if not issubclass(category, MismatchWarning):
+                show(message, category, *where, **more)
+            elif str(message) not in told:
+                told.add(str(message))
+                text = f"magtwin: warning: {' '.join(str(message).split())}"
+                loud = sys.stderr.isatty()  # yellow and bold
+                print(f"\033[1;33m{text}\033[0m" if loud else text, file=sys.stderr)  # noqa: T201
+
+        warnings.showwarning = line
+        yield
 
 
 def _fail(text: str) -> None:

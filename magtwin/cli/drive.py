@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from magtwin.cli.app import app
 from magtwin.cli.run import write_run
-from magtwin.cli.terminal import Force, Json, Seed, announcer, print_report, say
+from magtwin.cli.terminal import Force, Json, Seed, Session, announcer, print_report, say, silence
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -28,7 +28,9 @@ def drive(
     out: Path = Path("drive"),
     gamepad: Path | None = None,
     net: Path | None = None,
+    model_error: bool = True,
     seed: Seed = 0,
+    session: Session = None,
     view: bool = True,
     force: Force = False,
     json: Json = False,
@@ -50,8 +52,12 @@ def drive(
         drives, Start ends.
     net
         Weights to use in place of the scene's; "none" for a physical magnetometer.
+    model_error
+        As for `magtwin run`.
     seed
         Seed of all noise, and of the wheels' errors.
+    session
+        As for `magtwin run`.
     view
         Show the drive in a Rerun viewer while it goes on, where a window can be opened.
     force
@@ -67,13 +73,13 @@ def drive(
     from magtwin.sim.follow import CONTROL_RATE_HZ
     from magtwin.sim.manual import HELP, Gamepad, Keyboard, Recorder, at_start
     from magtwin.sim.simulate import streams
-    from magtwin.twin import open_twin
+    from magtwin.twin import in_session, open_twin
 
     existing(scene, "scene")
     if gamepad is not None and existing(gamepad, "gamepad").is_dir():
         raise RefusedError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
     with output(out, force=force) as folder:
-        twin = open_twin(scene, net=net)
+        twin = in_session(open_twin(scene, net=net, model_error=model_error), session, seed=seed)
         robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
         errors = draw_wheel_errors(robot.drive, streams(np.random.default_rng(seed))["drive"])
         chassis = at_start(
@@ -92,7 +98,8 @@ def drive(
                     print(f"  no view: {error}", file=sys.stderr)  # noqa: T201
             source = stack.enter_context(device(gamepad))
             print(f"  {HELP if gamepad is None else 'left stick drives, Start ends'}\r", file=sys.stderr)  # noqa: T201
-            _drive(recorder, hand, source, dt, show)
+            with silence():
+                _drive(recorder, hand, source, dt, show)
         folder.mkdir()
         write_commands(recorder.commands("commands.csv"), folder / "commands.csv")
         report = write_run(
@@ -103,12 +110,15 @@ def drive(
             facts={"commands_file": "commands.csv"},
             steps=announcer(quiet=json),
             net=net,
+            model_error=model_error,
             seed=seed,
+            session=session,
             title=f"Manual drive in {scene}",
         )
     print_report(report, json)
     if not json:
-        say(f"Wrote {out}; again: magtwin run {scene} --commands {out / 'commands.csv'} --seed {seed}")
+        again = "" if session is None else f" --session {session}"
+        say(f"Wrote {out}; again: magtwin run {scene} --commands {out / 'commands.csv'} --seed {seed}{again}")
 
 
 def _drive(recorder: "Recorder", hand: "Hand", device: int, dt: float, show: object) -> None:

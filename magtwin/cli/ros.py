@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Seed, Whole, announcer, say
+from magtwin.cli.terminal import Force, Seed, Session, Whole, announcer, progress, say, silence, step
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -84,7 +84,9 @@ def sim(
     speed: float = 1.0,
     duration: float | None = None,
     seed: Seed = 0,
+    session: Session = None,
     net: Path | None = None,
+    model_error: bool = True,
     rate_hz: float | None = None,
     profile: Profile = "ros",
     units: Literal["T", "nT"] | None = None,
@@ -110,8 +112,12 @@ def sim(
         How long, in sim time [s]; without an end unless given.
     seed
         Seed of all noise.
+    session
+        As for `magtwin run`.
     net
         Weights to use in place of the scene's; "none" for a physical magnetometer.
+    model_error
+        As for `magtwin run`.
     rate_hz
         Readings of the magnetometer a second [Hz]; the scene's unless given.
     profile
@@ -132,12 +138,13 @@ def sim(
 
     tell = announcer(quiet=False)
     tell(f"opening {scene}")
-    twin = open_twin(scene, net=net)
+    twin = open_twin(scene, net=net, model_error=model_error)
     with where.bus("magtwin_sim", duration=duration) as bus:
         node = Simulator(
             twin,
             bus,
             seed=seed,
+            session=session,
             speed=speed,
             rate_hz=rate_hz,
             units=units or UNITS[profile],
@@ -148,7 +155,14 @@ def sim(
             say=tell,
         )
         tell(f"simulating by {bus.backend} at {speed:g} x real time; Ctrl-C ends")
-        node.run(duration_s=duration)
+        with progress("Simulating", "s") if duration else silence() as advance:
+
+            def told() -> bool:
+                if advance is not None:
+                    advance(node.online.t, duration)
+                return False
+
+            node.run(told, duration_s=duration)
 
 
 @ros_app.command(name="magnetometer")
@@ -190,7 +204,7 @@ def magnetometer(
     values = settings_of(PARAMETERS, (f"units:={UNITS[profile]}", *settings))
     tell = announcer(quiet=False)
     tell(f"opening {scene}")
-    twin = open_twin(scene, net=net)
+    twin = open_twin(scene, net=net, model_error=False)  # it predicts, for a robot that reads
     sim_time = values["use_sim_time"]
     with where.bus("magtwin_magnetometer", sim_time=sim_time, duration=duration) as bus:
         Magnetometer(twin, bus, values, say=tell)
@@ -264,8 +278,14 @@ def follow(
         )
         tell(f"driving {way.name}, {way.length:.1f} m, by {bus.backend}; Ctrl-C ends")
         try:
-            while not node.done:
-                bus.spin_once(0.1)
+            with progress(f"Driving {way.name}") as advance:
+                while not node.done:
+                    bus.spin_once(0.1)
+                    advance(
+                        node.progress.laps,
+                        None if continuous else laps,
+                        f"{node.progress.rms_m:.3f} m RMS off it",
+                    )
         finally:
             node.stop()
             say(f"{node.progress.laps} times along {way.name}, {node.progress.rms_m:.3f} m RMS off it")
@@ -329,7 +349,7 @@ def teleop(
         source = stack.enter_context(device(gamepad))
         announcer(quiet=False)(HELP if gamepad is None else "left stick drives, Start ends")
         node = Teleop(bus, hand, source, stamped_commands=stamped_commands)
-        with suppress(KeyboardInterrupt):
+        with silence(), suppress(KeyboardInterrupt):
             node.run(recorder.step if recorder else lambda: None)
         node.stop()
     say(f"{node.sent} commands" + ("" if out is None else f"; wrote {out}"))
@@ -371,7 +391,9 @@ def record(
     try:
         with where.bus("magtwin_record", sim_time=sim_time, duration=duration) as bus:
             announcer(quiet=False)(f"recording by {bus.backend}; Ctrl-C ends")
-            Recorder(bus, writer, topic, sim_time=sim_time, say=_warn).run(duration_s=duration)
+            recorder = Recorder(bus, writer, topic, sim_time=sim_time, say=_warn)
+            with progress("Recording", "messages") as advance:
+                recorder.run(lambda: advance(sum(writer.counts.values()), None), duration_s=duration)
     finally:
         counts = dict(writer.counts)
         writer.close()
@@ -416,12 +438,13 @@ def replay(
     if not speed > 0:
         raise RefusedError(f"speed must be above 0, got {speed!r}")
     whole = read_run(run)
-    twin = None if scene is None else open_twin(scene)
+    twin = None if scene is None else open_twin(scene, model_error=False)
     with where.bus("magtwin_replay") as bus:
         player = Player(whole, bus, twin, units=units, topics=topic)
         announcer(quiet=False)(
             f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends"
         )
+        step("Replaying")
         count = player.run(speed=speed)
     say(f"{count} messages")
 
@@ -429,8 +452,11 @@ def replay(
 def spin(bus: "Bus", duration_s: float | None) -> None:
     """Have a node do what it does, without an end or for a time by the wall [s]."""
     begin = time.monotonic()
-    while duration_s is None or time.monotonic() - begin < duration_s:
-        bus.spin_once(0.1)
+    with progress("Reading", "s") if duration_s else silence() as advance:
+        while duration_s is None or (gone := time.monotonic() - begin) < duration_s:
+            bus.spin_once(0.1)
+            if duration_s is not None:
+                advance(gone, duration_s)
 
 
 def _warn(text: str) -> None:

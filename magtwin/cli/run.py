@@ -11,7 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, Seed, announcer, check_suffix, print_report, progress, say
+from magtwin.cli.terminal import (
+    Force,
+    Json,
+    Seed,
+    Session,
+    announcer,
+    check_suffix,
+    print_report,
+    progress,
+    say,
+    silence,
+    step,
+)
 from magtwin.names import RefusedError, find
 
 if TYPE_CHECKING:
@@ -25,7 +37,14 @@ if TYPE_CHECKING:
 
 
 @app.command
-def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json: Json = False) -> None:
+def demo(
+    *,
+    out: Path = Path("demo"),
+    seed: Seed = 0,
+    model_error: bool = True,
+    force: Force = False,
+    json: Json = False,
+) -> None:
     """Author a lab and a TurtleBot 4, drive a figure of eight, log what the magnetometer reads.
 
     Writes the stages, run.rrd (opens in Rerun), run.parquet and pictures. Takes under a minute.
@@ -36,6 +55,8 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
         Folder to make.
     seed
         Seed of all noise.
+    model_error
+        As for `magtwin run`.
     force
         Replace the folder if it exists.
     json
@@ -60,14 +81,10 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False, json
             scene_file,
             "figure8",
             folder,
-            # a day as those that its network learned from: the robot as it ships is that of the survey
-            facts={
-                "scene_file": scene_file.relative_to(folder).as_posix(),
-                "session_seed": seed,
-                "session": 0,
-            },
+            facts={"scene_file": scene_file.relative_to(folder).as_posix()},
             steps=steps,
             seed=seed,
+            model_error=model_error,
             speed=0.2,
             title=f"Demo in {out}",
         )
@@ -84,6 +101,7 @@ def run(
     scene: Path,
     *,
     path: str | None = None,
+    fit: Annotated[bool, Parameter(negative="")] = False,
     commands: Path | None = None,
     robot: str | None = None,
     meet: Literal["refuse", "flag"] | None = None,
@@ -92,7 +110,9 @@ def run(
     controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    model_error: bool = True,
     seed: Seed = 0,
+    session: Session = None,
     speed: float = 0.2,
     duration: float | None = None,
     rate_hz: float | None = None,
@@ -124,8 +144,10 @@ def run(
     path
         sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle,
         curvilinear, curvilinear_2; A to E, the cases of the paper's Table 1; random, a human-like driver
-        who goes where the seed takes them, for a minute or --duration; or a CSV file of x,y [m]. Unless
-        given, what the scene says, or else figure8.
+        who goes where the seed takes them, for a minute or --duration; or a CSV file of x,y [m]. Named paths
+        are scaled to the floor. Unless given, what the scene says, or else figure8.
+    fit
+        Move the path and make it smaller if it does not fit the floor or runs into something.
     commands
         CSV file of t,v,w [s, m/s, rad/s] to drive by in place of a path, as magtwin drive leaves it.
     robot
@@ -147,8 +169,15 @@ def run(
     magnetometer
         What it reads, in place of what the scene says: the exact field (physical), the map and what a
         network predicts (neural), or the map alone (map-only).
+    model_error
+        Let readings of a neural magnetometer be off what its network predicts, as they were on recordings
+        that it never saw. --no-model-error: they are the prediction and the sensor's own noise.
     seed
-        Seed of all noise; one seed, one Run.
+        Seed of all noise. The same seed gives the same bytes.
+    session
+        Number of a session to draw from the seed: charge, IMU zero, wheels, odometry and the robot's own
+        field differ from session to session. "survey" takes the robot as it was when the map was surveyed.
+        Default: 0.
     speed
         Forward speed where the path is straight [m/s].
     duration
@@ -227,6 +256,8 @@ def run(
         raise RefusedError(f"--controller {controller} follows a path, and {way} is none; drop one")
     if speed != 0.2 and (commands or replay):
         raise RefusedError(f"--speed is for a path or a driver, and {way} has speeds of its own; drop one")
+    if fit and (commands or replay or path == "random"):
+        raise RefusedError(f"--fit is for a path, and {way} is none; drop it")
     if engine == "newton":
         from magtwin.sim.newton import check_installed
 
@@ -237,7 +268,9 @@ def run(
         "engine": "newton" if engine == "newton" else "kinematic",
         "net": net,
         "magnetometer": magnetometer,
+        "model_error": model_error,
         "seed": seed,
+        "session": session,
         "speed": speed,
         "duration_s": duration,
         "rate_hz": rate_hz,
@@ -254,16 +287,23 @@ def run(
             raise RefusedError(f"--live and --viewer show one robot, and {scene} has {', '.join(robots)}")
         if robot is None and (path or commands or replay):
             raise RefusedError(f"which of {', '.join(robots)} is to drive {way}? say it with --robot NAME")
-        _run_together(scene, wanted, robot=robot, path=path, meet=meet, scans=scans, quiet=json, **options)
+        if fit and robot is None:
+            raise RefusedError(
+                f"whose path is to be fitted, of {', '.join(robots)}? say it with --robot NAME"
+            )
+        _run_together(
+            scene, wanted, robot=robot, path=path, fit=fit, meet=meet, scans=scans, quiet=json, **options
+        )
         return
     if meet is not None:
         raise RefusedError(f"--meet is for several robots, and {scene} has one; drop it")
     if not (path or commands or replay):
         way = str(robots[next(iter(robots))] or way)
     shown = _Live(window=live, address=viewer, pace=pace or 1.0) if live or viewer else None
+    step("Opening the scene")
     with ExitStack() as stack:
         written = wanted.begun() if shown else stack.enter_context(wanted.aside())
-        what = _drive(scene, way, steps=announcer(quiet=json), scans=scans, **options)
+        what = _drive(scene, way, steps=announcer(quiet=json), scans=scans, fit=fit, **options)
         if shown:
             what = _show(what, shown, written, quiet=json)
         written.write(what, steps=announcer(quiet=json), recorded=shown is not None)
@@ -325,41 +365,55 @@ def _drive(
     replay: Path | None = None,
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    model_error: bool = True,
+    seed: int = 0,
+    session: int | Literal["survey"] | None = None,
+    fit: bool = False,
     facts: Mapping[str, str | int] = MappingProxyType({}),
     **options: Any,
 ) -> _Driven:
     """Run a scene: along `path`, unless commands or a run say otherwise.
 
-    `facts` say where files will lie as seen from the run's own, for those that move with it, and on which day
-    it drives, if on one (`session_seed`, `session`).
+    `facts` say where files will lie as seen from the run's own, for those that move with it.
     """
     from magtwin.io.formats import read_run
-    from magtwin.path import resolve_path
     from magtwin.sim.commands import read_commands
-    from magtwin.twin import on_its_day, open_twin, scan, simulate
+    from magtwin.sim.way import way_of
+    from magtwin.twin import in_session, open_twin, room_of, scan, simulate
 
-    planned = None
+    planned: Any = None
     what: Any = path
     if commands is not None:
         what = read_commands(commands)
     elif replay is not None:
         what = read_run(replay)
-    elif path != "random":
-        what = planned = resolve_path(path)
-    twin = on_its_day(open_twin(scene_file, net=net, magnetometer=magnetometer), facts)
+    twin = open_twin(scene_file, net=net, magnetometer=magnetometer, model_error=model_error)
+    twin = in_session(twin, session, seed=seed)
+    if commands is None and replay is None and path != "random":
+        what = planned = way_of(path, room_of(twin), fit=fit)
+        _say_placing(planned, steps)
     if commands is not None and what.beyond(twin.scene.robot.drive):
         print(f"  {what.beyond(twin.scene.robot.drive)}", file=sys.stderr)  # noqa: T201
     steps(f"Driving {planned.name if planned else path}")
     if replay is not None:
         facts = {"replay_file": replay.as_posix(), **facts}
-    slow = options.get("engine") == "newton" and sys.stderr.isatty()
-    with progress("  Newton") if slow else nullcontext() as advance:
-        result = simulate(twin, what, progress=advance, **options).with_facts(**facts)
+    slow = options.get("engine") == "newton"
+    with progress("Driving in Newton", "steps") if slow else nullcontext() as advance:
+        result = simulate(twin, what, seed=seed, progress=advance, **options).with_facts(**facts)
     seen = None
     if scans:
         steps("Casting the LiDAR's rays")
-        seen = scan(twin, result, seed=options["seed"])
+        seen = scan(twin, result, seed=seed)
     return _Driven(result, twin, planned, seen)
+
+
+def _say_placing(path: Any, steps: Any) -> None:
+    """Tell how a path was brought onto the floor, where it was."""
+    if path.placing:
+        scale_x, scale_y, x, y = path.placing
+        scale = f"by {scale_x:.2g}" if scale_x == scale_y else f"by {scale_x:.2g} in x and {scale_y:.2g} in y"
+        moved = f", moved by ({x:.2f}, {y:.2f}) m" if max(abs(x), abs(y)) >= 0.005 else ""
+        steps(f"Path {path.name} is scaled {scale}{moved} to fit the floor")
 
 
 def _run_together(
@@ -368,6 +422,7 @@ def _run_together(
     *,
     robot: str | None,
     path: str | None,
+    fit: bool,
     meet: Literal["refuse", "flag"] | None,
     scans: bool,
     quiet: bool,
@@ -378,7 +433,8 @@ def _run_together(
     from magtwin.path import Path as Planned
     from magtwin.report import Report
     from magtwin.sim.commands import read_commands
-    from magtwin.twin import led_by, open_twin, scan, simulate_robots, way_of
+    from magtwin.sim.way import way_of
+    from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots
 
     steps = announcer(quiet=quiet)
     if options.pop("engine") == "newton":
@@ -386,11 +442,15 @@ def _run_together(
             f"--engine newton drives one robot by itself, and {scene_file} has several; drop it"
         )
     commands, replay = options.pop("commands"), options.pop("replay")
-    twin = open_twin(scene_file, net=options.pop("net"), magnetometer=options.pop("magnetometer"))
+    opening = {name: options.pop(name) for name in ("net", "magnetometer", "model_error")}
+    twin = open_twin(scene_file, **opening)
     ways: dict[str, Any] = {one.robot.name: one.path or "figure8" for one in twin.scene.robots}
     if robot is not None and (commands or replay or path):
         ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path
-    ways = {name: way_of(way) for name, way in ways.items()}
+    ways = {
+        name: way_of(way, room_of(led_by(twin, name)), fit=fit and name == robot)
+        for name, way in ways.items()
+    }
     names = list(ways) if robot is None else [robot]
     with ExitStack() as stack:
         written = {}
@@ -533,7 +593,7 @@ class _Outputs:
                         **options,
                     )
         if self.folder:
-            from magtwin.io.plots import plot_run
+            from magtwin.io.plotting import plot_run
 
             planned = driven.planned
             plot_run(
@@ -584,16 +644,16 @@ def _show(driven: _Driven, live: _Live, outputs: _Outputs, *, quiet: bool) -> _D
             known: dict[str, Any] = {"expected": run, "planned": driven.planned, "scans": driven.scans}
             viewers.append(LiveViewer(address, driven.twin, **known))
         sinks = outputs.sinks(driven)
-        advance = stack.enter_context(progress("  Live [s]")) if not quiet and sys.stderr.isatty() else None
+        advance = stack.enter_context(progress("Live", "s"))
         with Recorder(sinks, viewers) as recorder:
             for block in in_step(run, live.pace, stop=stop):
                 recorder.append(block)
-                if advance is not None:
-                    advance(round(float(block["t"][-1])), round(float(run["t"][-1])), "Ctrl-C ends it")
+                advance(round(float(block["t"][-1])), round(float(run["t"][-1])), "Ctrl-C ends it")
         if not recorder.rows:
             raise RefusedError("ended before the first reading; nothing is written")
         if live.window and address is not None and sys.stdin.isatty():
-            _wait(address, stop)
+            with silence():
+                _wait(address, stop)
     rows, scans = recorder.rows, driven.scans
     if rows < run.rows:
         run = run.take(slice(rows))

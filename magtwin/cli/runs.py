@@ -12,6 +12,12 @@ from magtwin.cli.terminal import Force, Json, Seed, Whole, announcer, print_repo
 
 Names = Annotated[list[str] | None, Parameter(consume_multiple=True, negative="")]
 
+MIXTURE = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
+"""Default paths: a model that learns from one kind of path does not know the others."""
+
+RUNS_A_SESSION = 5
+"""Default number of runs in each session, as many as there are paths."""
+
 
 @app.command
 def runs(
@@ -20,14 +26,17 @@ def runs(
     out: Path = Path("runs"),
     count: Whole = 100,
     path: Names = None,
+    fit: Annotated[bool, Parameter(negative="")] = False,
     seed: Seed = 0,
-    sessions: Whole = 0,
+    sessions: Whole | None = None,
+    session: Literal["survey"] | None = None,
     speed: float | None = None,
     duration: float | None = None,
     rate_hz: float | None = None,
     columns: Names = None,
     net: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     force: Force = False,
@@ -35,9 +44,9 @@ def runs(
 ) -> None:
     """Drive a scene's robot many times and write a data set: a Parquet file a run, and a list of them.
 
-    Run k, in run_00000.parquet and so on, has the seed SEED + k and drives the next path in turn; without
-    sessions it is what `magtwin run` writes with these, to the last bit. runs.csv lists file, path, seed,
-    session, speed and readings. Of a scene of several robots the first drives, alone.
+    Run k, in run_00000.parquet and so on, has the seed SEED + k and drives the next path in turn. runs.csv
+    lists file, path, seed, session, speed and readings. In a scene of several robots the first one drives,
+    alone.
 
     Parameters
     ----------
@@ -48,15 +57,20 @@ def runs(
     count
         How many runs.
     path
-        Paths to drive in turn, as for `magtwin run`: names, cases A to E, random, CSV files; figure8 unless
-        given.
+        Paths to drive in turn, as for `magtwin run`: names, cases A to E, random, CSV files. Default: sine,
+        lawnmower, figure8, continuous_cycle and random.
+    fit
+        As for `magtwin run`.
     seed
         Seed of the first run; each next one's is one more.
     sessions
-        Days to deal the runs to, in turn: on each, charge, IMU zero, wheels, odometry and the robot's own
-        field are drawn anew, and a speed for each run. 0 takes the robot as its asset has it.
+        Number of sessions. In each, charge, IMU zero, wheels, odometry and the robot's own field are drawn
+        from the seed; each takes as many runs, one after the other. Default: one for every 5 runs.
+    session
+        "survey" drives the robot as it was when the map was surveyed, in every run.
     speed
-        Forward speed where the path is straight [m/s]; 0.2 unless given, or drawn where there are sessions.
+        Forward speed where the path is straight [m/s]. Default: drawn for each run from 0.2 to 0.3; 0.2 with
+        --session survey.
     duration
         How long each run is [s]; once along its path unless given, longer gives further laps.
     rate_hz
@@ -66,6 +80,8 @@ def runs(
     net
         As for `magtwin run`.
     magnetometer
+        As for `magtwin run`.
+    model_error
         As for `magtwin run`.
     lidar
         Whether the LiDAR follows its schedule, or stays on or off.
@@ -81,26 +97,32 @@ def runs(
     from magtwin.files import existing, output
     from magtwin.io.tables import write_parquet
     from magtwin.names import RefusedError
-    from magtwin.path import resolve_path
     from magtwin.report import Figure, Report
-    from magtwin.sim.session import draw_speed, session_of
-    from magtwin.twin import open_twin, simulate_many
+    from magtwin.sim.session import draw_speed
+    from magtwin.sim.way import way_of
+    from magtwin.twin import in_session, open_twin, room_of, simulate_many
+    from magtwin.verdict import Tally
 
     existing(scene, "scene")
-    for name, value, least in (("count", count, 1), ("sessions", sessions, 0), ("seed", seed, 0)):
-        if value < least:
+    for name, value, least in (("count", count, 1), ("sessions", sessions, 1), ("seed", seed, 0)):
+        if value is not None and value < least:
             raise RefusedError(f"--{name} must be a whole number from {least} up, got {value}")
+    if sessions is not None and session is not None:
+        raise RefusedError("--session survey is one session; drop --sessions")
     steps = announcer(quiet=json)
     with output(out, force=force) as folder:
         steps("Opening the scene")
-        twin = open_twin(scene, net=net, magnetometer=magnetometer)
-        paths = [name if name == "random" else resolve_path(name) for name in path or ["figure8"]]
+        twin = open_twin(scene, net=net, magnetometer=magnetometer, model_error=model_error)
+        paths = [way_of(name, room_of(twin), fit=fit) for name in path or MIXTURE]
         robot = twin.scene.robot
-        days = [robot]
-        if sessions:
-            days = [session_of(robot, seed, day) for day in range(min(sessions, count))]
+        if session is not None:
+            drawn = [in_session(twin, session)]
+        else:
+            most = min(sessions or max(1, round(count / RUNS_A_SESSION)), count)
+            drawn = [in_session(twin, k, seed=seed) for k in range(most)]
+        of_run = [drawn[k * len(drawn) // count] for k in range(count)]
         speeds = [0.2 if speed is None else speed] * count
-        if sessions and speed is None:
+        if session is None and speed is None:
             draws = np.random.default_rng((seed, 1)).spawn(2)[1]  # which no run draws from
             speeds = [draw_speed(robot.drive, rng) for rng in draws.spawn(count)]
         made = simulate_many(
@@ -108,7 +130,7 @@ def runs(
             [paths[k % len(paths)] for k in range(count)],
             range(seed, seed + count),
             speeds=speeds,
-            robots=[days[k % len(days)] for k in range(count)],
+            robots=of_run,
             columns=columns,
             duration_s=duration,
             rate_hz=rate_hz,
@@ -116,23 +138,23 @@ def runs(
             outside=outside,
         )
         folder.mkdir()
+        tally = Tally()
         readings, seconds, start = 0, 0.0, time.monotonic()
         with (
-            progress("Driving") as advance,
+            progress("Driving", "runs") as advance,
             open(folder / "runs.csv", "w", encoding="utf-8", newline="") as listing,
         ):
             table: Any = csv.writer(listing, lineterminator="\n")
             table.writerow(("file", "path", "seed", "session", "speed_m_s", "readings"))
+            advance(0, count)
             for k, run in enumerate(made):
                 file = f"run_{k:05d}.parquet"
-                day: int | str = k % len(days) if sessions else ""
-                dealt = run.with_facts(session=k % len(days), session_seed=seed) if sessions else run
-                write_parquet(dealt, folder / file)
-                facts = run.facts
-                table.writerow((file, facts["path"], facts["seed"], day, facts["speed_m_s"], run.rows))
-                readings, seconds = readings + run.rows, seconds + float(facts["duration_s"])
-                rate = (k + 1) / (time.monotonic() - start)
-                advance(k + 1, count, f"{rate:.3g} runs/s")
+                write_parquet(run, folder / file)
+                run.add_to(tally)
+                listed = (run.facts[name] for name in ("path", "seed", "session", "speed_m_s"))
+                table.writerow((file, *listed, run.rows))
+                readings, seconds = readings + run.rows, seconds + float(run.facts["duration_s"])
+                advance(k + 1, count)
     took = time.monotonic() - start
     report = Report(
         f"{count} runs in {scene}",
@@ -143,7 +165,11 @@ def runs(
             Figure("took", round(took, 3), "s"),
             Figure("rate", count / took, "runs/s"),
         ),
-        {"paths": ", ".join(getattr(one, "name", "random") for one in paths), "sessions": sessions},
+        {
+            "paths": ", ".join(getattr(one, "name", "random") for one in paths),
+            "sessions": session or len(drawn),
+        },
+        tally.verdict(f"the exact field of {count} runs in {len(drawn)} sessions"),
     )
     print_report(report, json)
     if not json:

@@ -11,6 +11,7 @@ from magtwin.field.figures import Figures
 from magtwin.field.forward import Forward
 from magtwin.field.harmonic import HarmonicField
 from magtwin.field.headings import between
+from magtwin.field.model import FittedModel
 from magtwin.names import RefusedError
 
 Array = NDArray[np.float64]
@@ -22,8 +23,8 @@ COARSE = 1 / 3
 """Distance between nodes whose variance is evaluated, at most, in the depth of the nearest layer."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class HarmonicModel:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class HarmonicModel(FittedModel):
     """A harmonic field fitted to readings, and how sure it is."""
 
     field: HarmonicField

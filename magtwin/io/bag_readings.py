@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.field.readings import Readings
-from magtwin.field.survey import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER, check_unit
+from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER, check_unit
 from magtwin.files import existing, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 from magtwin.names import RefusedError, hint

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.grid import Grid
-from magtwin.field.readings import FARTHEST_M, SHAPES, Readings
-from magtwin.field.survey import check_unit, nt_per, read_grid
+from magtwin.field.readings import FARTHEST_M, SHAPES, TAKEN, Readings
+from magtwin.field.survey import read_grid
+from magtwin.field.units import check_unit, nt_per, unit_by_size
 from magtwin.files import existing, output, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
-from magtwin.io.columns import FIELDS, HEADINGS, Columns
+from magtwin.io.columns import FIELDS, HEADINGS, TIMES, VECTORS, Columns
 from magtwin.io.sheet import Sheet, read_csv, read_parquet_sheet
 from magtwin.names import RefusedError
 from magtwin.run import Run
@@ -34,6 +35,12 @@ LARGEST_TURN = 2 * np.pi + 0.01
 
 APART = 2.0
 """Times that vectors may be longer or shorter than magnitudes read beside them, in the median."""
+
+TURNED = 0.7
+"""Length of the mean of the headings' unit vectors above which a survey hardly turned."""
+
+ALIGNED = 0.8
+"""Part of the level field that its mean keeps, above which it keeps one direction."""
 
 _SURVEY = b"magtwin_readings"
 _PARTS = {"p_xy": ("x", "y"), "b_body_nt": ("x", "y", "z"), "node": ("heading", "row", "column")}
@@ -318,6 +325,7 @@ def _sheet(path: Path) -> Sheet:
 
 def _of_sheet(sheet: Sheet, paths: list[Path], columns: Columns) -> Readings:
     """The readings in a table."""
+    columns, taken = _told(sheet, columns)
     p = np.column_stack([sheet.numbers(columns.x), sheet.numbers(columns.y)])
     turn = _turn(sheet, columns)
     vector, b = _field(sheet, columns)
@@ -361,18 +369,76 @@ def _of_sheet(sheet: Sheet, paths: list[Path], columns: Columns) -> Readings:
     )
     if vector is not None:
         _check_sizes(vector[known], b[known], sheet, columns)
+        _check_axes(vector[known], yaw[known], sheet, columns)
     run, runs = _runs(sheet, columns, paths[0].stem, known)
     return Readings(
         p_xy=p[known],
         yaw=yaw[known],
         b_nt=b[known],
-        b_body_nt=None if vector is None else levelled(vector, turn, columns.axes)[known],
+        b_body_nt=None if vector is None else levelled(vector, turn, columns.axes or "body")[known],
         t=None if t is None else t[known],
         run=run,
         runs=runs,
         name=paths[0].stem,
-        source="; ".join(map(_sum, paths)) + _left_out(known),
+        source="; ".join([*map(_sum, paths)]) + _left_out(known) + "".join(f"; {TAKEN}{t}" for t in taken),
     )
+
+
+def _told(sheet: Sheet, columns: Columns) -> tuple[Columns, list[str]]:
+    """The columns and the unit, those that are not given found by their names and size; what was found so."""
+    taken = list[str]()
+    lower: dict[str, str] = {}
+    for label in sheet.names:
+        lower.setdefault(label.strip().lower(), label)
+    if not (columns.heading or columns.quaternion):
+        label = next((name for name in HEADINGS if name in sheet.names), "")
+        columns = replace(columns, heading=label or next((lower[n] for n in HEADINGS if n in lower), ""))
+    if not columns.time and (label := next((lower[name] for name in TIMES if name in lower), "")):
+        columns = replace(columns, time=label)
+    if not columns.field and not columns.vector:
+        three = next((names for names in VECTORS if set(names) <= lower.keys()), ())
+        if label := next((lower[name] for name in FIELDS if name in lower), ""):
+            columns = replace(columns, field=label)
+        elif three:
+            columns = replace(columns, vector=",".join(lower[name] for name in three))
+            if columns.axes is None:
+                taken.append(f"{columns.vector} as the field in the robot's axes, forward, left, up (--axes)")
+        else:
+            named = [label for label in sheet.names if not label.isdigit()]
+            known = (
+                f"columns: {', '.join(named)}" if named else f"{len(sheet.columns)} columns without a header"
+            )
+            raise RefusedError(
+                f"{sheet.path}: no column of the field was found by its name ({known}); name the magnitude "
+                "with --field NAME, or the components with --vector BX,BY,BZ"
+            )
+    if columns.unit is None and columns.scale is None:
+        _, b = _field(sheet, replace(columns, unit="nT"))
+        unit = unit_by_size(b)
+        if unit not in (None, "nT"):
+            columns = replace(columns, unit=unit)  # type: ignore[arg-type]
+            taken.append(f"{columns.field or columns.vector} in {unit}, as its size tells (--unit)")
+    return columns, taken
+
+
+def _check_axes(vector_nt: Array, yaw: Array, sheet: Sheet, columns: Columns) -> None:
+    """Refuse vectors whose level part keeps its direction in the other axes than those that were said."""
+    if np.hypot(np.cos(yaw).mean(), np.sin(yaw).mean()) > TURNED:
+        return  # one heading: nothing tells the axes apart
+    level = vector_nt[:, 0] + 1j * vector_nt[:, 1]
+    size = np.abs(level).mean()
+    if not size > 0:
+        return
+    as_world, as_body = abs(level.mean()) / size, abs((level * np.exp(1j * yaw)).mean()) / size
+    said = columns.axes or "body"
+    here, there = (as_body, as_world) if said == "body" else (as_world, as_body)
+    if there > ALIGNED and here < ALIGNED / 2:
+        other = "world" if said == "body" else "body"
+        raise RefusedError(
+            f"{sheet.path}: {columns.vector} are taken to be in {said} axes, but they keep one direction "
+            f"({100 * there:.0f} % of them) in {other} axes, as the Earth's field does: give --axes {other}, "
+            "or correct the headings or the order of the components"
+        )
 
 
 def levelled(vector_nt: Array, turn: Array, axes: str) -> Array:

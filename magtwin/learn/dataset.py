@@ -27,11 +27,13 @@ from magtwin.files import existing, output, sha256
 from magtwin.learn.features import FEATURES, SETS, columns_of, feature_names
 from magtwin.learn.features import features as features_of
 from magtwin.learn.labels import Alignment, fit_alignment, labelled
+from magtwin.learn.origin import map_facts, shared_facts
 from magtwin.learn.recording import Recording, Rows, Source, read, sources_of, thinned
 from magtwin.learn.split import Part, Split
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
 from magtwin.run import Facts, Run
+from magtwin.summary import Summarized, Summary, listed, span
 from magtwin.version import __version__
 
 Array = NDArray[np.float64]
@@ -59,8 +61,8 @@ KEPT = tuple(
 """Columns of a recording that a data set keeps, of those that it has."""
 
 
-@dataclass(frozen=True)
-class Dataset:
+@dataclass(frozen=True, repr=False)
+class Dataset(Summarized):
     """Recordings with labels on one map; see the module."""
 
     folder: Path
@@ -82,7 +84,8 @@ class Dataset:
     """Lever arm and latency that they were made with."""
 
     facts: Facts
-    """Version of magtwin, map's method, how the alignment came about."""
+    """Version of magtwin, the map's method and values, how the alignment came about, and the robot that
+    drove, where the recordings tell; see `magtwin.learn.origin`."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -243,7 +246,7 @@ class Dataset:
         facts = {
             "map": self.map_name,
             "map_sha256": self.map_sha256,
-            **self.facts,
+            **{name: fact for name, fact in self.facts.items() if name != "map_samples_nt"},
             "feature sets": ", ".join(sets),
         }
         return Report(f"Data set {self.folder}", tuple(figures), facts)
@@ -279,6 +282,39 @@ class Dataset:
 
     def _run(self, table: pa.Table, one: Recording) -> Run:
         return run_of(table, self.folder / RUNS / f"{one.name}.parquet")
+
+    def _summary(self) -> Summary:
+        """Folder and rows; sessions and paths; map and alignment; spread of the labels."""
+        rows, labelled = (sum(getattr(one, name) for one in self.recordings) for name in ("rows", "labelled"))
+        seconds = sum(one.duration_s for one in self.recordings)
+        (x, y), latency = self.alignment.lever_arm_m, self.alignment.latency_s
+        means = [one.label_mean_nt for one in self.recordings if one.labelled]
+        sessions, paths = ({getattr(one, name) for one in self.recordings} for name in ("session", "path"))
+        return Summary(
+            f"Dataset {self.folder.name}: {len(self.recordings):,} recordings, {rows:,} rows, "
+            f"{seconds / 60:.4g} min",
+            (
+                ("from", f"{len(sessions):,} sessions, {len(paths):,} paths: {listed(sorted(paths))}"),
+                ("map", f"{self.map_name}; lever arm ({x:.3g}, {y:.3g}) m, latency {latency:.3g} s"),
+                (
+                    "labels",
+                    f"{labelled:,} rows"
+                    + (f", means of recordings {span(min(means), max(means), 'nT')}" if means else ""),
+                ),
+                ("columns", f"{len(self.columns)}: {listed(self.columns)}"),
+            ),
+            ("recording", "session", "path", "rows", "labels: mean +- sd"),
+            [
+                (
+                    one.name,
+                    one.session,
+                    one.path,
+                    f"{one.rows:,}",
+                    f"{one.label_mean_nt:,.0f} +- {one.label_sd_nt:,.0f} nT",
+                )
+                for one in self.recordings
+            ],
+        )
 
 
 def build_dataset(
@@ -322,12 +358,19 @@ def build_dataset(
             tell(i, total, f"{source.name}: aligning")
             run = read(source)
             runs.append(thinned(run.select(*(c for c in _ALIGNED if c in run)), 25.0))
-        alignment = fit_alignment(runs, field)
+        alignment = fit_alignment(
+            runs,
+            field,
+            progress=lambda k, n, what: tell(
+                len(sources), total, f"lever arm and latency: {k} of {n} {what}"
+            ),
+        )
         del runs
     elif alignment is not None and not isinstance(alignment, Alignment):
         raise RefusedError(f'alignment must be "fit", an Alignment or None, got {alignment!r}')
     done: list[Recording] = []
     columns: list[set[str]] = []
+    told: list[Facts] = []
     with output(folder, force=force) as aside:
         (aside / RUNS).mkdir(parents=True)
         for i, source in enumerate(sources):
@@ -340,10 +383,12 @@ def build_dataset(
             run = run.select(*(column for column in KEPT if column in run))
             done.append(_write(run, source, aside / RUNS / f"{source.name}.parquet"))
             columns.append(set(run))
+            told.append(run.facts)
         _check_labels(done, field)
-        facts: dict[str, Any] = {"alignment": how, "magtwin": __version__}
-        facts |= {"map_method": field.method, "map_source": field.source, "map_licence": field.licence}
         shared = [c for c in KEPT if all(c in one for one in columns)]
+        facts: dict[str, Any] = {"alignment": how, "magtwin": __version__}
+        facts |= {"map_source": field.source, "map_licence": field.licence, **map_facts(field)}
+        facts |= {"poses": "mocap" if "mocap_p" in shared else "true", **shared_facts(told)}
         manifest = {
             "kind": KIND,
             "version": VERSION,

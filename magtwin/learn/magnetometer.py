@@ -1,5 +1,6 @@
 """NeuralMagnetometer: a predictor that gives a Run its disturbance."""
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,9 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin import files
 from magtwin.learn.features import columns_of, features
 from magtwin.learn.predictor import Predictor, load_predictor
+from magtwin.learn.regressor import summary_of
 from magtwin.learn.weights import Fact
 from magtwin.names import RefusedError
 from magtwin.run import Run
+from magtwin.sim.model_error import ModelError
+from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 
@@ -20,8 +24,8 @@ STEPS_ALIKE = 0.1
 """By what share times between rows may differ, for a network that looks back over them."""
 
 
-@dataclass(frozen=True)
-class Read:
+@dataclass(frozen=True, repr=False)
+class Read(Summarized):
     """What a predictor says of a run, row by row."""
 
     disturbance_nt: Array
@@ -34,7 +38,7 @@ class Read:
     """Whether an input left the range of the training rows, shape (N,); none where nobody asked."""
 
 
-class NeuralMagnetometer:
+class NeuralMagnetometer(Summarized):
     """Runs a predictor of any kind on runs; what one gives does not depend on the others beside it."""
 
     def __init__(self, net: Predictor, *, name: str = "", sha256: str = "") -> None:
@@ -80,6 +84,23 @@ class NeuralMagnetometer:
     def residual_sd_nt(self) -> float:
         """Root mean square of label minus prediction on held-out recordings [nT]; nan where unknown."""
         return self.net.residual_sd_nt
+
+    def model_error(self) -> ModelError | None:
+        """Statistics of the error of its predictions; None where its file does not tell them.
+
+        Raises:
+            RefusedError: Its file tells figures that cannot be.
+        """
+        told = [self.net.facts.get(name) for name in ("residual_offset_sd_nt", "residual_time_s")]
+        if None in told or (self.net.kind == "mlp" and math.isnan(self.residual_sd_nt)):
+            return None
+        figures = [float(one) if isinstance(one, int | float) else math.nan for one in told]
+        if not all(0 <= one < math.inf for one in figures):
+            raise RefusedError(
+                f"{self.name}: residual_offset_sd_nt and residual_time_s of its facts must be finite and not "
+                f"below 0, got {told[0]!r} and {told[1]!r}"
+            )
+        return ModelError(*figures)
 
     @property
     def facts(self) -> Mapping[str, Fact]:
@@ -158,3 +179,6 @@ class NeuralMagnetometer:
     def predict_with_sd(self, x: ArrayLike) -> tuple[Array, Array]:
         """Disturbances and the standard deviations of their errors [nT], each (N,); `x` as for `predict`."""
         return self.net.predict(x)
+
+    def _summary(self) -> Summary:
+        return summary_of(self.net, f"NeuralMagnetometer {self.name}".rstrip())

@@ -13,6 +13,7 @@ from magtwin.learn.config import TrainConfig
 from magtwin.learn.descent import Epoch
 from magtwin.learn.ensemble import Ensemble, fit_ensemble
 from magtwin.learn.hybrid import Hybrid
+from magtwin.learn.inputs import Array
 from magtwin.learn.linear import Fitted, Linear, fit_linear
 from magtwin.learn.material import Material
 from magtwin.learn.predictor import Predictor
@@ -53,6 +54,10 @@ class Made:
 
     choice: Choice | None = None
     """Of a hybrid."""
+
+    held_out_nt: Array | None = None
+    """Disturbance at each training row by a fit without its group [nT], shape (N,); that of a hybrid's base.
+    None for a kind that is fitted once."""
 
 
 Going = Mapping[str, Any]
@@ -123,7 +128,8 @@ def _linear(
     fitted = _ridge(config, material, init)
     model = fitted.model
     known = material.yardstick_of(fitted, *model.predict(material.rows["validation"].x))
-    return Made(replace(model, spread=model.spread.scaled(known.everywhere)))
+    model = replace(model, spread=model.spread.scaled(known.everywhere))
+    return Made(model, held_out_nt=_left_out(fitted))
 
 
 def _hybrid(
@@ -165,7 +171,7 @@ def _hybrid(
     error = model.predict(stops.x)[0] - stops.y
     known = material.yardstick_of(base, base_mean, base_sd)
     model.sd_factor = transferred_factor(error, base_sd, material.groups["validation"], known)
-    return Made(model, history, choice)
+    return Made(model, history, choice, _left_out(base) if "base" not in config.freeze else None)
 
 
 def _ensemble(
@@ -215,6 +221,11 @@ def _calibrated(
     told = peer.model.predict(material.rows["validation"].x)
     model.sd_factor = transferred_factor(error, sd, groups, material.yardstick_of(peer, *told))
     return Made(model, history)
+
+
+def _left_out(fitted: Fitted) -> Array | None:
+    """What fits without each group say of it; None of one group, which no fit left out."""
+    return fitted.held_out_nt if len(np.unique(fitted.groups)) > 1 else None
 
 
 def _ridge(config: TrainConfig, material: Material, start: Linear | None) -> Fitted:

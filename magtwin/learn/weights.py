@@ -250,6 +250,11 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     return about
 
 
+def shown(facts: Mapping[str, Fact]) -> dict[str, Fact]:
+    """Facts for people: without the map's samples, which are for comparing maps."""
+    return {name: fact for name, fact in facts.items() if name != "map_samples_nt"}
+
+
 def say(tensor: torch.Tensor) -> str:
     """Type and shape of a tensor, for refusals."""
     return f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"

@@ -19,9 +19,10 @@ from magtwin.ros.diagnostics import Reporter, Status
 from magtwin.ros.network import Following
 from magtwin.ros.topics import READ, SAMPLED, TICKS
 from magtwin.run import Run
+from magtwin.sim.exact import check_field
 from magtwin.sim.online import Online
 from magtwin.sim.online_sensors import Samples
-from magtwin.twin import Twin
+from magtwin.twin import Session, Twin, in_session, model_error_of
 
 RESET = "/robot/reset"
 """Topic (std_msgs/Empty), and with rclpy service (std_srvs/Empty), that puts the robot back to its start and
@@ -77,6 +78,7 @@ class Simulator:
         bus: Bus,
         *,
         seed: int = 0,
+        session: Session | None = None,
         speed: float = 1.0,
         rate_hz: float | None = None,
         units: Unit = "T",
@@ -92,6 +94,7 @@ class Simulator:
             twin: What is simulated.
             bus: The node; its own clock is not used.
             seed: Seed of all noise.
+            session: As for `magtwin.simulate`.
             speed: Sim time for each wall time.
             rate_hz: Readings of the magnetometer a second [Hz]; None takes the scene's.
             units: Unit of fields: "T", as ROS has them, or "nT", as APRILab's robot publishes them.
@@ -108,6 +111,7 @@ class Simulator:
             raise RefusedError(f"speed must be above 0 and at most 100 times real time, got {speed!r}")
         if rate_hz is not None and rate_hz > MOST_HZ:
             raise RefusedError(f"rate_hz must be at most {MOST_HZ:g} Hz live, got {rate_hz!r}")
+        twin = in_session(twin, session, seed=seed)
         self._twin, self._bus, self._seed, self._rate, self._lidar = twin, bus, seed, rate_hz, lidar
         self._speed, self._wall, self._say = speed, stamps == "wall", say
         self._reads = magnetometer
@@ -172,6 +176,7 @@ class Simulator:
 
     def _online(self) -> Online:
         twin = self._twin
+        check_field(twin.scene, twin.field)
         return Online(
             twin.scene,
             anomaly_map=twin.field,
@@ -179,6 +184,7 @@ class Simulator:
             obstacles=twin.obstacles,
             rate_hz=self._rate,
             network=Following(twin.magnetometer) if twin.magnetometer else None,
+            model_error=model_error_of(twin, self._seed),
             lidar=self._lidar,
         )
 

@@ -33,17 +33,23 @@ from magtwin.sim.battery import SECONDS_PER_HOUR, current_a, open_voltage
 from magtwin.sim.controllers import guide_by_commands
 from magtwin.sim.course import Course, fence_of
 from magtwin.sim.drive import Moment, Pose, draw_wheel_errors, wheel_rates
+from magtwin.sim.exact import ExactField, check_truth
 from magtwin.sim.follow import CONTROL_RATE_HZ
-from magtwin.sim.interference import TORQUE_S, field_at_sensor_nt, platforms_of_rows
+from magtwin.sim.interference import TORQUE_S, platforms_of_rows
 from magtwin.sim.lidar import lidar_on
 from magtwin.sim.magnetometer import rounded
+from magtwin.sim.model_error import ModelError
 from magtwin.sim.sensors import into_sensor
+from magtwin.sim.simulate import Predict
 from magtwin.spec import RobotSpec, Scene
 
 Array = NDArray[np.float64]
 
 _WHITE = 22
 """Standard normal numbers that a robot's sensors take a step."""
+
+_ERROR_KEY = 2**31
+"""Spawn key of the generators of model errors: no generator that is spawned one by one comes to it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +83,8 @@ class Fleet:
         anomaly_map: AnomalyMap,
         obstacles: Obstacles,
         step_s: float,
-        disturbance_nt: Callable[[Run], Array] | None = None,
+        disturbance_nt: Predict | None = None,
+        model_error: ModelError | None = None,
     ) -> None:
         """Make room for robots; each must be put somewhere by `begin` before the first step.
 
@@ -87,7 +94,10 @@ class Fleet:
             anomaly_map: What the scene's map layer holds; outside its extent it reads the nearest value.
             obstacles: What stops the robots.
             step_s: Length of a step [s], a multiple of the control step.
-            disturbance_nt: What predicts the disturbance of a neural magnetometer, from a table.
+            disturbance_nt: What predicts the disturbance of a neural magnetometer and the standard deviation
+                of its error, from a table.
+            model_error: Statistics of that error, drawn for each robot each time that it begins; None draws
+                none.
 
         Raises:
             RefusedError: `count` or `step_s` is out of range, or nothing gives the disturbance.
@@ -101,10 +111,17 @@ class Fleet:
                 f"step_s must be a multiple of the control step, {1 / CONTROL_RATE_HZ:g} s, below the "
                 f"drive's command_timeout_s, {timeout:g} s; got {step_s!r}"
             )
-        if disturbance_nt is None and (kind == "neural" or (kind == "physical" and scene.earth is None)):
+        if disturbance_nt is None:
+            check_truth(scene, anomaly_map)
+        if disturbance_nt is None and kind == "neural":
             raise RefusedError(f"nothing gives the disturbance of scene {scene.name!r}, of the kind {kind!r}")
         self.scene, self.count, self.step_s = scene, count, step_s
         self._map, self._obstacles, self._disturbance_nt = anomaly_map, obstacles, disturbance_nt
+        self._exact = ExactField(scene=scene, anomaly_map=anomaly_map, outside="clamp")
+        self._model_error = model_error
+        self._begun = [0] * count
+        self._error_rngs: list[np.random.Generator] = [np.random.default_rng(0)] * count
+        self._offset, self._process = np.zeros(count), np.zeros(count)
         self._fence = fence_of(obstacles)
         self._drive = _compiled_or_plain()
         self._figures, self._state = np.zeros((count, loop.FIGURES)), np.zeros((count, loop.STATE))
@@ -158,6 +175,7 @@ class Fleet:
             self._figures[i], self._state[i] = course.figures(), course.state()
             self._state[i, 8] = 0.0 if len(self._obstacles) else np.inf
             self._rngs[i] = rng
+            self._begin_error(i, rng)
             draw = rng.standard_normal(4)
             self._factors[i] = np.array(drive.odometry_scale) * (1 + drive.odometry_noise_std * draw[:2])
             self._bias[i], self._ran_away[i], self._tilt[i] = imu.gyro_bias, 0.0, draw[2:]
@@ -168,6 +186,25 @@ class Fleet:
             self._record[i] = 0.0
             self._record[i, :3] = np.array(pose)[:, None]
         self._sense(np.asarray(which), moved=False)
+
+    def _begin_error(self, i: int, rng: np.random.Generator) -> None:
+        """A session of a robot's model error, from a generator of its own: `rng` is left as it is."""
+        if self._model_error is None:
+            return
+        parent: Any = rng.bit_generator.seed_seq
+        key = (*parent.spawn_key, _ERROR_KEY, self._begun[i])
+        own = np.random.default_rng(np.random.SeedSequence(parent.entropy, spawn_key=key))
+        self._begun[i] += 1
+        self._error_rngs[i], self._offset[i] = own, self._model_error.in_session(own).offset
+
+    def _error_nt(self, which: NDArray[np.intp], sd_nt: Array, *, moved: bool) -> Array:
+        """Errors of what a network predicted for some robots [nT], shape (len(which),)."""
+        if self._model_error is None:
+            return np.zeros(len(which))
+        white = np.array([self._error_rngs[i].standard_normal() for i in which])
+        decay = self._model_error.decay(self.step_s) if moved else 0.0
+        self._process[which] = decay * self._process[which] + math.sqrt(1 - decay * decay) * white
+        return self._model_error.error_nt(sd_nt, self._process[which], self._offset[which])
 
     def step(self, commands: ArrayLike, which: Sequence[int] | NDArray[np.intp] | None = None) -> None:
         """Drive robots on for a step, and read their sensors.
@@ -228,7 +265,7 @@ class Fleet:
         table |= self._odometry(which, turned, white[:, :6])
         table |= self._imu(which, now, white[:, 6:20], moved=moved)
         table |= self._battery(which, now, turned, on, white[:, 20], moved=moved)
-        table |= self._field(which, now, table, white[:, 21])
+        table |= self._field(which, now, table, white[:, 21], moved=moved)
         self._twist[which] = np.column_stack([now.v, now.w])
         whole = {name: values.copy() for name, values in self._columns.items()}  # what was given stays
         for name, values in table.items():
@@ -332,29 +369,40 @@ class Fleet:
         }
 
     def _field(
-        self, which: NDArray[np.intp], now: Moment, table: dict[str, NDArray[Any]], white: Array
+        self,
+        which: NDArray[np.intp],
+        now: Moment,
+        table: dict[str, NDArray[Any]],
+        white: Array,
+        *,
+        moved: bool,
     ) -> dict[str, NDArray[Any]]:
         """The map, the disturbance, and what the magnetometer reads of their sum."""
         scene = self.scene
         spec = scene.robot.magnetometer
         b_map = self._map.lookup(now.pose[:, :2], table["yaw"], outside="clamp")
         b_map = np.where(np.isnan(b_map), np.nanmean(self._map.values_nt), b_map)  # beside masked nodes
+        error = np.zeros(len(which))
         if self._disturbance_nt is not None:
             slopes = self._map.gradient(now.pose[:, :2], table["yaw"], outside="clamp")[:, :2]
             sloped = into_base(np.nan_to_num(slopes), table["yaw"])
             known = {"b_map_nt": b_map, "b_map_gradient_nt_m": sloped}
-            disturbance = self._disturbance_nt(Run(table | known))
+            found = self._disturbance_nt(Run(table | known))
+            mean, sd = found if isinstance(found, tuple) else (found, np.zeros(len(which)))
+            disturbance, error = mean, self._error_nt(which, sd, moved=moved)
         elif spec.kind == "physical":
             early = max(self._steps - 1 - round(TORQUE_S * CONTROL_RATE_HZ), 0)
-            field = field_at_sensor_nt(
+            field = self._exact.at_sensor_nt(
                 self._scene_of(which),
                 _Before(self._moment(which, early)),
                 np.maximum(self._t[which], TORQUE_S),  # rows are robots, whose times come in no order
                 true=now,
                 lidar_on=table["lidar_on"],
                 supply_a=self._supply_a[which],
+                at_rest_nt=b_map,
             )
             disturbance = np.sqrt(np.sum(field * field, axis=1)) - b_map
+            disturbance = np.nan_to_num(disturbance)  # a map of one heading is read beside b_map's place
         else:
             disturbance = np.zeros(len(which))
         noise = spec.noise_density_nt * math.sqrt(spec.rate_hz / 2) * white
@@ -362,7 +410,8 @@ class Fleet:
             "b_map_nt": b_map,
             "b_disturbance_nt": disturbance,
             "b_total_nt": b_map + disturbance,
-            "b_measured_nt": rounded(b_map + disturbance + noise, spec.resolution_nt),
+            "b_model_error_nt": error,
+            "b_measured_nt": rounded(b_map + disturbance + error + noise, spec.resolution_nt),
         }
 
     def _scene_of(self, which: NDArray[np.intp]) -> Scene:

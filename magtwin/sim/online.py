@@ -19,12 +19,14 @@ from magtwin.run import COLUMNS, Run
 from magtwin.sim.commands import Commands
 from magtwin.sim.course import Chassis
 from magtwin.sim.drive import Moment, advance, draw_wheel_errors, wheel_rates
+from magtwin.sim.exact import ExactField
 from magtwin.sim.follow import CONTROL_RATE_HZ
-from magtwin.sim.interference import field_at_sensor_nt, level_gradient_nt_m, sensor_places
+from magtwin.sim.interference import level_gradient_nt_m, sensor_places
 from magtwin.sim.lidar import Scans, lidar_on, scan
 from magtwin.sim.magnetometer import LOCK_RATE_HZ
 from magtwin.sim.manual import at_start
-from magtwin.sim.online_sensors import Battery, Imu, Magnetometer, Mocap, Odometry, Samples
+from magtwin.sim.model_error import ModelError
+from magtwin.sim.online_sensors import Battery, Imu, Magnetometer, Markov, Mocap, Odometry, Samples
 from magtwin.sim.sensors import into_sensor
 from magtwin.sim.simulate import check_run, flags, mapped, streams, truth
 from magtwin.spec import DriveSpec, Scene
@@ -102,6 +104,7 @@ class Online:
         obstacles: Obstacles | None = None,
         rate_hz: float | None = None,
         network: Network | None = None,
+        model_error: ModelError | None = None,
         outside: Literal["nan", "clamp"] = "nan",
         lidar: Literal["schedule", "on", "off"] = "schedule",
     ) -> None:
@@ -114,6 +117,7 @@ class Online:
             obstacles: What stops it, and what its LiDAR sees.
             rate_hz: Magnetometer readings a second [Hz]; None takes the scene's.
             network: What predicts the disturbance of a neural magnetometer.
+            model_error: Statistics of the error of these predictions; None draws none.
             outside: What the map reads outside its extent.
             lidar: Whether the LiDAR follows its schedule, or stays on or off.
 
@@ -123,7 +127,13 @@ class Online:
         robot, obstacles = scene.robot, obstacles or Obstacles()
         still = Commands("online", np.zeros((1, 3)))
         self.rate_hz = check_run(
-            scene, still, rate_hz=rate_hz, duration_s=None, lidar=lidar, network=network is not None
+            scene,
+            still,
+            anomaly_map=anomaly_map,
+            rate_hz=rate_hz,
+            duration_s=None,
+            lidar=lidar,
+            network=network is not None,
         )
         self.step_s = 1.0 / CONTROL_RATE_HZ
         draws = streams(rng)
@@ -138,12 +148,18 @@ class Online:
         self._mocap = Mocap(robot.mocap, robot.base_height_m, draws["mocap"])
         self._battery = Battery(robot.battery, robot.drive, self._lidar_on, draws["battery"])
         self._magnetometer = Magnetometer(robot.magnetometer, self.rate_hz, draws["magnetometer"])
+        self._model_error, self._error_rng = model_error, draws["model_error"]
+        self._wandering = Markov(model_error.time_s if model_error else 0.0, self.rate_hz)
         self._scanner = Scanner(scene, obstacles, self._lidar_on, draws["lidar"])
         self._readings, self._looks, self._steep = 0, 0, False
         self._rows: list[tuple[float, float, float]] = []
+        self._exact = ExactField(scene=scene, anomaly_map=anomaly_map, outside=outside)
+        physical = network is None and robot.magnetometer.kind == "physical"
+        self._known = self._exact.of == "sources" or (self._exact.of == "map" and physical)
         self._facts: dict[str, str | int | float | bool]
         self._facts = {"scene": scene.name, "controller": "commands", "rate_hz": float(self.rate_hz)}
         self._facts |= {"lidar": lidar, "magnetometer": "neural" if network else robot.magnetometer.kind}
+        self._facts |= self._exact.facts if physical else {}
 
     @property
     def t(self) -> float:
@@ -216,21 +232,29 @@ class Online:
         columns |= mapped(self._map, true.pose[:, :2], columns["yaw"], self._outside, gradient=True)
         vector = np.full((count, 3), np.nan)
         columns["b_truth_nt"] = np.full(count, np.nan)
-        if scene.earth is not None and count:
-            exact = field_at_sensor_nt(
-                scene, track, t, true=true, lidar_on=columns["lidar_on"], supply_a=supply_a
+        if self._known and count:
+            exact = self._exact.at_sensor_nt(
+                scene,
+                track,
+                t,
+                true=true,
+                lidar_on=columns["lidar_on"],
+                supply_a=supply_a,
+                at_rest_nt=columns["b_map_nt"],
             )
             vector = into_sensor(exact, robot.q_base_magnetometer_xyzw)
-            x, y, z = exact.T
-            columns["b_truth_nt"] = np.sqrt(x * x + y * y + z * z)
+            columns["b_truth_nt"] = self._exact.magnitude_nt(exact, columns["b_map_nt"])
         columns["b_vector_nt"] = vector
         columns["b_vector_measured_nt"], lost = self._magnetometer.axes(vector, self._steepness(t))
         dropped = self._magnetometer.dropped(count)
         columns["b_vector_measured_nt"][dropped] = np.nan
         columns |= flags(scene, true)
-        columns["b_sd_nt"] = np.full(count, np.nan)
+        columns["b_sd_nt"], error = np.full(count, np.nan), np.zeros(count)
         if self._network is not None:
             disturbance, sd, beyond = self._network(Run(columns, self._facts))
+            if self._model_error is not None:
+                process = self._wandering.next(self._error_rng.standard_normal(count))
+                error = self._model_error.error_nt(sd, process)
             density = robot.magnetometer.noise_density_nt
             columns["b_sd_nt"] = np.hypot(sd, density * np.sqrt(self.rate_hz / 2))
             if beyond is not None:
@@ -241,9 +265,10 @@ class Online:
             disturbance = np.zeros(count)
         columns["b_disturbance_nt"] = np.asarray(disturbance, float)
         columns["b_total_nt"] = columns["b_map_nt"] + columns["b_disturbance_nt"]
-        columns |= self._magnetometer.read(columns["b_total_nt"], vector, lost)
+        columns["b_model_error_nt"] = error
+        columns |= self._magnetometer.read(columns["b_total_nt"] + error, vector, lost)
         columns["b_measured_nt"][dropped] = np.nan
-        columns["b_noise_nt"] = columns["b_measured_nt"] - columns["b_total_nt"]
+        columns["b_noise_nt"] = columns["b_measured_nt"] - (columns["b_total_nt"] + error)
         return Run({name: columns[name] for name in COLUMNS if name in columns}, self._facts)
 
     def _steepness(self, t: Array) -> NDArray[np.bool_]:
@@ -261,7 +286,7 @@ class Online:
     def _look(self, t: float) -> None:
         spec, scene = self._scene.robot.magnetometer, self._scene
         pose = self._track.at(np.array([t])).pose
-        if scene.earth is None:
+        if self._exact.of != "sources":
             gradient = float(np.hypot(*self._map.gradient(pose[:, :2], pose[:, 2])[0, :2]))
         else:
             places = sensor_places(scene.robot, pose)

@@ -6,6 +6,7 @@ runs over the named paths have the means and scales of the 20 signals that the r
 trained on (its scalers, over 73 min of driving); each says what it was taken from.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -86,17 +87,36 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
     )
 
 
-def session_of(robot: RobotSpec, seed: int, day: int) -> RobotSpec:
-    """The robot as it is on one of the days of a data set, which its seed and the day's number decide.
+def session_of(robot: RobotSpec, seed: int, session: int, *, which: int = 0) -> RobotSpec:
+    """The robot as it is in one session of a data set, which a seed and the session's number decide.
 
     Args:
         robot: The robot as its asset has it.
         seed: Seed of the data set.
-        day: Number of the day, from 0.
+        session: Number of the session, from 0.
+        which: Place of the robot in a scene of several, from 0.
     """
+    key = (0, session, which) if which else (0, session)
     return draw_session(
-        robot, np.random.default_rng(np.random.SeedSequence((seed, 1), spawn_key=(0, day)))
+        robot, np.random.default_rng(np.random.SeedSequence((seed, 1), spawn_key=key))
     )  # a child that no run draws from
+
+
+def offset_generator(
+    session: Mapping[str, str | int | float | bool], seed: int, *, which: int = 0
+) -> np.random.Generator:
+    """Source of a session's part of the model error: the same session, the same part.
+
+    Args:
+        session: Facts of the session, `session_seed` and `session`; without them each seed is a session of
+            its own.
+        seed: Seed of the run.
+        which: Place of the robot in a scene of several, from 0.
+    """
+    entropy, key = seed, (3, 0, which)
+    if "session_seed" in session:
+        entropy, key = int(session["session_seed"]), (2, int(session["session"]), which)
+    return np.random.default_rng(np.random.SeedSequence((entropy, 1), spawn_key=key))
 
 
 def draw_speed(drive: DriveSpec, rng: np.random.Generator) -> float:

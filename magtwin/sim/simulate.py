@@ -22,18 +22,26 @@ from magtwin.sim.controllers import Controller
 from magtwin.sim.drive import Moment, draw_wheel_errors
 from magtwin.sim.driver import Driver
 from magtwin.sim.engine import Engine, Kinematic, Travel
+from magtwin.sim.exact import ExactField, check_truth
 from magtwin.sim.follow import follow, play
 from magtwin.sim.imu import sense_imu
-from magtwin.sim.interference import field_at_sensor_nt, level_gradient_nt_m, sensor_places
+from magtwin.sim.interference import level_gradient_nt_m, sensor_places
 from magtwin.sim.lidar import lidar_on
 from magtwin.sim.magnetometer import LOCK_RATE_HZ, feels_direction, lost_in, sense_axes, sense_magnetometer
 from magtwin.sim.mocap import sense_mocap
+from magtwin.sim.model_error import ModelError
 from magtwin.sim.odometry import sense_odometry
 from magtwin.sim.replay import replayed
 from magtwin.sim.sensors import Moving, into_sensor
-from magtwin.spec import Scene
+from magtwin.spec import RobotSpec, Scene
 
 Array = NDArray[np.float64]
+
+Predicted = NDArray[Any] | tuple[NDArray[Any], NDArray[Any]]
+"""Disturbance of each reading [nT], shape (N,), and the standard deviation of its error where it is known."""
+
+Predict = Callable[[Run], Predicted]
+"""From a Run to what a network predicts of it."""
 
 RANDOM_S = 60.0
 """How long a driver drives about unless told otherwise [s]."""
@@ -41,7 +49,10 @@ RANDOM_S = 60.0
 MOST_READINGS = 20_000_000
 """Most readings of a run: about 8 GB of columns."""
 
-_STREAMS = ("odometry", "imu", "battery", "magnetometer", "mocap", "lidar", "drive", "driver")
+_STREAMS = (
+    *("odometry", "imu", "battery", "magnetometer", "mocap", "lidar", "drive", "driver"),
+    "model_error",
+)
 """Who draws random numbers, each from a child generator of its own; append only: the order is the seed."""
 
 
@@ -50,7 +61,9 @@ _IMU = frozenset(("imu_q_xyzw", "imu_w", "imu_a"))
 _MOCAP = frozenset(("mocap_p", "mocap_q_xyzw", "flag_pose_lost"))
 _BATTERY = frozenset(("battery_v", "battery_a", "battery_fraction"))
 _EXACT = frozenset(("b_vector_nt", "b_truth_nt", "b_vector_measured_nt"))
-_READ = frozenset(("b_measured_nt", "b_noise_nt", "b_vector_measured_nt", "flag_lost_lock"))
+_READ = frozenset(
+    ("b_measured_nt", "b_model_error_nt", "b_noise_nt", "b_vector_measured_nt", "flag_lost_lock")
+)
 """Columns that are made together."""
 
 
@@ -70,18 +83,21 @@ def simulate(
     rate_hz: float | None = None,
     obstacles: Obstacles | None = None,
     controller: str | Controller = "follower",
-    disturbance_nt: Callable[[Run], NDArray[Any]] | None = None,
+    disturbance_nt: Predict | None = None,
+    model_error: ModelError | None = None,
     outside: Literal["nan", "clamp", "raise"] = "nan",
     lidar: Literal["schedule", "on", "off"] = "schedule",
     engine: Engine | None = None,
 ) -> Run:
     """Drive a scene's robot along a path and read its sensors.
 
-    b_total = b_map + b_disturbance, b_map at base_link's pose, and b_measured = b_total + b_noise. The
+    b_total = b_map + b_disturbance, b_map at base_link's pose, and b_measured = b_total + b_noise, and of a
+    neural magnetometer b_model_error besides. The
     disturbance is what `disturbance_nt` predicts, for a neural magnetometer; without it, for a physical
-    one, b_truth - b_map: the exact field of the Earth, the scene's sources and the robot itself at the
-    magnetometer, less the map; for one of the kind "map-only" it is 0. Where the scene's Earth field is
-    known, b_truth and b_vector are given whatever the kind.
+    one, b_truth - b_map: the exact field of the lab and of the robot itself at the magnetometer, less the
+    map; for one of the kind "map-only" it is 0. `magtwin.sim.exact` says what makes the exact field. Where
+    Earth and sources do, b_truth and b_vector are given whatever the kind; where the map does, for a physical
+    magnetometer alone.
 
     Args:
         scene: Lab, robot and sensors.
@@ -97,7 +113,9 @@ def simulate(
         obstacles: What the path must be clear of, and what stops the robot if it leaves its path.
         controller: A name of `magtwin.sim.controllers.CONTROLLERS`, or a controller of one's own.
         disturbance_nt: From a Run in which every other sensor has been read, the vector axes too, to the
-            disturbance of each reading [nT], shape (N,). Called once.
+            disturbance of each reading [nT], shape (N,), or that and the standard deviation of its error.
+            Called once.
+        model_error: Statistics of that error, which is drawn then; None draws none.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
         engine: What moves the robot; None is the kinematic one. A Run is not moved anew.
@@ -111,7 +129,13 @@ def simulate(
             gives the disturbance. Nothing has been computed then.
     """
     rate = check_run(
-        scene, path, rate_hz=rate_hz, duration_s=duration_s, lidar=lidar, network=disturbance_nt is not None
+        scene,
+        path,
+        anomaly_map=anomaly_map,
+        rate_hz=rate_hz,
+        duration_s=duration_s,
+        lidar=lidar,
+        network=disturbance_nt is not None,
     )
     draws = streams(rng)
     motion, facts = travel(
@@ -129,7 +153,7 @@ def simulate(
         facts=facts,
         network=disturbance_nt is not None,
     )
-    return sensed.read(None if disturbance_nt is None else disturbance_nt(sensed.run))
+    return sensed.read(None if disturbance_nt is None else disturbance_nt(sensed.run), model_error)
 
 
 def travel(
@@ -185,6 +209,7 @@ def check_run(
     scene: Scene,
     path: Path | Commands | Run | str,
     *,
+    anomaly_map: AnomalyMap,
     rate_hz: float | None,
     duration_s: float | None,
     lidar: Literal["schedule", "on", "off"],
@@ -201,6 +226,7 @@ def check_run(
         raise RefusedError(f"rate_hz of the magnetometer must be above 0 Hz and finite, got {rate!r}")
     if not network:
         _check_kind(scene)
+        check_truth(scene, anomaly_map)
     lidar_on(robot.lidar, 0.0, lidar)  # refuses an unknown mode before anything is computed
     if isinstance(path, Path):
         check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
@@ -227,35 +253,49 @@ class Sensed:
     rng: np.random.Generator
     """Source of the magnetometer's noise; spent by one reading."""
 
+    error_rng: np.random.Generator
+    """Source of the error of a network's predictions; spent by one reading."""
+
     wanted: frozenset[str]
     """Columns of `COLUMNS` that the whole run is to have."""
 
     beside_nt: Array | float = 0.0
     """What other robots add to the field's magnitude at each reading [nT], shape (N,); 0 without others."""
 
-    def read(self, disturbance_nt: NDArray[Any] | None = None) -> Run:
+    def read(
+        self,
+        predicted: Predicted | None = None,
+        model_error: ModelError | None = None,
+    ) -> Run:
         """The whole run, of the columns that are wanted.
 
         Args:
-            disturbance_nt: What a network predicts for each reading [nT], shape (N,); none for a magnetometer
-                without one.
+            predicted: What a network predicts; None for a magnetometer without one.
+            model_error: Statistics of the error of that; None draws none, nor does a prediction without a
+                standard deviation.
         """
         columns, spec = dict(self.run.columns), self.scene.robot.magnetometer
         rows = len(columns["t"])
-        if disturbance_nt is None:
+        error = np.zeros(rows)
+        if predicted is None:
             exact = columns["b_truth_nt"] - columns["b_map_nt"]
             disturbance = exact if spec.kind == "physical" else np.zeros(rows)
         else:
-            disturbance = np.asarray(disturbance_nt, float)
+            mean, sd = predicted if isinstance(predicted, tuple) else (predicted, None)
+            disturbance = np.asarray(mean, float)
+            if model_error is not None and sd is not None:
+                white = self.error_rng.standard_normal(rows)
+                error = model_error.error_nt(sd, model_error.process(white, self.rate_hz))
             if disturbance.shape != (rows,):
                 raise RefusedError(f"disturbance_nt must give shape {(rows,)}, got {disturbance.shape}")
             disturbance = disturbance + self.beside_nt
         columns["b_disturbance_nt"] = disturbance
         columns["b_total_nt"] = columns["b_map_nt"] + disturbance
+        columns["b_model_error_nt"] = error
         if self.wanted & _READ:
             columns |= sense_magnetometer(
                 spec,
-                columns["b_total_nt"],
+                columns["b_total_nt"] + error,
                 columns["b_vector_nt"] if "b_vector_nt" in columns else np.full((rows, 3), np.nan),
                 self.rng,
                 rate_hz=self.rate_hz,
@@ -306,13 +346,17 @@ def sense(
     needed = wanted | frozenset(inputs if network else ())
     read = bool(wanted & _READ)
     felt = network and "b_vector_measured_nt" in needed
+    beside_others = bool(companions and scene.earth is not None)
     exact = bool(
         felt
         or wanted & _EXACT
         or (not network and robot.magnetometer.kind == "physical")
         or (read and feels_direction(robot.magnetometer))
-        or (companions and scene.earth is not None)
+        or beside_others
     )
+    field = ExactField(scene=scene, anomaly_map=anomaly_map, outside=outside)
+    physical = not network and robot.magnetometer.kind == "physical"
+    known = field.of == "sources" or (field.of == "map" and (physical or beside_others))
     end = motion.duration_s if duration_s is None else duration_s
     _check_readings(end, rate_hz)
     t = np.arange(max(1, math.ceil(end * rate_hz - 1e-9))) / rate_hz
@@ -332,13 +376,15 @@ def sense(
         columns |= sense_battery(robot.battery, pack, t, draws["battery"])
         if exact:
             supply_a = pack.current_a[pack.index(t)]
-            columns |= _exact_field(scene, motion, t, true, columns["lidar_on"], supply_a)
-            if companions and scene.earth is not None:
+            columns |= _exact_field(field if known else None, scene, motion, t, true, columns, supply_a)
+            if beside_others:
                 added = companions_field_nt(scene, companions, motion, t, true)
-                alone = columns["b_truth_nt"]
+                before = columns["b_truth_nt"]
                 columns |= _with(columns["b_vector_nt"], into_sensor(added, robot.q_base_magnetometer_xyzw))
-                beside = columns["b_truth_nt"] - alone
-    steep = _steep(scene, anomaly_map, motion, t) if read or felt else np.zeros(len(t), bool)
+                beside = columns["b_truth_nt"] - before
+            if field.of == "map" and not physical:  # the robot's spec is no measurement to judge a network by
+                columns |= _exact_field(None, scene, motion, t, true, columns, supply_a)
+    steep = _steep(field, motion, t) if read or felt else np.zeros(len(t), bool)
     if felt:
         columns["b_vector_measured_nt"] = sense_axes(
             robot.magnetometer, columns["b_vector_nt"], draws["magnetometer"], rate_hz=rate_hz, steep=steep
@@ -350,11 +396,13 @@ def sense(
     told: dict[str, str | int | float | bool] = {
         "scene": scene.name,
         **facts,
+        **robot_facts(robot),
         "rate_hz": float(rate_hz),
         "duration_s": round(float(end), 9),
         "outside": outside,
         "lidar": lidar,
         "magnetometer": "neural" if network else robot.magnetometer.kind,
+        **(field.facts if physical else {}),
     }
     return Sensed(
         run=Run(columns, told),
@@ -362,9 +410,28 @@ def sense(
         rate_hz=rate_hz,
         steep=steep,
         rng=draws["magnetometer"],
+        error_rng=draws["model_error"],
         wanted=wanted,
         beside_nt=beside,
     )
+
+
+def robot_facts(robot: RobotSpec) -> dict[str, str | int | float | bool]:
+    """What a run tells of its robot, for a network that learns from it: name, sensor, motion capture.
+
+    `mocap_latency_s` is the mean age of motion capture's pose: latency, mean jitter and half a period.
+    """
+    mocap = robot.mocap
+    return {
+        "robot_name": robot.name,
+        "sensor_m": _listed(robot.p_base_magnetometer),
+        "mocap_offset_m": _listed(mocap.offset_m),
+        "mocap_latency_s": round(mocap.latency_s + mocap.jitter_s + 0.5 / mocap.rate_hz, 6),
+    }
+
+
+def _listed(values: Iterable[float]) -> str:
+    return ", ".join(f"{value:.6g}" for value in values)
 
 
 def _check_kind(scene: Scene) -> None:
@@ -374,12 +441,6 @@ def _check_kind(scene: Scene) -> None:
         raise RefusedError(
             f"scene {scene.name!r} has a neural magnetometer, and no network predicts its disturbance; open "
             'it as a twin that names one, or take the kind "physical" or "map-only"'
-        )
-    if kind == "physical" and scene.earth is None:
-        raise RefusedError(
-            f"scene {scene.name!r} has neither a network nor an Earth field, so nothing gives the "
-            "disturbance; name a network's weights, give the scene an Earth field, or take the "
-            'kind "map-only"'
         )
 
 
@@ -433,16 +494,29 @@ def mapped(
 
 
 def _exact_field(
-    scene: Scene, motion: Moving, t: Array, true: Moment, on: NDArray[np.bool_], supply_a: Array
+    field: ExactField | None,
+    scene: Scene,
+    motion: Moving,
+    t: Array,
+    true: Moment,
+    columns: Mapping[str, NDArray[Any]],
+    supply_a: Array,
 ) -> dict[str, NDArray[Any]]:
-    """Field at the magnetometer, vector in its axes and magnitude; nan where the Earth's is not known."""
-    if scene.earth is None:
+    """Field at the magnetometer, vector in its axes and magnitude; nan where it is not known."""
+    if field is None or field.of == "none":
         return {"b_vector_nt": np.full((len(t), 3), np.nan), "b_truth_nt": np.full(len(t), np.nan)}
-    vector = field_at_sensor_nt(scene, motion, t, true=true, lidar_on=on, supply_a=supply_a)
-    x, y, z = vector.T
+    vector = field.at_sensor_nt(
+        scene,
+        motion,
+        t,
+        true=true,
+        lidar_on=columns["lidar_on"],
+        supply_a=supply_a,
+        at_rest_nt=columns["b_map_nt"],
+    )
     return {
         "b_vector_nt": into_sensor(vector, scene.robot.q_base_magnetometer_xyzw),
-        "b_truth_nt": np.sqrt(x * x + y * y + z * z),
+        "b_truth_nt": field.magnitude_nt(vector, columns["b_map_nt"]),
     }
 
 
@@ -453,15 +527,15 @@ def _with(b_vector_nt: Array, added_nt: Array) -> dict[str, NDArray[Any]]:
     return {"b_vector_nt": vector, "b_truth_nt": np.sqrt(x * x + y * y + z * z)}
 
 
-def _steep(scene: Scene, anomaly_map: AnomalyMap, motion: Moving, t: Array) -> NDArray[np.bool_]:
+def _steep(field: ExactField, motion: Moving, t: Array) -> NDArray[np.bool_]:
     """Where the magnetometer has lost lock to the gradient: the exact one, or the map's where that is all."""
-    spec = scene.robot.magnetometer
+    scene, spec = field.scene, field.scene.robot.magnetometer
     if not spec.gradient_max_nt_m:
         return np.zeros(len(t), bool)
     seen = (t * LOCK_RATE_HZ + 1e-9).astype(int)
     pose = motion.at(np.arange(seen[-1] + 1) / LOCK_RATE_HZ).pose
-    if scene.earth is None:
-        gradient = np.hypot(*anomaly_map.gradient(pose[:, :2], pose[:, 2])[:, :2].T)
+    if field.of != "sources":
+        gradient = np.hypot(*field.anomaly_map.gradient(pose[:, :2], pose[:, 2])[:, :2].T)
     else:
         places = sensor_places(scene.robot, pose)
         gradient = level_gradient_nt_m(scene, places[:, :2], places[0, 2])

@@ -4,11 +4,10 @@ Each is driven as if it were alone, on random numbers of its own. Then it is see
 one's sensors are read with the others beside it: their iron in its magnetometer, their footprints at its own.
 """
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Literal
+from collections.abc import Iterable, Mapping
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError, find
@@ -18,11 +17,11 @@ from magtwin.run import Run
 from magtwin.sim.commands import Commands
 from magtwin.sim.companions import Approach, Companion, approaches
 from magtwin.sim.engine import Kinematic
-from magtwin.sim.simulate import check_run, sense, streams, travel
+from magtwin.sim.model_error import ModelError
+from magtwin.sim.simulate import Predict, check_run, sense, streams, travel
 from magtwin.spec import Scene
 
 Way = Path | Commands | Run | str
-Predict = Callable[[Run], NDArray[Any]]
 
 
 def simulate_together(
@@ -39,6 +38,7 @@ def simulate_together(
     obstacles: Obstacles | None = None,
     controller: str = "follower",
     disturbances_nt: Mapping[str, Predict | None] | None = None,
+    model_errors: Mapping[str, ModelError | None] | None = None,
     outside: Literal["nan", "clamp", "raise"] = "nan",
     lidar: Literal["schedule", "on", "off"] = "schedule",
 ) -> dict[str, Run]:
@@ -61,6 +61,7 @@ def simulate_together(
         obstacles: As for `simulate`.
         controller: A name of `magtwin.sim.controllers.CONTROLLERS`.
         disturbances_nt: What predicts the disturbance of each robot with a neural magnetometer, by name.
+        model_errors: Statistics of the errors of these predictions, by name; None draws none.
         outside: As for `simulate`.
         lidar: As for `simulate`.
 
@@ -83,6 +84,7 @@ def simulate_together(
             rates[name] = check_run(
                 led[name],
                 way,
+                anomaly_map=anomaly_map,
                 rate_hz=rate_hz,
                 duration_s=duration_s,
                 lidar=lidar,
@@ -122,7 +124,7 @@ def simulate_together(
             companions=[other for key, other in robots.items() if key != name],
         )
         predict = predicts[name]
-        run = sensed.read(None if predict is None else predict(sensed.run))
+        run = sensed.read(None if predict is None else predict(sensed.run), (model_errors or {}).get(name))
         runs[name] = run.with_facts(robot=name, **_nearest(name, near))
     return runs
 
