@@ -6,8 +6,8 @@
 shorten live commands and give them keys, and `LEFT_OUT`, which need a window or the network. Python blocks
 are run in the same folder. Blocks of the language `text` are quoted output: the commands before must have
 printed each line, with numbers at most `NEAR` off. my_robot.urdf, which a reader brings along, is that of
-docs/own.md. The folder `aprilab`, which README fetches, is taken from the real data beside the checkout; its commands are
-left out where these are absent.
+docs/own.md. The folder `aprilab`, which README fetches, is taken from the real data beside the checkout; its
+commands are left out where these are absent.
 
 Then the promises of the first run and of section 3 are checked, see `check_first_run` and `check_training`.
 """
@@ -48,8 +48,8 @@ SEEDS = 10
 """Seeds of the first run that are tried, on each named path."""
 
 MOST_NT, MOST_RATIO, HELD = 200.0, 0.45, (0.8, 0.97)
-"""Promises: mean absolute error of a first run [nT], error of a trained hybrid by the naive one, and the share
-of readings within 90 % intervals."""
+"""Promises: mean absolute error of a first run [nT], error of a trained hybrid by the naive one, and share of
+readings within 90 % intervals."""
 
 
 def steps() -> Iterator[tuple[str, str]]:
