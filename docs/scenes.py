@@ -36,18 +36,17 @@ line.
 
 ## Where the field comes from
 
-* **A map, and nothing else**: the field is that of the map.
+* **A map, and nothing else**: the map is the truth, which a physical magnetometer reads with the robot's own
+  field. [own.md](own.md) shows how to bring a survey and a robot of your own.
 * **`[earth]` with `[[furniture]]` or `[[source]]`, and no map**: the exact field is known everywhere. The
   scene's own robot surveys it (`[survey]`): it stands at each node of a grid in each heading, and reads its
   magnetometer. `magtwin scene` prints nodes, spacing, headings, height and the range of the field. Nodes
   where the robot would stand in furniture, or where its magnetometer loses lock, are filled from their
   neighbours. The same TOML gives the same map to the byte.
 * **A map and `[earth]` with furniture or sources**: the map is what is looked up, the exact field is what a
-  physical magnetometer reads. The two are compared at the map's nodes. A difference of 50 nT rms or more is
-  printed, with the place where it is largest. They are refused as contradictory where the rms difference is
-  above 1,000 nT and above half of the map's standard deviation: another robot's iron, errors of pose and a
-  fitted map's interpolation together stay below the first, and above the second the sources leave more than
-  a quarter of the map's variance unexplained.
+  physical magnetometer reads. The two are compared at the map's nodes, but for those in steel or right
+  beside it. A difference of 50 nT rms or more is printed, with the place where it is largest. Above 500 nT
+  rms and above 0.3 of the map's standard deviation they contradict each other, and the scene is refused.
 * Neither a map nor `[earth]`: refused.
 
 ## Furniture

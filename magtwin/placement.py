@@ -128,6 +128,8 @@ def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
             slack = np.maximum(room.reach_m - half * scale - clear, 0.0)
             start = middle * scale if each_way else middle
             shifts = _shifts(np.clip(start, -slack, slack), slack) - middle * scale + 0.0
+            if each_way:  # scaled with the floor a path keeps the room that it is made with
+                shifts = np.vstack([np.zeros(2), shifts])
             dense = _dense(path, scale, max(free.step_m, 0.02))
             for shift in shifts[free.holds(dense, shifts)]:
                 numbers = (float(scale[0]), float(scale[1]), float(shift[0]), float(shift[1]))

@@ -992,7 +992,7 @@ def _steel(piece: FurnitureSpec) -> tuple[SourceSpec, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class SurveySpec(Spec):
-    """How the robot surveys a scene that names no map: it stands at each node of a grid in each heading."""
+    """How the robot surveys a room without a map: it stands at each node of a grid in each heading."""
 
     spacing_m: float = 0.25
     """Distance between nodes [m]."""

@@ -9,7 +9,8 @@ import magtwin
 from magtwin.files import shipped
 from magtwin.names import RefusedError
 from magtwin.sim.contradiction import check_agrees, contradiction_nt
-from magtwin.usd.maps import load_map, save_map
+from magtwin.sim.survey import survey
+from magtwin.usd.maps import save_map
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +20,7 @@ def lab():
 
 @pytest.fixture(scope="module")
 def field(lab):
-    return load_map(lab.map_layer)
+    return survey(lab, rng=np.random.default_rng(0), readings=135)
 
 
 def test_the_map_of_a_scene_agrees_with_its_sources(lab, field):

@@ -411,9 +411,10 @@ def _say_placing(path: Any, steps: Any) -> None:
     """Tell how a path was brought onto the floor, where it was."""
     if path.placing:
         scale_x, scale_y, x, y = path.placing
-        scale = f"by {scale_x:.2g}" if scale_x == scale_y else f"by {scale_x:.2g} in x and {scale_y:.2g} in y"
-        moved = f", moved by ({x:.2f}, {y:.2f}) m" if max(abs(x), abs(y)) >= 0.005 else ""
-        steps(f"Path {path.name} is scaled {scale}{moved} to fit the floor")
+        scale = f"{scale_x:.2g}" if scale_x == scale_y else f"{scale_x:.2g} in x and {scale_y:.2g} in y"
+        how = [f"scaled by {scale}"] if (scale_x, scale_y) != (1, 1) else []
+        how += [f"moved by ({x:.2f}, {y:.2f}) m"] if max(abs(x), abs(y)) >= 0.005 else []
+        steps(f"Path {path.name} is {' and '.join(how)} to fit the floor")
 
 
 def _run_together(

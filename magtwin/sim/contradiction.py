@@ -6,7 +6,9 @@ import numpy as np
 
 from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError
-from magtwin.sim.survey import field_at_rest_nt
+from magtwin.sim.interference import ambient_gradient_nt_m
+from magtwin.sim.room_survey import in_steel
+from magtwin.sim.survey import field_at_rest_nt, sensor_height_m
 from magtwin.spec import Scene
 
 LEAST_NT = 500.0
@@ -58,6 +60,9 @@ class Contradiction:
 def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
     """Compare a map with the exact field of a scene, as its robot at rest would read it at each node.
 
+    Nodes at which the robot would stand in something magnetised, or at which its magnetometer would lose
+    lock, are left out: a survey has no reading there, and a map has filled them from their neighbours.
+
     Args:
         scene: A scene with the Earth's field; its own map is not read.
         anomaly_map: The map.
@@ -66,7 +71,7 @@ def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
         The difference. `agrees` is true up to `LEAST_NT`, or `PART` of the map's standard deviation.
 
     Raises:
-        RefusedError: The scene has no Earth's field, or the map no valid node.
+        RefusedError: The scene has no Earth's field, or the map no valid node where a robot can stand.
     """
     p_xy, yaw = anomaly_map.grid.poses()
     read = anomaly_map.recorded_yaw
@@ -76,10 +81,17 @@ def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
     if not len(valid):
         raise RefusedError(f"map {anomaly_map.name!r} has no valid node, so nothing to compare")
     valid = valid[:: -(-len(valid) // MOST_NODES)]
-    p_xy, yaw = p_xy.reshape(-1, 2)[valid], yaw.ravel()[valid]
-    exact = field_at_rest_nt(scene, p_xy, yaw, height_m=anomaly_map.height_m)
-    values = anomaly_map.values_nt.ravel()[valid]
-    off = values - exact
+    p_xy, yaw, values = p_xy.reshape(-1, 2)[valid], yaw.ravel()[valid], anomaly_map.values_nt.ravel()[valid]
+    height = sensor_height_m(scene) if anomaly_map.height_m is None else anomaly_map.height_m
+    clear = ~in_steel(scene, p_xy, height)
+    p_xy, yaw, values = p_xy[clear], yaw[clear], values[clear]
+    off = values - field_at_rest_nt(scene, p_xy, yaw, height_m=anomaly_map.height_m)
+    kept = _in_lock(scene, p_xy, height, np.abs(off) > LEAST_NT)
+    p_xy, yaw, values, off = p_xy[kept], yaw[kept], values[kept], off[kept]
+    if not len(off):
+        raise RefusedError(
+            f"map {anomaly_map.name!r} has no node that is clear of what scene {scene.name!r} has there"
+        )
     worst = int(np.argmax(np.abs(off)))
     return Contradiction(
         rms_nt=float(np.sqrt(np.mean(off * off))),
@@ -88,8 +100,18 @@ def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
         y_m=float(p_xy[worst, 1]),
         yaw=float(yaw[worst]),
         allowed_nt=max(LEAST_NT, PART * float(values.std())),
-        nodes=len(valid),
+        nodes=len(off),
     )
+
+
+def _in_lock(scene: Scene, p_xy: np.ndarray, height_m: float, asked: np.ndarray) -> np.ndarray:
+    """Whether the magnetometer keeps lock at points (N, 2), shape (N,); true where that is not asked."""
+    steepest = scene.robot.magnetometer.gradient_max_nt_m
+    kept = np.ones(len(p_xy), bool)
+    if steepest and asked.any():
+        at = np.column_stack([p_xy[asked], np.full(np.count_nonzero(asked), height_m)])
+        kept[asked] = ambient_gradient_nt_m(scene, at) <= steepest
+    return kept
 
 
 def check_agrees(scene: Scene, anomaly_map: AnomalyMap, where: str) -> Contradiction | None:

@@ -9,8 +9,11 @@ import numpy as np
 from magtwin.field.holes import filled
 from magtwin.field.map import AnomalyMap
 from magtwin.obstacles import Obstacles
-from magtwin.sim.survey import survey
+from magtwin.sim.survey import sensor_height_m, survey
 from magtwin.spec import Scene, SurveySpec
+
+FLOOR_M = 0.01
+"""What does not rise above this is driven over [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +27,9 @@ class Surveyed:
     """Nodes that were filled from those around them, over all headings: the robot cannot stand there, or
     its magnetometer loses lock."""
 
+    magnets: int
+    """How many things are magnetised."""
+
     def __str__(self) -> str:
         field = self.field
         headings, rows, columns = field.values_nt.shape
@@ -34,6 +40,8 @@ class Surveyed:
         return (
             f"surveyed by its own robot: {columns} x {rows} nodes {field.cell_m[0]:g} m apart, {headings} "
             f"headings, {field.height_m:.3g} m above the floor, {low:.2f} to {high:.2f} uT{holes}"
+            + "; nothing is magnetised, so the field is the same everywhere"
+            * (not self.magnets)
         )
 
 
@@ -88,11 +96,12 @@ def survey_room(
     return Surveyed(
         replace(whole, values_nt=values, variance_nt2=variance, parameters=parameters),
         holes,
+        len(scene.magnets),
     )
 
 
 def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[np.ndarray], np.ndarray]:
-    """Which nodes a scene's robot cannot stand at, for what stands on the floor.
+    """Which nodes a scene's robot cannot stand at, for what stands on the floor or is magnetised there.
 
     The walls at the border of the floor are not among that: the values there are needed up to them.
 
@@ -113,10 +122,38 @@ def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[np.ndarray], np.
     radius = scene.robot.footprint_radius_m
 
     def blocked(nodes: np.ndarray) -> np.ndarray:
-        distance, _ = standing.clearance(nodes.reshape(-1, 2), reach_m=radius)
-        return np.asarray(distance < radius).reshape(nodes.shape[:-1])
+        p = nodes.reshape(-1, 2)
+        distance, _ = standing.clearance(p, reach_m=radius)
+        inside = in_steel(scene, p, sensor_height_m(scene))
+        return np.asarray((distance < radius) | inside).reshape(nodes.shape[:-1])
 
     return blocked
+
+
+def in_steel(scene: Scene, p: np.ndarray, height_m: float) -> np.ndarray:
+    """At which points (N, 2) of the floor a robot would stand in something magnetised, shape (N,).
+
+    Args:
+        scene: The scene.
+        p: Where its base stands [m].
+        height_m: Height up to which the robot reaches [m]. What does not rise above the floor is no obstacle.
+    """
+    radius = scene.robot.footprint_radius_m
+    inside = np.zeros(len(p), bool)
+    for source in scene.magnets:
+        if source.shape == "point":
+            continue
+        body = replace(source, susceptibility=0.0).body()
+        middle = body.p_world + body.rotation @ body.middle
+        half = np.abs(body.rotation) @ (body.size_m / 2)
+        near = np.flatnonzero(np.all(np.abs(p - middle[:2]) < half[:2] + radius, axis=1))
+        low, high = middle[2] - half[2], middle[2] + half[2]
+        if high <= FLOOR_M or low >= height_m or not len(near):
+            continue
+        for z in np.linspace(max(low, FLOOR_M), min(high, height_m), 5):
+            at = np.column_stack([p[near], np.full(len(near), z)])
+            inside[near] |= body.clearance(at) < radius
+    return inside
 
 
 def _nearest_to_middle(outline: np.ndarray) -> np.ndarray:

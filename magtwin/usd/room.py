@@ -15,9 +15,10 @@ from magtwin.field.bodies import mesh_moments
 from magtwin.files import existing, refused_at, shipped
 from magtwin.frames import IDENTITY_XYZW, quat_from_yaw, rotate
 from magtwin.furniture import drawn_magnetization
-from magtwin.names import RefusedError, find
+from magtwin.names import RefusedError
 from magtwin.obstacles import Obstacles
 from magtwin.spec import ZERO3, FurnitureSpec, LabSpec, PlacedRobot, Quat, Spec, Vec3
+from magtwin.usd.figures import check_prim_name
 from magtwin.usd.furniture import FURNITURE, define_furniture
 from magtwin.usd.lab import define_lab
 from magtwin.usd.maps import load_map
@@ -77,6 +78,7 @@ class FurnitureTable(Spec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_prim_name(self.name, "furniture")
         self._above_zero("scale")
         degrees = f"be in radians, at most 2 pi; {self.yaw:g} deg are {math.radians(self.yaw):.4f} rad"
         self._require("yaw", abs(self.yaw) <= 2 * math.pi + 1e-6, degrees, self.yaw)
@@ -227,10 +229,8 @@ def lab_of(
         map_layer: The map that it names; None where it names none.
 
     Raises:
-        RefusedError: The floor cannot be in metres, or there is a [survey] beside a map.
+        RefusedError: The floor cannot be in metres.
     """
-    if map_layer is not None and "survey" in table:
-        raise refused_at(path, "", "is for a scene without a map; drop it, or the map", section="survey")
     if map_layer is not None and "floor_m" not in table.get("lab", {}):
         x0, x1, y0, y1 = load_map(map_layer).extent
         floor = 2 * max(abs(x0), abs(x1)), 2 * max(abs(y0), abs(y1))
@@ -290,13 +290,11 @@ def asset_named(file: Path, text: str, where: str) -> Path:
         return file
     folders = sorted(shipped("robots").iterdir())
     known = {f.name: f / f"{f.name}.usda" for f in folders if (f / f"{f.name}.usda").is_file()}
-    try:
-        return find("robot", text, known)
-    except RefusedError as error:
-        names = ", ".join(known)
-        raise RefusedError(
-            f"{where} asset: {error}; robots that ship: {names}; or give the name of a USD file"
-        ) from error
+    if text in known:
+        return known[text]
+    raise RefusedError(
+        f"{where} asset: no robot {text!r}; known: {', '.join(known)}; or give the name of a USD file"
+    )
 
 
 def check_name(name: str) -> None:
@@ -313,8 +311,8 @@ def check_name(name: str) -> None:
         )
 
 
-def names_once(pieces: Iterable[FurnitureSpec]) -> None:
-    """Refuse two pieces of one name, before one is drawn over the other.
+def check_names(pieces: Iterable[FurnitureSpec], path: str | os.PathLike[str]) -> None:
+    """Refuse two pieces of furniture of one name, before one is drawn over the other.
 
     Raises:
         RefusedError: Two have one name.
@@ -322,5 +320,7 @@ def names_once(pieces: Iterable[FurnitureSpec]) -> None:
     seen = set()
     for piece in pieces:
         if piece.name in seen:
-            raise RefusedError(f"two pieces of furniture are called {piece.name!r}; give each its own name")
+            raise RefusedError(
+                f"{path}: two pieces of furniture are called {piece.name!r}; give each its own name"
+            )
         seen.add(piece.name)

@@ -38,9 +38,9 @@ from magtwin.usd.room import (
     FurnitureTable,
     asset_named,
     check_name,
+    check_names,
     check_start,
     lab_of,
-    names_once,
     no_map,
     obstacles_in,
     placed_furniture,
@@ -352,6 +352,10 @@ def scene_from_toml(
     given = from_table(SceneFile, table, path)
     if not given.robot:
         raise RefusedError(f"{path}: has no robot; add a [robot] table")
+    try:
+        check_name(given.name)
+    except RefusedError as error:
+        raise refused_at(path, "name", str(error)) from error
     layer = Path(map_layer).resolve() if map_layer is not None else given.map
     lab = lab_of(given.lab, table, path, None if layer is None else existing(layer, "map layer"))
     pieces = placed_furniture(given.furniture, lab, path, seed=given.seed)
@@ -361,7 +365,7 @@ def scene_from_toml(
         sources, pieces = (*listed[0], *sources), (*listed[1], *pieces)
     if layer is None and (given.earth is None or survey_of is None):
         raise no_map(path, furnished=bool(pieces or sources))
-    names_once(pieces)
+    check_names(pieces, path)
     standing = obstacles_in(lab, pieces)
     robots: list[PlacedRobot] = []
     for number, (one, keys) in enumerate(zip(given.robot, table["robot"], strict=True)):
@@ -395,7 +399,10 @@ def scene_from_toml(
     )
     if layer is None and survey_of is not None:
         _check_things(scene)
-        surveyed = survey_of(scene, given.survey or SurveySpec(), given.seed, standing)
+        try:
+            surveyed = survey_of(scene, given.survey or SurveySpec(), given.seed, standing)
+        except RefusedError as error:
+            raise RefusedError(f"{path}: cannot be surveyed: {error}") from error
         scene = replace(scene, map_layer=surveyed, map_sha256=sha256(surveyed))
     return scene
 
