@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q install -c constraint
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow simready ros physics lint bench wheel-test schema assets pictures clean help
+.PHONY: demo test test-slow readme simready ros physics lint bench wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -21,6 +21,9 @@ test: $(VENV)/.dev  ## Run the tests
 
 test-slow: $(VENV)/.dev  ## Run the tests that take minutes: fits of large surveys
 	$(BIN)/python -m pytest -m slow
+
+readme: $(VENV)/.dev  ## Type README's commands in an empty folder and check the figures that it states
+	$(ONE_THREAD) $(BIN)/python tests/readme.py
 
 simready: $(VENV)/.dev  ## Hold robots against NVIDIA's SimReady profiles, in an environment of its own
 	test -x build/simready/bin/simready-validate || $(PYTHON) -m venv build/simready
@@ -62,6 +65,7 @@ schema: $(VENV)/.dev  ## Generate the schema library anew from schema.usda
 assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
 	$(BIN)/python robots/turtlebot4/build.py
 	$(BIN)/python maps/lab/build.py
+	$(BIN)/python scenes/build.py  # names the new map; its network is the old one until the last line
 	rm -rf build/protocol && $(BIN)/python weights/protocol.py --out build/protocol --ship
 	$(BIN)/python scenes/build.py
 

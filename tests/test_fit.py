@@ -64,7 +64,7 @@ def test_a_harmonic_raster_is_the_fit_at_its_nodes_and_on_fine_grids_nearly_its_
         value, variance = model.predict(p, yaw)
         assert_allclose(field.values_nt, value, rtol=1e-9)
         ratio.append(np.sqrt(field.variance_nt2 / variance)[field.valid])
-    assert_allclose(ratio[0], 1, rtol=1e-9)
+    assert_allclose(ratio[0], 1, rtol=1e-6)  # a difference of sums: prior less what is known
     # scattered readings 6 cm apart: as rough a variance as there is; between means of a drive it is smoother
     assert np.all(np.quantile(ratio[1], (0.1, 0.01)) > (0.95, 0.9))
     assert np.all(np.quantile(ratio[1], (0.9, 0.99)) < (1.07, 1.2))

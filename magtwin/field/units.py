@@ -86,11 +86,11 @@ def check_unit(
         f"were it {other}, it would be {value:,.0f} nT, so say --unit {other}"
         for other, value in could.items()
     )
-    low, high = INDOORS_NT
-    if not any(low <= value <= high for value in could.values()):
+    if not any(INDOORS_NT[0] <= value <= INDOORS_NT[1] for value in could.values()):
+        no_unit = "no usual unit makes it the Earth's field"
         advice = (
-            f"{advice or 'no usual unit makes it the field of the Earth'}; for a normalised sensor give "
-            f"--scale, the factor to nT ({_four(USUAL_NT / number)} would make it {USUAL_NT:,.0f} nT)"
+            f"{advice or no_unit}; for a normalised sensor give --scale, the factor to nT "
+            f"({_four(USUAL_NT / number)} would make it {USUAL_NT:,.0f} nT)"
         )
     raise RefusedError(
         f"{where}: the mean of {column} is {mean:.6g} nT, outside {LEAST_MEAN_NT:,.0f}.."

@@ -104,13 +104,18 @@ class NeuralMagnetometer(Summarized):
 
     @property
     def facts(self) -> Mapping[str, Fact]:
-        """What a run says of its network: file, checksum, layers, parameters; its kind if no perceptron."""
+        """Facts of a run about its network: file, checksum, layers, parameters; its kind if no perceptron.
+
+        The mean training label too, where the weights have it.
+        """
         facts: dict[str, Fact] = {
             "network": self.name,
             "network_sha256": self.sha256,
             "network_layers": self.net.layers_text,
             "network_parameters": self.net.parameters_count,
         }
+        if "label_mean_nt" in self.net.facts:
+            facts["network_label_mean_nt"] = float(self.net.facts["label_mean_nt"])
         return facts if self.net.kind == "mlp" else facts | {"network_kind": self.net.kind}
 
     def disturbance_nt(self, run: Run) -> Array:

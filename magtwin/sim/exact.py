@@ -222,8 +222,9 @@ def check_field(scene: Scene, anomaly_map: AnomalyMap) -> None:
     Raises:
         RefusedError: The map is constant, and nothing on the stage is magnetised.
     """
-    if not anomaly_map.is_constant or (scene.earth is not None and (scene.magnets or scene.others)):
-        return  # other robots move their own iron about
+    made = scene.magnets or scene.others  # other robots have iron too
+    if not anomaly_map.is_constant or (scene.earth is not None and made):
+        return
     values = anomaly_map.values_nt[anomaly_map.valid]
     what = f"{values.mean():,.0f} nT at every node" if values.size else "without a valid node"
     raise RefusedError(
