@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check -q install -c constraint
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow simready ros physics lint bench wheel-test schema assets pictures clean help
+.PHONY: demo test test-slow readme simready ros physics lint bench wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -21,6 +21,9 @@ test: $(VENV)/.dev  ## Run the tests
 
 test-slow: $(VENV)/.dev  ## Run the tests that take minutes: fits of large surveys
 	$(BIN)/python -m pytest -m slow
+
+readme: $(VENV)/.dev  ## Type README's commands in an empty folder and check the figures that it states
+	$(ONE_THREAD) $(BIN)/python tests/readme.py
 
 simready: $(VENV)/.dev  ## Hold robots against NVIDIA's SimReady profiles, in an environment of its own
 	test -x build/simready/bin/simready-validate || $(PYTHON) -m venv build/simready
@@ -66,12 +69,13 @@ assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
 	rm -rf build/protocol && $(BIN)/python weights/protocol.py --out build/protocol --ship
 	$(BIN)/python scenes/build.py
 
-pictures: $(VENV)/.installed  ## Take the README's pictures anew, but for the viewer's
+pictures: $(VENV)/.installed  ## Draw the README's pictures again
 	$(BIN)/magtwin picture scenes/lab/lab.usda --out docs/lab.png --force
 	$(BIN)/magtwin picture robots/turtlebot4/turtlebot4.usda --size 1100x900 --out docs/robot.png --force
 	$(BIN)/magtwin map plot maps/lab/lab.usdc --out docs/map.png --force
 	$(BIN)/magtwin run scenes/lab/lab.usda --seed 1 --out build/pictures --force
-	$(BIN)/magtwin film build/pictures/run.parquet --camera 0,-1.6,5.6:0,-0.2,0 --size 560x350 --speed 10 --fps 8 --out docs/run.gif --force
+	$(BIN)/magtwin picture build/pictures/run.rrd --time 35 --size 1600x900 --out docs/recording.png --force
+	$(BIN)/magtwin film build/pictures/run.parquet --camera 0.4,-1.6,6.1:0.4,-0.2,0 --size 560x350 --speed 10 --fps 8 --out docs/run.gif --force
 
 clean:  ## Remove the environment and what was built
 	rm -rf $(VENV) build demo

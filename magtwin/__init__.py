@@ -11,11 +11,20 @@ from magtwin.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from magtwin.field.map import AnomalyMap
+    from magtwin.io.plotting import plot
     from magtwin.names import MismatchWarning, RefusedError
     from magtwin.path import Path
     from magtwin.run import COLUMNS, Run
     from magtwin.spec import Scene
-    from magtwin.twin import Twin, open_twin, scene_from_toml, simulate, simulate_many, simulate_robots
+    from magtwin.twin import (
+        Twin,
+        author_scene,
+        open_twin,
+        scene_from_toml,
+        simulate,
+        simulate_many,
+        simulate_robots,
+    )
 
 _HOME = {
     "AnomalyMap": "magtwin.field.map",
@@ -26,7 +35,9 @@ _HOME = {
     "Run": "magtwin.run",
     "Scene": "magtwin.spec",
     "Twin": "magtwin.twin",
+    "author_scene": "magtwin.twin",
     "open_twin": "magtwin.twin",
+    "plot": "magtwin.io.plotting",
     "scene_from_toml": "magtwin.twin",
     "simulate": "magtwin.twin",
     "simulate_many": "magtwin.twin",
@@ -42,7 +53,9 @@ __all__ = [
     "Run",
     "Scene",
     "Twin",
+    "author_scene",
     "open_twin",
+    "plot",
     "scene_from_toml",
     "simulate",
     "simulate_many",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from magtwin.frames import wrap_angle, yaw_from_quat
 from magtwin.names import RefusedError
 from magtwin.run import Run
+from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 Align = Literal["time", "path", "none"]
@@ -60,8 +61,8 @@ class Agreement:
     """Pearson's, of the two quantities themselves; none for what is only known as a difference."""
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Summarized):
     """Run B laid over run A, at the readings of A over which B lies."""
 
     align: Align
@@ -120,20 +121,33 @@ class Comparison:
         """The comparison as one JSON object."""
         return json.dumps(self.summary(), indent=2)
 
+    def _summary(self) -> Summary:
+        """How B was laid over A, and how each quantity agrees."""
+        agreements = [
+            (one.name, f"mean {one.mean:.4g}, rms {one.rms:.4g}, largest {one.greatest:.4g} {one.unit}")
+            for one in self.agreements()
+        ]
+        by = (
+            "as they are"
+            if self.align == "none"
+            else f"by {self.align}, B shifted by {self.shift:.4g} {self.unit}"
+        )
+        return Summary(f"Comparison: {len(self.at):,} readings of A, aligned {by}", tuple(agreements))
+
 
 DRAWN = "b_model_error_nt"
 
 ERRORS: Mapping[str, tuple[str, tuple[str, ...], str]] = MappingProxyType(
     {
-        "map": ("b_map_nt", ("b_truth_nt",), "what the map does not know of the field at the sensor"),
-        "disturbance": ("b_total_nt", ("b_truth_nt",), "what the model of the disturbance misses"),
+        "map": ("b_map_nt", ("b_truth_nt",), "error of the map at the sensor"),
+        "disturbance": ("b_total_nt", ("b_truth_nt",), "error of the prediction, map plus disturbance"),
         "model error": (DRAWN, (), "error drawn for the network's prediction"),
-        "noise": ("b_measured_nt", ("b_total_nt", DRAWN), "the sensor's own error"),
-        "total": ("b_measured_nt", ("b_truth_nt",), "the reading's error, all of these together"),
+        "noise": ("b_measured_nt", ("b_total_nt", DRAWN), "noise of the sensor"),
+        "total": ("b_measured_nt", ("b_truth_nt",), "error of the reading"),
     }
 )
-"""Errors of a run by their address: a column, those that are subtracted from it, and what it means. A run
-without `b_model_error_nt` has none."""
+"""Errors of a run by source: a column, those that are subtracted from it, and what it means. Runs without
+`b_model_error_nt` have none."""
 
 
 def errors_of(run: Run) -> dict[str, Agreement]:

@@ -175,7 +175,9 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise RefusedError(f"{path}: not TOML: {error}") from error
 
 
-def from_table(cls: type[T], table: dict[str, Any], path: str | os.PathLike[str], section: str = "") -> T:
+def from_table(
+    cls: type[T], table: dict[str, Any], path: str | os.PathLike[str], section: str = "", number: int = 0
+) -> T:
     """A dataclass made from a table of a TOML file, every key and type checked.
 
     Args:
@@ -183,12 +185,13 @@ def from_table(cls: type[T], table: dict[str, Any], path: str | os.PathLike[str]
         table: What `read_toml` gave, or a part of it.
         path: The file, for refusals; relative `Path` fields are taken from its folder.
         section: Name of the table in the file, for refusals.
+        number: Which of several tables of that name it is, from 0.
 
     Raises:
         RefusedError: A key that the class does not have (the nearest one is named), a missing key, or
             a value of the wrong type or range, each with file and line.
     """
-    where = _Where(Path(path), section)
+    where = _Where(Path(path), section, number)
     hints = typing.get_type_hints(cls)
     known = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for key in table:
@@ -208,19 +211,35 @@ def from_table(cls: type[T], table: dict[str, Any], path: str | os.PathLike[str]
         raise where.refused(next((k for k in values if k in str(error)), ""), str(error)) from error
 
 
+def refused_at(
+    path: str | os.PathLike[str], key: str, text: str, *, section: str = "", number: int = 0
+) -> RefusedError:
+    """A refusal that names the line of a key in a TOML file.
+
+    Args:
+        path: The file.
+        key: The key.
+        text: What is wrong, and what to do.
+        section: Name of the table that holds the key; "" for the top.
+        number: Which of several tables of that name it is, from 0.
+    """
+    return _Where(Path(path), section, number).refused(key, text)
+
+
 @dataclasses.dataclass(frozen=True)
 class _Where:
     """A table of a TOML file, for refusals that name the line."""
 
     path: Path
     section: str
+    number: int = 0
 
     def refused(self, key: str, text: str) -> RefusedError:
         table = f"[{self.section}] " if self.section else ""
         return RefusedError(f"{self.path}{self._line(key)}: {table}{text}")
 
     def _line(self, key: str) -> str:
-        inside = not self.section
+        inside, seen = not self.section, -1
         try:
             lines = self.path.read_text(encoding="utf-8").splitlines()
         except OSError:
@@ -228,7 +247,9 @@ class _Where:
         for number, line in enumerate(lines, 1):
             text = line.strip()
             if text.startswith("["):
-                inside = text.strip("[] ") == self.section
+                header = text.split("#")[0].strip("[] ")
+                seen += header == self.section
+                inside = header == self.section and seen == self.number
                 if inside and not key:
                     return f":{number}"
                 if self.section and text.strip("[] ") == f"{self.section}.{key}":
@@ -259,7 +280,10 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
         if any(dataclasses.is_dataclass(a) for a in args):
             if not all(isinstance(v, dict) for v in value):
                 raise wrong
-            return tuple(from_table(a, v, where.path, section) for a, v in zip(args, value, strict=True))
+            return tuple(
+                from_table(a, v, where.path, section, k)
+                for k, (a, v) in enumerate(zip(args, value, strict=True))
+            )
         return tuple(_value(a, v, where, key) for a, v in zip(args, value, strict=True))
     if origin is typing.Literal:
         if value not in args:

@@ -17,15 +17,18 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from magtwin.names import RefusedError, find
-from magtwin.path import Path, check_clear, check_on_floor, resolve_path
+from magtwin.path import Path, check_clear, check_on_floor
 from magtwin.run import COLUMNS, Run
+from magtwin.sim.exact import check_field
 from magtwin.sim.fleet import SENSED, Fleet
 from magtwin.sim.session import draw_session
 from magtwin.sim.simulate import Predict
-from magtwin.twin import Kind, Twin, open_twin, without_model_error
+from magtwin.sim.way import way_of
+from magtwin.spec import Scene
+from magtwin.twin import Kind, Twin, open_twin, room_of, without_model_error
 
 if TYPE_CHECKING:
     from magtwin.learn.magnetometer import NeuralMagnetometer
@@ -115,11 +118,11 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         self,
         num_envs: int = 1,
         *,
-        scene: Twin | str | FilePath | None = None,
+        scene: Twin | Scene | str | FilePath | None = None,
         net: str | FilePath | None = None,
         magnetometer: Kind | None = None,
         model_error: bool = True,
-        path: Path | str = "figure8",
+        path: Path | str | FilePath | ArrayLike = "figure8",
         signals: Sequence[str] = SIGNALS,
         reward: Reward = progress,
         step_s: float = 0.1,
@@ -133,11 +136,12 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
 
         Args:
             num_envs: How many robots.
-            scene: A scene's file, or what `magtwin.open_twin` gave.
+            scene: The file of a stage, a `Scene`, or what `magtwin.open_twin` gave.
             net: As for `magtwin.open_twin`, where `scene` is a file.
             magnetometer: As for `magtwin.open_twin`, where `scene` is a file.
             model_error: As for `magtwin.simulate`; each episode is a session of its own to it.
-            path: What the robots begin on and are rewarded by: a path, the name of one, or a CSV file.
+            path: What the robots begin on and are rewarded by: a path, its name, a CSV file, or
+                points in world [m], shape (N, 2).
             signals: Columns that are observed, of `BOUNDS`, one after the other.
             reward: From a step of N robots to N rewards.
             step_s: Time between commands [s], a multiple of 0.02.
@@ -163,10 +167,14 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             twin = scene if model_error else without_model_error(scene)
         else:
             twin = open_twin(scene, net=net, magnetometer=magnetometer, model_error=model_error)
+        check_field(twin.scene, twin.field)
         if twin.magnetometer:
             _check_network(twin.magnetometer)
         robot = twin.scene.robot
-        self.path = path if isinstance(path, Path) else resolve_path(path)
+        way = way_of(path, room_of(twin))
+        if not isinstance(way, Path):
+            raise RefusedError(f"path must be one to drive along, got {way!r}")
+        self.path = way
         check_on_floor(self.path, twin.scene.lab.floor_m, robot.footprint_radius_m)
         check_clear(self.path, twin.obstacles, robot.footprint_radius_m)
         if not callable(reward):

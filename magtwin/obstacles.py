@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.names import RefusedError
+from magtwin.summary import Summarized, Summary, listed
 
 Array = NDArray[np.float64]
 
@@ -15,8 +16,8 @@ LEVEL_M = 1e-9
 """Vertices nearer than this to a line through two others make no corner [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Obstacles:
+@dataclass(frozen=True, eq=False, repr=False)
+class Obstacles(Summarized):
     """Solid things in world, each with its outline on the floor and its surface.
 
     The outline is convex: a thing that is not is seen from above as its hull. Arrays are copied at
@@ -83,6 +84,12 @@ class Obstacles:
         sides = [np.hstack([o, np.roll(o, -1, axis=0)]) for o in self.outlines]
         begins = np.concatenate([[0], np.cumsum([len(s) for s in sides])]).astype(np.intp)
         return (np.vstack(sides) if sides else np.empty((0, 4))), begins
+
+    def _summary(self) -> Summary:
+        names = ["/".join(name.split("/")[-2:]) for name in self.names]
+        return Summary(
+            f"Obstacles: {len(self)}, {len(self.triangles):,} triangles", (("names", listed(names, 80)),)
+        )
 
 
 def _distance(p: Array, outline: Array) -> Array:

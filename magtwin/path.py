@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.files import existing
 from magtwin.names import RefusedError, find, hint
 from magtwin.obstacles import Obstacles
+from magtwin.summary import Summarized, Summary, rectangle
 
 Array = NDArray[np.float64]
 
@@ -23,8 +24,8 @@ _SAME_M = 1e-6
 """Neighbours nearer than this are one point; a line whose ends are nearer than this is closed [m]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Path:
+@dataclass(frozen=True, eq=False, repr=False)
+class Path(Summarized):
     """A polyline in the plane of the floor, parametrised by its arc length.
 
     Neighbours that coincide are merged at birth. A closed path ends where it began: its first point
@@ -42,6 +43,9 @@ class Path:
 
     file: str = ""
     """The file that it was read from, as that was named; "" for one that came from no file."""
+
+    placing: tuple[float, ...] = ()
+    """How a path was brought onto its floor: scale in x and y, then shift in x and y [m]; () for none."""
 
     s: Array = field(init=False, repr=False)
     """Arc length at each point, from 0 [m], shape (N,)."""
@@ -151,11 +155,37 @@ class Path:
         parts = [self.p_xy[:1], *((there, back)[n % 2] for n in range(times))]
         return Path(self.name, np.vstack(parts))
 
+    def placed(self, placing: tuple[float, float, float, float]) -> "Path":
+        """This path scaled about the world's origin, then moved.
+
+        Args:
+            placing: Scale in x and in y, above 0, then shift in x and in y [m].
+        """
+        if len(placing) != 4 or not (min(placing[:2]) > 0 and all(map(math.isfinite, placing))):
+            raise RefusedError(
+                f"placing of path {self.name!r} must be two scales above 0 and two shifts, got {placing}"
+            )
+        points = self.p_xy * np.array(placing[:2]) + np.array(placing[2:])
+        return Path(self.name, points, self.closed, self.file, tuple(map(float, placing)))
+
     def _segment(self, s: ArrayLike) -> tuple[Array, NDArray[np.intp]]:
         s = np.asarray(s, float)
         if self.closed:
             s = s % self.length
         return s, np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, len(self.s) - 2)
+
+    def _summary(self) -> Summary:
+        """Name, length, extent, and where it begins and ends."""
+        (x0, y0), (x1, y1) = self.p_xy.min(axis=0), self.p_xy.max(axis=0)
+        (ax, ay), (bx, by) = self.p_xy[0], self.p_xy[-1]
+        ends = f"begins and ends at ({ax:z.2f}, {ay:z.2f}) m"
+        if not self.closed:
+            ends = f"({ax:z.2f}, {ay:z.2f}) to ({bx:z.2f}, {by:z.2f}) m"
+        return Summary(
+            f"Path {self.name}: {self.length:.4g} m, {'closed' if self.closed else 'open'}, "
+            f"{len(self.p_xy):,} points",
+            (("over", rectangle(x0, x1, y0, y1)), ("ends", ends), ("file", self.file)),
+        )
 
 
 def sine(
@@ -368,7 +398,8 @@ PATHS: Mapping[str, Callable[..., Path]] = MappingProxyType(
         "fast_sine": fast_sine,
     }
 )
-"""Functions that make paths, by name; each with defaults that fit a floor of 6 x 3.5 m."""
+"""Functions that make paths, by name; their defaults fit a floor of 6 x 3.5 m, and `magtwin.placement`
+brings them onto others."""
 
 CASES: Mapping[str, str] = MappingProxyType(
     {
@@ -391,13 +422,36 @@ def path_named(name: str) -> Path:
     return find("path", CASES.get(name, name), PATHS)()
 
 
-def resolve_path(name_or_file: str | os.PathLike[str]) -> Path:
-    """A path from a name of `PATHS`, a case A to E of `CASES`, or else from a CSV file.
+def path_of_points(p_xy: ArrayLike, name: str = "points", file: str = "") -> Path:
+    """A polyline through points, as a CSV file of them gives it; closed where it ends where it began.
+
+    Args:
+        p_xy: Points in world [m], shape (N, 2), N >= 2. Neighbours that coincide are merged.
+        name: What to call it.
+        file: The file that they were read from.
 
     Raises:
-        RefusedError: It is neither, or the file is not a path.
+        RefusedError: They are not finite numbers of that shape, or only one point.
     """
-    text = os.fspath(name_or_file)
+    try:
+        p = np.asarray(p_xy, float)
+    except (TypeError, ValueError) as error:
+        raise RefusedError(f"path {name!r}: points must be numbers of shape (N, 2) [m] ({error})") from error
+    if p.ndim != 2 or p.shape[1] != 2 or not len(p):
+        raise RefusedError(f"path {name!r}: points must have shape (N, 2) [m], got {p.shape}")
+    line = _without_repeats(p)
+    return Path(name, p, len(line) > 2 and math.dist(line[0], line[-1]) < _SAME_M, file)
+
+
+def resolve_path(path: "str | os.PathLike[str] | ArrayLike") -> Path:
+    """A path from a name of `PATHS`, a case A to E of `CASES`, a CSV file, or points of shape (N, 2) [m].
+
+    Raises:
+        RefusedError: It is none of these, or the file is not a path.
+    """
+    if not isinstance(path, str | os.PathLike):
+        return path_of_points(path)
+    text = os.fspath(path)
     if text in PATHS or text in CASES:
         return path_named(text)
     file = FilePath(text)
@@ -441,10 +495,9 @@ def read_path_csv(file: str | os.PathLike[str]) -> Path:
         points.append(point)
     if not points:
         raise RefusedError(f"{file}: no points in it; one x,y in metres a line is wanted")
-    p = _without_repeats(np.array(points))
-    if len(p) < 2:
+    if len(_without_repeats(np.array(points))) < 2:
         raise RefusedError(f"{file}: only one point in it; a path needs two that differ")
-    return Path(file.name, p, len(p) > 2 and math.dist(p[0], p[-1]) < _SAME_M, file.as_posix())
+    return path_of_points(points, file.name, file.as_posix())
 
 
 def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> None:
@@ -463,11 +516,27 @@ def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m:
     if len(outside):
         i = int(outside[0])
         x, y = path.p_xy[i]
+        needs = np.ptp(path.p_xy, axis=0) + 2 * footprint_radius_m
         raise RefusedError(
-            f"path {path.name} leaves the floor at point {i + 1} of {len(beyond)}, ({x:.3f}, {y:.3f}) m: "
-            f"a robot of radius {footprint_radius_m:g} m is {beyond[i]:.3f} m outside the floor of "
-            f"{floor_m[0]:g} x {floor_m[1]:g} m; move or shrink the path, or enlarge the floor"
+            f"path {path.name} leaves the floor at point {i + 1} of {len(beyond)}, ({x:.3f}, {y:.3f}) m, by "
+            f"{beyond[i]:.3f} m: with a robot of radius {footprint_radius_m:g} m it needs {needs[0]:.2f} x "
+            f"{needs[1]:.2f} m, the floor is {floor_m[0]:g} x {floor_m[1]:g} m; "
+            f"{_what_fits(path, floor_m, footprint_radius_m)}"
         )
+
+
+def _what_fits(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> str:
+    """What would bring a path onto the floor, in words."""
+    room = np.array(floor_m) - 2 * footprint_radius_m
+    if min(room) <= 0:
+        return "the floor is no wider than the robot; enlarge it"
+    low, high = path.p_xy.min(axis=0), path.p_xy.max(axis=0)
+    with np.errstate(divide="ignore"):
+        scale = float(np.min(room / (high - low)))
+    if scale >= 1:
+        x, y = np.clip(0.0, high - room / 2, low + room / 2) * -1.0 + 0.0
+        return f"moved by ({x:.2f}, {y:.2f}) m it fits: give --fit, or move its points"
+    return f"scaled by {math.floor(scale * 100) / 100:g} it fits: give --fit, or enlarge the floor"
 
 
 def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> None:
@@ -491,7 +560,7 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
         raise RefusedError(
             f"path {path.name} runs into {obstacles.names[which[i]]}: {s[i]:.3f} m along it, at "
             f"({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, a robot of radius {footprint_radius_m:g} m is "
-            f"{footprint_radius_m - distance[i]:.3f} m too near; move the path, or the obstacle"
+            f"{footprint_radius_m - distance[i]:.3f} m too near; give --fit, or move the path or the obstacle"
         )
 
 

@@ -4,6 +4,8 @@ import json
 from dataclasses import dataclass, field
 from typing import Any
 
+from magtwin.summary import LINES, Summarized, Summary
+
 
 @dataclass(frozen=True)
 class Figure:
@@ -18,13 +20,15 @@ class Figure:
     """Where it comes from, or what it means."""
 
 
-@dataclass(frozen=True)
-class Report:
+@dataclass(frozen=True, repr=False)
+class Report(Summarized):
     """A titled list of figures, with the facts that they rest on."""
 
     title: str
     figures: tuple[Figure, ...] = ()
     facts: dict[str, Any] = field(default_factory=dict)
+    verdict: str = ""
+    """Whether what it is of is any good, in one line; see `magtwin.verdict`."""
 
     def to_json(self) -> str:
         """The report as one JSON object; a figure becomes {value, unit, spread, note}."""
@@ -32,4 +36,24 @@ class Report:
             f.name: {k: v for k, v in vars(f).items() if k != "name" and v not in ("", None)}
             for f in self.figures
         }
-        return json.dumps({"title": self.title, "figures": figures, "facts": self.facts}, indent=2)
+        told = {"title": self.title, "figures": figures, "facts": self.facts}
+        return json.dumps(told | ({"verdict": self.verdict} if self.verdict else {}), indent=2)
+
+    def _summary(self) -> Summary:
+        """The figures, of which a prompt shows the first four; a notebook shows the facts as well."""
+        facts = [(str(name), str(value)) for name, value in self.facts.items()]
+        count = f" ({len(self.figures)} figures)" if len(self.figures) >= LINES else ""
+        return Summary(
+            f"{self.title}{count}",
+            (("verdict", self.verdict), *((one.name, _told(one)) for one in self.figures)),
+            ("fact", "value"),
+            facts,
+        )
+
+
+def _told(figure: Figure) -> str:
+    """A figure in a line."""
+    value = figure.value
+    number = f"{value:,.6g}" if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
+    spread = "" if figure.spread is None else f" +- {figure.spread:,.4g}"
+    return f"{number}{spread} {figure.unit}".rstrip() + (f"  ({figure.note})" if figure.note else "")

@@ -14,11 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
 from magtwin.resample import RULES, Interpolation, bracket, check_instants, grid
+from magtwin.run_summary import run_summary
+from magtwin.summary import Summarized, Summary
+from magtwin.verdict import Tally
 
 if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
     import xarray as xr
+    from matplotlib.figure import Figure as Picture
 
 Facts = Mapping[str, str | int | float | bool]
 
@@ -131,8 +135,8 @@ as far from the mean as the network was from recordings that it never saw.
 """
 
 
-@dataclass(frozen=True)
-class Run(Mapping[str, NDArray[Any]]):
+@dataclass(frozen=True, repr=False)
+class Run(Summarized, Mapping[str, NDArray[Any]]):
     """A table of equally long columns, and the facts under which it came about.
 
     A mapping from column name to array: `run["b_total_nt"]` has shape (N,), `run["p_world_base"]`
@@ -174,6 +178,10 @@ class Run(Mapping[str, NDArray[Any]]):
     def __len__(self) -> int:
         """Number of columns, as for any mapping; rows are counted by `rows`."""
         return len(self.columns)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        """Names of the columns, which IPython and Jupyter offer after `run["`."""
+        return list(self.columns)
 
     @property
     def rows(self) -> int:
@@ -392,14 +400,19 @@ class Run(Mapping[str, NDArray[Any]]):
     def to_pandas(self) -> "pd.DataFrame":
         """A DataFrame with the columns of `flat`, one row a reading.
 
-        `attrs["units"]` gives the unit of every column, `attrs["facts"]` the run's facts.
+        `attrs["units"]` and `attrs["frames"]` give the unit and the frame of every column, `attrs["facts"]`
+        the run's facts.
 
         Raises:
             RefusedError: pandas is not installed, or a column cannot stand in a table.
         """
         frame = _optional("pandas").DataFrame(self.flat())
-        units = {name: self.spec(column).unit for name, (column, _, _) in self.members().items()}
-        frame.attrs = {"units": units, "facts": dict(self.facts)}
+        specs = {name: self.spec(column) for name, (column, _, _) in self.members().items()}
+        frame.attrs = {
+            "units": {name: spec.unit for name, spec in specs.items()},
+            "frames": {name: spec.frame for name, spec in specs.items()},
+            "facts": dict(self.facts),
+        }
         return frame
 
     def to_polars(self) -> "pl.DataFrame":
@@ -434,6 +447,20 @@ class Run(Mapping[str, NDArray[Any]]):
         coords["t"] = variables.pop("t")
         return xarray.Dataset(variables, coords, dict(self.facts))
 
+    def plot(self, anomaly_map: Any = None) -> "Picture":
+        """Draw the path over the floor and the readings against time; see `magtwin.plot`.
+
+        Args:
+            anomaly_map: An `AnomalyMap` to draw below the path; None draws a bare floor.
+
+        Returns:
+            A matplotlib figure. A notebook shows it; `figure.savefig("run.png")` writes it.
+
+        Raises:
+            RefusedError: The run has no rows, or no column that can be drawn.
+        """
+        return importlib.import_module("magtwin").plot(self, anomaly_map=anomaly_map)  # loads io when called
+
     def report(self, title: str = "Run") -> Report:
         """What happened, in a few figures; columns that the run does not have are passed over."""
         figures = [Figure("duration", self.duration_s, "s"), Figure("readings", self.rows)]
@@ -459,12 +486,34 @@ class Run(Mapping[str, NDArray[Any]]):
             Figure(n, int(self[n].sum()), "readings", None, COLUMNS[n].doc if n in COLUMNS else "")
             for n in raised
         ]
-        return Report(title, tuple(figures), dict(self.facts))
+        return Report(title, tuple(figures), dict(self.facts), self._verdict())
+
+    def _verdict(self) -> str:
+        """How well a network predicted the exact field of a simulated run; "" where none did."""
+        tally = Tally()
+        self.add_to(tally)
+        return tally.verdict("the exact field of this run")
+
+    def add_to(self, tally: Tally) -> None:
+        """Add the errors of a simulated run's network against the exact field, where it has both."""
+        wanted = {"b_sd_nt", "b_total_nt", "b_map_nt", "b_truth_nt"}
+        if self.facts.get("magnetometer") != "neural" or not wanted <= set(self):
+            return
+        truth, mean = self["b_truth_nt"], float(self.facts.get("network_label_mean_nt", 0.0))
+        tally.than = "the map plus the mean training label" if mean else "the map alone"
+        tally.add(self["b_total_nt"] - truth, self["b_map_nt"] + mean - truth, self["b_sd_nt"])
 
     def _derived(self, step: str, columns: Mapping[str, NDArray[Any]] | None = None) -> "Run":
         """What a step made of this run, and the fact that it did."""
         told = "; ".join(text for text in (str(self.facts.get("derived", "")), step) if text)
         return Run(self.columns if columns is None else columns, {**self.facts, "derived": told}, self.specs)
+
+    def _summary(self) -> Summary:
+        return run_summary(
+            self.columns,
+            self.facts,
+            [(name, *(getattr(self.spec(name), part) for part in ("unit", "frame", "doc"))) for name in self],
+        )
 
     def _span(self) -> str:
         """From when to when it goes, for refusals."""

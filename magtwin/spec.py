@@ -6,7 +6,7 @@ for one attribute of a prim. Lengths are metres, angles radians, fields nT. A sp
 
 import datetime
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -16,8 +16,9 @@ import numpy as np
 from magtwin.field.bodies import SHAPES, Body, check_mesh, induced_magnetization
 from magtwin.field.earth import MODEL, SPAN
 from magtwin.frames import IDENTITY_XYZW, quat_multiply, rotate
-from magtwin.furniture import parts_of
+from magtwin.furniture import Part, parts_of
 from magtwin.names import RefusedError, find, hint
+from magtwin.summary import Summarized, Summary, listed
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -76,6 +77,20 @@ def _least(value: float | tuple[float, ...]) -> float:
     return min(value) if isinstance(value, tuple) else value
 
 
+def spelled(value: Any) -> str:
+    """Every figure of a spec as text, of which checksums are taken.
+
+    It is what `repr` of a plain dataclass gives, whatever a class shows of itself at a prompt; runs keep its
+    checksum, so it must not change.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        figures = ", ".join(f"{f.name}={spelled(getattr(value, f.name))}" for f in fields(value) if f.repr)
+        return f"{type(value).__qualname__}({figures})"
+    if type(value) is tuple:
+        return f"({', '.join(map(spelled, value))}{',' * (len(value) == 1)})"
+    return repr(value)
+
+
 @dataclass(frozen=True, kw_only=True)
 class MountSpec(Spec):
     """Where a sensor sits: a pose on a link of the robot."""
@@ -103,6 +118,7 @@ class MagnetometerSpec(MountSpec):
     """A scalar magnetometer, whose vector axes are measured in turn; see `magtwin.sim.magnetometer`."""
 
     link: str = "magnetometer_link"
+    """Name of the robot link that carries the sensor."""
 
     kind: Literal["physical", "neural", "map-only"] = "physical"
     """"physical": the disturbance is the exact field less the map; "neural": `network` predicts it;
@@ -433,7 +449,10 @@ class DriveSpec(Spec):
     """A differential drive: its size, its limits and its odometry."""
 
     left_wheel_joint: str = "left_wheel_joint"
+    """Name of the left wheel's joint."""
+
     right_wheel_joint: str = "right_wheel_joint"
+    """Name of the right wheel's joint."""
 
     wheel_separation_m: float = 0.233
     """Distance between the wheels' contact points [m]."""
@@ -595,6 +614,10 @@ class PlatformFieldSpec(Spec):
     caster_radius_m: float = 0.01
     """Radius that the caster rolls on [m]."""
 
+    hard_iron_change_nt: Vec3 = ZERO3
+    """Part of h that came after the survey of the map [nT]; 0 in the survey's session. A map that this robot
+    surveyed holds h without it."""
+
     hard_iron_drift_nt: Vec3 = ZERO3
     """Mean change of h from the day of a survey to the days of driving that follow [nT]: handling, docking
     and tools magnetise or demagnetise."""
@@ -612,8 +635,8 @@ class PlatformFieldSpec(Spec):
         self._not_negative("hard_iron_std_nt", "current_std")
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobotSpec(Spec):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class RobotSpec(Summarized, Spec):
     """A robot: the USD asset that shows it, and what the simulator needs to drive it."""
 
     name: str
@@ -671,6 +694,31 @@ class RobotSpec(Spec):
         """LiDAR's axes in base_link."""
         return _product(self.q_base_lidar_link_xyzw, self.lidar.q_link_sensor_xyzw)
 
+    def _summary(self) -> Summary:
+        """Name and magnetometer; drive; other sensors; the field that it makes itself."""
+        sensor, drive = self.magnetometer, self.drive
+        network = "" if sensor.network is None else f" ({sensor.network.name})"
+        x, y, z = self.p_base_magnetometer
+        return Summary(
+            f"RobotSpec {self.name}: {sensor.kind} magnetometer{network} at {sensor.rate_hz:g} Hz",
+            (
+                (
+                    "sensor",
+                    f"({x:.3g}, {y:.3g}, {z:.3g}) m in base_link, {sensor.noise_density_nt:.3g} nT/sqrt(Hz)",
+                ),
+                (
+                    "drive",
+                    f"{drive.v_max:.3g} m/s, {drive.w_max:.3g} rad/s, radius {self.footprint_radius_m:.3g} m",
+                ),
+                (
+                    "others",
+                    f"LiDAR {self.lidar.rays} rays, IMU {self.imu.rate_hz:g} Hz, "
+                    f"battery {self.battery.capacity_wh:g} Wh",
+                ),
+                ("asset", str(self.asset)),
+            ),
+        )
+
 
 def _product(a: Quat, b: Quat) -> Quat:
     x, y, z, w = quat_multiply(a, b).tolist()
@@ -682,7 +730,7 @@ class LabSpec(Spec):
     """A room: a floor centred on the world's origin, low walls, posts of a motion-capture frame."""
 
     floor_m: tuple[float, float] = (6.0, 3.5)
-    """Extent of the floor in x and y [m]."""
+    """Size of the floor in x and y [m]."""
 
     wall_height_m: float = 0.3
     """Height of the walls [m]; 0 for none."""
@@ -711,22 +759,22 @@ class EarthFieldSpec(Spec):
     """Field in world axes [nT]."""
 
     latitude_deg: float
-    """Geodetic latitude of the lab [deg]."""
+    """Geodetic latitude of the room, north positive [deg]."""
 
     longitude_deg: float
-    """Longitude of the lab [deg]."""
+    """Longitude of the room, east positive [deg]."""
 
     height_m: float
     """Height above the WGS 84 ellipsoid [m]."""
 
     date: str
-    """Day for which the field holds, YYYY-MM-DD."""
+    """Date of the field, YYYY-MM-DD."""
 
     north_deg: float = 0.0
-    """Where true north lies: angle from world +y about world +z, counter-clockwise from above [deg]."""
+    """Angle from the world's y to true north, counter-clockwise seen from above [deg]."""
 
     measured: bool = False
-    """Whether the field was measured; otherwise it is the IGRF's, whose span then holds the day."""
+    """Whether the field was measured, so that it may differ from the model's."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -747,12 +795,12 @@ def _is_day(text: str) -> bool:
         return False
 
 
-@dataclass(frozen=True, kw_only=True)
-class SourceSpec(Spec):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class SourceSpec(Summarized, Spec):
     """A magnetised thing: a point dipole, or a uniformly magnetised body of some shape."""
 
     name: str
-    """Name of its prim."""
+    """Name of its prim: letters, digits and _, no digit first."""
 
     p_world: Vec3
     """Where it is: the middle of all but a mesh [m]."""
@@ -858,7 +906,7 @@ class FurnitureSpec(Spec):
     """Name of its prim."""
 
     kind: str
-    """What it is, a name of `magtwin.furniture.KINDS`."""
+    """What it is, a name of `magtwin.furniture.KINDS`, or "box", "cylinder" or "mesh"."""
 
     p_world: Vec3
     """Where it stands: the middle of its footprint, on the floor [m]."""
@@ -872,17 +920,42 @@ class FurnitureSpec(Spec):
     susceptibility: float = 0.0
     """Volume susceptibility of its steel parts [1]."""
 
+    material: str = ""
+    """What a box, cylinder or mesh is made of, a name of `magtwin.furniture.MATERIALS`."""
+
+    size_m: Vec3 = ZERO3
+    """Size of a box along its own x, y and z, or diameter, diameter and height of a cylinder [m]."""
+
+    vertices_m: tuple[Vec3, ...] = ()
+    """Vertices of a mesh about the middle of its box [m], in single precision; it stands on the floor."""
+
+    faces: tuple[tuple[int, int, int], ...] = ()
+    """Corners of a mesh's triangles, counter-clockwise from outside."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         self._unit("q_world_xyzw")
         self._not_negative("susceptibility")
-        steel = [part.name for part in parts_of(self.kind) if part.steel]
+        steel = [part.name for part in self.parts if part.steel]
         fits = len(self.magnetization) in (0, len(steel))
-        self._require(
-            "magnetization", fits, f"have one number for each of {', '.join(steel)}", self.magnetization
-        )
+        what = f"have one number for each of {', '.join(steel)}" if steel else "be left out: it has no steel"
+        self._require("magnetization", fits, what, self.magnetization)
         if not any(self.magnetization):
             object.__setattr__(self, "magnetization", ())
+        if self.faces:
+            object.__setattr__(self, "vertices_m", self.parts[0].vertices_m)
+            self.sources()  # refuses a steel mesh that is not closed
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """What it consists of."""
+        return parts_of(
+            self.kind,
+            material=self.material,
+            size_m=self.size_m,
+            vertices_m=self.vertices_m,
+            faces=self.faces,
+        )
 
     def sources(self, *, in_world: bool = True) -> tuple[SourceSpec, ...]:
         """Its steel, a source each, named after the piece and the part.
@@ -890,7 +963,7 @@ class FurnitureSpec(Spec):
         Args:
             in_world: Whether they stand where it does; otherwise they are in its own axes.
         """
-        steel = [part for part in parts_of(self.kind) if part.steel]
+        steel = [part for part in self.parts if part.steel]
         turn = self.q_world_xyzw if in_world else IDENTITY_XYZW
         sources = []
         for part, m in zip(steel, self.magnetization or (0.0,) * len(steel), strict=True):
@@ -901,7 +974,9 @@ class FurnitureSpec(Spec):
                     p_world=(float(x), float(y), float(z)),
                     shape=part.shape,
                     q_world_xyzw=turn,
-                    size_m=part.size_m,
+                    size_m=ZERO3 if part.faces else part.size_m,
+                    vertices_m=part.vertices_m,
+                    faces=part.faces,
                     magnetization=tuple(m * (k == part.along) for k in range(3)),  # type: ignore[arg-type]
                     susceptibility=self.susceptibility,
                 )
@@ -916,7 +991,41 @@ def _steel(piece: FurnitureSpec) -> tuple[SourceSpec, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlacedRobot(Spec):
+class SurveySpec(Spec):
+    """How the robot surveys a room without a map: it stands at each node of a grid in each heading."""
+
+    spacing_m: float = 0.25
+    """Distance between nodes [m]."""
+
+    headings_deg: tuple[float, ...] = (0.0, 90.0, 180.0, 270.0)
+    """Headings in which it stands at each node, ascending [deg]."""
+
+    readings: int = 135
+    """Readings whose mean a node gives."""
+
+    height_m: float | None = None
+    """Height of the sensor above the floor [m]; by default the robot's own."""
+
+    heading_error_deg: float = 0.0
+    """Standard deviation of its heading about the node's [deg]."""
+
+    position_error_m: float = 0.0
+    """Standard deviation of where it stands about the node, along x and y [m]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._above_zero("spacing_m")
+        self._require("readings", self.readings >= 1, "be at least 1", self.readings)
+        self._not_negative("heading_error_deg", "position_error_m")
+        self._require("height_m", (self.height_m or 0.0) >= 0, "not be below 0", self.height_m)
+        headings = self.headings_deg
+        rises = bool(headings) and list(headings) == sorted(set(headings))
+        within = rises and headings[0] >= 0 and headings[-1] < 360
+        self._require("headings_deg", within, "ascend from 0 to below 360", headings)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class PlacedRobot(Summarized, Spec):
     """A robot in a scene: what it is, where it begins, and what it drives."""
 
     robot: RobotSpec
@@ -929,8 +1038,8 @@ class PlacedRobot(Spec):
     what whoever runs the scene takes."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Scene(Spec):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Scene(Summarized, Spec):
     """A lab, its magnetic map, and a robot in it, or several.
 
     What is asked of a scene is asked of its first robot, `robot`; `led_by` makes another one the first.
@@ -985,6 +1094,25 @@ class Scene(Spec):
         placed = find("robot", name, {placed.robot.name: placed for placed in self.robots})
         rest = tuple(other for other in self.robots if other.robot.name != name)
         return replace(self, robot=placed.robot, start=placed.start, path=placed.path, others=rest)
+
+    def _summary(self) -> Summary:
+        """Name and floor; robots; map; what makes the field; what is driven."""
+        width, depth = self.lab.floor_m
+        robots = [f"{one.robot.name} ({one.robot.magnetometer.kind} magnetometer)" for one in self.robots]
+        field = "no Earth's field" if self.earth is None else f"Earth's field of {self.earth.date}"
+        return Summary(
+            f"Scene {self.name}: floor {width:g} x {depth:g} m",
+            (
+                ("robots" if self.others else "robot", listed(robots, 80)),
+                ("map", str(self.map_layer)),
+                (
+                    "field",
+                    f"{field}, {len(self.sources):,} sources, {len(self.furniture):,} pieces of furniture",
+                ),
+                ("path", listed([str(one.path) or "not set" for one in self.robots])),
+                ("furniture", listed([one.name for one in self.furniture], 200)),
+            ),
+        )
 
     @property
     def magnets(self) -> tuple[SourceSpec, ...]:

@@ -2,30 +2,39 @@
 
 import dataclasses
 import hashlib
+import shutil
+import tempfile
 import warnings
+import weakref
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import magtwin
 from magtwin.field.map import AnomalyMap
 from magtwin.files import existing, git_revision, sha256
 from magtwin.names import MismatchWarning, RefusedError, find
 from magtwin.obstacles import Obstacles
-from magtwin.path import Path, resolve_path
+from magtwin.path import Path
+from magtwin.placement import Room
 from magtwin.run import Run
-from magtwin.spec import MagnetometerSpec, RobotSpec, Scene
+from magtwin.sim.way import way_of, ways_of
+from magtwin.spec import MagnetometerSpec, RobotSpec, Scene, SurveySpec, spelled
+from magtwin.summary import Summarized, Summary
 
 Kind = Literal["physical", "neural", "map-only"]
 Session = int | Literal["survey"]
 Facts = dict[str, str | int | float | bool]
 
 if TYPE_CHECKING:
+    from tempfile import TemporaryDirectory
+
     from magtwin.learn.magnetometer import NeuralMagnetometer, Read
+    from magtwin.placement import Room
     from magtwin.sim.commands import Commands
     from magtwin.sim.controllers import Controller
     from magtwin.sim.engine import Engine
@@ -35,8 +44,8 @@ if TYPE_CHECKING:
     from magtwin.sim.simulate import Predict, Sensed
 
 
-@dataclass(frozen=True)
-class Twin:
+@dataclass(frozen=True, repr=False)
+class Twin(Summarized):
     """A scene, and what runs it."""
 
     scene: Scene
@@ -67,9 +76,57 @@ class Twin:
     session: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
     """Facts of the session that the robots are in (`session`, `session_seed`); empty before one is chosen."""
 
+    stage: object = dataclasses.field(default=None, repr=False, compare=False)
+    """Keeps the temporary stage of a `Scene` that no file holds; None where `scene_file` is a user's own."""
+
+    def _summary(self) -> Summary:
+        """The scene and its file, the robot, the map and the network."""
+        robot, field = self.scene.robot, self.field._summary()
+        sensor = f"{robot.name}, {robot.magnetometer.kind} magnetometer at {robot.magnetometer.rate_hz:g} Hz"
+        more = f", and {len(self.scene.others)} more robots" if self.scene.others else ""
+        width, depth = self.scene.lab.floor_m
+        network = self.magnetometer._summary().title.partition(" ")[2] if self.magnetometer else "none"
+        return Summary(
+            f"Twin {self.scene.name}: floor {width:g} x {depth:g} m, {len(self.obstacles)} obstacles",
+            (
+                ("robot", sensor + more + (f", session {self.session['session']}" if self.session else "")),
+                ("map", field.title.partition(" ")[2]),
+                ("network", network),
+                ("file", str(self.scene_file) if self.stage is None else "none: opened from a Scene"),
+            ),
+        )
+
+
+class _Stage:
+    """A temporary folder for the stage of a scene that no file holds; it lasts as long as its twins."""
+
+    def __init__(self) -> None:
+        self.folder = FilePath(tempfile.mkdtemp(prefix="magtwin-"))
+        weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+
+    def __reduce__(self) -> tuple[type[FilePath], tuple[str]]:
+        return FilePath, (str(self.folder),)  # a copy in another process must not end it
+
+
+def _twin_of_scene(
+    scene: Scene, net: str | FilePath | None, magnetometer: Kind | None, model_error: bool
+) -> Twin:
+    """The twin of a scene that no file holds: authored as `author_scene` does, for as long as it is used."""
+    from magtwin.usd.scene import author_scene
+
+    stage = _Stage()
+    twin = open_twin(
+        author_scene(scene, stage.folder / "scene"),
+        net=net,
+        magnetometer=magnetometer,
+        model_error=model_error,
+    )
+    facts = {name: fact for name, fact in twin.facts.items() if name != "scene_file"}
+    return dataclasses.replace(twin, facts=facts, stage=stage)
+
 
 def open_twin(
-    scene_file: str | FilePath,
+    scene_file: Scene | str | FilePath,
     *,
     net: str | FilePath | None = None,
     magnetometer: Kind | None = None,
@@ -81,7 +138,8 @@ def open_twin(
     place than the robot's own, with the expected effect. Runs keep the text as the fact `network_mismatch`.
 
     Args:
-        scene_file: Root layer of a scene.
+        scene_file: Root layer of a scene; or a `Scene`, which is authored to a temporary folder. Only what
+            the `Scene` itself holds is in it: colliders that were added to a stage by hand are not.
         net: Weights to use in place of those that the magnetometer names (.safetensors or .pth), for a
             neural magnetometer; or "none" for a physical one.
         magnetometer: Kind of magnetometer to use in place of the scene's: "physical", "neural" or "map-only".
@@ -92,6 +150,8 @@ def open_twin(
         RefusedError: The stage, its map or its weights are missing, broken, or not what the stage's
             checksums say.
     """
+    if isinstance(scene_file, Scene):
+        return _twin_of_scene(scene_file, net, magnetometer, model_error)
     from magtwin.usd.layers import stage_sha256
     from magtwin.usd.maps import load_map
     from magtwin.usd.obstacles import read_obstacles
@@ -122,7 +182,7 @@ def open_twin(
 
 def _platform_sha256(robot: RobotSpec) -> str:
     """Checksum of what makes a robot's own field."""
-    return hashlib.sha256(repr(robot.platform).encode()).hexdigest()
+    return hashlib.sha256(spelled(robot.platform).encode()).hexdigest()
 
 
 def _platform_of(twin: Twin, robot: RobotSpec) -> str:
@@ -323,26 +383,139 @@ def scene_from_toml(
     map_layer: str | FilePath | None = None,
     network: str | FilePath | None = None,
     workshop: str | FilePath | None = None,
+    report: Callable[[str], Any] = lambda text: None,
+    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
 ) -> Scene:
     """The scene that a TOML describes, its network read and its inputs named.
 
+    A scene that names no map is surveyed by its own robot, where its Earth's field is known. The map of one
+    that names a map, sources or furniture too is compared with their field.
+
     Args:
         path: The TOML; files that it names are taken from its folder.
-        map_layer: Map to use in place of the one that it names, without the TOML's Earth and sources.
+        map_layer: Map to use in place of the one that it names. The Earth's field, sources and furniture stay
+            as the TOML has them.
         network: Weights to use in place of those that it names (.safetensors or .pth).
-        workshop: Folder to build the robot in, where the TOML names one by its URDF.
+        workshop: Folder for the robot, where the TOML names one by its URDF, and for the map of a survey.
+            Default: a temporary folder, which is deleted when Python ends; `author_scene` copies from it.
+        report: Called with a line on how the scene was surveyed, or how map and sources differ.
+        progress: Called in a survey with headings done, headings in all, and what is being done.
 
     Raises:
-        RefusedError: A key is misspelt or missing, or a file is not there, or not what it should be.
+        RefusedError: A key is misspelt or missing, a file is not there or not what it should be, there is
+            neither a map nor a field to survey, or the map contradicts the Earth's field, sources and
+            furniture; the text says by how much.
     """
+    from magtwin.sim.contradiction import check_agrees
+    from magtwin.usd.maps import load_map
     from magtwin.usd.scene import scene_from_toml as scene_of
+
+    if workshop is None:
+        import tempfile
+
+        _WORKSHOPS.append(tempfile.TemporaryDirectory(prefix="magtwin-"))
+        workshop = _WORKSHOPS[-1].name
 
     def inputs_of(weights: FilePath) -> tuple[str, ...]:
         from magtwin.learn.predictor import load_predictor
 
         return load_predictor(weights).features
 
-    return scene_of(path, map_layer=map_layer, network=network, workshop=workshop, inputs_of=inputs_of)
+    def survey_of(scene: Scene, spec: SurveySpec, seed: int, obstacles: Obstacles) -> FilePath:
+        from magtwin.sim.room_survey import survey_room
+        from magtwin.usd.maps import save_map
+
+        source = f"{FilePath(path).name} sha256:{sha256(path)}"
+        surveyed = survey_room(scene, spec, seed=seed, obstacles=obstacles, source=source, progress=progress)
+        layer = FilePath(workshop) / f"{scene.name}.map.usdc"
+        save_map(surveyed.field, layer)
+        report(f"{scene.name} names no map: {surveyed}")
+        return layer
+
+    scene = scene_of(
+        path,
+        map_layer=map_layer,
+        network=network,
+        workshop=workshop,
+        inputs_of=inputs_of,
+        survey_of=survey_of,
+    )
+    if scene.map_layer.parent != FilePath(workshop):
+        where = f"{path} with {map_layer or scene.map_layer.name}"
+        found = check_agrees(scene, load_map(scene.map_layer), where)
+        if found and found.rms_nt >= NOTED_NT:
+            report(
+                f"Note: the map differs from the field of the scene's Earth, sources and furniture by {found}"
+            )
+    return scene
+
+
+def new_scene(file: str | FilePath, *, force: bool = False) -> FilePath:
+    """Write a TOML that describes a small furnished room, with comments; `scene_from_toml` reads it.
+
+    Args:
+        file: TOML file to write; the scene gets its name.
+        force: Whether a file that exists is replaced.
+
+    Returns:
+        The file.
+
+    Raises:
+        RefusedError: The file exists and `force` was not given, or its name cannot name a scene.
+    """
+    from magtwin.files import output, shipped
+    from magtwin.usd.room import check_name
+
+    name = FilePath(file).stem
+    check_name(name)
+    text = shipped("scenes", "starter.toml").read_text(encoding="utf-8")
+    text = text.replace('name = "room"', f'name = "{name}"', 1)
+    with output(file, force=force) as aside:
+        aside.write_text(text, encoding="utf-8")
+    return FilePath(file)
+
+
+NOTED_NT = 50.0
+"""Difference of a map from its sources that is reported [nT]: above what a careful survey errs by."""
+
+_WORKSHOPS: "list[TemporaryDirectory[str]]" = []
+"""Temporary folders of scenes, deleted when Python ends."""
+
+
+def author_scene(
+    scene: Scene | str | FilePath,
+    folder: str | FilePath,
+    *,
+    force: bool = False,
+    report: Callable[[str], Any] = lambda text: None,
+    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
+) -> FilePath:
+    """Write a scene as a folder of USD layers that needs nothing outside of it.
+
+    Args:
+        scene: A Scene, or the TOML of one; see `scene_from_toml`.
+        folder: Folder to make.
+        force: Whether a folder that exists is replaced.
+        report: As for `scene_from_toml`.
+        progress: As for `scene_from_toml`.
+
+    Returns:
+        The root layer, `folder/<name>.usda`.
+
+    Raises:
+        RefusedError: The folder exists, or as for `scene_from_toml`.
+    """
+    import tempfile
+
+    from magtwin.files import check_free
+    from magtwin.usd.scene import author_scene as author
+
+    check_free(folder, force=force)
+    if isinstance(scene, Scene):
+        return author(scene, folder, force=force)
+    with tempfile.TemporaryDirectory() as workshop:
+        read = scene_from_toml(scene, workshop=workshop, report=report, progress=progress)
+        return author(read, folder, force=force)
 
 
 def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
@@ -390,18 +563,14 @@ def engine_named(
     return Newton(twin.scene_file, twin.scene.robot, progress)
 
 
-def way_of(way: "Path | Commands | Run | str | FilePath") -> "Path | Commands | Run | str":
-    """What is to be driven: the path that a name or a CSV file stands for, all else ("random" too) as it is.
-
-    Raises:
-        RefusedError: There is no such path.
-    """
-    return resolve_path(way) if isinstance(way, str | FilePath) and way != "random" else way  # type: ignore[return-value]
+def room_of(twin: Twin) -> Room:
+    """What a path of a twin's first robot must fit into."""
+    return Room(twin.scene.lab.floor_m, twin.scene.robot.footprint_radius_m, twin.obstacles)
 
 
 def simulate(
-    twin: Twin | str | FilePath,
-    path: "Path | Commands | Run | str" = "figure8",
+    twin: Twin | Scene | str | FilePath,
+    path: "Path | Commands | Run | str | FilePath | ArrayLike" = "figure8",
     *,
     seed: int = 0,
     session: Session | None = None,
@@ -420,8 +589,9 @@ def simulate(
     """Drive the scene's robot along a path and read every sensor.
 
     Args:
-        twin: What `open_twin` gave, or the file of a scene.
-        path: A path, the name of one, or a CSV file of x, y [m]; "random", for a human-like driver who goes
+        twin: What `open_twin` gave, a `Scene`, or the file of a stage.
+        path: A path: its name, a CSV file of x, y [m], an array or list of points in world [m], shape
+            (N, 2), or a `Path`; "random", for a human-like driver who goes
             where the seed takes them; Commands, to be played; or a Run, to be driven once more as it was
             recorded, with the sensors as the scene has them now.
         seed: Seed of all noise. The same seed gives the same bytes.
@@ -447,14 +617,17 @@ def simulate(
         A Run with every column of `magtwin.COLUMNS`; its facts tell how it came about.
 
     Raises:
-        RefusedError: The path leaves the floor or touches an obstacle, or an option is out of range.
+        RefusedError: The path leaves the floor or touches an obstacle, an option is out of range, the scene's
+            field is constant, or the path leaves the map so that there is nothing to read.
     """
+    from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.simulate import simulate as run_scene
 
     seed = _seed(seed)
     twin = in_session(_opened(twin, net, magnetometer, model_error, "simulate"), session, seed=seed)
+    check_field(twin.scene, twin.field)
     network = twin.magnetometer
-    path = way_of(path)
+    path = way_of(path, room_of(twin))
     _check_commands(path, network)
     read: Read | None = None
 
@@ -480,6 +653,7 @@ def simulate(
         controller=controller,
         engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
     )
+    check_read(run, twin.field)
     return run.with_columns(**_known(twin.scene, run, read)).with_facts(
         **_facts(twin, seed, path, duration_s, _config_sha256(twin.scene))
     )
@@ -501,8 +675,8 @@ def model_error_of(twin: Twin, seed: int, *, which: int = 0) -> "ModelError | No
 
 
 def simulate_robots(
-    twin: Twin | str | FilePath,
-    paths: "Mapping[str, Path | Commands | Run | str | FilePath] | None" = None,
+    twin: Twin | Scene | str | FilePath,
+    paths: "Mapping[str, Path | Commands | Run | str | FilePath | ArrayLike] | None" = None,
     *,
     robots: Iterable[str] | None = None,
     meet: Literal["refuse", "flag"] = "refuse",
@@ -525,7 +699,7 @@ def simulate_robots(
     in the scene.
 
     Args:
-        twin: What `open_twin` gave, or the file of a scene.
+        twin: What `open_twin` gave, a `Scene`, or the file of a stage.
         paths: What robots drive, by name, as for `simulate`; who is not named drives what the scene says,
             or "figure8" where that says nothing.
         robots: Names of those whose sensors are read; all unless given. All drive nevertheless.
@@ -550,18 +724,20 @@ def simulate_robots(
     Raises:
         RefusedError: A name is none of a robot's, robots would meet, or `simulate` would refuse one.
     """
+    from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.together import simulate_together
 
     seed = _seed(seed)
     twin = in_session(_opened(twin, net, magnetometer, model_error, "simulate_robots"), session, seed=seed)
+    check_field(twin.scene, twin.field)
     placed = {one.robot.name: one for one in twin.scene.robots}
     for name in (*(paths or {}), *(robots or ())):
         find("robot", name, placed)
+    led = {name: led_by(twin, name) for name in placed}
     ways: dict[str, Path | Commands | Run | str] = {}
     for name, one in placed.items():
-        ways[name] = way_of((paths or {}).get(name, one.path or "figure8"))
+        ways[name] = way_of((paths or {}).get(name, one.path or "figure8"), room_of(led[name]))
     wanted = [name for name in placed if robots is None or name in set(robots)]
-    led = {name: led_by(twin, name) for name in placed}
     for name, way in ways.items():
         _check_commands(way, led[name].magnetometer)
     reads: dict[str, Read] = {}
@@ -595,6 +771,7 @@ def simulate_robots(
         lidar=lidar,
     )
     for name, run in runs.items():
+        check_read(run, twin.field)
         own = led[name]
         runs[name] = run.with_columns(**_known(own.scene, run, reads.get(name))).with_facts(
             **_facts(own, seed, ways[name], duration_s, _config_sha256(own.scene))
@@ -624,8 +801,8 @@ def led_by(twin: Twin, name: str) -> Twin:
 
 
 def simulate_many(
-    twin: Twin | str | FilePath,
-    paths: "Path | Commands | Run | str | FilePath | Iterable[Path | Commands | Run | str | FilePath]",
+    twin: Twin | Scene | str | FilePath,
+    paths: "Path | Commands | Run | str | FilePath | ArrayLike | Iterable[Any]",
     seeds: Iterable[int],
     *,
     session: Session | None = None,
@@ -650,7 +827,7 @@ def simulate_many(
     over the result to have bounded memory, `list` it to keep all.
 
     Args:
-        twin: What `open_twin` gave, or the file of a scene.
+        twin: What `open_twin` gave, a `Scene`, or the file of a stage.
         paths: What is driven in each run, as for `simulate`, or one for all.
         seeds: A seed for each run; their number is that of the runs.
         session: As for `simulate`, each run's drawn from its own seed.
@@ -676,9 +853,11 @@ def simulate_many(
         RefusedError: There is no seed, numbers of paths, speeds, robots and seeds differ, a seed is no whole
             number from 0 up, a robot's magnetometer is not the twin's, or `simulate` would refuse a run.
     """
+    from magtwin.sim.exact import check_field, check_read
     from magtwin.sim.many import BLOCK, Conditions, Job, Runs
 
     twin = _opened(twin, net, magnetometer, model_error, "simulate_many")
+    check_field(twin.scene, twin.field)
     numbers = [_seed(seed) for seed in seeds]
     if not isinstance(controller, str):
         raise RefusedError(
@@ -686,8 +865,7 @@ def simulate_many(
             "remembers a single run: give it to simulate"
         )
     count = len(numbers)
-    given = _each("paths", paths, count)
-    resolved: dict[Any, Any] = {path: way_of(path) for path in given if isinstance(path, str | FilePath)}
+    given = _each("paths", ways_of(paths, room_of(twin)), count)
     if robots is not None and session is not None:
         raise RefusedError("robots are taken as they are; give robots or session, not both")
     jobs, of = [], {}
@@ -711,8 +889,6 @@ def simulate_many(
                 own = dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot))
             drawn[key] = own.scene
             of[id(own.scene)] = own, _config_sha256(own.scene)
-        if isinstance(path, str | FilePath):
-            path = resolved[path]
         _check_commands(path, twin.magnetometer)
         jobs.append(Job(drawn[key], path, seed, speed))
     network = twin.magnetometer
@@ -726,6 +902,7 @@ def simulate_many(
             own, config = of[id(job.scene)]
             predicted = (read.disturbance_nt, read.sd_nt) if read else None
             run = one.read(predicted, model_error_of(own, job.seed))
+            check_read(run, twin.field)
             known = _known(job.scene, run, read)
             run = run.with_columns(**{name: known[name] for name in known.keys() & run.keys()})
             runs.append(run.with_facts(**_facts(own, job.seed, job.path, duration_s, config)))
@@ -746,7 +923,7 @@ def simulate_many(
 
 
 def _opened(
-    twin: Twin | str | FilePath,
+    twin: Twin | Scene | str | FilePath,
     net: str | FilePath | None,
     magnetometer: Kind | None,
     model_error: bool,
@@ -837,6 +1014,8 @@ def path_facts(path: "Path | Commands | Run | str") -> Facts:
     else:
         arrays, what, file = (path.rows,), "commands", path.file
     facts: Facts = {f"{what}_file": file} if file else {}
+    if isinstance(path, Path) and path.placing:
+        facts["path_placing"] = " ".join(map(repr, path.placing))
     checksum = hashlib.sha256()
     for array in arrays:
         checksum.update(np.ascontiguousarray(array).tobytes())
@@ -859,19 +1038,21 @@ def _config_sha256(scene: Scene) -> str:
     scene = dataclasses.replace(
         scene, map_layer=FilePath(), map_sha256="", robot=bare(scene.robot), path="", others=others
     )
-    return hashlib.sha256(repr(scene).encode()).hexdigest()
+    return hashlib.sha256(spelled(scene).encode()).hexdigest()
 
 
-def scan(twin: Twin, run: Run, *, seed: int = 0) -> "Scans":
+def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Scans":
     """What the LiDAR of a scene's robot saw in a run, one scan a turn while it spun.
 
     Args:
-        twin: What `open_twin` gave.
+        twin: What `open_twin` gave; or a `Scene` or the file of a stage, opened in the run's session.
         run: What `simulate` gave, or any run with t, p_world_base, yaw and lidar_on.
         seed: Seed of its noise; that of the run, unless another draw is wanted.
     """
     from magtwin.sim.lidar import scans_of
     from magtwin.sim.simulate import streams
 
+    if not isinstance(twin, Twin):
+        twin = in_session_of(open_twin(twin, magnetometer="map-only"), run.facts)
     rng = streams(np.random.default_rng(seed))["lidar"]
     return scans_of(run, twin.scene.robot, twin.obstacles, rng)

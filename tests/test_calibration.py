@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from magtwin.learn.calibration import (
-    Z_90,
     Spread,
-    coverage,
     few_groups_factor,
     fit_spread,
     quantile_factor,
@@ -14,6 +12,7 @@ from magtwin.learn.calibration import (
     yardstick,
 )
 from magtwin.names import RefusedError
+from magtwin.verdict import Z_90, coverage
 
 
 def days(rng, count, rows, offset_nt=100.0, noise_nt=50.0):

@@ -1,5 +1,7 @@
 """Pictures and films of runs in their lab."""
 
+import itertools
+import re
 import stat
 from dataclasses import replace
 
@@ -11,9 +13,10 @@ from pxr import Usd, UsdGeom
 
 from magtwin.cli import main
 from magtwin.files import shipped
+from magtwin.io.cutaway import VEIL
 from magtwin.io.films import LONGEST_S, film_of_run, frame_times
 from magtwin.io.pictures import Camera, turntable
-from magtwin.io.scenery import Scenery, View, picture_of_run
+from magtwin.io.scenery import WALL_M, Scenery, View, _free_share, picture_of_run
 from magtwin.io.tables import write_parquet
 from magtwin.names import RefusedError
 from magtwin.run import Run
@@ -72,6 +75,65 @@ def test_bodies_are_where_pose_and_wheels_say(scenery, run):
 def test_the_trail_grows_behind_the_robot(scenery):
     white = [(scenery.frame(k).min(axis=-1) > 235).sum() for k in (0, 2, 5)]
     assert white[0] < white[1] < white[2]
+
+
+def test_the_trail_stands_out_from_the_map_by_a_light_and_a_dark_edge(scenery, run):
+    frame = scenery.frame(5)
+    p = run["p_world_base"][run["t"] < 5][::3, :2]
+    ahead = np.gradient(p, axis=0)
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0]]) / np.linalg.norm(ahead, axis=1, keepdims=True)
+    far = np.linalg.norm(p - p[-1], axis=1) > 0.3  # not below the robot
+    for place, side in zip(p[far], left[far], strict=True):
+        spots = [pixel(scenery, (*(place + at * side), 0.01)) for at in np.linspace(-0.07, 0.07, 29)]
+        seen = np.array([frame[y, x] for x, y in spots]).astype(int)
+        assert np.ptp(seen @ (0.2126, 0.7152, 0.0722)) > 110, place  # of 255, in luminance
+
+
+def test_the_robot_is_seen_behind_a_column_in_every_frame(run, lab_scene):
+    column, robot = np.array([-4.6, -3.2]), run.resample(np.arange(6.0))["p_world_base"][:, :2]
+    with Scenery(run, lab_scene, np.arange(6.0), view=View.of("top"), size=(480, 270)) as scenery:
+
+        def drawn_without(actors, k):
+            shown = [actor.visibility for actor in actors]
+            for actor in actors:
+                actor.visibility = False
+            image = scenery.frame(k, whole=True).astype(int)
+            for actor, visible in zip(actors, shown, strict=True):
+                actor.visibility = visible
+            return image
+
+        for k, (x, y) in enumerate(robot):
+            place = column + 1.2 * (column - (x, y)) / np.linalg.norm(column - (x, y))
+            scenery._view = View.of(f"{place[0]},{place[1]},1.2:{x},{y},0.2")
+            seen, solid = (scenery.frame(k, whole=whole).astype(int) for whole in (False, True))
+            bare = drawn_without(scenery._screens, k)
+            empty = drawn_without([*scenery._screens, *scenery._actors.values()], k)
+            on_robot = (np.abs(bare - empty) > 30).any(axis=-1)
+            for axis, step in itertools.product((0, 1), (-1, 1)):  # edges are smoothed in both pictures
+                on_robot = on_robot & np.roll(on_robot, step, axis)
+            assert on_robot.sum() > 50
+            assert np.mean(np.ptp(solid[on_robot], axis=0)) < 30  # one plain face of the column
+            veiled = np.abs(seen - bare)[on_robot].max(axis=-1)
+            assert np.mean(veiled <= VEIL * 255 + 3) > 0.9  # but for thin posts, all edge
+            far, near = (np.abs(image - bare)[on_robot].mean() for image in (solid, seen))
+            assert near < 0.6 * far  # 0.30 to 0.48 seen: 0.3 but for the posts
+
+
+def test_the_camera_that_follows_stays_on_the_robots_side_of_a_wall():
+    wall = np.array([[[-1.0, -2.0, 0.0], [-0.9, 2.0, 2.5]]])
+    p = np.array([0.0, 0.0, 0.75])
+    share = _free_share(p, np.array([-1.3, 0.0, 0.0]), wall)
+    assert 1.3 * share == pytest.approx(0.9 - WALL_M)
+    assert _free_share(p, np.array([1.3, 0.0, 0.0]), wall) == 1
+    assert _free_share(p + np.array([0.0, 0.0, 2.0]), np.array([-1.3, 0.0, 0.0]), wall) == 1  # above it
+    assert _free_share(p, np.array([-1.3, 0.0, 0.0]), np.empty((0, 2, 3))) == 1
+
+
+def test_the_words_of_a_frame_are_rounded(run, lab_scene):
+    back = run.with_columns(v_base=np.where(np.arange(3) < 1, -1e-9, run["v_base"]))
+    with Scenery(back, lab_scene, [1.23000001], view=View.of("top"), size=SIZE, speed=2.459753) as scenery:
+        (words,) = scenery._words
+    assert re.fullmatch(r"1\.2 s   \d\d\.\d\d µT   0\.00 m/s   x2\.46", words)
 
 
 def test_frames_come_again_the_same_and_in_any_order(scenery):

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_gp import survey, truth
 
-from magtwin.field.fit import METHODS, fit, raster
+from magtwin.field.fit import METHODS, fit, grid_report, raster
 from magtwin.field.readings import Readings
 from magtwin.names import RefusedError
 
@@ -37,16 +37,37 @@ def test_a_trilinear_raster_of_a_grid_is_the_survey_to_the_last_digit():
 
 
 @pytest.mark.parametrize("method", ["cubic", "gp"])
-def test_a_smooth_raster_has_a_fifth_of_the_spacing_and_24_headings(method):
+def test_a_smooth_raster_is_as_fine_as_its_fit_needs(method):
     readings = survey()
-    field = raster(fit(readings, method), readings)
-    assert_allclose(field.cell_m, (0.05, 0.05))
-    assert_allclose(field.headings_rad, np.radians(np.arange(0, 360, 15)))
-    assert_allclose(field.extent, readings.grid.extent)
+    model = fit(readings, method)
+    field = raster(model, readings)
+    assert 0.05 <= field.cell_m[0] <= 0.15
+    assert 4 <= len(field.headings_rad) <= 24
+    assert_allclose(np.diff(field.headings_rad), 2 * np.pi / len(field.headings_rad))
+    assert_allclose(field.extent, readings.grid.extent, atol=field.cell_m[0] / 2)
     p, yaw = field.grid.poses()
     known = field.valid
     assert known.mean() > 0.95
     assert np.sqrt(np.mean((field.values_nt[known] - truth(p, yaw)[known]) ** 2)) < 60
+    figures = {f.name: f for f in grid_report(field).figures}
+    assert figures["node spacing"].value == pytest.approx(field.cell_m[0], abs=1e-4)
+    assert "errs by" in figures["headings apart"].note
+
+
+def test_a_harmonic_raster_is_the_fit_at_its_nodes_and_on_fine_grids_nearly_its_sd():
+    readings = drive()
+    model = fit(readings, "harmonic")
+    ratio = []
+    for spacing in (0.075, 0.05):
+        field = raster(model, readings, spacing_m=spacing, headings_rad=[0.0, 1.0])
+        p, yaw = field.grid.poses()
+        value, variance = model.predict(p, yaw)
+        assert_allclose(field.values_nt, value, rtol=1e-9)
+        ratio.append(np.sqrt(field.variance_nt2 / variance)[field.valid])
+    assert_allclose(ratio[0], 1, rtol=1e-6)  # a difference of sums: prior less what is known
+    # scattered readings 6 cm apart: as rough a variance as there is; between means of a drive it is smoother
+    assert np.all(np.quantile(ratio[1], (0.1, 0.01)) > (0.95, 0.9))
+    assert np.all(np.quantile(ratio[1], (0.9, 0.99)) < (1.07, 1.2))
 
 
 @pytest.mark.parametrize("method", QUICK)
@@ -78,7 +99,8 @@ def test_progress_counts_up_to_its_total():
     assert [s[0] for s in said] == sorted(s[0] for s in said)
     said.clear()
     raster(model, readings, progress=lambda *step: said.append(step))
-    assert said[-1] == (24, 24, "headings")
+    assert said[-1][0] == said[-1][1]
+    assert said[-1][2] == "headings"
 
 
 def test_an_unknown_method_or_option_is_refused_with_the_near_one():
@@ -122,7 +144,9 @@ def test_a_latched_hole_is_masked_at_every_heading_and_a_node_read_at_one_is_not
     hole = (node[:, 1] >= 2) & (node[:, 1] <= 4) & (node[:, 2] >= 3) & (node[:, 2] <= 5)
     latched = hole | ((node[:, 0] > 0) & (node[:, 1] == 5) & (node[:, 2] == 1))
     readings = readings.with_(good=~latched)
-    field = raster(fit(readings, "gp"), readings, spacing_m=0.125)
+    field = raster(
+        fit(readings, "gp"), readings, spacing_m=0.125, headings_rad=np.radians(np.arange(0, 360, 15))
+    )
     assert field.values_nt.shape == (24, 13, 15)
     masked = np.zeros((13, 15), bool)
     masked[4:9, 6:11] = True  # half a spacing around its nodes, where these are the nearest

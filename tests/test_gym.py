@@ -60,6 +60,17 @@ def test_gymnasiums_checker_passes(twin, session):
     check_env(gymnasium.make(NAME, scene=twin, session=session).unwrapped)
 
 
+def test_robots_on_a_survey_alone_read_its_map_and_their_own_field(twin):
+    bare = replace(twin, scene=replace(twin.scene, earth=None, sources=(), furniture=()))
+    env = vector(bare, 3)
+    env.reset(seed=1)
+    for _ in range(5):
+        env.step(np.tile(AHEAD, (3, 1)))
+    table = env.unwrapped.fleet.columns
+    assert np.isfinite(table["b_total_nt"]).all()
+    assert (np.abs(table["b_disturbance_nt"]) > 10).all(), "of drawn sessions, in motion"
+
+
 def test_each_episode_is_a_session_of_its_own_unless_that_of_the_survey_is_wanted(twin):
     names = ("battery_fraction", "imu_q_xyzw", "b_total_nt")
     for session in ("drawn", "survey"):

@@ -8,8 +8,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.field.grid import Grid
 from magtwin.field.harmonic import HarmonicField
+from magtwin.field.headings import surveyed
 from magtwin.field.interpolation import fit_trilinear
-from magtwin.field.inversion import _headings, fit_harmonic
+from magtwin.field.inversion import fit_harmonic
 from magtwin.field.readings import Readings
 from magtwin.names import RefusedError
 
@@ -289,11 +290,11 @@ def test_headings_that_a_platform_does_not_explain_widen_what_lies_between_them(
 
 
 def test_a_drive_with_headings_all_around_has_no_gaps_between_them():
-    heading, group = _headings(np.linspace(0, 2 * np.pi, 200))
+    heading, group = surveyed(np.linspace(0, 2 * np.pi, 200))
     assert not len(heading)
     assert (group == -1).all()
     stray = np.concatenate([np.repeat(QUARTERS, 30), [0.8]])
-    heading, group = _headings(stray)
+    heading, group = surveyed(stray)
     assert_allclose(heading, QUARTERS, atol=1e-12)
     assert_array_equal(group, [*np.repeat([0, 1, 2, 3], 30), -1])
 

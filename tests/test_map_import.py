@@ -193,7 +193,7 @@ def test_a_refusal_names_the_survey_not_the_file_to_be_written(tmp_path, capsys)
     (tmp_path / "hall.csv").write_text("x,y,heading,field\n0,0,0,41000\n1,0,0,42000\n")
     with pytest.raises(SystemExit):
         run("map", "fit", tmp_path / "hall.csv", "--out", tmp_path / "z.usdc")
-    assert "2 of 2 readings of 'hall' are good" in capsys.readouterr().err
+    assert "hall.csv: 2 of 2 readings are good" in capsys.readouterr().err
 
 
 def test_runs_under_several_licences_keep_all_of_them(tmp_path, capsys):
@@ -264,3 +264,32 @@ def test_an_option_of_another_method_and_a_field_that_is_none_are_refused(
     monkeypatch.chdir(tmp_path)
     assert what in refused(capsys, "map", "fit", "a.csv", "--out", "a.usdc", *arguments)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_fit_of_one_heading_and_of_few_readings_says_that_they_are_doubtful(tmp_path, capsys):
+    rows = "".join(f"{x},{y},0.5,{41 + 0.1 * x * y:.3f}\n" for x in range(4) for y in range(4))
+    (tmp_path / "hall.csv").write_text("x,y,heading,field\n" + rows)
+    run(
+        "map",
+        "fit",
+        tmp_path / "hall.csv",
+        "--method",
+        "gp",
+        "--spacing",
+        "0.5",
+        "--out",
+        tmp_path / "z.usdc",
+    )
+    said = " ".join(capsys.readouterr().out.split())
+    assert "only 16 good readings" in said
+    assert "one heading only, 29 deg: nothing tells the robot's own field from the room's" in said
+    assert "field in uT, as its size tells (--unit)" in said
+
+
+@pytest.mark.parametrize("method", ["harmonic", "gp", "trilinear"])
+def test_too_few_readings_are_no_map(tmp_path, capsys, method):
+    rows = "".join(f"{x},{x % 2},{x},41000\n" for x in range(7))
+    (tmp_path / "hall.csv").write_text("x,y,heading,field\n" + rows)
+    with pytest.raises(SystemExit):
+        run("map", "fit", tmp_path / "hall.csv", "--method", method, "--out", tmp_path / "z.usdc")
+    assert "hall.csv: 7 of 7 readings are good; a map needs 8 at least" in capsys.readouterr().err

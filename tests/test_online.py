@@ -25,9 +25,12 @@ DURATION_S = 8.0
 ERROR = ModelError(60.0, 2.0, offset=0.7)
 
 
-@pytest.fixture(scope="module", params=["physical", "neural"])
+@pytest.fixture(scope="module", params=["physical", "surveyed", "neural"])
 def twin(request: pytest.FixtureRequest, lab_scene: Path) -> Twin:
-    twin = open_twin(lab_scene, magnetometer=request.param)
+    surveyed = request.param == "surveyed"  # only a map, without Earth and sources
+    twin = open_twin(lab_scene, magnetometer="physical" if surveyed else request.param)
+    if surveyed:
+        twin = replace(twin, scene=replace(twin.scene, earth=None, sources=(), furniture=()))
     robot = twin.scene.robot  # on a day of its own: markers that are off, wheels and IMU with their errors
     robot = replace(draw_session(robot, np.random.default_rng(9)), magnetometer=robot.magnetometer)
     robot = replace(robot, mocap=replace(robot.mocap, offset_m=(0.02, -0.01), dropout_every_s=2.0))

@@ -187,3 +187,56 @@ def test_options_that_make_no_sense_are_refused(tmp_path, arguments, message):
     with pytest.raises(RefusedError, match=message):
         main(["robot", str(CART), "--out", str(tmp_path / "cart"), *arguments, "--debug"])
     assert not list(tmp_path.iterdir())
+
+
+def test_what_the_settings_say_comes_before_the_shape(tmp_path):
+    settings = RobotSettings(
+        footprint_radius_m=0.4,
+        drive=DriveSpec(
+            left_wheel_joint="left", right_wheel_joint="right", wheel_separation_m=0.5, wheel_radius_m=0.08
+        ),
+        magnetometer=MagnetometerSpec(link="mast"),
+    )
+    robot = from_urdf(CART, tmp_path / "cart", settings=settings).spec
+    assert robot.footprint_radius_m == 0.4
+    assert robot.drive.wheel_separation_m == 0.5, "as a robot that skids has it"
+
+
+def test_wheels_are_found_by_what_turns_without_end_and_mirrors(tmp_path):
+    made = from_urdf(
+        CART, tmp_path / "cart", settings=RobotSettings(magnetometer=MagnetometerSpec(link="mast"))
+    )
+    drive = made.spec.drive
+    assert (drive.left_wheel_joint, drive.right_wheel_joint) == ("left", "right")
+    assert (drive.wheel_separation_m, drive.wheel_radius_m) == pytest.approx((0.34, 0.08), abs=1e-4)
+    assert made.spec.base_height_m == 0.0, "it stands on the floor already"
+    assert any("'left' is the left one" in note for note in made.report.notes)
+
+
+@pytest.mark.parametrize("lower", [0.0, 0.08, -0.05])
+def test_a_robot_stands_on_its_wheels_wherever_its_root_is(tmp_path, lower):
+    file = tmp_path / "cart.urdf"
+    text = CART.read_text()
+    for joint in ("0 0.17 0.08", "0 -0.17 0.08"):
+        x, y, z = joint.split()
+        text = text.replace(f'xyz="{joint}"', f'xyz="{x} {y} {float(z) - lower:g}"')
+    file.write_text(text)
+    settings = RobotSettings(magnetometer=MagnetometerSpec(link="mast"))
+    made = from_urdf(file, tmp_path / "cart", settings=settings)
+    stage = Usd.Stage.Open(str(made.asset))
+    cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["default", "render"])
+    low = [
+        cache.ComputeWorldBound(stage.GetPrimAtPath(f"/cart/{wheel}")).ComputeAlignedRange().GetMin()[2]
+        for wheel in ("wheel_l", "wheel_r")
+    ]
+    assert low == pytest.approx([0.0, 0.0], abs=1e-4)
+    chassis = stage.GetPrimAtPath("/cart/chassis")
+    up = UsdGeom.XformCache().GetLocalToWorldTransform(chassis).ExtractTranslation()[2]
+    assert up == pytest.approx(lower, abs=1e-4)
+
+
+def test_without_a_pair_of_wheels_the_joints_must_be_named(tmp_path):
+    file = tmp_path / "cart.urdf"
+    file.write_text(CART.read_text().replace('xyz="0 -0.17 0.08"', 'xyz="0.1 -0.17 0.08"'))
+    with pytest.raises(RefusedError, match=r"no joint 'left_wheel_joint' for left_wheel_joint"):
+        from_urdf(file, tmp_path / "cart", settings=RobotSettings(magnetometer=MagnetometerSpec(link="mast")))

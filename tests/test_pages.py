@@ -12,7 +12,7 @@ import pytest
 
 from magtwin.cli import main
 from magtwin.compare import compare
-from magtwin.io.charts import pictures_of_run, thinned
+from magtwin.io.charts import pictures_of_run, short_names, thinned
 from magtwin.io.pages import (
     MOST_SPANS,
     Told,
@@ -149,6 +149,39 @@ def test_a_run_of_few_columns_is_told_by_what_it_has():
     assert Reader(to_html(page)).open == []
 
 
+def test_pages_are_made_for_phones_and_their_wide_tables_scroll_on_a_desk(page):
+    read = Reader(to_html(page))
+    viewport = next(a["content"] for tag, a in read.tags if tag == "meta" and a.get("name") == "viewport")
+    assert "width=device-width" in viewport
+    inside = [
+        at > 0 and read.tags[at - 1] == ("div", {"class": "wide"})
+        for at, (tag, _) in enumerate(read.tags)
+        if tag == "table"
+    ]
+    assert inside
+    assert all(inside)
+    labels = [a for tag, a in read.tags if tag == "span" and a.get("class") == "label"]
+    assert len(labels) > 50  # what a phone shows before each value
+
+
+def test_charts_shorten_long_names_and_tell_two_apart(runs):
+    names = tuple(f"{'a_long_name_' * 8}{end}.parquet" for end in ("one", "two"))
+    assert short_names(("a.parquet", "b.parquet")) == ("a.parquet", "b.parquet")
+    alike = short_names((f"{names[0]}1{names[0]}", f"{names[0]}2{names[0]}"))
+    assert alike[0] != alike[1]
+    found = compare(*runs, align="path")
+    widths = []
+    for pair in (("a", "b"), names):
+        page = page_of_comparison(Told(pair[0], runs[0]), Told(pair[1], runs[1]), found)
+        svg = page.sections[0].pictures[0].data.decode()
+        left, right = (
+            float(x)
+            for x in re.search(r"M ([\d.]+) [\d.]+ \nL ([\d.]+) ", svg[svg.index('"axes_1"') :]).groups()
+        )
+        widths.append(right - left)
+    assert widths[1] > 0.9 * widths[0]
+
+
 def test_the_same_runs_give_the_same_bytes(runs, twin, tmp_path):
     for name in ("a.html", "b.html"):
         write_page(page_of_runs([Told("a.parquet", runs[0], twin.field)]), tmp_path / name)
@@ -232,11 +265,16 @@ def test_a_browser_lays_a_page_out_within_its_window_on_a_phone_as_on_a_desk(pag
     probe = (
         "<script>onload = () => { const d = document; d.title = [d.documentElement.scrollWidth,"
         " d.documentElement.clientWidth, [...d.images].filter(i => !i.naturalWidth).length,"
-        " Math.min(...[...d.images].map(i => i.clientWidth))].join(' ') }</script>"
+        " Math.min(...[...d.images].map(i => i.clientWidth)),"
+        " [...d.querySelectorAll('.wide')].filter(w => w.scrollWidth > w.clientWidth + 1).length,"
+        " Math.round(100 * Math.min(...[...d.querySelectorAll('.pictures')].map(p => {"
+        " const area = e => e.getBoundingClientRect().width * e.getBoundingClientRect().height;"
+        " return [...p.children].map(area).reduce((a, b) => a + b) / area(p) })))].join(' ') }</script>"
     )
     text = re.sub(r"<meta http-equiv[^>]*>", "", to_html(page))
+    text = text.replace("a.parquet", f"{'a_run_of_a_long_name_' * 5}.parquet")
     (tmp_path / "page.html").write_text(text.replace("</body>", probe + "</body>"))
-    windows = ((360, 780), (390, 844), (1280, 900))
+    windows = ((360, 780), (390, 844), (1280, 900), (1440, 900))
     frames = "".join(f"<iframe src=page.html width={w} height={h}></iframe>" for w, h in windows)
     outer = tmp_path / "frames.html"  # a window of Chromium's own is never narrower than 500, a frame can be
     outer.write_text(
@@ -248,7 +286,9 @@ def test_a_browser_lays_a_page_out_within_its_window_on_a_phone_as_on_a_desk(pag
     out = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
     said = re.search(r"<title>([\d ,]+)</title>", out)[1].split(",")
     for (width, _), frame in zip(windows, said, strict=True):
-        wide, window, broken, least = map(int, frame.split())
+        wide, window, broken, least, cut, filled = map(int, frame.split())
         assert wide <= window <= width
         assert broken == 0
         assert least > 0.8 * min(width, 500)
+        assert cut == 0  # no table has to be scrolled
+        assert filled > 80  # per cent of the pictures' space

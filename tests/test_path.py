@@ -169,7 +169,7 @@ def test_a_released_path_that_leaves_the_floor_is_refused_with_the_point_and_how
 
 def test_a_path_that_leaves_the_floor_says_by_how_much():
     path = Path("far", np.array([[0.0, 0.0], [2.0, 0.0], [3.0, 0.0]]))
-    with pytest.raises(RefusedError, match=r"at point 3 of 3, \(3\.000, 0\.000\) m.* 0\.171 m outside"):
+    with pytest.raises(RefusedError, match=r"at point 3 of 3, \(3\.000, 0\.000\) m, by 0\.171 m"):
         check_on_floor(path, FLOOR, FOOTPRINT)
 
 

@@ -8,8 +8,10 @@ from hypothesis import strategies as st
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from magtwin.files import shipped
-from magtwin.io.pictures import BACKGROUND, Camera, picture_of_stage, view_distance
+from magtwin.io.cutaway import VEIL
+from magtwin.io.pictures import BACKGROUND, BAR_SHARE, Camera, picture_of_stage, view_distance
 from magtwin.names import RefusedError
+from magtwin.usd.geometry import srgb_from_linear
 
 SIZE = (240, 160)
 BEHIND = np.array([int(BACKGROUND[i : i + 2], 16) for i in (1, 3, 5)])
@@ -99,6 +101,41 @@ def test_a_maps_colours_reach_the_screen_unchanged_by_light(stage, tmp_path):
     screen = [188, 89, 0]  # sRGB of linear 0.5, 0.1, 0
     assert np.abs(left - screen).max() <= 2
     assert np.abs(right - screen[::-1]).max() <= 2
+
+
+@pytest.mark.parametrize("azimuth_deg", [-90, 40, 160])
+@pytest.mark.parametrize("elevation_deg", [15, 36])
+def test_no_wall_or_column_hides_the_map_from_any_side(
+    stage, tmp_path, azimuth_deg, elevation_deg, monkeypatch
+):
+    heat_map(stage, [(0.9, 0.05, 0.0), (0.0, 0.05, 0.9)])
+    camera = Camera(azimuth_deg, elevation_deg, distance_m=9, target=(0, 0, 0))
+    bare = draw(stage, tmp_path, camera=camera, legend=False)
+    for k, (x, y) in enumerate(((0, -2), (2, 0), (0, 2), (-2, 0), (0.5, 0.5), (-0.5, -0.3))):
+        wall = UsdGeom.Cube.Define(stage, f"/wall_{k}")
+        wall.CreateSizeAttr(1.0)
+        wall.AddTranslateOp().Set((x, y, 1.25))
+        wall.AddScaleOp().Set((0.2 + 3 * (abs(y) == 2), 0.2 + 3 * (abs(x) == 2), 2.5))
+    veiled = draw(stage, tmp_path, camera=camera, legend=False)
+    monkeypatch.setattr("magtwin.io.cutaway.VEIL", 1.0)
+    solid = draw(stage, tmp_path, camera=camera, legend=False)
+    inks = 255 * srgb_from_linear([(0.9, 0.05, 0.0), (0.0, 0.05, 0.9)])  # edges are mixed with what is beside
+    on_map = np.any([np.abs(bare - ink).max(axis=-1) <= 2 for ink in inks], axis=0)
+    assert on_map.sum() > 500
+    changed = np.abs(veiled - bare)[on_map].max(axis=-1), np.abs(solid - bare)[on_map].max(axis=-1)
+    assert np.mean(changed[1] > 100) > 0.2  # without the cutaway, they do
+    assert changed[0].max() <= VEIL * 255 + 3
+    there = ~drawn(bare)
+    np.testing.assert_allclose(veiled[there], solid[there], atol=8)  # solid elsewhere; drawn() sees from 8 on
+
+
+def test_a_camera_that_fits_a_map_keeps_it_clear_of_the_colour_bar(stage, tmp_path):
+    heat_map(stage, [(0.9, 0.05, 0.0), (0.0, 0.05, 0.9)])
+    barred = draw(stage, tmp_path, camera=Camera(azimuth_deg=-90, elevation_deg=90))
+    blue = (barred[..., 2] > 200) & (barred[..., 0] < 60)  # no colour of viridis
+    columns = np.flatnonzero(blue.any(axis=0))
+    assert columns.size
+    assert columns.max() < (1 - BAR_SHARE) * SIZE[0]
 
 
 def test_a_stage_with_a_map_gets_its_colour_bar(stage, tmp_path):

@@ -58,8 +58,8 @@ def test_units_are_turned_into_nt(tmp_path, unit, factor):
 @pytest.mark.parametrize(
     ("value", "said", "wanted"),
     [
-        ("41", None, "uT"),
-        ("4.1e-5", None, "T"),
+        ("41", "nT", "uT"),
+        ("4.1e-5", "nT", "T"),
         ("0.41", "nT", "G"),
         ("410", "uT", "mG"),
         ("41000", "T", "nT"),
@@ -71,6 +71,48 @@ def test_a_mistaken_unit_is_refused_by_the_one_that_would_fit(tmp_path, value, s
         RefusedError, match=f"a.csv: the mean of field .* were it {wanted}, .*--unit {wanted}$"
     ):
         read_readings(path, columns=Columns(unit=said))
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "factor"),
+    [("41000", "nT", 1), ("41", "uT", 1e3), ("4.1e-5", "T", 1e9), ("410", "mG", 1e2), ("0.41", "G", 1e5)],
+)
+def test_a_unit_that_is_not_given_follows_from_the_size_and_is_told(tmp_path, value, unit, factor):
+    readings = read_readings(file(tmp_path, f"x,y,yaw,field\n0,0,0,{value}\n"))
+    assert_allclose(readings.b_nt, float(value) * factor)
+    told = f"taken field in {unit}, as its size tells (--unit)"
+    assert (told in readings.source) == (unit != "nT")
+
+
+def test_a_size_of_no_unit_is_refused(tmp_path):
+    with pytest.raises(RefusedError, match=r"a\.csv: the mean of field is 3 nT, .*no usual unit makes it"):
+        read_readings(file(tmp_path, "x,y,yaw,field\n0,0,0,3\n"))
+
+
+@pytest.mark.parametrize("name", ["b_total", "B", "|B|", "b_uT", "Total_Field"])
+def test_a_magnitude_is_found_by_its_usual_names(tmp_path, name):
+    readings = read_readings(file(tmp_path, f"Timestamp,x,y,Yaw,{name}\n5.5,0,0,0.25,41\n"))
+    assert (readings.b_nt[0], readings.yaw[0], readings.t[0]) == (41e3, 0.25, 5.5)
+
+
+def test_components_are_found_by_their_usual_names_where_there_is_no_magnitude(tmp_path):
+    rows = "timestamp,x,y,yaw,bx,by,bz\n0,0,0,0,3,4,-40\n"
+    readings = read_readings(file(tmp_path, rows))
+    assert_allclose(readings.b_body_nt, [[3e3, 4e3, -40e3]])
+    assert "taken bx,by,bz as the field in the robot's axes" in readings.source
+    both = read_readings(file(tmp_path, "x,y,yaw,field,bx,by,bz\n0,0,0,40000,3,4,-40\n"))
+    assert both.b_body_nt is None, "a magnitude that is there is what is read"
+
+
+@pytest.mark.parametrize(("said", "fits"), [(None, "world"), ("body", "world"), ("world", "body")])
+def test_vectors_in_other_axes_than_those_that_were_said_are_refused(tmp_path, said, fits):
+    yaw = np.linspace(0, 6, 20)
+    b = 20.0 * np.exp(1j * (1.2 - yaw * (fits == "body")))
+    rows = "".join(f"0,0,{a:.4f},{c.real:.4f},{c.imag:.4f},-40\n" for a, c in zip(yaw, b, strict=True))
+    path = file(tmp_path, "x,y,yaw,bx,by,bz\n" + rows)
+    with pytest.raises(RefusedError, match=rf"a\.csv: bx,by,bz .* one direction .*give --axes {fits}"):
+        read_readings(path, columns=Columns(axes=said))
+    assert len(read_readings(path, columns=Columns(axes=fits))) == 20
 
 
 def test_headings_in_degrees_are_refused_until_said_so_and_turns_that_count_are_taken(tmp_path):
@@ -308,7 +350,11 @@ REFUSALS = {
         {},
         r"a\.csv: no heading: no column is called heading, yaw, theta",
     ),
-    "no field": ("x,y,yaw,b\n0,0,0,41000\n", {}, r"a\.csv: no column 'field'; known: b, x, y, yaw"),
+    "no field": (
+        "x,y,yaw,strength\n0,0,0,41000\n",
+        {},
+        r"a\.csv: no column of the field .*x, y, yaw, strength.*--field NAME, or .*--vector BX,BY,BZ",
+    ),
     "body vector without heading": (
         "x,y,bx,by,bz\n0,0,12000,20000,1\n",
         {"vector": "bx,by,bz"},
@@ -401,3 +447,61 @@ def test_rows_of_two_units_are_refused_by_the_first_line_that_is_off(tmp_path):
 def test_an_outlier_is_no_row_of_another_unit(tmp_path):
     rows = [f"{k},0,0,{41_000 + k if k != 7 else 410}\n" for k in range(1, 300)]
     assert len(read_readings(file(tmp_path, "x,y,yaw,field\n" + "".join(rows)))) == 299
+
+
+def test_a_scale_takes_the_values_of_a_normalised_sensor_to_nt(tmp_path):
+    path = file(tmp_path, "x,y,yaw,b,bx,by,bz\n0,0,0,0.9,0.3,0.2,-0.8\n1,0,1,1.1,0.5,0,-1\n")
+    scaled = read_readings(path, columns=Columns(field="b", scale=45_000.0))
+    assert_allclose(scaled.b_nt, [40_500, 49_500])
+    body = read_readings(path, columns=Columns(vector="bx,by,bz", scale=45_000.0)).b_body_nt
+    assert_allclose(body, 45_000 * np.array([[0.3, 0.2, -0.8], [0.5, 0, -1]]))
+
+
+def test_a_scale_takes_a_folder_of_csvs_to_nt(tmp_path):
+    text = "# x,y,theta,scalar_mag\n0,0,{0},1\n1,0,{0},1.1\n0,1,{0},0.9\n1,1,{0},1\n"
+    for heading in (0, 90, 180, 270):
+        file(tmp_path, text.format(np.radians(heading)), f"{heading}_map.csv")
+    readings = read_readings(tmp_path, columns=Columns(scale=45_000.0))
+    assert_allclose(np.unique(readings.b_nt), [40_500, 45_000, 49_500])
+
+
+def test_a_scale_that_cannot_be_is_refused_with_one_that_could(tmp_path):
+    path = file(tmp_path, "x,y,yaw,b\n0,0,0,0.9\n1,0,1,1.1\n")
+    with pytest.raises(RefusedError, match=r"normalised sensor give --scale, the factor to nT \(50000 would"):
+        read_readings(path, columns=Columns(field="b"))
+    with pytest.raises(RefusedError, match=r"mean of b is 3 nT with scale 3, .*; --scale 50000 would give"):
+        read_readings(path, columns=Columns(field="b", scale=3.0))
+    with pytest.raises(RefusedError, match="the field's unit or its scale"):
+        Columns(scale=3.0, unit="uT")
+    with pytest.raises(RefusedError, match="scale is a factor to nT, above 0, got 0"):
+        Columns(scale=0.0)
+    save_readings(read_readings(file(tmp_path, ROWS, "b.csv")), tmp_path / "b.parquet")
+    with pytest.raises(RefusedError, match="in nT already; leave out --scale"):
+        read_readings(tmp_path / "b.parquet", columns=Columns(scale=2.0))
+
+
+def test_a_pattern_stands_for_the_files_that_match_it_in_the_order_of_their_names(tmp_path, monkeypatch):
+    files = [file(tmp_path, ROWS.replace("0,0,0.5", f"{k},0,0.5"), f"drive_{k}.csv") for k in (2, 0, 1)]
+    want = read_readings(*sorted(files))
+    assert want.runs == ("drive_0", "drive_1", "drive_2")
+    assert same(read_readings(tmp_path / "drive_*.csv"), want)
+    monkeypatch.chdir(tmp_path)
+    assert same(read_readings("drive_?.csv"), want)
+    with pytest.raises(
+        RefusedError, match=r"^no file or folder matches 'nowhere/\*\.csv'; check the pattern$"
+    ):
+        read_readings("nowhere/*.csv")
+
+
+def test_a_file_whose_name_looks_like_a_pattern_is_that_file(tmp_path):
+    file(tmp_path, ROWS, "a1.csv")
+    own = file(tmp_path, ROWS.replace("41000", "42000"), "a[1].csv")
+    assert read_readings(own).b_nt[0] == 42_000
+
+
+def test_a_folder_of_parquet_files_is_several_runs(tmp_path):
+    for name in ("b", "a"):
+        readings = read_readings(file(tmp_path, ROWS, f"{name}.csv"))
+        (tmp_path / "runs").mkdir(exist_ok=True)
+        save_readings(readings, tmp_path / "runs" / f"{name}.parquet")
+    assert read_readings(tmp_path / "runs").runs == ("a", "b")

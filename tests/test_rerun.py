@@ -1,14 +1,19 @@
+import contextlib
 import dataclasses
 import os
+import re
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
 import rerun as rr
 import rerun_cli
+from PIL import Image
 from rerun.chunk import RrdReader
 
 from magtwin.cli import main
@@ -751,6 +756,62 @@ def test_the_viewer_draws_every_view_without_a_complaint(written, tmp_path):
     content = (tmp_path / "run.png").read_bytes()
     assert content[:4] == b"\x89PNG"
     assert [int.from_bytes(content[k : k + 4]) for k in (16, 20)] == [800, 500]
+
+
+def test_what_is_no_recording_is_refused_before_a_viewer_starts(written, tmp_path, monkeypatch):
+    monkeypatch.setattr("magtwin.io.viewer.headless_viewer", lambda size: pytest.fail("was started"))
+    fake, out = tmp_path / "fake.rrd", tmp_path / "run.png"
+    fake.write_text("t,b\n0,1\n")
+    with pytest.raises(RefusedError, match=r"fake\.rrd: not a Rerun recording"):
+        screenshot(fake, out)
+    with pytest.raises(RefusedError, match=r"a folder; name the \.rrd file in it"):
+        screenshot(tmp_path, out)
+    with pytest.raises(RefusedError, match=r"must lie in 200\.\.8000 pixels each way, got 20 x 500"):
+        screenshot(written, out, size=(20, 500))
+    assert not out.exists()
+
+
+@pytest.mark.usefixtures("drawable")
+def test_the_picture_command_draws_a_recording_and_refuses_a_time_beyond_it(written, tmp_path, capsys):
+    out = tmp_path / "run.png"
+    with pytest.raises(SystemExit):
+        main(["picture", str(written), "--out", str(out), "--time", "9999"])
+    assert re.search(r"the recording goes from 0 to [\d.]+ s; there is no 9999 s", capsys.readouterr().err)
+    assert not out.exists()
+    main(["picture", str(written), "--out", str(out), "--time", "5", "--size", "640x400"])
+    with Image.open(out) as image:
+        assert image.size == (640, 400)
+        assert np.std(np.asarray(image.convert("L"))) > 20
+
+
+@pytest.mark.usefixtures("drawable")
+def test_a_picture_that_is_interrupted_leaves_no_viewer_and_no_file(written, tmp_path):
+    if not FilePath("/proc").is_dir():
+        pytest.skip("processes are read from /proc, which is not there")
+
+    def viewers(parent):
+        found = []
+        for stat in FilePath("/proc").glob("[0-9]*/stat"):
+            with contextlib.suppress(OSError):
+                words = stat.read_text().rpartition(")")[2].split()
+                if int(words[1]) == parent and b"--headless" in (stat.parent / "cmdline").read_bytes():
+                    found.append(stat.parent)
+        return found
+
+    command = [sys.executable, "-m", "magtwin", "picture", str(written), "--out", str(tmp_path / "run.png")]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    try:
+        end = time.monotonic() + 60
+        while not (found := viewers(process.pid)) and time.monotonic() < end:
+            time.sleep(0.05)
+        assert len(found) == 1
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+    finally:
+        process.kill()
+        process.wait()
+    assert not found[0].exists()
+    assert [path.name for path in tmp_path.iterdir() if "run.png" in path.name] == []
 
 
 @pytest.mark.usefixtures("drawable")

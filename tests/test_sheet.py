@@ -140,3 +140,9 @@ def test_parquet_whose_middle_is_damaged_is_refused(tmp_path):
     path.write_bytes(whole)
     with pytest.raises(RefusedError, match="damaged Parquet"):
         read_parquet_sheet(path)
+
+
+def test_the_header_may_stand_above_remarks(tmp_path):
+    file = tmp_path / "a.csv"
+    file.write_text('# x,y,field\n# said "so" by, a friend\n# units: ["m", "m", "nT"]\n1,2,3\n4,5,6\n')
+    assert read_csv(file).names == ["x", "y", "field"]

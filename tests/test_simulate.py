@@ -59,6 +59,7 @@ def wavy_map(extent_m: tuple[float, float] = (6.0, 3.5)) -> AnomalyMap:
 
 
 MAP = wavy_map()
+FLAT = dataclasses.replace(MAP, values_nt=np.full((4, 15, 25), 41_000.0))
 
 
 def drive(scene: Scene = KNOWN, path: Path = LINE, *, seed: int = 0, **options) -> Run:
@@ -151,7 +152,7 @@ def test_the_total_is_map_plus_disturbance_and_by_physics_the_truth():
 
 def test_without_sources_or_iron_the_truth_is_the_earths_field_seen_from_the_robot():
     scene = with_robot(dataclasses.replace(KNOWN, sources=()), platform=PlatformFieldSpec())
-    run = drive(scene, path_named("figure8"), duration_s=20.0)
+    run = drive(scene, path_named("figure8"), duration_s=20.0, anomaly_map=FLAT)
     assert_allclose(run["b_truth_nt"], np.linalg.norm(EARTH_NT), rtol=1e-12)
     assert_allclose(rotate(run["q_world_base_xyzw"], run["b_vector_nt"]), [EARTH_NT] * run.rows, atol=1e-6)
 
@@ -159,7 +160,7 @@ def test_without_sources_or_iron_the_truth_is_the_earths_field_seen_from_the_rob
 def test_hard_iron_makes_a_cosine_of_heading():
     iron = PlatformFieldSpec(hard_iron_nt=(620.0, -430.0, 250.0))
     scene = with_robot(dataclasses.replace(KNOWN, sources=()), platform=iron)
-    run = drive(scene, path_named("figure8"))
+    run = drive(scene, path_named("figure8"), anomaly_map=FLAT)
     h = rotate(run["q_world_base_xyzw"], np.array(iron.hard_iron_nt))
     assert_allclose(run["b_truth_nt"], np.linalg.norm(EARTH_NT + h, axis=1), rtol=1e-12)
     assert np.ptp(run["b_truth_nt"]) > 500
@@ -184,7 +185,7 @@ def test_eddy_currents_see_the_fields_rate_in_turning_axes():
     e = 0.01
     platform = PlatformFieldSpec(eddy_s=(e, 0, 0, 0, e, 0, 0, 0, e))
     scene = with_robot(dataclasses.replace(KNOWN, sources=()), platform=platform)
-    run = drive(scene, path_named("narrow_figure8"))
+    run = drive(scene, path_named("narrow_figure8"), anomaly_map=FLAT)
     b = rotate(run["q_world_base_xyzw"] * [-1, -1, -1, 1], np.broadcast_to(EARTH_NT, (run.rows, 3)))
     assert_allclose(run["b_vector_nt"], b - e * np.cross(run["w_base"], b), atol=1e-6)
 
@@ -502,7 +503,10 @@ def test_a_single_reading_is_a_run_too():
         ),
         ({"lidar": "maybe"}, 'lidar must be "schedule", "on" or "off"'),
         ({"outside": "guess"}, 'outside must be "nan", "clamp" or "raise"'),
-        ({"scene": SURVEYED}, r"scene 'surveyed' has neither a network nor an Earth field.*name a network"),
+        (
+            {"scene": SURVEYED, "anomaly_map": FLAT},
+            r"scene 'surveyed' has a constant map and no Earth field.*name a map that was fitted",
+        ),
         (
             {"scene": with_robot(KNOWN, magnetometer=MagnetometerSpec(kind="neural"))},
             "scene 'known' has a neural magnetometer, and no network predicts its disturbance; open it",

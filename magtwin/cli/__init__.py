@@ -10,6 +10,7 @@ from magtwin.cli import (  # noqa: F401 - each registers its commands
     file,
     map,  # noqa: A004
     net,
+    new,
     picture,
     report,
     rerun_of,

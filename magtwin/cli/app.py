@@ -12,6 +12,7 @@ from cyclopts.config import Env, Toml
 from cyclopts.exceptions import CycloptsError
 
 import magtwin
+from magtwin.cli.progress import watched
 from magtwin.names import MismatchWarning, RefusedError
 
 app = App(
@@ -25,15 +26,28 @@ app = App(
 )
 
 
+HELP = {"--help", "-h"}
+"""Options that ask for help."""
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `magtwin` command; `arguments` are those of the command line unless given."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what is half-written goes
+    plain = not sys.stderr.isatty()
     try:
-        with _warnings_in_lines():
-            app([a for a in arguments if a != "--debug"], exit_on_error=False, result_action="return_value")
-    except CycloptsError:
+        with watched(), _warnings_in_lines():
+            app(
+                [a for a in arguments if a != "--debug"],
+                exit_on_error=False,
+                print_error=not plain,
+                result_action="return_value",
+                **_help_of(arguments),
+            )
+    except CycloptsError as error:
+        if plain:
+            print("magtwin: " + " ".join(str(error).split()), file=sys.stderr)  # noqa: T201
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
@@ -48,6 +62,19 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(error, OSError | MemoryError):
             _fail(f"{error} ({type(error).__name__})")
         _fail(f"a fault of magtwin's own, {type(error).__name__}: {error}; --debug shows where, do report it")
+
+
+def _help_of(arguments: list[str]) -> dict[str, Any]:
+    """Options that print help for a file or another program: without boxes, no line broken."""
+    asked = HELP & set(arguments) or len(arguments) < 2  # `magtwin map` is answered by its help too
+    if sys.stdout.isatty() or not asked:
+        return {}
+    from cyclopts.help import PlainFormatter
+
+    from magtwin.cli.terminal import stdout_console
+
+    app.help_formatter = PlainFormatter()
+    return {"console": stdout_console()}
 
 
 @contextmanager

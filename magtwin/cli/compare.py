@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, say
+from magtwin.cli.terminal import Force, Json, check_suffix, say, stdout_console, step
 
 if TYPE_CHECKING:
     from magtwin.compare import Comparison
@@ -46,8 +46,11 @@ def compare(
     if out is not None:
         check_suffix(out, (".html", ".md", ".json", ".png", ".svg"), "a comparison")
         check_free(out, force=force)
+    step("Reading the runs")
     runs = read_run(a), read_run(b)
+    step("Comparing the runs")
     found = compare_runs(*runs, align=align)
+    step("Writing the comparison")
     names = (a.name, b.name) if a.name != b.name else (str(a), str(b))
     if out is not None and out.suffix in (".png", ".svg"):
         from magtwin.io.charts import plot_comparison
@@ -68,12 +71,11 @@ def compare(
 
 def _print(found: "Comparison", names: tuple[str, str]) -> None:
     """The figures as a table for people."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     how = "clocks as they stand" if found.align == "none" else f"moved by {found.shift:+.4f} {found.unit}"
-    console = Console(highlight=False)
+    console = stdout_console()
     console.print(Text(f"{names[1]} less {names[0]}, {how}; {len(found.at):,} readings", style="bold"))
     table = Table(box=None, pad_edge=False)
     for column in ("", "unit", "mean", "RMS", "mean abs.", "greatest", "correlation"):

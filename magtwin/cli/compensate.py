@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say
+from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say, step
 
 compensate_app = App(name="compensate", help="Take the platform's field out of a run (Tolles-Lawson).")
 app.command(compensate_app)
@@ -60,6 +60,7 @@ def fit(
     check_suffix(out, (".json",), "a Tolles-Lawson model")
     check_free(out, force=force)
     names = tuple(name.strip() for name in terms.split(",") if name.strip())
+    step("Fitting the model")
     model = fit_run(
         read_parquet(run),
         vector="exact" if exact else "measured",

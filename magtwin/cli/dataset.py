@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, print_report, progress, say
+from magtwin.cli.terminal import Force, Json, print_report, progress, say, step
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def build(
     alignment: Any = "fit" if align == "fit" else None
     if given:
         alignment = Alignment(lever_arm or (0.0, 0.0), latency or 0.0)
-    with progress("Labelling") as advance:
+    with progress("Labelling", "recordings") as advance:
         made = build_dataset(
             sources,
             _open_map(map),
@@ -124,6 +124,7 @@ def info(dataset: Path, *, json: Json = False) -> None:
 
     from magtwin.learn.dataset import open_dataset
 
+    step("Checking the shards")
     found = open_dataset(dataset)
     found.check()
     report = found.report()
@@ -167,12 +168,14 @@ def correlate(
 
     if out is not None:
         check_free(out, force=force)
+    step("Reading the data set")
     found = open_dataset(dataset)
     rows = found.rows(features)
     sessions = [found.recording(name).session for name in rows.names]
     of = rows.names if len(set(sessions)) < 2 else sessions
     number = {key: i for i, key in enumerate(dict.fromkeys(of))}
     groups = np.array([number[key] for key in of])[rows.recording]
+    step("Ranking the inputs")
     result = correlations(rows.x, rows.y, rows.features, groups)
     if out is not None:
         from magtwin.io.correlations import plot_correlations

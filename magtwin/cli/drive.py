@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from magtwin.cli.app import app
 from magtwin.cli.run import write_run
-from magtwin.cli.terminal import Force, Json, Seed, Session, announcer, print_report, say
+from magtwin.cli.terminal import Force, Json, Seed, Session, announcer, print_report, say, silence
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -98,7 +98,8 @@ def drive(
                     print(f"  no view: {error}", file=sys.stderr)  # noqa: T201
             source = stack.enter_context(device(gamepad))
             print(f"  {HELP if gamepad is None else 'left stick drives, Start ends'}\r", file=sys.stderr)  # noqa: T201
-            _drive(recorder, hand, source, dt, show)
+            with silence():
+                _drive(recorder, hand, source, dt, show)
         folder.mkdir()
         write_commands(recorder.commands("commands.csv"), folder / "commands.csv")
         report = write_run(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, Seed, progress, say
+from magtwin.cli.terminal import Force, Json, Seed, progress, say, stdout_console, step
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -97,17 +97,20 @@ def evaluate(
         raise RefusedError(
             "--scene adds an error budget, for which --train is needed too; give it, or no --scene"
         )
+    step("Reading maps and weights")
     charts = _charts(map, scene)
     names = _short(weights)
     own = [
         room.contender(path, charts, any_map=any_map, name=name)
         for path, name in zip(weights, names, strict=True)
     ]
+    step("Reading the data set")
     trials, learned = _trials(runs, dataset, train, own)
+    step("Fitting the Tolles-Lawson baselines")
     baselines = [] if train is None else _baselines(charts, own, *learned[0])
     first = room.naive(charts[0], dataset=learned[0][0], names=learned[0][1]) if learned else None
     first = first or room.naive(charts[0], weights=own)
-    with progress("Judging") as advance:
+    with progress("Judging", "recordings") as advance:
         found = room.evaluate(
             [first, *own, *baselines],
             trials,
@@ -118,7 +121,7 @@ def evaluate(
         )
     sections, data = [], {}
     if scene is not None and train is not None:
-        with progress("Budgets") as advance:
+        with progress("Error budgets", "models") as advance:
             section, told = _budget(found, scene, *learned[0], advance)
         sections.append(section)
         data["budget"] = told
@@ -126,6 +129,7 @@ def evaluate(
         section, told = _traversals(found, scene, against, engine)
         sections.append(section)
         data["traversals"] = told
+    step("Writing the report")
     curves = {name: read_curve(path) for path, name in zip(weights, names, strict=True)}
     page = page_of_evaluation(found, curves=curves, more=sections, data=data)
     write_evaluation(page, out, force=force)
@@ -267,7 +271,7 @@ def _traversals(
     else:
         seed = first.run.facts.get("seed")
         seed = seed + 1 if isinstance(seed, int) and seed >= 0 else 1
-        with progress(f"Driving {first.path}") as advance:
+        with progress(f"Driving {first.path}", "steps") as advance:
             other = made_again(first.run, scene, engine=engine, seed=seed, progress=advance)
         name = f"{first.path} by {engine}"
     both = traversals(first.run, other)
@@ -289,12 +293,12 @@ def _cases(given: Sequence[str] | None) -> dict[str, str]:
 
 def _print(found: "Evaluation") -> None:
     """Table 1 for people: a line a model, its error, and its ratio to the naive one by path."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(highlight=False)
-    shown = [*found.cases[:MOST_CASES], *(case for case in found.cases[MOST_CASES:] if case is found.every)]
+    console = stdout_console()
+    most = MOST_CASES if console.is_terminal else len(found.cases)
+    shown = [*found.cases[:most], *(case for case in found.cases[most:] if case is found.every)]
     table = Table(box=None, pad_edge=False)
     table.add_column("ratio to naive", overflow="fold")
     for column in (*(case.name for case in shown), "MAE", "90 %"):
@@ -307,5 +311,7 @@ def _print(found: "Evaluation") -> None:
     readings = found.every.scores[0].rows
     console.print(Text(f"{readings:,} readings of {len(found.judged)} recordings", style="bold"))
     console.print(table)
+    for name, line in found.verdicts().items():
+        console.print(Text(f"{name}: {line}", style="bold"), soft_wrap=True)
     for why, count in found.left_out.items():
         console.print(Text(f"left out: {count:,} readings that {why}", style="dim"))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, print_report, progress, say
+from magtwin.cli.terminal import Force, Json, print_report, progress, say, silence, step
 from magtwin.names import RefusedError, hint
 
 if TYPE_CHECKING:
@@ -20,14 +20,14 @@ _NETS = (".safetensors", ".pth", ".onnx")
 
 @app.command
 def info(file: Path, *, json: Json = False) -> None:
-    """Say what a run, a stage, a map or a network holds; of a run also what it came from.
+    """Tell what a run, a stage, a map or a network holds, and where it came from.
 
     Parameters
     ----------
     file
         A run (.parquet, .rrd, .mcap, .db3, .csv, .npz, .usd, a .json of the released node, or the folder of a
-        bag, of Parquet parts, or of magtwin run), a stage (.usd, .usda, .usdc, .usdz), or a network
-        (.safetensors, .pth, .onnx).
+        bag, of Parquet parts, or of magtwin run), a stage or a map (.usd, .usda, .usdc, .usdz), a folder of
+        survey CSVs (0_map.csv, ...), or a network (.safetensors, .pth, .onnx).
     json
         Print it as JSON.
     """
@@ -38,10 +38,16 @@ def info(file: Path, *, json: Json = False) -> None:
     if not file.is_dir() and file.suffix not in {*FORMATS, *_STAGES, *_NETS}:
         kinds = hint(file.suffix, {*FORMATS, *_STAGES, *_NETS})
         raise RefusedError(f"{file}: no kind of file {file.suffix!r} that magtwin knows; {kinds}")
+    step(f"Reading {file.name}")
     if file.suffix in _NETS:
         report = _info_of_net(file)
     elif file.suffix in _STAGES and not file.is_dir():
         report = _info_of_usd(file)
+    elif file.is_dir() and any(file.glob("*_map.csv")):
+        from magtwin.field.card import map_card
+        from magtwin.field.survey import import_survey
+
+        report = map_card(import_survey(file))
     else:
         report = _info_of_run(file)
     print_report(report, json)
@@ -128,8 +134,10 @@ def convert(
     if out.resolve() == run.resolve():
         raise RefusedError(f"{out}: is the run itself; name another file")
     named: dict[str, Any] = {"topics": _named(topic) if topic else None, "unit": field_unit}
+    step("Reading the run")
     result = read_run(run, **{name: value for name, value in named.items() if value is not None})
     twin = _twin(result, run, scene) if takes & {"twin", "scene_file"} else None
+    step(f"Writing {out.name}")
     write_run(result, out, twin, force=force, **options)
     say(f"Wrote {out}: {result.rows:,} rows, {len(result)} columns, {result.duration_s:g} s")
 
@@ -159,7 +167,7 @@ def fetch(
     from magtwin.fetch import fetch as fetch_files
 
     dest = dest or Path(what)
-    with progress(f"Fetching {what}") as advance:
+    with progress(f"Fetching {what}", "files") as advance:
         files = fetch_files(what, dest, base_url=base_url, force=force, progress=advance)
     say(f"Wrote {len(files)} files to {dest}")
 
@@ -178,14 +186,31 @@ def _info_of_usd(file: Path) -> Any:
 
     from magtwin.usd.animation import is_animation
     from magtwin.usd.info import info_of_stage
+    from magtwin.usd.maps import is_map_layer
 
-    if file.suffix == ".usdz" or not is_animation(file):
+    if file.suffix == ".usdz":
         return info_of_stage(file)
+    if not is_animation(file):
+        return _info_of_map(file) if is_map_layer(file) else info_of_stage(file)
     run = _info_of_run(file)
     try:
         return replace(run, figures=(*run.figures, *info_of_stage(file).figures))
     except RefusedError as error:  # the run is whole without its scene
         return replace(run, facts={**run.facts, "stage": str(error)})
+
+
+def _info_of_map(file: Path) -> Any:
+    """The map's card, and below it what any stage holds."""
+    from dataclasses import replace
+
+    from magtwin.field.card import map_card
+    from magtwin.usd.info import info_of_stage
+    from magtwin.usd.maps import load_epochs
+
+    epochs = load_epochs(file)
+    card = map_card(epochs[-1], epochs)
+    stage = [figure for figure in info_of_stage(file).figures if figure.value != 0]
+    return replace(card, title=f"{card.title} ({file})", figures=(*card.figures, *stage))
 
 
 def _info_of_run(file: Path) -> Any:
@@ -252,17 +277,22 @@ def _view_run(file: Path, scene: Path | None) -> None:
 
     existing(file, "run")
     if file.suffix == ".rrd" and scene is None:
-        view_recording(file)
+        with silence():
+            view_recording(file)
         return
+    step("Reading the run")
     run = read_run(file)
     twin = _twin(run, file, scene)
     if twin is None:
-        view_recording(file)
+        with silence():
+            view_recording(file)
         return
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder) / f"{file.stem}.rrd"
+        step("Writing a recording for the viewer")
         write_rrd(run, rrd, twin)
-        show(rrd, shown=file)
+        with silence():
+            show(rrd, shown=file)
 
 
 def _view_together(files: tuple[Path, ...], scene: Path | None, offsets: list[float]) -> None:
@@ -280,7 +310,8 @@ def _view_together(files: tuple[Path, ...], scene: Path | None, offsets: list[fl
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder) / "runs.rrd"
         write_comparison(runs, rrd, twin, offsets_s=dict(zip(runs, offsets, strict=True)))
-        show(rrd, shown=files[0])
+        with silence():
+            show(rrd, shown=files[0])
 
 
 def _view_stage(file: Path) -> None:
@@ -292,7 +323,8 @@ def _view_stage(file: Path) -> None:
 
     existing(file, "stage")
     if usdview := shutil.which("usdview"):
-        result = subprocess.run([usdview, str(file)], check=False)
+        with silence():
+            result = subprocess.run([usdview, str(file)], check=False)
         if result.returncode:
             raise RefusedError(f"{file}: usdview ended with status {result.returncode}")
     elif file.suffix != ".usdz" and is_animation(file):
@@ -300,4 +332,5 @@ def _view_stage(file: Path) -> None:
     else:
         from magtwin.io.pictures import show_stage
 
-        show_stage(file)
+        with silence():
+            show_stage(file)

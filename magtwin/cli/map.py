@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, Seed, check_suffix, print_report, progress, say
+from magtwin.cli.terminal import Force, Json, Seed, check_suffix, print_report, progress, say, step
 from magtwin.io.columns import Columns
 from magtwin.names import RefusedError
 
@@ -81,7 +81,8 @@ def map_import(
     ----------
     sources
         Folder of 0_map.csv, 90_map.csv, ...: rows of x [m], y [m], heading [rad], field. Or tables (CSV,
-        Parquet), Runs or rosbag2 folders, each a run of its own; files whose rows belong together are
+        Parquet), Runs or rosbag2 folders, each a run of its own; a pattern in quotes ('drives/*.parquet')
+        or a folder of Parquet files stands for all files in it. Files whose rows belong together are
         joined by a plus, time.csv+place.csv+field.csv.
     out
         Map layer to write, a .usdc file; or readings, a .parquet file, to fit a model to.
@@ -104,7 +105,13 @@ def map_import(
     given = about.given(out)
     if out.suffix != ".parquet" and len(sources) == 1 and _is_survey_folder(sources[0], columns):
         field: Any
-        field, report = read_survey(sources[0], **given, unit=columns.unit or "nT", keep_latched=keep_latched)
+        field, report = read_survey(
+            sources[0],
+            **given,
+            unit=columns.unit or "nT",
+            scale=columns.scale,
+            keep_latched=keep_latched,
+        )
     else:
         readings, found = _read(sources, columns, given, keep_latched, pose_topic, field_topic)
         readings = readings.with_(name=given["name"])
@@ -145,7 +152,8 @@ def map_fit(
     Parameters
     ----------
     sources
-        Readings of any form that `magtwin map import` takes, its .parquet files too.
+        Readings of any form that `magtwin map import` takes, its .parquet files too; several runs as
+        several files, as a pattern in quotes ('drives/*.parquet'), or as a folder of Parquet files.
     out
         Map layer to write, a .usdc file.
     method
@@ -159,9 +167,11 @@ def map_fit(
         [deg, deg, m, YYYY-MM-DD], where the world's y is true north; or its x,y,z in the world [nT]. That
         of a survey of a twin is known unless given.
     spacing
-        Distance between the map's nodes [m]; the survey's own for trilinear, else a fifth of it.
+        Distance between the map's nodes [m]. Default: the survey's own for trilinear, else the widest that
+        costs next to no accuracy; the summary shows the error of interpolation.
     headings
-        Headings of the map [deg], as 0,90,180,270; the survey's own for trilinear, else every 15 deg.
+        Headings of the map [deg], as 0,90,180,270. Default: the survey's own for trilinear, else the
+        fewest of 4, 6, 8, 12 or 24 that cost next to no accuracy.
     keep_latched
         Leave latched and stuck readings in.
     pose_topic
@@ -182,14 +192,17 @@ def map_fit(
     given = about.given(out)
     options = _options([method], kernel, earth).get(method, {})
     readings, found = _read(sources, columns, given, keep_latched, pose_topic, field_topic)
-    from magtwin.field.fit import fit, raster
+    from magtwin.field.fit import fit, grid_report, raster
+
+    found = _worth_a_map(readings, found, sources[0])
 
     with progress(f"Fitting {method}") as advance:
         model = fit(readings, method, progress=advance, **options)
         named = readings.with_(name=given["name"])
         field = raster(model, named, spacing_m=spacing, headings_rad=angles, progress=advance)
+    step("Writing the map")
     save_map(field, out, force=force)
-    print_report(_joined(field.report(), found), json)
+    print_report(_joined(_joined(field.report(), grid_report(field)), found), json)
     if not json:
         say(f"Wrote {out}")
 
@@ -272,7 +285,8 @@ def map_survey(
     """Survey a scene as its robot would, from node to node, with its sensor's noise and its own errors.
 
     What the stage holds now makes the field: move a desk in it, survey again, and `magtwin map diff` finds
-    it. The map's variance is that of noise and errors; nodes where the sensor lost lock are masked.
+    it. The map's variance is that of noise and errors; nodes where the sensor lost lock or where the robot
+    cannot stand are masked.
 
     Parameters
     ----------
@@ -312,14 +326,17 @@ def map_survey(
     import numpy as np
 
     from magtwin.files import check_free, sha256
+    from magtwin.sim.room_survey import blocked_by
     from magtwin.sim.survey import survey, survey_readings
     from magtwin.usd.layers import layer_files
+    from magtwin.usd.obstacles import read_obstacles
     from magtwin.usd.scene import read_scene
 
     check_suffix(out, (".usdc", ".usd", ".parquet"), "a map layer, or a file of readings,")
     check_free(out, force=force)
     if seed < 0:
         raise RefusedError(f"seed must be a whole number from 0 up, got {seed}")
+    step("Reading the scene")
     twin = read_scene(scene, check_network=False)
     day = twin.earth.date if twin.earth is not None else ""
     files = [file for file in layer_files(scene) if file.resolve() != twin.map_layer.resolve()]
@@ -335,11 +352,12 @@ def map_survey(
         "licence": licence,
         "created": day if created is None else created,
     }
-    with progress(f"Surveying {twin.name}") as advance:
+    with progress(f"Surveying {twin.name}", "headings") as advance:
         if out.suffix == ".parquet":
             read = survey_readings(twin, **about, progress=advance)
         else:
-            field = survey(twin, **about, name=name or out.stem, progress=advance)
+            blocked = blocked_by(twin, read_obstacles(scene))
+            field = survey(twin, **about, name=name or out.stem, progress=advance, blocked=blocked)
     if out.suffix == ".parquet":
         from magtwin.io.readings import save_readings
 
@@ -389,6 +407,7 @@ def map_plot(
     check_suffix(out, (".png", ".svg"), "a picture")
     check_free(out, force=force)
     angles = None if headings is None else _headings_rad(headings)
+    step("Drawing the map")
     plot_map(_open_map(file, date), out, what=what, headings=angles, force=force)
     say(f"Wrote {out}")
 
@@ -443,6 +462,7 @@ def map_diff(
     if out is not None:
         check_suffix(out, (".png", ".svg"), "a picture")
         check_free(out, force=force)
+    step("Comparing the maps")
     found = difference(_open_map(before), _open_map(after))
     if out is not None:
         from magtwin.io.plots import plot_difference
@@ -484,6 +504,7 @@ def map_continue(
 
     check_suffix(out, (".usdc", ".usd"), "a map layer")
     check_free(out, force=force)
+    step(f"Continuing the field to {height:g} m")
     field = at_height(_open_map(file, date), height)
     save_map(field, out, force=force)
     print_report(map_card(field), json)
@@ -493,7 +514,9 @@ def map_continue(
 
 @map_app.command(name="export")
 def map_export(file: Path, *, out: Path, date: str | None = None, force: Force = False) -> None:
-    """Write a map as a survey's CSVs, one a heading, as map import reads them: of a survey, the same rows.
+    """Write a map as CSVs, one per heading, as map import reads them; a survey's rows come back unchanged.
+
+    Comment lines above the rows keep the map's method, frame, height, day, licence and statistics.
 
     Parameters
     ----------
@@ -542,8 +565,12 @@ def map_epochs(*files: Path, out: Path, force: Force = False, json: Json = False
 
 def _is_survey_folder(source: Path, columns: Columns) -> bool:
     """Whether a source is a folder of one CSV a heading, whose columns need no names."""
-    bag = (source / "metadata.yaml").is_file()
-    return not bag and (source.is_dir() or not source.exists()) and replace(columns, unit=None) == Columns()
+    from magtwin.io.readings import is_pattern
+
+    if (source / "metadata.yaml").is_file() or is_pattern(source) or any(source.glob("*.parquet")):
+        return False
+    named = replace(columns, unit=None, scale=None) != Columns()
+    return (source.is_dir() or not source.exists()) and not named
 
 
 def _read(
@@ -556,18 +583,53 @@ def _read(
 ) -> Any:
     """The readings of the sources, and the report of what was found latched, stuck or outlying in them."""
     from magtwin.field.latch import mask_latched
+    from magtwin.field.readings import TAKEN
     from magtwin.io.readings import read_readings
 
+    step("Reading the survey")
     readings = read_readings(
         *sources, columns=columns, pose_topic=pose_topic, field_topic=field_topic, **{**about, "name": None}
     )  # refusals name the survey, not the file to be written
     masked, found = mask_latched(readings)
+    taken = [part for part in readings.source.split("; ") if part.startswith(TAKEN)]
+    if taken:
+        found = replace(found, facts={**found.facts, "taken": [part.removeprefix(TAKEN) for part in taken]})
     if not (keep_latched or masked.good.any()):
         raise RefusedError(
             f"{sources[0]}: all {len(readings)} readings are those of a sensor that was stuck; "
             "survey again, or give --keep-latched to take them as they are"
         )
     return (readings if keep_latched else masked), found
+
+
+LEAST_READINGS = 8
+"""Good readings of a drive that a map needs at least."""
+
+USUAL_READINGS = 100
+"""Good readings of a drive below which the summary says that a map of them tells little."""
+
+
+def _worth_a_map(readings: Any, found: Any, source: Path) -> Any:
+    """The report with what makes a map of these readings doubtful; refused where they are too few."""
+    import numpy as np
+
+    from magtwin.field.problem import ONE_HEADING
+
+    count, yaw, notes = int(readings.good.sum()), readings.yaw[readings.good], list[str]()
+    if readings.grid is None and count < LEAST_READINGS:
+        raise RefusedError(
+            f"{source}: {count} of {len(readings)} readings are good; a map needs {LEAST_READINGS} at least, "
+            "and some hundred to be of use"
+        )
+    if readings.grid is None and count < USUAL_READINGS:
+        notes.append(f"only {count} good readings: the map holds next to them alone")
+    way = np.exp(1j * yaw).mean()
+    if np.abs(way) >= ONE_HEADING:
+        notes.append(
+            f"one heading only, {np.degrees(np.angle(way)):.0f} deg: nothing tells the robot's own field "
+            "from the room's, and a simulated robot adds its whole platform field; survey in all headings"
+        )
+    return replace(found, facts={**found.facts, "doubts": notes}) if notes else found
 
 
 def _options(methods: list[str], kernel: str | None, earth: str | None) -> dict[str, dict[str, Any]]:
@@ -590,7 +652,7 @@ def _earth_nt(text: str) -> tuple[float, float, float]:
     if len(words) in (3, 4) and not Path(text).exists():
         from magtwin.field.earth import earth_field_nt
         from magtwin.field.readings import checked_earth_nt
-        from magtwin.field.survey import GREATEST_MEAN_NT, LEAST_MEAN_NT
+        from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT
 
         try:
             x, y, z = (float(word) for word in words[:3])

@@ -5,7 +5,7 @@ from pathlib import Path
 from cyclopts import App
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say
+from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say, step
 
 net_app = App(name="net", help="Work with networks.")
 app.command(net_app)
@@ -29,6 +29,7 @@ def net_convert(pth: Path, *, out: Path, licence: str = "", force: Force = False
     from magtwin.learn.model import convert
 
     check_suffix(out, (".safetensors",), "a network")
+    step("Reading the checkpoint")
     net = convert(pth, out, licence=licence, force=force)
     print_report(net.report(str(out)), as_json=False)
     say(f"Wrote {out}")
@@ -56,6 +57,7 @@ def net_export(weights: Path, *, onnx: Path, force: Force = False, json: Json = 
     from magtwin.learn.onnx import export_onnx
 
     check_suffix(onnx, (".onnx",), "an ONNX file")
+    step("Exporting the network")
     report = export_onnx(weights, onnx, force=force)
     print_report(report, json)
     if not json:

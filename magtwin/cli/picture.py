@@ -1,14 +1,13 @@
-"""`magtwin picture` and `magtwin film`: a run, or a stage, to look at."""
+"""`magtwin picture` and `magtwin film`: a run, a stage or a recording, to look at."""
 
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, announcer, progress, say
+from magtwin.cli.terminal import Force, announcer, progress, say, step
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -28,33 +27,43 @@ def picture(
     scene: Path | None = None,
     force: Force = False,
 ) -> None:
-    """Draw a moment of a run in its lab, or a stage as it stands.
+    """Draw a moment of a run in its lab, a stage as it stands, or a recording as the Rerun viewer shows it.
+
+    In pictures of a lab, what stands between the camera and the map or the robot is drawn as a veil.
+    Recordings (.rrd) are drawn by the viewer, without a window; it needs Vulkan, in software if there is no
+    graphics card. With --camera or --scene, the run in a recording is drawn in its lab.
 
     Parameters
     ----------
     file
-        A run, in any format that magtwin reads, or a stage.
+        A run, in any format that magtwin reads; a stage; or a Rerun recording.
     out
         PNG to write.
     camera
         orbit, from above at a slant; top, straight from above; chase, from behind the robot; or
-        x,y,z:x,y,z, from where to where in metres. orbit unless given.
+        x,y,z:x,y,z, the camera's place and its target in metres. Default: orbit.
     at
-        Moment of a run [s]; its end unless given.
+        Moment of a run or recording [s]. Default: the end of a run; where the viewer starts in a recording.
     size
         Width and height in pixels.
     scene
-        Where the scene of a run lies; looked for where the run says unless given.
+        The scene of a run. Default: where the run's metadata has it.
     force
         Replace what exists.
     """
     from magtwin.files import check_free, existing
     from magtwin.io.pictures import check_png
 
-    existing(file, "run or stage")
+    existing(file, "run, stage or recording")
     check_free(check_png(out), force=force)
     pixels, steps = _size(size), announcer(quiet=False)
-    if file.suffix in STAGES and at is None and scene is None:
+    if file.suffix == ".rrd" and camera is None and scene is None:
+        from magtwin.io.viewer import screenshot
+
+        steps("Drawing the recording in the Rerun viewer")
+        for complaint in screenshot(file, out, time_s=at, size=pixels, force=force):
+            print(f"  the viewer reports: {complaint}", file=sys.stderr)  # noqa: T201
+    elif file.suffix in STAGES and at is None and scene is None:
         from magtwin.io.pictures import picture_of_stage
         from magtwin.io.scenery import View
 
@@ -86,6 +95,8 @@ def film(
 ) -> None:
     """Draw a run in its lab as a film, or a stage on a turntable.
 
+    What stands between the camera and the map or the robot is drawn as a veil.
+
     Parameters
     ----------
     file
@@ -93,17 +104,16 @@ def film(
     out
         MP4 or GIF to write.
     camera
-        orbit, going slowly round the lab; top, straight from above; chase, from behind the robot;
-        x,y,z:x,y,z, from where to where in metres; or turntable, once round a stage as it stands, in 10 s.
+        orbit, slowly round the lab; top, straight from above; chase, from behind the robot; x,y,z:x,y,z, the
+        camera's place and its target in metres; or turntable, once round a stage as it stands, in 10 s.
     fps
-        Frames a second.
+        Frames per second.
     speed
-        How many times faster it is shown than it happened; as it happened unless given, and what lasts longer
-        than 30 s in 30 s.
+        Playback speed, relative to the run. Default: 1, or more for a film of at most 30 s.
     size
-        Width and height in pixels; 1280x720, of a GIF 640x360, unless given.
+        Width and height in pixels. Default: 1280x720, or 640x360 for a GIF.
     scene
-        Where the scene of the run lies; looked for where the run says unless given.
+        The scene of the run. Default: where the run's metadata has it.
     force
         Replace what exists.
     """
@@ -117,11 +127,10 @@ def film(
     if turned and (speed is not None or scene is not None):
         raise RefusedError("a turntable shows a stage as it stands: it takes no --speed and no --scene")
     run, stage = (None, file) if turned else _run_and_scene(file, scene)
-    start = time.monotonic()
-    with progress("Drawing frames") as advance:
+    with progress("Filming", "frames") as advance:
 
         def told(k: int, n: int) -> None:
-            advance(k, n, f"{k / (time.monotonic() - start):.3g} frames/s")
+            advance(k, n)
 
         if run is None:
             film_of_stage(stage, out, fps=fps, size=pixels, force=force, advance=told)
@@ -146,6 +155,7 @@ def _run_and_scene(file: Path, scene: Path | None) -> "tuple[Run, Path]":
     from magtwin.twin import scene_of
     from magtwin.usd.layers import stage_sha256
 
+    step("Reading the run")
     run = read_run(file)
     stage = scene_of(run, scene, near=file)
     if "scene_sha256" in run.facts and run.facts["scene_sha256"] != stage_sha256(stage):

@@ -1,6 +1,5 @@
 """`magtwin report`: a run, or a set of runs, as one page."""
 
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +22,7 @@ def report(
 ) -> None:
     """Write what happened in a run, or in a set of runs, as one page with its pictures inside.
 
-    What was run, the map with the path, time series, errors by their address, events, and provenance.
+    What was run, the map with the path, time series, errors by source, events, and provenance.
     Several runs get an overview first.
 
     Parameters
@@ -48,21 +47,23 @@ def report(
     told = []
     files = [file for given in runs for file in _files(given)]
     names = [file.name for file in files]
-    for file in files:
-        run = read_run(file)
-        note, field = "", None
-        try:
-            field = map_of(run, scene, near=file)
-        except RefusedError as error:
-            note = f"Its map is not shown: {error}."
-        name = file.name if names.count(file.name) == 1 else str(file)
-        told.append(Told(name, run, field, planned_of(run, near=file), note))
-    start = time.monotonic()
-    with progress("Drawing") as advance:
+    with progress("Reading", "runs") as advance:
+        for k, file in enumerate(files):
+            advance(k, len(files), file.name)
+            run = read_run(file)
+            note, field = "", None
+            try:
+                field = map_of(run, scene, near=file)
+            except RefusedError as error:
+                note = f"Its map is not shown: {error}."
+            name = file.name if names.count(file.name) == 1 else str(file)
+            told.append(Told(name, run, field, planned_of(run, near=file), note))
+    with progress("Drawing", "runs") as advance:
+        advance(0, len(told))
         page = page_of_runs(
             told,
             pictures=out.suffix == ".html" and len(told) <= MOST_PICTURED,
-            advance=lambda done: advance(done, len(told), f"{done / (time.monotonic() - start):.2g} runs/s"),
+            advance=lambda done: advance(done, len(told)),
         )
     if out.suffix == ".html" and len(told) > MOST_PICTURED:
         page = replace(page, lead=f"{page.lead} Pictures are left out of more than {MOST_PICTURED} runs.")

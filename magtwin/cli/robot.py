@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say
+from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say, step
 from magtwin.names import RefusedError
 
 
@@ -115,6 +115,7 @@ def robot(
         "single_file": single_file,
         "strict": strict,
     }
+    step("Converting the robot")
     made = from_urdf(
         urdf,
         out,

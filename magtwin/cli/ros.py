@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Seed, Session, Whole, announcer, say
+from magtwin.cli.terminal import Force, Seed, Session, Whole, announcer, progress, say, silence, step
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -155,7 +155,14 @@ def sim(
             say=tell,
         )
         tell(f"simulating by {bus.backend} at {speed:g} x real time; Ctrl-C ends")
-        node.run(duration_s=duration)
+        with progress("Simulating", "s") if duration else silence() as advance:
+
+            def told() -> bool:
+                if advance is not None:
+                    advance(node.online.t, duration)
+                return False
+
+            node.run(told, duration_s=duration)
 
 
 @ros_app.command(name="magnetometer")
@@ -271,8 +278,14 @@ def follow(
         )
         tell(f"driving {way.name}, {way.length:.1f} m, by {bus.backend}; Ctrl-C ends")
         try:
-            while not node.done:
-                bus.spin_once(0.1)
+            with progress(f"Driving {way.name}") as advance:
+                while not node.done:
+                    bus.spin_once(0.1)
+                    advance(
+                        node.progress.laps,
+                        None if continuous else laps,
+                        f"{node.progress.rms_m:.3f} m RMS off it",
+                    )
         finally:
             node.stop()
             say(f"{node.progress.laps} times along {way.name}, {node.progress.rms_m:.3f} m RMS off it")
@@ -336,7 +349,7 @@ def teleop(
         source = stack.enter_context(device(gamepad))
         announcer(quiet=False)(HELP if gamepad is None else "left stick drives, Start ends")
         node = Teleop(bus, hand, source, stamped_commands=stamped_commands)
-        with suppress(KeyboardInterrupt):
+        with silence(), suppress(KeyboardInterrupt):
             node.run(recorder.step if recorder else lambda: None)
         node.stop()
     say(f"{node.sent} commands" + ("" if out is None else f"; wrote {out}"))
@@ -378,7 +391,9 @@ def record(
     try:
         with where.bus("magtwin_record", sim_time=sim_time, duration=duration) as bus:
             announcer(quiet=False)(f"recording by {bus.backend}; Ctrl-C ends")
-            Recorder(bus, writer, topic, sim_time=sim_time, say=_warn).run(duration_s=duration)
+            recorder = Recorder(bus, writer, topic, sim_time=sim_time, say=_warn)
+            with progress("Recording", "messages") as advance:
+                recorder.run(lambda: advance(sum(writer.counts.values()), None), duration_s=duration)
     finally:
         counts = dict(writer.counts)
         writer.close()
@@ -429,6 +444,7 @@ def replay(
         announcer(quiet=False)(
             f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends"
         )
+        step("Replaying")
         count = player.run(speed=speed)
     say(f"{count} messages")
 
@@ -436,8 +452,11 @@ def replay(
 def spin(bus: "Bus", duration_s: float | None) -> None:
     """Have a node do what it does, without an end or for a time by the wall [s]."""
     begin = time.monotonic()
-    while duration_s is None or time.monotonic() - begin < duration_s:
-        bus.spin_once(0.1)
+    with progress("Reading", "s") if duration_s else silence() as advance:
+        while duration_s is None or (gone := time.monotonic() - begin) < duration_s:
+            bus.spin_once(0.1)
+            if duration_s is not None:
+                advance(gone, duration_s)
 
 
 def _warn(text: str) -> None:

@@ -21,6 +21,8 @@ from magtwin.cli.terminal import (
     print_report,
     progress,
     say,
+    silence,
+    step,
 )
 from magtwin.names import RefusedError, find
 
@@ -99,6 +101,7 @@ def run(
     scene: Path,
     *,
     path: str | None = None,
+    fit: Annotated[bool, Parameter(negative="")] = False,
     commands: Path | None = None,
     robot: str | None = None,
     meet: Literal["refuse", "flag"] | None = None,
@@ -141,8 +144,10 @@ def run(
     path
         sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle,
         curvilinear, curvilinear_2; A to E, the cases of the paper's Table 1; random, a human-like driver
-        who goes where the seed takes them, for a minute or --duration; or a CSV file of x,y [m]. Unless
-        given, what the scene says, or else figure8.
+        who goes where the seed takes them, for a minute or --duration; or a CSV file of x,y [m]. Named paths
+        are scaled to the floor. Unless given, what the scene says, or else figure8.
+    fit
+        Move the path and make it smaller if it does not fit the floor or runs into something.
     commands
         CSV file of t,v,w [s, m/s, rad/s] to drive by in place of a path, as magtwin drive leaves it.
     robot
@@ -251,6 +256,8 @@ def run(
         raise RefusedError(f"--controller {controller} follows a path, and {way} is none; drop one")
     if speed != 0.2 and (commands or replay):
         raise RefusedError(f"--speed is for a path or a driver, and {way} has speeds of its own; drop one")
+    if fit and (commands or replay or path == "random"):
+        raise RefusedError(f"--fit is for a path, and {way} is none; drop it")
     if engine == "newton":
         from magtwin.sim.newton import check_installed
 
@@ -280,16 +287,23 @@ def run(
             raise RefusedError(f"--live and --viewer show one robot, and {scene} has {', '.join(robots)}")
         if robot is None and (path or commands or replay):
             raise RefusedError(f"which of {', '.join(robots)} is to drive {way}? say it with --robot NAME")
-        _run_together(scene, wanted, robot=robot, path=path, meet=meet, scans=scans, quiet=json, **options)
+        if fit and robot is None:
+            raise RefusedError(
+                f"whose path is to be fitted, of {', '.join(robots)}? say it with --robot NAME"
+            )
+        _run_together(
+            scene, wanted, robot=robot, path=path, fit=fit, meet=meet, scans=scans, quiet=json, **options
+        )
         return
     if meet is not None:
         raise RefusedError(f"--meet is for several robots, and {scene} has one; drop it")
     if not (path or commands or replay):
         way = str(robots[next(iter(robots))] or way)
     shown = _Live(window=live, address=viewer, pace=pace or 1.0) if live or viewer else None
+    step("Opening the scene")
     with ExitStack() as stack:
         written = wanted.begun() if shown else stack.enter_context(wanted.aside())
-        what = _drive(scene, way, steps=announcer(quiet=json), scans=scans, **options)
+        what = _drive(scene, way, steps=announcer(quiet=json), scans=scans, fit=fit, **options)
         if shown:
             what = _show(what, shown, written, quiet=json)
         written.write(what, steps=announcer(quiet=json), recorded=shown is not None)
@@ -354,6 +368,7 @@ def _drive(
     model_error: bool = True,
     seed: int = 0,
     session: int | Literal["survey"] | None = None,
+    fit: bool = False,
     facts: Mapping[str, str | int] = MappingProxyType({}),
     **options: Any,
 ) -> _Driven:
@@ -362,27 +377,28 @@ def _drive(
     `facts` say where files will lie as seen from the run's own, for those that move with it.
     """
     from magtwin.io.formats import read_run
-    from magtwin.path import resolve_path
     from magtwin.sim.commands import read_commands
-    from magtwin.twin import in_session, open_twin, scan, simulate
+    from magtwin.sim.way import way_of
+    from magtwin.twin import in_session, open_twin, room_of, scan, simulate
 
-    planned = None
+    planned: Any = None
     what: Any = path
     if commands is not None:
         what = read_commands(commands)
     elif replay is not None:
         what = read_run(replay)
-    elif path != "random":
-        what = planned = resolve_path(path)
     twin = open_twin(scene_file, net=net, magnetometer=magnetometer, model_error=model_error)
     twin = in_session(twin, session, seed=seed)
+    if commands is None and replay is None and path != "random":
+        what = planned = way_of(path, room_of(twin), fit=fit)
+        _say_placing(planned, steps)
     if commands is not None and what.beyond(twin.scene.robot.drive):
         print(f"  {what.beyond(twin.scene.robot.drive)}", file=sys.stderr)  # noqa: T201
     steps(f"Driving {planned.name if planned else path}")
     if replay is not None:
         facts = {"replay_file": replay.as_posix(), **facts}
-    slow = options.get("engine") == "newton" and sys.stderr.isatty()
-    with progress("  Newton") if slow else nullcontext() as advance:
+    slow = options.get("engine") == "newton"
+    with progress("Driving in Newton", "steps") if slow else nullcontext() as advance:
         result = simulate(twin, what, seed=seed, progress=advance, **options).with_facts(**facts)
     seen = None
     if scans:
@@ -391,12 +407,23 @@ def _drive(
     return _Driven(result, twin, planned, seen)
 
 
+def _say_placing(path: Any, steps: Any) -> None:
+    """Tell how a path was brought onto the floor, where it was."""
+    if path.placing:
+        scale_x, scale_y, x, y = path.placing
+        scale = f"{scale_x:.2g}" if scale_x == scale_y else f"{scale_x:.2g} in x and {scale_y:.2g} in y"
+        how = [f"scaled by {scale}"] if (scale_x, scale_y) != (1, 1) else []
+        how += [f"moved by ({x:.2f}, {y:.2f}) m"] if max(abs(x), abs(y)) >= 0.005 else []
+        steps(f"Path {path.name} is {' and '.join(how)} to fit the floor")
+
+
 def _run_together(
     scene_file: Path,
     outputs: "_Outputs",
     *,
     robot: str | None,
     path: str | None,
+    fit: bool,
     meet: Literal["refuse", "flag"] | None,
     scans: bool,
     quiet: bool,
@@ -407,7 +434,8 @@ def _run_together(
     from magtwin.path import Path as Planned
     from magtwin.report import Report
     from magtwin.sim.commands import read_commands
-    from magtwin.twin import led_by, open_twin, scan, simulate_robots, way_of
+    from magtwin.sim.way import way_of
+    from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots
 
     steps = announcer(quiet=quiet)
     if options.pop("engine") == "newton":
@@ -420,7 +448,10 @@ def _run_together(
     ways: dict[str, Any] = {one.robot.name: one.path or "figure8" for one in twin.scene.robots}
     if robot is not None and (commands or replay or path):
         ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path
-    ways = {name: way_of(way) for name, way in ways.items()}
+    ways = {
+        name: way_of(way, room_of(led_by(twin, name)), fit=fit and name == robot)
+        for name, way in ways.items()
+    }
     names = list(ways) if robot is None else [robot]
     with ExitStack() as stack:
         written = {}
@@ -563,7 +594,7 @@ class _Outputs:
                         **options,
                     )
         if self.folder:
-            from magtwin.io.plots import plot_run
+            from magtwin.io.plotting import plot_run
 
             planned = driven.planned
             plot_run(
@@ -614,16 +645,16 @@ def _show(driven: _Driven, live: _Live, outputs: _Outputs, *, quiet: bool) -> _D
             known: dict[str, Any] = {"expected": run, "planned": driven.planned, "scans": driven.scans}
             viewers.append(LiveViewer(address, driven.twin, **known))
         sinks = outputs.sinks(driven)
-        advance = stack.enter_context(progress("  Live [s]")) if not quiet and sys.stderr.isatty() else None
+        advance = stack.enter_context(progress("Live", "s"))
         with Recorder(sinks, viewers) as recorder:
             for block in in_step(run, live.pace, stop=stop):
                 recorder.append(block)
-                if advance is not None:
-                    advance(round(float(block["t"][-1])), round(float(run["t"][-1])), "Ctrl-C ends it")
+                advance(round(float(block["t"][-1])), round(float(run["t"][-1])), "Ctrl-C ends it")
         if not recorder.rows:
             raise RefusedError("ended before the first reading; nothing is written")
         if live.window and address is not None and sys.stdin.isatty():
-            _wait(address, stop)
+            with silence():
+                _wait(address, stop)
     rows, scans = recorder.rows, driven.scans
     if rows < run.rows:
         run = run.take(slice(rows))

@@ -26,6 +26,7 @@ def runs(
     out: Path = Path("runs"),
     count: Whole = 100,
     path: Names = None,
+    fit: Annotated[bool, Parameter(negative="")] = False,
     seed: Seed = 0,
     sessions: Whole | None = None,
     session: Literal["survey"] | None = None,
@@ -58,6 +59,8 @@ def runs(
     path
         Paths to drive in turn, as for `magtwin run`: names, cases A to E, random, CSV files. Default: sine,
         lawnmower, figure8, continuous_cycle and random.
+    fit
+        As for `magtwin run`.
     seed
         Seed of the first run; each next one's is one more.
     sessions
@@ -94,10 +97,11 @@ def runs(
     from magtwin.files import existing, output
     from magtwin.io.tables import write_parquet
     from magtwin.names import RefusedError
-    from magtwin.path import resolve_path
     from magtwin.report import Figure, Report
     from magtwin.sim.session import draw_speed
-    from magtwin.twin import in_session, open_twin, simulate_many
+    from magtwin.sim.way import way_of
+    from magtwin.twin import in_session, open_twin, room_of, simulate_many
+    from magtwin.verdict import Tally
 
     existing(scene, "scene")
     for name, value, least in (("count", count, 1), ("sessions", sessions, 1), ("seed", seed, 0)):
@@ -109,7 +113,7 @@ def runs(
     with output(out, force=force) as folder:
         steps("Opening the scene")
         twin = open_twin(scene, net=net, magnetometer=magnetometer, model_error=model_error)
-        paths = [name if name == "random" else resolve_path(name) for name in path or MIXTURE]
+        paths = [way_of(name, room_of(twin), fit=fit) for name in path or MIXTURE]
         robot = twin.scene.robot
         if session is not None:
             drawn = [in_session(twin, session)]
@@ -134,21 +138,23 @@ def runs(
             outside=outside,
         )
         folder.mkdir()
+        tally = Tally()
         readings, seconds, start = 0, 0.0, time.monotonic()
         with (
-            progress("Driving") as advance,
+            progress("Driving", "runs") as advance,
             open(folder / "runs.csv", "w", encoding="utf-8", newline="") as listing,
         ):
             table: Any = csv.writer(listing, lineterminator="\n")
             table.writerow(("file", "path", "seed", "session", "speed_m_s", "readings"))
+            advance(0, count)
             for k, run in enumerate(made):
                 file = f"run_{k:05d}.parquet"
                 write_parquet(run, folder / file)
+                run.add_to(tally)
                 listed = (run.facts[name] for name in ("path", "seed", "session", "speed_m_s"))
                 table.writerow((file, *listed, run.rows))
                 readings, seconds = readings + run.rows, seconds + float(run.facts["duration_s"])
-                rate = (k + 1) / (time.monotonic() - start)
-                advance(k + 1, count, f"{rate:.3g} runs/s")
+                advance(k + 1, count)
     took = time.monotonic() - start
     report = Report(
         f"{count} runs in {scene}",
@@ -163,6 +169,7 @@ def runs(
             "paths": ", ".join(getattr(one, "name", "random") for one in paths),
             "sessions": session or len(drawn),
         },
+        tally.verdict(f"the exact field of {count} runs in {len(drawn)} sessions"),
     )
     print_report(report, json)
     if not json:

@@ -1,10 +1,11 @@
 """`magtwin scene`: a scene's TOML in, stages out."""
 
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, print_report, say
+from magtwin.cli.terminal import Force, Json, announcer, print_report, progress, say
 
 
 @app.command
@@ -17,7 +18,10 @@ def scene(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Author a scene from its TOML: the lab, its map, a robot with sensors.
+    """Author a scene from its TOML: the room, its magnetic map, a robot with sensors.
+
+    A scene that names no map is surveyed by its own robot, from the Earth's field, furniture and sources.
+    `magtwin new room.toml` writes a TOML to start from; docs/scenes.md has every key.
 
     Parameters
     ----------
@@ -26,7 +30,8 @@ def scene(
     out
         Folder to make; it holds all that the stage needs and can be moved.
     map
-        Map layer to use in place of the one that the TOML names.
+        Map layer to use in place of the one that the TOML names. Earth, sources and furniture stay; a map
+        that contradicts them is refused, and the difference is told in nT.
     net
         Weights to use in place of those that the TOML names (.safetensors or .pth).
     force
@@ -34,9 +39,10 @@ def scene(
     json
         Print the summary as JSON.
     """
-    from magtwin.files import shipped
+    from magtwin.files import check_free, shipped
     from magtwin.twin import scene_from_toml
     from magtwin.usd.info import info_of_stage
+    from magtwin.usd.robot import notes_of
     from magtwin.usd.scene import author_scene
 
     file = Path(spec)
@@ -44,9 +50,22 @@ def scene(
         from magtwin.names import find
 
         file = find("scene", spec, {f.stem: f for f in sorted(shipped("scenes").glob("*.toml"))})
+    check_free(out, force=force)
+    told: list[str] = []
+    steps = announcer(quiet=json)
     with TemporaryDirectory() as workshop:
-        scene = scene_from_toml(file, map_layer=map, network=net, workshop=workshop)
+        steps(f"Reading {file}")
+        with progress("Surveying", "nodes") as advance:
+            scene = scene_from_toml(
+                file, map_layer=map, network=net, workshop=workshop, report=told.append, progress=advance
+            )
+        steps("Authoring the stage")
         root = author_scene(scene, out, force=force)
-    print_report(info_of_stage(root), json)
+        built = [
+            one.robot for one in scene.robots if one.robot.asset.is_relative_to(Path(workshop).resolve())
+        ]
+        notes = {f"notes on {robot.name}": notes_of(robot.asset) for robot in built}
+    report = info_of_stage(root)
+    print_report(replace(report, facts={**report.facts, **notes}), json)
     if not json:
-        say(f"Wrote {root}")
+        say("\n".join([*told, f"Wrote {root}"]))

@@ -1,14 +1,24 @@
 """What commands say, and how: reports, steps, progress, refusals; options that many of them share."""
 
+import io
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TextIO, cast
 
 from cyclopts import Parameter
 
+from magtwin.cli.progress import announcer, progress, silence, step
 from magtwin.names import RefusedError
+
+__all__ = [
+    "announcer",
+    "progress",
+    "silence",
+    "step",
+]  # beside what is made here: commands have all from one place
+
+WIDE = 100_000
+"""Columns of output that goes to a file or another program: no line is broken."""
 
 
 def _whole(kind: type, tokens: Any) -> int:
@@ -44,28 +54,28 @@ def say(text: str) -> None:
     print(text)  # noqa: T201
 
 
-def announcer(*, quiet: bool) -> Any:
-    """A function that says what is being done, on stderr."""
-    return (lambda text: None) if quiet else (lambda text: print(f"  {text} ...", file=sys.stderr))  # noqa: T201
+class _Trimmed(io.TextIOBase):
+    """Stdout without the spaces that rich fills up lines with."""
+
+    def write(self, text: str) -> int:
+        """Write whole lines."""
+        return sys.stdout.write("\n".join(line.rstrip(" ") for line in text.split("\n")))
+
+    def flush(self) -> None:
+        """Hand on what was written."""
+        sys.stdout.flush()
 
 
-@contextmanager
-def progress(title: str) -> Iterator[Any]:
-    """A progress bar with rate and time left, on a terminal; gives `advance(done, total, what)`."""
+def stdout_console() -> Any:
+    """A console on stdout: as wide as the terminal, or as wide as its text needs where there is none."""
+    import os
+
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (
-        TextColumn(title),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[what]}"),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task(title, total=None, what="")
-        yield lambda done, total, what: progress.update(task, completed=done, total=total, what=what)
+    if sys.stdout.isatty():
+        return Console(highlight=False)
+    width = None if os.environ.get("COLUMNS") else WIDE
+    return Console(highlight=False, width=width, file=cast(TextIO, _Trimmed()))
 
 
 def check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:
@@ -79,11 +89,10 @@ def print_report(report: Any, as_json: bool) -> None:
     if as_json:
         say(report.to_json())
         return
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(highlight=False)
+    console = stdout_console()
     numbers, words = ((Table(show_header=False, box=None, pad_edge=False)) for _ in range(2))
     for column in ("name", "value", "unit"):
         numbers.add_column(column, justify="right" if column == "value" else "left", no_wrap=True)
@@ -109,6 +118,8 @@ def print_report(report: Any, as_json: bool) -> None:
     for table in (numbers, words):
         if table.row_count:
             console.print(table)
+    if report.verdict:
+        console.print(Text(printable(report.verdict), style="bold"), soft_wrap=True)
     for name, fact in lists:
         console.print(Text(name))
         entries = fact.items() if isinstance(fact, dict) else (("", entry) for entry in fact)

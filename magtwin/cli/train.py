@@ -1,13 +1,12 @@
 """`magtwin train`: a neural magnetometer from a data set."""
 
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, Whole, check_suffix, print_report, progress, say
+from magtwin.cli.terminal import Force, Json, Whole, check_suffix, print_report, progress, say, step
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -172,11 +171,12 @@ def train(
             raise RefusedError("--rrd: a linear model is fitted at once and has no learning curve")
     for path in (*curves, *([rrd] if rrd else [])):
         check_free(path, force=force)
+    step("Reading the data set")
     found = open_dataset(dataset)
     deals, draws = np.random.default_rng(options.seed).spawn(2)
     parts = split_of(found.recordings, options.split, hold_out=options.hold_out, rng=deals)
-    with progress("Training") as show:
-        pace = _Pace(show)
+    with progress("Training", "rows") as show:
+        pace = _Pace(show, options.epochs)
         trained = fit(
             options,
             found,
@@ -187,6 +187,7 @@ def train(
             progress=pace.epoch,
             advance=pace.rows,
         )
+    step("Writing the model")
     if trained.history:
         naive = trained.parts[0].naive_rmse_nt
         plot_learning_curve(trained.history, picture, naive_rmse_nt=naive, title=out.name, force=force)
@@ -203,24 +204,20 @@ def train(
 
 
 class _Pace:
-    """What a progress bar says of a training: rows a second, and the last epoch's error on validation."""
+    """What is reported of a training: rows that are done, and the last epoch's error on validation."""
 
-    def __init__(self, show: Any) -> None:
-        self.show, self.ended = show, ""
-        self.start: tuple[float, int] | None = None
+    def __init__(self, show: Any, epochs: int | None) -> None:
+        self.show, self.epochs, self.ended, self.begun = show, epochs, "", 1
 
     def rows(self, done: int, total: int) -> None:
         """Rows that are done, of those of all epochs."""
-        now = time.perf_counter()
-        if self.start is None:
-            self.start = now, done
-        spent, more = now - self.start[0], done - self.start[1]
-        rate = f"{more / spent:,.0f} rows/s" if more and spent > 0 else ""
-        self.show(done, total, f"{rate} {self.ended}".strip())
+        epochs = "" if self.epochs is None else f" of {self.epochs}"
+        self.show(done, total, f"epoch {self.begun}{epochs}{self.ended}")
 
     def epoch(self, epoch: "Epoch") -> None:
         """An epoch that has ended."""
-        self.ended = f"epoch {epoch.number}: {epoch.val_rmse_nt:.1f} nT"
+        self.begun = epoch.number + (self.epochs is None or epoch.number < self.epochs)
+        self.ended = f", validation {epoch.val_rmse_nt:.1f} nT RMS"
 
 
 def _widths(text: str) -> tuple[int, ...]:

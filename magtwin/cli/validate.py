@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, printable, say
+from magtwin.cli.terminal import Force, Json, announcer, check_suffix, printable, say, stdout_console
 from magtwin.names import RefusedError
 
 if TYPE_CHECKING:
@@ -89,20 +89,18 @@ def validate(
 
 
 def _announce(file: Path, *, quiet: bool) -> Any:
-    """A function that says on a terminal which validator looks."""
-    if quiet or not sys.stderr.isatty():
-        return None
-    return lambda name: print(f"  {file.name}: {name} ...", file=sys.stderr)  # noqa: T201
+    """A function that says which validator looks at a file."""
+    steps = announcer(quiet=quiet)
+    return lambda name: steps(f"{file.name}: {name}")
 
 
 def _print(findings: "Findings") -> None:
     """A table, a row a validator; below it what each found, errors first."""
-    from rich.console import Console
     from rich.padding import Padding
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(highlight=False)
+    console = stdout_console()
     console.print(Text(printable(str(findings.file)), style="bold"))
     for line in findings.mended:
         console.print(Padding(Text(f"mended {printable(line)}"), (0, 0, 0, 2), expand=False))

@@ -9,7 +9,9 @@ import numpy as np
 from magtwin.field.epochs import drift
 from magtwin.field.harmonic import HarmonicField
 from magtwin.field.map import AnomalyMap
+from magtwin.field.statistics import statistics
 from magtwin.report import Figure, Report
+from magtwin.summary import span
 
 _FILE = re.compile(r"(?P<name>.+?) sha256:(?P<sha256>[0-9a-f]{64})")
 
@@ -26,9 +28,9 @@ def map_card(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report:
 
     Returns:
         The figures of `AnomalyMap.report`, the share of valid nodes, the spread of their standard
-        deviations, the height, those of the harmonic field and of the robot it was surveyed with, and the
-        drift. As facts its method with its figures, frame, datum, day, licence, and the files that it was
-        made from with their checksums. What is unknown is said to be.
+        deviations, the height, mean and range of each heading, those of the harmonic field and of the robot
+        it was surveyed with, and the drift. As facts its method with its figures, frame, datum, day, licence,
+        and the files that it was made from with their checksums. What is unknown is said to be.
     """
     figures = [*field.report().figures]
     share = 100 * float(field.valid.mean())
@@ -38,7 +40,7 @@ def map_card(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report:
     figures.append(
         Figure("extent", f"x {x0:g}..{x1:g}, y {y0:g}..{y1:g}", "m", note=f"cells {dx:g} x {dy:g} m")
     )
-    figures += [_deviation(field), _height(field)]
+    figures += [_deviation(field), _height(field), *_headings(field)]
     if field.harmonic is not None:
         figures += _harmonic(field.harmonic, "sensor" if field.height_m is None else "floor")
     if len(epochs) > 1:
@@ -72,6 +74,22 @@ def source_files(source: str) -> dict[str, str]:
             name = f"{found['name']} ({count})"
         files[name] = found["sha256"]
     return files
+
+
+def _headings(field: AnomalyMap) -> list[Figure]:
+    """Mean and standard deviation of each heading, with its range and masked share."""
+    return [
+        Figure(
+            f"heading {one.heading_deg:.6g}",
+            round(one.mean_nt, 1),
+            "nT",
+            round(one.sd_nt, 1),
+            f"{span(one.least_nt, one.greatest_nt, 'nT')}; {100 * one.masked / one.nodes:.3g} % masked",
+        )
+        if one.masked < one.nodes
+        else Figure(f"heading {one.heading_deg:.6g}", "no valid node")
+        for one in statistics(field)
+    ]
 
 
 def _deviation(field: AnomalyMap) -> Figure:

@@ -10,6 +10,7 @@ from magtwin.field.grid import Grid
 from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -64,8 +65,8 @@ class Region:
         )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MapDifference:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class MapDifference(Summarized):
     """Field of a later survey minus that of an earlier one, on the nodes that both know.
 
     Arrays are nan where one of the surveys knows nothing.
@@ -164,6 +165,23 @@ class MapDifference:
     def _where(self, h: Any, j: Any, i: Any) -> str:
         x, y = self.grid.x_m[i], self.grid.y_m[j]
         return f"at ({x:g}, {y:g}) m, heading {np.degrees(self.grid.headings_rad[h]):g} deg"
+
+    def _summary(self) -> Summary:
+        """What is compared; how much changed, and where most."""
+        before, after = (" ".join(t for t in pair if t) for pair in zip(self.names, self.days, strict=True))
+        known, changed = (int(a.any(axis=0).sum()) for a in (np.isfinite(self.z), self.changed))
+        return Summary(
+            f"MapDifference: {before} to {after}",
+            (
+                (
+                    "nodes",
+                    f"{changed:,} of {known:,} changed (|z| >= {self.threshold_z:.2f})",
+                ),
+                ("bias", f"{self.bias_nt.mean():+.3g} nT, mean over {len(self.bias_nt)} headings"),
+                ("regions", f"{len(self.regions)}" + (f"; first: {self.regions[0]}" if self.regions else "")),
+                ("caution", "; ".join(self.cautions)),
+            ),
+        )
 
 
 def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:

@@ -27,6 +27,7 @@ MOST_THREADS = 8
 
 _IN = types.Array(types.float64, 2, "C", readonly=True)
 _OUT = types.Array(types.float64, 2, "C")
+_IN_3, _OUT_3 = types.Array(types.float64, 3, "C", readonly=True), types.Array(types.float64, 3, "C")
 
 
 def dipole_field_nt(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike) -> Array:
@@ -109,6 +110,44 @@ def _sum(
     field *= scale
     five *= scale
     return field.reshape(p.shape), five.reshape(*p.shape[:-1], 5) if gradient else five
+
+
+def moment_rows(p_world: Array, p_world_dipole: Array, ways: Array, out: Array) -> None:
+    """Derivatives of parts of the field by every dipole's moment.
+
+    w . dB/dm = mu_0 / 4 pi * (3 (w . r) r / |r|^5 - w / |r|^3),  r = p - p_d
+
+    Args:
+        p_world: Observation points [m], shape (N, 3).
+        p_world_dipole: Dipole positions [m], shape (D, 3).
+        ways: The w of each point: C directions along which the field is read, shape (N, C, 3).
+        out: Takes the derivatives [nT/(A m^2)], dipole by dipole, in its first 3 D columns, shape (N, C, P).
+    """
+    _moment_rows(p_world, p_world_dipole, np.ascontiguousarray(ways), MU_0_OVER_4_PI * NT_PER_T, out)
+
+
+@compiled(_IN, _IN, _IN_3, types.float64, _OUT_3)
+def _moment_rows(p: Array, place: Array, ways: Array, factor: float, out: Array) -> None:
+    """See `moment_rows`; places of the dipoles are taken apart so that the inner loop has no stride."""
+    count = place.shape[0]
+    rx, ry, rz, cubed = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    px, py, pz = place[:, 0].copy(), place[:, 1].copy(), place[:, 2].copy()
+    for n in range(p.shape[0]):
+        x, y, z = p[n, 0], p[n, 1], p[n, 2]
+        for d in range(count):
+            rx[d], ry[d], rz[d] = x - px[d], y - py[d], z - pz[d]
+            inverse = 1 / (rx[d] * rx[d] + ry[d] * ry[d] + rz[d] * rz[d])
+            root = np.sqrt(inverse)
+            cubed[d] = factor * inverse * root
+            rx[d], ry[d], rz[d] = rx[d] * root, ry[d] * root, rz[d] * root
+        for c in range(ways.shape[1]):
+            wx, wy, wz = ways[n, c, 0], ways[n, c, 1], ways[n, c, 2]
+            row = out[n, c]
+            for d in range(count):
+                along = 3 * (wx * rx[d] + wy * ry[d] + wz * rz[d])
+                row[3 * d] = (along * rx[d] - wx) * cubed[d]
+                row[3 * d + 1] = (along * ry[d] - wy) * cubed[d]
+                row[3 * d + 2] = (along * rz[d] - wz) * cubed[d]
 
 
 @compiled(_IN, _IN, _IN, _OUT, _OUT)

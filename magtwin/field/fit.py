@@ -21,22 +21,24 @@ from magtwin.field.interpolation import fit_cubic, fit_trilinear
 from magtwin.field.map import AnomalyMap
 from magtwin.field.model import FieldModel
 from magtwin.field.readings import Readings
+from magtwin.field.resolution import resolution
 from magtwin.names import RefusedError, find, hint
+from magtwin.report import Figure, Report
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
 
-FINER = 5
-"""Nodes of a smooth method's raster along one spacing of the readings."""
-
-STEP_RAD = np.radians(15.0)
-"""Headings of a smooth method's raster: linear interpolation of cos 2 yaw between them errs by 3.4 %."""
+NARROW = 5.0
+"""Readings whose extent is narrower than their spacing over this lie on a line."""
 
 REACH = 2.0
 """Distance to the nearest good reading up to which a node is known, in spacings of the readings."""
 
 MOST_DOUBT = 0.5
 """Part of the readings' standard deviation from which a method's own counts as not knowing."""
+
+ERRORS = ("error between nodes [nT]", "error between headings [nT]")
+"""Parameters of a map: root of the mean squared error of linear interpolation."""
 
 MOST_THREADS = 4
 """Headings of a raster that are told beside each other: each holds blocks of 100 MB."""
@@ -125,27 +127,30 @@ def raster(
     Args:
         model: What was fitted.
         readings: What it was fitted to.
-        spacing_m: Distance between nodes [m]. Unless given, for "trilinear" on a gridded survey its
-            own nodes, else a fifth of the readings' spacing (`magtwin.field.bins.spacing_m`).
-        headings_rad: Headings of the layers [rad], ascending in [0, 2 pi). Unless given, for "trilinear" on
-            a gridded survey its own, else every 15 deg; the one heading of a survey that has one only.
+        spacing_m: Distance between nodes [m]. Default: for "trilinear" on a gridded survey its own nodes,
+            else the widest spacing that costs next to no accuracy (`magtwin.field.resolution`).
+        headings_rad: Headings of the layers [rad], ascending in [0, 2 pi). Default: for "trilinear" on a
+            gridded survey its own; the one heading of a survey that has only one; else the fewest of 4 to
+            24 that cost next to no accuracy.
         extent: Least x, greatest x, least y, greatest y [m]; that of the readings unless given.
         progress: Called as progress(done, total, what), once a heading.
 
     Returns:
         The map, with values, variance, method, parameters and the survey's name, source, licence, day,
-        frame, datum and height; and with the harmonic field where the model has one.
+        frame, datum and height; and with the harmonic field where the model has one. The parameters hold
+        the error of linear interpolation between its nodes and between its headings.
 
     Raises:
         RefusedError: The spacing leaves no cell, the headings do not ascend, or no node is valid.
     """
-    grid = _grid(model, readings, spacing_m, headings_rad, extent)
+    grid, errors = _grid(model, readings, spacing_m, headings_rad, extent)
     p, _ = grid.poses()
     values, variance = np.empty(grid.shape), np.empty(grid.shape)
     headings = grid.headings_rad
+    predict = getattr(model, "predict_nodes", model.predict)
     threads = min(MOST_THREADS, os.cpu_count() or 1, len(headings))
     with _one_thread(), ThreadPoolExecutor(threads) as pool:
-        for h, told in enumerate(pool.map(model.predict, p, headings)):
+        for h, told in enumerate(pool.map(predict, p, headings)):
             if progress is not None:
                 progress(h, len(headings), "headings")
             values[h], variance[h] = told
@@ -168,7 +173,7 @@ def raster(
         headings_rad=np.asarray(grid.headings_rad),
         name=readings.name,
         method=model.method,
-        parameters=dict(model.parameters),
+        parameters={**model.parameters, **errors},
         source=readings.source,
         licence=readings.licence,
         created=readings.created,
@@ -179,40 +184,67 @@ def raster(
     )
 
 
+def grid_report(field: AnomalyMap) -> Report:
+    """How far a map's nodes and headings are apart, and the error of linear interpolation between them."""
+    dx, dy = field.cell_m
+    figures = []
+    for label, value, unit, error in (
+        ("node spacing", round(max(dx, dy), 4), "m", ERRORS[0]),
+        ("headings apart", round(360 / len(field.headings_rad), 2), "deg", ERRORS[1]),
+    ):
+        known = field.parameters.get(error)
+        note = "" if known is None else f"interpolation between them errs by {known:.3g} nT RMS"
+        figures.append(Figure(label, value, unit, note=note))
+    if field.variance_nt2 is not None and field.valid.any():
+        sd = float(np.sqrt(np.median(field.variance_nt2[field.valid])))
+        figures.append(Figure("standard deviation", round(sd, 1), "nT", note="median over the nodes"))
+    return Report("grid", tuple(figures), {})
+
+
 def _grid(
     model: FieldModel,
     readings: Readings,
     spacing: float | None,
     headings_rad: ArrayLike | None,
     extent: ArrayLike | None,
-) -> Grid:
+) -> tuple[Grid, dict[str, float]]:
+    """Nodes of the map, and what interpolation between them costs, by name with unit."""
     own = readings.grid if model.method in ON_NODES else None
     if own is not None and spacing is None and extent is None:
         if headings_rad is None:
-            return own
-        return replace(own, headings_rad=tuple(np.asarray(headings_rad, float).ravel().tolist()))
+            return own, {}
+        return replace(own, headings_rad=tuple(np.asarray(headings_rad, float).ravel().tolist())), {}
     if headings_rad is None:
-        headings_rad = own.headings_rad if own is not None else _headings(readings)
+        headings_rad = own.headings_rad if own is not None else _only_heading(readings)
     if extent is None:
         extent = readings.grid.extent if readings.grid is not None else _box(readings)
-        if readings.grid is None and spacing is None:
-            x0, x1, y0, y1 = extent
-            if min(x1 - x0, y1 - y0) < spacing_m(readings) / FINER:
-                raise RefusedError(
-                    f"the readings of {readings.name!r} lie on one line, x {x0:g}..{x1:g}, y {y0:g}..{y1:g} "
-                    "m; a map needs an area"
-                )
-    return Grid.over(extent, spacing_m(readings) / FINER if spacing is None else spacing, headings_rad)
+    x0, x1, y0, y1 = (float(v) for v in np.asarray(extent, float))
+    if spacing is None and readings.grid is None and min(x1 - x0, y1 - y0) < spacing_m(readings) / NARROW:
+        raise RefusedError(
+            f"the readings of {readings.name!r} lie on one line, x {x0:g}..{x1:g}, y {y0:g}..{y1:g} "
+            "m; a map needs an area"
+        )
+    with _one_thread():
+        chosen = resolution(
+            model,
+            readings,
+            spacing=spacing,
+            headings_rad=headings_rad,
+            largest_m=max(min(x1 - x0, y1 - y0), 0.0),
+        )
+    errors = zip(ERRORS, (chosen.nodes_nt, chosen.turn_nt), strict=True)
+    known = {name: round(error, 2) for name, error in errors if np.isfinite(error)}
+    return Grid.over(extent, chosen.spacing_m, chosen.headings_rad), known
 
 
-def _headings(readings: Readings) -> tuple[float, ...]:
-    """Every 15 deg; or the only heading that there is."""
+def _only_heading(readings: Readings) -> tuple[float, ...] | None:
+    """The heading of a survey that has only one, else None."""
     if readings.grid is not None:
         only = readings.grid.headings_rad
     else:
         yaw = readings.yaw[readings.good]
         only = (float(yaw[0] % TURN),) if np.ptp(yaw) == 0 else ()
-    return only if len(only) == 1 else tuple(STEP_RAD * np.arange(round(TURN / STEP_RAD)))
+    return only if len(only) == 1 else None
 
 
 def _box(readings: Readings) -> tuple[float, float, float, float]:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.field.dipoles import dipole_field_and_gradient_nt, moment_rows
 from magtwin.field.harmonic import HarmonicField
-from magtwin.field.sources import MU_0_OVER_4_PI, NT_PER_T
 
 Array = NDArray[np.float64]
 
@@ -80,11 +80,9 @@ class Forward:
         Args:
             p_world: Points [m], shape (N, 3).
         """
-        jacobian = np.zeros((len(p_world), 3, self.size))
-        count = 3 * len(self.p_world_dipole)
-        self._fill(
-            jacobian[:, :, :count], np.broadcast_to(np.eye(3), (len(p_world), 3, 3)), *self._ways(p_world)
-        )
+        p, count = np.ascontiguousarray(p_world, float), 3 * len(self.p_world_dipole)
+        jacobian = np.zeros((len(p), 3, self.size))
+        moment_rows(p, self.p_world_dipole, np.tile(np.eye(3), (len(p), 1, 1)), jacobian)
         jacobian[:, :, count : count + 3] = np.eye(3)
         return jacobian
 
@@ -100,8 +98,7 @@ class Forward:
         m, uniform, hard, soft, lever = self._parts(unknowns)
         turn, swing = _turns(yaw)
         at = np.column_stack([p_xy + turn[:, :2, :2] @ lever, np.full(len(p_xy), self.height_m)])
-        way, cubed, fifth = self._ways(at)
-        b, slope = self._sums(m, at, way, cubed, fifth)
+        b, slope = dipole_field_and_gradient_nt(at, self.p_world_dipole, m)
         b += uniform
         whole = np.eye(3) + soft
         base = np.einsum("nji,nj->ni", turn, b)
@@ -117,7 +114,7 @@ class Forward:
         carried = np.einsum("nji,njk,nk->ni", turn, slope[:, :, :2], swing[:, :2, :2] @ lever)
         count, parts = m.size, out.shape[1]
         jacobian = np.empty((len(b), parts, self.size))
-        self._fill(jacobian[:, :, :count], world, way, cubed, fifth)
+        moment_rows(at, self.p_world_dipole, world, jacobian)
         jacobian[:, :, count : count + 3] = world
         jacobian[:, :, count + 3 : count + 6] = out
         jacobian[:, :, count + 6 : count + 14] = np.einsum("nci,kij,nj->nck", out, SOFT, base, optimize=True)
@@ -136,43 +133,6 @@ class Forward:
             np.tensordot(rest[6:14], SOFT, 1),
             rest[14:],
         )
-
-    def _ways(self, p: Array) -> tuple[Array, Array, Array]:
-        """Ways r from the dipoles [m], (3, N, D); 1 / |r|^3 and 3 / |r|^5 with the factor, (N, D)."""
-        way = p.T[:, :, None] - self.p_world_dipole.T[:, None, :]
-        inverse = 1 / (way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
-        cubed = MU_0_OVER_4_PI * NT_PER_T * inverse * np.sqrt(inverse)
-        return way, cubed, 3 * cubed * inverse
-
-    @staticmethod
-    def _fill(jacobian: Array, world: Array, way: Array, cubed: Array, fifth: Array) -> None:
-        """Derivatives by the moments of world (N, C, 3) . field, into (N, C, 3 D)."""
-        for c in range(world.shape[1]):
-            w = world[:, c, :, None]
-            towards = fifth * (w[:, 0] * way[0] + w[:, 1] * way[1] + w[:, 2] * way[2])
-            for axis in range(3):
-                jacobian[:, c, axis::3] = towards * way[axis] - w[:, axis] * cubed
-
-    def _sums(self, m: Array, at: Array, way: Array, cubed: Array, fifth: Array) -> tuple[Array, Array]:
-        """Field (N, 3) and its gradient dB_a/dx_b (N, 3, 3): see `magtwin.field.dipoles`.
-
-        The powers of r = p - p_d come out of products with the powers of p_d, both from the middle.
-        """
-        middle = self.p_world_dipole.mean(axis=0)
-        q, at = self.p_world_dipole - middle, at - middle
-        radial = way[0] * m[:, 0] + way[1] * m[:, 1] + way[2] * m[:, 2]
-        along = fifth * radial
-        one = np.column_stack([np.ones(len(q)), q])
-        a = along @ one
-        b = at * a[:, :1] - a[:, 1:] - cubed @ m
-        tilt = at[:, :, None] * (fifth @ m)[:, None, :]
-        tilt -= (fifth @ (q[:, :, None] * m[:, None, :]).reshape(len(q), 9)).reshape(-1, 3, 3)
-        s = 5 / 3 * along * fifth / cubed
-        first = s @ one
-        cross = at[:, :, None] * first[:, None, 1:]
-        square = at[:, :, None] * at[:, None, :] * first[:, :1, None] - cross - cross.transpose(0, 2, 1)
-        square += (s @ (q[:, :, None] * q[:, None, :]).reshape(len(q), 9)).reshape(-1, 3, 3)
-        return b, tilt + tilt.transpose(0, 2, 1) + a[:, :1, None] * np.eye(3) - square
 
 
 def _turns(yaw: ArrayLike) -> tuple[Array, Array]:

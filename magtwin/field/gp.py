@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.field.bins import GRAIN_M, Bins, bin_readings, spacing_m
 from magtwin.field.covariance import Covariance, Kernel
 from magtwin.field.interpolation import check_readings, flat_poses
+from magtwin.field.model import FittedModel
 from magtwin.field.readings import Readings
 from magtwin.field.roughness import local_mean, tail
 from magtwin.names import RefusedError
@@ -51,8 +52,8 @@ BLOCK = 1024
 """Poses predicted at a time."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GpModel:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class GpModel(FittedModel):
     """A Gaussian process conditioned on readings."""
 
     parameters: Mapping[str, Any]

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.names import RefusedError
+from magtwin.summary import Summarized, Summary, listed, rectangle
 
 Array = NDArray[np.float64]
 
@@ -15,8 +16,8 @@ MOST_NODES = 50_000_000
 """A larger grid is taken for a slip in its spacing: 0.4 GB of values."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Grid:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Grid(Summarized):
     """Evenly spaced nodes over a floor, in one or more headings.
 
     Node (h, j, i) lies at x = origin_m[0] + i cell_m[0], y = origin_m[1] + j cell_m[1] in world, with
@@ -117,3 +118,14 @@ class Grid:
         """World x and y of every node [m], shape (H, Y, X, 2), and its heading [rad], shape (H, Y, X)."""
         yaw, y, x = np.meshgrid(np.asarray(self.headings_rad), self.y_m, self.x_m, indexing="ij")
         return np.stack([x, y], axis=-1), yaw
+
+    def _summary(self) -> Summary:
+        headings, rows, columns = self.shape
+        return Summary(
+            f"Grid: {columns} x {rows} nodes, {self.cell_m[0]:.3g} x {self.cell_m[1]:.3g} m apart, "
+            f"{headings} headings",
+            (
+                ("over", rectangle(*self.extent)),
+                ("headings", listed([f"{d:.4g}" for d in np.degrees(self.headings_rad)]) + " deg"),
+            ),
+        )

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.field.sources import dipole_field_nt
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.names import RefusedError
+from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 
@@ -22,8 +23,8 @@ SHAPES = {
 }
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class HarmonicField:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class HarmonicField(Summarized):
     """The field of dipoles below a floor and of the Earth, and the robot that it was surveyed with.
 
     B(p) = B_0 + sum of the dipoles' fields has neither curl nor divergence above them, so it is known at

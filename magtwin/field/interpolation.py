@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.field.bins import Bins, bin_readings, spacing_m
 from magtwin.field.errors import node_errors
 from magtwin.field.grid import TURN, Grid
+from magtwin.field.model import FittedModel
 from magtwin.field.readings import Readings
 from magtwin.field.roughness import Roughness
 from magtwin.names import RefusedError
@@ -92,8 +93,8 @@ def check_readings(readings: Readings) -> None:
         raise RefusedError(f"the {count} good readings {of} lie on one line; a map needs an area")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GridInterpolation:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class GridInterpolation(FittedModel):
     """Values on the nodes of a survey, and the rule between them."""
 
     method: str
@@ -164,8 +165,8 @@ class GridInterpolation:
         return [RectBivariateSpline(rows, columns, layer, kx=ky, ky=kx, s=0) for layer in self.values_nt]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ScatterInterpolation:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class ScatterInterpolation(FittedModel):
     """A surface over the triangles of scattered readings, and a wave over heading."""
 
     method: str

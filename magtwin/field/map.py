@@ -1,9 +1,10 @@
 """AnomalyMap: the magnitude of the magnetic field over a floor, by position and heading."""
 
-from collections.abc import Mapping
+import importlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +15,10 @@ from magtwin.field.harmonic import HarmonicField
 from magtwin.field.lookup import EDGE, Lookup
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary, listed, rectangle, span
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Picture
 
 Array = NDArray[np.float64]
 
@@ -21,11 +26,14 @@ TURN = 2 * np.pi
 TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")
 """What a map says of itself in words."""
 
+CONSTANT_NT = 1e-3
+"""Range of a map's values up to which it is constant [nT]."""
+
 Outside = Literal["nan", "clamp", "raise"]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class AnomalyMap:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class AnomalyMap(Summarized):
     """Total field on a grid over x, y and heading, as a robot reads it that stands at each node.
 
     Node (h, j, i) lies at x = origin_m[0] + i cell_m[0], y = origin_m[1] + j cell_m[1] in world, with
@@ -249,6 +257,21 @@ class AnomalyMap:
             self._check_outside(np.array([[x, y]]), outside)
         return self._lookup.at_with_gradient(x, y, yaw, clamp=outside == "clamp")
 
+    def plot(self, quantity: str = "field", headings: Sequence[float] | None = None) -> "Picture":
+        """Draw the map as filled contours, a panel per heading; see `magtwin.plot`.
+
+        Args:
+            quantity: "field", "gradient", "variance", "mask" or "headings".
+            headings: Headings to show [rad]. None shows the map's own, of more than eight four.
+
+        Returns:
+            A matplotlib figure. A notebook shows it; `figure.savefig("map.png")` writes it.
+
+        Raises:
+            RefusedError: No heading is to be shown, or nothing is known of the quantity.
+        """
+        return importlib.import_module("magtwin").plot(self, quantity=quantity, headings=headings)  # loads io
+
     def report(self) -> Report:
         """The figures that tell one map from another, over its valid nodes.
 
@@ -288,6 +311,12 @@ class AnomalyMap:
         return Report(f"map {self.name}", tuple(figures), {"method": self.method, "licence": self.licence})
 
     @cached_property
+    def is_constant(self) -> bool:
+        """Whether all valid nodes have the same value, within 1 pT, or no node is valid."""
+        values = self.values_nt[self.valid]
+        return not values.size or float(np.ptp(values)) <= CONSTANT_NT
+
+    @cached_property
     def _lookup(self) -> Lookup:
         return Lookup(self.values_nt, self.valid, self.origin_m, self.cell_m, self.headings_rad)
 
@@ -325,6 +354,39 @@ class AnomalyMap:
                 f"(x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m), the first at ({where}); "
                 'keep inside, or ask for outside="clamp" or "nan"'
             )
+
+    def _summary(self) -> Summary:
+        """Name and range; nodes and extent; headings; how well it is known; method."""
+        known, (x0, x1, y0, y1) = self.values_nt[self.valid], self.extent
+        title = f"AnomalyMap {self.name or 'without a name'}: "
+        if known.size:
+            title += f"{span(known.min(), known.max(), 'nT')}, mean {known.mean():,.0f} nT"
+        else:
+            title += "no valid node"
+        headings, rows, columns = self.values_nt.shape
+        masked = int(np.count_nonzero(~self.valid))
+        degrees = listed([f"{d:.4g}" for d in np.degrees(self.headings_rad)], 40)
+        about = [self.created or "day unknown"]
+        about.append("height unknown" if self.height_m is None else f"sensor at {self.height_m:.3g} m")
+        if self.variance_nt2 is not None and known.size:
+            about.append(f"sd {np.sqrt(np.median(self.variance_nt2[self.valid])):.3g} nT (median)")
+        about += [self.licence] if self.licence else []
+        return Summary(
+            title,
+            (
+                (
+                    "nodes",
+                    f"{columns} x {rows}, {self.cell_m[0]:.3g} x {self.cell_m[1]:.3g} m apart, "
+                    f"{rectangle(x0, x1, y0, y1)}",
+                ),
+                ("headings", f"{headings}: {degrees} deg" + (f"; {masked:,} nodes masked" if masked else "")),
+                ("known", ", ".join(about)),
+                ("method", self.method or "unknown"),
+                ("source", self.source),
+                ("frame", self.frame),
+                ("datum", self.datum),
+            ),
+        )
 
 
 def _frozen(values: ArrayLike, kind: type) -> NDArray[Any]:

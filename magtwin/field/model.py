@@ -1,10 +1,13 @@
 """FieldModel: what fitting readings gives, whatever the method."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from magtwin.summary import Summarized, Summary, printable
 
 Array = NDArray[np.float64]
 
@@ -35,3 +38,20 @@ class FieldModel(Protocol):
             Field magnitude [nT] and variance of it [nT^2], each of shape (...); nan where the method
             knows nothing.
         """
+
+
+class FittedModel(Summarized):
+    """What every method's model shows of itself: method, figures and noise."""
+
+    method: Any
+    parameters: Any
+    noise_nt2: Any
+
+    def _summary(self) -> Summary:
+        figures = [f"{name} {value}" for name, value in self.parameters.items()]
+        return Summary(
+            f"{type(self).__name__}: {self.method}, noise sd {math.sqrt(self.noise_nt2):.3g} nT",
+            (("figures", printable(", ".join(figures))),),
+            ("parameter", "value"),
+            [(name, str(value)) for name, value in self.parameters.items()],
+        )

@@ -10,6 +10,7 @@ from magtwin.field.days import check_texts
 from magtwin.field.grid import Grid
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary, listed, rectangle, span
 
 Array = NDArray[np.float64]
 
@@ -17,8 +18,8 @@ FARTHEST_M = 1e8
 """Distance from the origin beyond which a coordinate is none: twice round the Earth [m]."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Readings:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Readings(Summarized):
     """Readings of a magnetometer on a robot at known poses, one row each.
 
     A reading has a magnitude, a vector, or both. Arrays are copied at birth and cannot be written to.
@@ -166,13 +167,42 @@ class Readings:
             Figure("least", round(float(good.b_nt.min()), 1), "nT"),
             Figure("greatest", round(float(good.b_nt.max()), 1), "nT"),
         ]
-        facts = {"source": self.source.split("; "), "licence": self.licence, "created": self.created}
+        files = [part for part in self.source.split("; ") if not part.startswith(TAKEN)]
+        facts = {"source": files, "licence": self.licence, "created": self.created}
         return Report(f"readings {self.name}", tuple(figures), {k: v for k, v in facts.items() if v})
 
     def with_(self, **changes: Any) -> "Readings":
         """The same readings with other values of some fields, such as `good`."""
         return Readings(**{**{f.name: getattr(self, f.name) for f in fields(self)}, **changes})
 
+    def _summary(self) -> Summary:
+        """Name and number; extent; range; runs; day, height and licence."""
+        good = self.b_nt[self.good] if self.good.any() else self.b_nt
+        (x0, y0), (x1, y1) = self.p_xy.min(axis=0), self.p_xy.max(axis=0)
+        bad = len(self) - int(self.good.sum())
+        about = [self.created or "day unknown"]
+        about.append("height unknown" if self.height_m is None else f"sensor at {self.height_m:.3g} m")
+        about += [text for text in (self.licence, self.frame) if text]
+        gridded = "" if self.grid is None else f", on a grid of {' x '.join(map(str, self.grid.shape))}"
+        return Summary(
+            f"Readings {self.name or 'without a name'}: {len(self):,} rows"
+            + (f", {bad:,} of them not field" if bad else ""),
+            (
+                ("over", rectangle(x0, x1, y0, y1) + gridded),
+                (
+                    "field",
+                    f"{span(good.min(), good.max(), 'nT')}, mean {good.mean():,.0f} nT"
+                    + (", with vectors" if self.b_body_nt is not None else ""),
+                ),
+                ("runs", f"{len(self.runs):,}: {listed(self.runs)}" if any(self.runs) else ""),
+                ("known", ", ".join(about)),
+                ("source", self.source),
+            ),
+        )
+
+
+TAKEN = "taken "
+"""How a part of `source` begins that says what was found by a name or a size."""
 
 TEXTS = ("name", "source", "licence", "created", "frame", "datum")
 """What readings say of themselves in words."""

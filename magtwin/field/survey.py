@@ -2,8 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,8 @@ from magtwin.field.errors import node_errors
 from magtwin.field.grid import Grid
 from magtwin.field.map import AnomalyMap
 from magtwin.field.readings import Readings
+from magtwin.field.survey_header import ERROR, MASKED, header_lines, read_header
+from magtwin.field.units import check_unit, nt_per
 from magtwin.files import existing, output, sha256
 from magtwin.frames import wrap_angle
 from magtwin.names import RefusedError
@@ -24,20 +25,14 @@ Array = NDArray[np.float64]
 COLUMNS = ("x", "y", "theta", "scalar_mag")
 SUFFIX = "_map.csv"
 
-LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
-"""Bounds of a survey's mean [nT]; the Earth's field lies in 22,000..67,000 nT, a building bends it."""
-
-NT_PER = {"nT": 1.0, "uT": 1e3, "T": 1e9, "mG": 1e2, "G": 1e5}
-"""Units that a field may be in, and the nT that each is."""
-
-MIXED = 0.01
-"""Share of readings that are a unit's factor off the others, above which they are no outliers."""
-
 WIDEST_DEG = 90.0
 """Headings farther apart than this are taken for an incomplete survey unless the caller names them."""
 
 GRAIN_M = 1e-6
 """Coordinates closer than this are one."""
+
+METHOD = "survey, one reading a node and heading, the robot at rest"
+"""Method of a map whose values are readings."""
 
 SAID = 60
 """Characters of a file's own text that a refusal quotes."""
@@ -54,16 +49,18 @@ def read_grid(
     datum: str = "",
     headings_deg: tuple[float, ...] | None = None,
     unit: str = "nT",
+    scale: float | None = None,
 ) -> Readings:
     """The readings of a survey folder, `0_map.csv`, `90_map.csv`, `180_map.csv`, `270_map.csv`.
 
     Each file begins with the line `# x,y,theta,scalar_mag` and has one row a node, in any order:
     x and y in world [m], the recorded heading [rad], the total field [nT]. A node's heading is the
-    nominal one of the file's name; the reading's `yaw` is the recorded one.
+    nominal one of the file's name; the reading's `yaw` is the recorded one. Further comment lines, as
+    `write_survey` writes them, give what the arguments leave open, and the rows that are not field.
 
     Args:
         folder: Folder that holds the files. Other files in it are left alone.
-        name: Name of the survey; that of the folder unless given.
+        name: Name of the survey. Default: the one in the files, else that of the folder.
         licence: SPDX name of the survey's licence.
         created: Day of the survey, YYYY-MM-DD.
         height_m: Height of the sensor above the floor [m].
@@ -71,18 +68,19 @@ def read_grid(
         datum: Where that frame lies, in words.
         headings_deg: Headings that the survey has [deg]. Unless given, the files must be evenly
             spaced on the circle and at most 90 deg apart, so that a lost file is noticed.
-        unit: Unit of the field, one of `NT_PER`.
+        unit: Unit of the field, one of `magtwin.field.units.NT_PER`.
+        scale: Factor from the file's values to nT, in place of a unit.
 
     Returns:
         Readings in the order of the rows, heading after heading, one run a file, with `grid` and
-        `node`; all of them good: `magtwin.field.latch` finds those that are not.
+        `node`; all good but those that the files mark: `magtwin.field.latch` finds others that are not.
 
     Raises:
         RefusedError: A file or a heading is missing, a row or a value is none, the grid has a hole or
             a node two values, the headings' grids differ, or the unit cannot be; with file and line.
     """
-    readings = _readings(_read(folder, headings_deg, unit), Path(folder), name)
-    return readings.with_(licence=licence, created=created, height_m=height_m, frame=frame, datum=datum)
+    about = {"licence": licence, "created": created, "height_m": height_m, "frame": frame, "datum": datum}
+    return _readings(_read(folder, headings_deg, unit, scale), Path(folder), name, about)
 
 
 def node_map(readings: Readings) -> AnomalyMap:
@@ -124,7 +122,7 @@ def node_map(readings: Readings) -> AnomalyMap:
         cell_m=grid.cell_m,
         headings_rad=np.asarray(grid.headings_rad),
         name=readings.name,
-        method="survey, one reading a node and heading, the robot at rest",
+        method=METHOD,
         source=readings.source,
         licence=readings.licence,
         created=readings.created,
@@ -144,14 +142,15 @@ def _recorded_yaw(readings: Readings, flat: NDArray[np.intp], grid: Grid) -> Arr
 
 
 def write_survey(field: AnomalyMap, folder: str | os.PathLike[str], *, force: bool = False) -> list[Path]:
-    """Write a map as a survey folder, one CSV a heading, as `read_survey` takes it.
+    """Write a map as a survey folder, one CSV per heading, as `read_survey` takes it.
 
-    A row a node, x fastest: x and y in world [m], the heading that was recorded there, else the map's own
-    [rad], and the field [nT], each the number itself and not a rounded one. So the CSVs of a survey come back
-    from its map row by row.
+    Comment lines keep name, method and its figures, frame, day, licence, height, spacing, statistics and
+    masked rows; `read_survey` restores them. Below them is a row per node, x fastest: x and y in world [m],
+    the heading that was recorded there, else the map's own [rad], and the field [nT], each the number itself
+    and not a rounded one. So the CSVs of a survey come back from its map row by row.
 
     Args:
-        field: The map. Which nodes are valid has no place in a CSV.
+        field: The map. Of its variance only the median per heading is kept, and no harmonic field.
         folder: Folder to make.
         force: Whether one that exists is replaced.
 
@@ -177,7 +176,8 @@ def write_survey(field: AnomalyMap, folder: str | os.PathLike[str], *, force: bo
                 yaw = field.recorded_yaw[h]
             x, y = np.meshgrid(field.x_m, field.y_m)
             rows = np.stack([x, y, yaw, field.values_nt[h]], axis=-1).reshape(-1, len(COLUMNS)).tolist()
-            lines = [f"# {','.join(COLUMNS)}", *(",".join(map(repr, row)) for row in rows)]
+            header = [f"# {','.join(COLUMNS)}", *header_lines(field, h)]
+            lines = [*header, *(",".join(map(repr, row)) for row in rows)]
             (aside / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
     return [Path(folder, name) for name in names]
 
@@ -198,24 +198,28 @@ def read_survey(
     datum: str = "",
     headings_deg: tuple[float, ...] | None = None,
     unit: str = "nT",
+    scale: float | None = None,
     keep_latched: bool = False,
 ) -> tuple[AnomalyMap, Report]:
     """The map of a survey folder's nodes, and its report.
 
     Args:
         folder: As `read_grid` takes it, and so all others but the last.
-        name: Name of the map; that of the folder unless given.
+        name: Name of the map. Default: the one in the files, else that of the folder.
         licence: SPDX name of the survey's licence.
         created: Day of the survey, YYYY-MM-DD.
         height_m: Height of the sensor above the floor [m].
         frame: Axes that x, y and heading are in, in words.
         datum: Where that frame lies, in words.
         headings_deg: Headings that the survey has [deg].
-        unit: Unit of the field, one of `NT_PER`.
+        unit: Unit of the field, one of `magtwin.field.units.NT_PER`.
+        scale: Factor from the file's values to nT, in place of a unit.
         keep_latched: Whether readings of a sensor that had lost lock stay valid nodes.
 
     Returns:
-        The map, in which latched nodes are not valid (`magtwin.field.latch`). And the report: the
+        The map, in which latched nodes are not valid (`magtwin.field.latch`). A fitted map that
+        `write_survey` wrote comes back as it was, but for its variance, which is uniform in each heading,
+        and its harmonic field, which is left out. And the report: the
         map's figures; the median and the largest deviation of a recorded heading from the nominal
         one, with the worst row; how many readings repeat the one before in their row to the last
         digit; what was found latched, stuck or outlying.
@@ -225,9 +229,12 @@ def read_survey(
     """
     from magtwin.field.latch import mask_latched
 
-    layers = _read(folder, headings_deg, unit)
-    readings = _readings(layers, Path(folder), name)
-    readings = readings.with_(licence=licence, created=created, height_m=height_m, frame=frame, datum=datum)
+    layers = _read(folder, headings_deg, unit, scale)
+    about = {"licence": licence, "created": created, "height_m": height_m, "frame": frame, "datum": datum}
+    readings = _readings(layers, Path(folder), name, about)
+    if _said(layers, "method") not in ("", METHOD):
+        field = _fitted(layers, readings)
+        return field, _report(layers, field, folder, Report(""))
     masked, found = mask_latched(readings)
     if not (keep_latched or masked.good.any()):
         raise RefusedError(
@@ -235,7 +242,38 @@ def read_survey(
             "survey it again, or import them as they are with keep_latched (--keep-latched)"
         )
     field = node_map(readings if keep_latched else masked)
+    field = replace(field, parameters=_said(layers, "parameters") or {})
     return field, _report(layers, field, folder, found)
+
+
+def _fitted(layers: "list[_Layer]", readings: Readings) -> AnomalyMap:
+    """A map that was no survey when it was written: its values are not searched for what a sensor does."""
+    field = node_map(readings)
+    sd = [layer.said.get(ERROR, math.nan) for layer in layers]
+    variance = np.broadcast_to(np.square(sd)[:, None, None], field.values_nt.shape)
+    return replace(
+        field,
+        variance_nt2=variance if np.isfinite(variance).all() else None,
+        recorded_yaw=None,
+        method=_said(layers, "method"),
+        parameters=_said(layers, "parameters") or {},
+    )
+
+
+def _said(layers: "list[_Layer]", key: str) -> Any:
+    """What the files' comment lines say of the map; "" where none does.
+
+    Raises:
+        RefusedError: Two of them differ.
+    """
+    told = [layer for layer in layers if key in layer.said]
+    for other in told[1:]:
+        if other.said[key] != told[0].said[key]:
+            raise RefusedError(
+                f"{other.path}: its {key} is {str(other.said[key])[:SAID]!r}, in {told[0].path.name} it is "
+                f"{str(told[0].said[key])[:SAID]!r}; these are files of two maps"
+            )
+    return told[0].said[key] if told else ""
 
 
 def import_survey(folder: str | os.PathLike[str], **options: Any) -> AnomalyMap:
@@ -255,9 +293,16 @@ class _Layer:
     theta: Array
     field: Array
     sha256: str
+    said: dict[str, Any]
+    """What its comment lines say; see `magtwin.field.survey_header`."""
 
 
-def _read(folder: str | os.PathLike[str], headings_deg: tuple[float, ...] | None, unit: str) -> list[_Layer]:
+def _read(
+    folder: str | os.PathLike[str],
+    headings_deg: tuple[float, ...] | None,
+    unit: str,
+    scale: float | None,
+) -> list[_Layer]:
     folder = existing(folder, "survey folder")
     if not folder.is_dir():
         raise RefusedError(f"{folder}: not a folder; give the one that holds 0{SUFFIX}, 90{SUFFIX}, ...")
@@ -270,7 +315,7 @@ def _read(folder: str | os.PathLike[str], headings_deg: tuple[float, ...] | None
             )
         files[heading] = path
     _check_headings(folder, sorted(files), headings_deg)
-    return [_read_layer(files[heading], heading, unit) for heading in sorted(files)]
+    return [_read_layer(files[heading], heading, unit, scale) for heading in sorted(files)]
 
 
 def _heading(path: Path) -> float:
@@ -315,7 +360,7 @@ def _say(headings: list[float] | tuple[float, ...]) -> str:
     return ", ".join(f"{h:g}" for h in headings)
 
 
-def _read_layer(path: Path, heading_deg: float, unit: str) -> _Layer:
+def _read_layer(path: Path, heading_deg: float, unit: str, scale: float | None) -> _Layer:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (UnicodeDecodeError, OSError) as error:
@@ -325,14 +370,19 @@ def _read_layer(path: Path, heading_deg: float, unit: str) -> _Layer:
     first, *rest = text.splitlines()
     if tuple(word.strip() for word in first.lstrip("#").split(",")) != COLUMNS:
         raise RefusedError(f"{path}:1: must be the header '# {','.join(COLUMNS)}', got {first[:SAID]!r}")
-    lines = [(number, line) for number, line in enumerate(rest, 2) if line.strip()]
+    numbered = [(number, line) for number, line in enumerate(rest, 2) if line.strip()]
+    said = read_header(path, [(number, line) for number, line in numbered if line.startswith("#")])
+    lines = [(number, line) for number, line in numbered if not line.startswith("#")]
     if not lines:
         raise RefusedError(f"{path}: no rows below the header; expected one a node")
     table = np.array([_row(path, number, line) for number, line in lines])
     x, y, theta, field = table.T
-    field = NT_PER[unit] * field
-    layer = _Layer(path, heading_deg, np.array([n for n, _ in lines]), x, y, theta, field, sha256(path))
-    check_unit(field, str(path), "scalar_mag", unit, lambda k: f"{path}:{layer.lines[k]}")
+    field = nt_per(unit, scale) * field
+    beyond = max(said.get(MASKED, []), default=0)
+    if beyond >= len(x):
+        raise RefusedError(f"{path}: {MASKED} names row {beyond}, and it has {len(x)}, counted from 0")
+    layer = _Layer(path, heading_deg, np.array([n for n, _ in lines]), x, y, theta, field, sha256(path), said)
+    check_unit(field, str(path), "scalar_mag", unit, lambda k: f"{path}:{layer.lines[k]}", scale)
     return layer
 
 
@@ -360,49 +410,7 @@ def _row(path: Path, number: int, line: str) -> list[float]:
     return values
 
 
-def check_unit(
-    b_nt: Array, where: str, column: str, unit: str = "nT", row: Callable[[int], str] | None = None
-) -> None:
-    """Refuse readings whose mean cannot be the Earth's field in nT, and those of two units.
-
-    Args:
-        b_nt: Magnitudes of the field as taken for nT, shape (N,).
-        where: File, for the refusal.
-        column: Its column.
-        unit: Unit that the file was said to be in.
-        row: Says where a reading stands, by its index; the file itself unless given.
-
-    Raises:
-        RefusedError: The mean lies outside 10,000..100,000 nT; the text names the unit that would fit. Or
-            more readings than outliers would be are another unit's factor off the others.
-    """
-    usual = float(np.sort(b_nt)[len(b_nt) // 2])
-    for other, factor in NT_PER.items():
-        ratio = b_nt / usual * factor / NT_PER[unit]
-        odd = np.flatnonzero((np.abs(np.log10(np.maximum(ratio, 1e-12))) < 0.3) & (other != unit))
-        if LEAST_MEAN_NT <= usual <= GREATEST_MEAN_NT and len(odd) > max(1, MIXED * len(b_nt)):
-            first = int(odd[0])
-            raise RefusedError(
-                f"{row(first) if row else where}: {column} is {b_nt[first]:.6g} nT, where most readings are "
-                f"about {usual:,.0f} nT; it and {len(odd) - 1} more would fit in {other}: give all rows in "
-                "one unit"
-            )
-    mean = float(b_nt.mean())
-    if LEAST_MEAN_NT <= mean <= GREATEST_MEAN_NT:
-        return
-    number = mean / NT_PER[unit]
-    fits = [
-        f"were it {other}, it would be {number * factor:,.0f} nT, so say --unit {other}"
-        for other, factor in NT_PER.items()
-        if LEAST_MEAN_NT <= number * factor <= GREATEST_MEAN_NT
-    ]
-    raise RefusedError(
-        f"{where}: the mean of {column} is {mean:.6g} nT, outside {LEAST_MEAN_NT:,.0f}.."
-        f"{GREATEST_MEAN_NT:,.0f} nT; " + (" or ".join(fits) or "no usual unit makes it the Earth's field")
-    )
-
-
-def _readings(layers: list[_Layer], folder: Path, name: str | None) -> Readings:
+def _readings(layers: list[_Layer], folder: Path, name: str | None, about: dict[str, Any]) -> Readings:
     axes = [(_axis(s, "x", s.x), _axis(s, "y", s.y)) for s in layers]
     for layer, own in zip(layers, axes, strict=True):
         for label, first, axis in zip("xy", axes[0], own, strict=True):
@@ -420,6 +428,10 @@ def _readings(layers: list[_Layer], folder: Path, name: str | None) -> Readings:
         columns=len(x),
     )
     run = np.repeat(np.arange(len(layers)), [len(s.x) for s in layers])
+    good = np.concatenate([~np.isin(np.arange(len(s.x)), s.said.get(MASKED, [])) for s in layers])
+    given = {key: _said(layers, key) if value in ("", None) else value for key, value in about.items()}
+    if given.get("height_m") == "":
+        given["height_m"] = None
     return Readings(
         p_xy=np.concatenate([np.column_stack([s.x, s.y]) for s in layers]),
         yaw=np.concatenate([s.theta for s in layers]),
@@ -428,8 +440,10 @@ def _readings(layers: list[_Layer], folder: Path, name: str | None) -> Readings:
         runs=tuple(s.path.name for s in layers),
         grid=grid,
         node=np.column_stack([run, np.concatenate([_nodes(s, x, y) for s in layers])]),
-        name=folder.resolve().name if name is None else name,
+        good=good,
+        name=(_said(layers, "name") or folder.resolve().name) if name is None else name,
         source="; ".join(f"{s.path.name} sha256:{s.sha256}" for s in layers),
+        **given,
     )
 
 

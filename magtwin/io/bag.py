@@ -62,7 +62,7 @@ class Connection:
 
 
 class Batch(NamedTuple):
-    """Messages of a topic, in the order of their times."""
+    """Messages of one topic and one size, in the order of their times; a topic may have several batches."""
 
     connection: Connection
     received: Index
@@ -70,6 +70,9 @@ class Batch(NamedTuple):
 
     rows: Bytes
     """A message a row, after `ROOM` free bytes, shape (M, ROOM + size)."""
+
+    arrival: Index | None = None
+    """Rank of each message among messages with the same time, shape (M,). None: the order of the batches."""
 
 
 class Heard(NamedTuple):
@@ -172,5 +175,6 @@ def in_time(batches: Sequence[Batch]) -> tuple[Index, NDArray[np.intp]]:
     """Times of all messages of batches, ascending [ns], and of which batch each is; both shape (M,)."""
     times = np.concatenate([b.received for b in batches]) if batches else np.zeros(0, np.int64)
     which = np.repeat(np.arange(len(batches)), [len(b.received) for b in batches])
-    order = np.argsort(times, kind="stable")
+    ranks = [np.zeros(len(b.received), np.int64) if b.arrival is None else b.arrival for b in batches]
+    order = np.lexsort((np.concatenate(ranks), times)) if batches else np.zeros(0, np.int64)
     return times[order], which[order]

@@ -62,8 +62,8 @@ class RawBagWriter:
             )
         self._connections: dict[str, Connection] = {}
         self._tally = Tally({})
-        self._waiting: dict[str, list[tuple[int, bytes]]] = {}
-        self._latest = -1
+        self._waiting: dict[str, list[tuple[int, int, bytes]]] = {}
+        self._arrived = 0
 
     def add(self, topic: str, kind: str, qos: Qos) -> None:
         """Tell of a topic, before its first message.
@@ -85,7 +85,8 @@ class RawBagWriter:
 
     def write(self, topic: str, received_ns: int, data: bytes) -> None:
         """Take a message of a topic that was told of; it is in the file at the next `flush`."""
-        self._waiting.setdefault(topic, []).append((received_ns, data))
+        self._waiting.setdefault(topic, []).append((received_ns, self._arrived, data))
+        self._arrived += 1
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -97,15 +98,11 @@ class RawBagWriter:
 
     def flush(self) -> None:
         """Have all that was taken outlive this process."""
-        batches = []
-        for topic, messages in self._waiting.items():
-            for size in {len(data) for _, data in messages}:
-                chosen = [(t, data) for t, data in messages if len(data) == size]
-                rows = np.zeros((len(chosen), ROOM + size), np.uint8)
-                for row, (_, data) in zip(rows, chosen, strict=True):
-                    row[ROOM:] = np.frombuffer(data, np.uint8)
-                times = np.array([t for t, _ in chosen], np.int64)
-                batches.append(Batch(self._connections[topic], times, rows))
+        batches = [
+            batch
+            for topic, messages in self._waiting.items()
+            for batch in _batches(self._connections[topic], messages)
+        ]
         self._waiting.clear()
         with refused(self._path):
             self._store.write(batches)
@@ -147,3 +144,17 @@ class RawBagWriter:
             aside = self._folder / "metadata.yaml.new"
             aside.write_text(yaml_of({"rosbag2_bagfile_information": self._metadata()}), encoding="utf-8")
             aside.replace(self._folder / "metadata.yaml")
+
+
+def _batches(connection: Connection, messages: list[tuple[int, int, bytes]]) -> list[Batch]:
+    """Messages of a topic (time, arrival, content) as a batch for each size."""
+    by_size: dict[int, list[tuple[int, int, bytes]]] = {}
+    for message in sorted(messages, key=lambda m: m[:2]):
+        by_size.setdefault(len(message[2]), []).append(message)
+    batches = []
+    for size, chosen in by_size.items():
+        times, arrivals, contents = zip(*chosen, strict=True)
+        rows = np.zeros((len(chosen), ROOM + size), np.uint8)
+        rows[:, ROOM:] = np.frombuffer(b"".join(contents), np.uint8).reshape(len(chosen), size)
+        batches.append(Batch(connection, np.array(times, np.int64), rows, np.array(arrivals, np.int64)))
+    return batches

@@ -15,7 +15,7 @@ import yaml
 from numpy.typing import NDArray
 
 from magtwin.arrow import spec_said
-from magtwin.field.survey import NT_PER, check_unit
+from magtwin.field.units import NT_PER, check_unit
 from magtwin.files import existing, sha256
 from magtwin.frames import canonical, quat_conjugate, rotate, yaw_from_quat
 from magtwin.io.bag import Heard
@@ -88,6 +88,8 @@ def read_bag(
     q_world_base_xyzw and yaw are motion capture's too, between two poses interpolated. Gravity is taken off
     accelerations that hold it. The facts say which topics were read, the unit and how it was told.
 
+    Messages that the index of an MCAP file lacks are read too; the fact `messages_not_indexed` counts them.
+
     Args:
         path: Folder of a rosbag2, or its storage file (.mcap, .db3).
         topics: What topics are called in a robot's recording, where not as in `TOPICS`:
@@ -113,8 +115,10 @@ def read_bag(
         if READING.name in bag.kinds and NAMES.name in bag.kinds and not topics:
             if unit:
                 raise RefusedError(f"{path}: magtwin wrote it and it says its unit itself; drop {unit!r}")
-            return _own(bag)
-        return _recorded(bag, topics or {}, unit)
+            run = _own(bag)
+        else:
+            run = _recorded(bag, topics or {}, unit)
+        return run.with_facts(messages_not_indexed=bag.unindexed) if bag.unindexed else run
 
 
 @contextlib.contextmanager
@@ -160,6 +164,11 @@ class _Bag:
     def whole(self) -> bool:
         """Whether every file has its end."""
         return all(r.whole for r in self._readers if isinstance(r, McapReader))
+
+    @property
+    def unindexed(self) -> int:
+        """How many of the messages that were read are missing from the index of an MCAP file."""
+        return sum(sum(r.unindexed.values()) for r in self._readers if isinstance(r, McapReader))
 
     def __enter__(self) -> "_Bag":
         return self

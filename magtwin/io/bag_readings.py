@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.field.readings import Readings
-from magtwin.field.survey import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER, check_unit
+from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT, NT_PER, check_unit
 from magtwin.files import existing, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 from magtwin.names import RefusedError, hint
@@ -51,6 +51,7 @@ def read_bag_readings(
     pose_topic: str | None = None,
     field_topic: str | None = None,
     unit: Literal["nT", "uT", "T", "mG", "G"] | None = None,
+    scale: float | None = None,
 ) -> Readings:
     """The readings of a bag: each message of the field, at the pose that the robot had at its stamp.
 
@@ -66,6 +67,7 @@ def read_bag_readings(
         field_topic: Topic of the field, of a type in `FIELDS`; the only such topic unless given.
         unit: Unit of the field; that which makes it the Earth's unless given: 1e-5..1e-4 is T,
             10,000..100,000 nT, and so on, which do not overlap.
+        scale: Factor from the bag's values to nT, in place of a unit.
 
     Returns:
         Readings in the order of their stamps. A MagneticField with y = z = 0 is a magnitude in x, as
@@ -95,28 +97,30 @@ def read_bag_readings(
     t, b, p, q = t[known], b[known], p[known], q[known]
     vector = b if b.shape[1] == 3 and np.any(b[:, 1:] != 0) else None
     size = np.abs(b[:, 0]) if vector is None else np.linalg.norm(b, axis=1)
-    unit, told = (
-        (unit, "given") if unit else (unit_of(float(size.mean()), path, fields.topic), "told by its size")
-    )
-    check_unit(NT_PER[unit] * size, str(path), fields.topic, unit)
+    if scale is not None:
+        factor, label, told = scale, f"units of {scale:g} nT", "given"
+    else:
+        label = unit or unit_of(float(size.mean()), path, fields.topic)
+        factor, told = NT_PER[label], "given" if unit else "told by its size"
+    check_unit(factor * size, str(path), fields.topic, "nT" if scale else label, scale=scale)
     nought = np.flatnonzero(size == 0)
     if len(nought):
         raise RefusedError(
-            f"{path}: {fields.topic} is 0 {unit} at {t[nought[0]]:.3f} s; a magnitude is above 0"
+            f"{path}: {fields.topic} is 0 {label} at {t[nought[0]]:.3f} s; a magnitude is above 0"
         )
     level = None
     if vector is not None:
-        level = NT_PER[unit] * rotate(quat_conjugate(quat_from_yaw(yaw_from_quat(q))), rotate(q, vector))
+        level = factor * rotate(quat_conjugate(quat_from_yaw(yaw_from_quat(q))), rotate(q, vector))
     left = f", {np.count_nonzero(~known)} of {len(known)} fields not between poses or not a number left out"
     return Readings(
         p_xy=p[:, :2],
         yaw=yaw_from_quat(q),
-        b_nt=NT_PER[unit] * size,
+        b_nt=factor * size,
         b_body_nt=level,
         t=t - t[0],
         runs=(path.stem,),
         name=path.stem,
-        source=f"{messages.sums()} (poses {poses.topic}, field {fields.topic} in {unit}, {told}; stamps of "
+        source=f"{messages.sums()} (poses {poses.topic}, field {fields.topic} in {label}, {told}; stamps of "
         f"{clock}{left if not known.all() else ''})",
     )
 

@@ -4,6 +4,7 @@ They are drawn narrow, so that their words stay readable on a phone and on paper
 """
 
 import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
+
+LONGEST_NAME = 28
+"""Characters of a run's name that a chart shows."""
 
 POINTS = 1200
 """Points of a line: more cannot be told apart in a picture of this width."""
@@ -41,10 +45,17 @@ class Picture:
     kind: str
     """"png" or "svg+xml"."""
     data: bytes
-    tall: bool = False
-    """Whether it stands beside two of the others."""
     file: str = ""
     """Where it lies, seen from a page of Markdown; "" where that shows no pictures."""
+
+    def aspect(self) -> float:
+        """Width over height."""
+        if self.kind == "png":
+            width, height = (int.from_bytes(self.data[at : at + 4]) for at in (16, 20))
+            return width / height
+        found = re.search(rb'viewBox="0 0 ([\d.]+) ([\d.]+)"', self.data[:2000])
+        assert found is not None  # as matplotlib writes every figure
+        return float(found[1]) / float(found[2])
 
 
 def pictures_of_run(
@@ -94,13 +105,25 @@ def plot_comparison(
 
 
 def pictures_of_comparison(a: Run, b: Run, found: Comparison, names: tuple[str, str]) -> list[Picture]:
-    """The same for a page, a picture a panel."""
+    """Draw the same for a page, one picture per panel."""
     made = []
     for panel in _panels(a, b, found, names):
         figure = new_figure(WIDTH_IN, 2.5 * panel.height)
         panel.draw(figure.subplots())
-        made.append(Picture(panel.title, panel.title, "svg+xml", drawn(figure, ".svg"), panel.height > 1))
+        made.append(Picture(panel.title, panel.title, "svg+xml", drawn(figure, ".svg")))
     return made
+
+
+def short_names(names: tuple[str, str]) -> tuple[str, str]:
+    """Names of two runs for legends and captions: the middle of a long one is left out, and they differ."""
+    a, b = (short_name(name) for name in names)
+    return (a, b) if a != b else (f"A: {a}", f"B: {b}")
+
+
+def short_name(name: str, most: int = LONGEST_NAME) -> str:
+    """A name, without its middle where it is long."""
+    half = (most - 1) // 2
+    return name if len(name) <= most else f"{name[:half]}…{name[-half:]}"
 
 
 def thinned(t: Array, values: Array, points: int = POINTS) -> tuple[Array, Array]:
@@ -178,7 +201,6 @@ def _path(run: Run, field: AnomalyMap | None, planned: ArrayLike | None) -> Pict
         f"{over}, coloured by the field along it",
         "png",
         drawn(figure, ".png"),
-        tall=True,
     )
 
 
@@ -207,10 +229,10 @@ def _errors(run: Run, ax: "Axes") -> str:
         told.append("Disturbance")
     if _has(run, "b_measured_nt", "b_truth_nt"):
         error = run["b_measured_nt"] - run["b_truth_nt"]
-        _line(ax, t, error, color=INK, label="error: measured less exact")
+        _line(ax, t, error, color=INK, label="error (measured - exact)")
         told.append("error")
     ax.axhline(0, color="0.7", lw=0.6, zorder=0)
-    ax.set_ylabel("[nT]", fontsize=9)
+    ax.set_ylabel(f"{', '.join(told).lower()} [nT]", fontsize=9)
     return " and ".join(told).capitalize()
 
 
@@ -248,7 +270,7 @@ class _Panel:
 
 def _panels(a: Run, b: Run, found: Comparison, names: tuple[str, str]) -> list[_Panel]:
     """Field as recorded, field laid over each other, distance between the two, and the two paths."""
-    column, position = field_name(a, b), position_name(a, b)
+    column, position, names = field_name(a, b), position_name(a, b), short_names(names)
     moved = f"{names[1]} moved by {found.shift:+.3f} {found.unit}"
     along = "length driven [m]" if found.align == "path" else "time [s]"
     inks = (INK, OTHER_INK)
@@ -267,7 +289,7 @@ def _panels(a: Run, b: Run, found: Comparison, names: tuple[str, str]) -> list[_
         for values, name, ink in ((found.along_m, "along", MAP_INK), (found.cross_m, "across", INK)):
             _line(ax, found.at, values, color=ink, label=name)
         ax.axhline(0, color="0.7", lw=0.6, zorder=0)
-        _label(ax, along, "[m]")
+        _label(ax, along, "distance [m]")
 
     def paths(ax: "Axes") -> None:
         looks: tuple[dict[str, Any], ...] = ({"lw": 2.6, "alpha": 0.45}, {"lw": 1.0})
@@ -287,7 +309,7 @@ def _panels(a: Run, b: Run, found: Comparison, names: tuple[str, str]) -> list[_
         how = "clocks as they stand" if found.align == "none" else moved
         panels += [_Panel(f"{column} as recorded", 1.0, recorded), _Panel(how + told, 1.0, aligned)]
     if position is not None:
-        panels.append(_Panel(f"Position of {names[1]} seen from {names[0]}", 1.0, apart))
+        panels.append(_Panel(f"Distance of {names[1]} from {names[0]}", 1.0, apart))
         panels.append(_Panel("Paths", 1.5, paths))
     return panels
 
@@ -300,7 +322,7 @@ def _comparison(a: Run, b: Run, found: Comparison, names: tuple[str, str]) -> "F
     axes = figure.subplots(len(panels), 1, squeeze=False, height_ratios=heights)[:, 0]
     for ax, panel in zip(axes, panels, strict=True):
         panel.draw(ax)
-        ax.set_title(panel.title, fontsize=10, loc="left")
+        ax.set_title(panel.title, fontsize=10, loc="right")
     return figure
 
 
@@ -310,4 +332,4 @@ def _label(ax: "Axes", x: str, y: str) -> None:
     ax.set_xlabel(x, fontsize=9)
     ax.set_ylabel(y, fontsize=9)
     ax.tick_params(labelsize=9)
-    ax.legend(fontsize=8, framealpha=0.8, loc="best")
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=1, fontsize=9, frameon=False, borderaxespad=0)

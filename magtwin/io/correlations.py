@@ -32,7 +32,7 @@ def plot_correlations(
 def figure_of_correlations(found: Correlations, *, title: str = "") -> "Figure":
     """The same as a figure, for a page."""
     count = len(found.features)
-    figure = new_figure(6.4, 1.3 + 0.24 * count)
+    figure = new_figure(5.2, 1.5 + 0.24 * count)
     ax = figure.subplots()
     y = np.arange(count)
     rho = np.nan_to_num(found.rho)
@@ -54,18 +54,18 @@ def figure_of_correlations(found: Correlations, *, title: str = "") -> "Figure":
     if paper:
         ax.plot(*zip(*paper, strict=True), "D", color=MAP_INK, ms=4.5, label="the paper's Figure 2")
     for i in np.flatnonzero(np.isnan(found.rho)).tolist():
-        ax.text(0.01, i, "never varies", va="center", fontsize=8, color="0.4")
+        ax.text(0.01, i, "never varies", va="center", fontsize=9, color="0.4")
     reach = np.nanmax(np.abs(np.append(rho, 0.4)) + np.nan_to_num(np.append(found.sd, 0.0)))
     reach = min(1.1 * reach, 1.05)
     ax.set_xlim(-reach, reach)
-    ax.set_yticks(y, found.features, fontsize=8)
+    ax.set_yticks(y, found.features, fontsize=9)
     ax.set_ylim(count - 0.4, -0.6)
     ax.axvline(0, color=INK, lw=0.8)
     ax.set_xlabel("Spearman's correlation with the disturbance", fontsize=9)
-    ax.tick_params(axis="x", labelsize=8)
+    ax.tick_params(axis="x", labelsize=9)
     ax.grid(axis="x", color="0.9")
     ax.set_axisbelow(True)
     if title:
         ax.set_title(title, fontsize=10)
-    figure.legend(loc="outside lower center", ncols=3, fontsize=7.5, frameon=False)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     return figure

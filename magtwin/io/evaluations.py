@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magtwin.field.map import AnomalyMap
 from magtwin.files import output
-from magtwin.io.charts import Picture, thinned
+from magtwin.io.charts import WIDTH_IN, Picture, short_name, thinned
 from magtwin.io.correlations import figure_of_correlations
 from magtwin.io.learning_curves import label_epochs
 from magtwin.io.pages import WRITERS, Page, Section, Table
@@ -75,9 +75,10 @@ def page_of_evaluation(
     against = "the exact field" if found.truth else "the reading"
     lead = (
         f"{len(found.judged)} recordings of {every.sessions} sessions, {every.scores[0].rows:,} readings "
-        "on which every model was judged. Errors are of the total field at the sensor, predicted less "
+        "on which every model was evaluated. Errors: total field at the sensor, predicted minus "
         f"{against}."
     )
+    lead = " ".join([*(f"{name}: {line}" for name, line in found.verdicts().items()), lead])
     sections = [
         Section("Table 1", _lead_of_table(found), (), (_table(found),)),
         Section("Models and maps", "", (), (_models(found), _maps(found), _left_out(found))),
@@ -144,7 +145,6 @@ class Drawing:
     alt: str
     figure: "Figure"
     kind: str = "svg"
-    tall: bool = False
 
 
 def pictured(drawings: Sequence[Drawing | None]) -> tuple[Picture, ...]:
@@ -155,17 +155,20 @@ def pictured(drawings: Sequence[Drawing | None]) -> tuple[Picture, ...]:
             continue
         one.figure.set_dpi(160)
         kind = "svg+xml" if one.kind == "svg" else one.kind
-        made.append(Picture(one.title, one.alt, kind, drawn(one.figure, f".{one.kind}"), one.tall, one.file))
+        made.append(Picture(one.title, one.alt, kind, drawn(one.figure, f".{one.kind}"), one.file))
     return tuple(made)
 
 
 def _lead_of_table(found: Evaluation) -> str:
     sessions = found.every.sessions
-    one = " Of one session only runs and blocks are drawn: nothing is said of other days." * (sessions == 1)
+    one = " With one session only runs and blocks are drawn: the intervals do not cover other sessions." * (
+        sessions == 1
+    )
     return (
-        "Mean absolute error [nT], and in brackets its ratio to that of the naive model: the first map and "
-        f"the mean training label on every row. Intervals hold {LEVEL:.0%} of {DRAWS:,} draws of sessions, "
-        f"of runs within them, and of blocks of time within those.{one}"
+        "Mean absolute error [nT], with its ratio to that of the naive model in brackets (lower is better). "
+        "The naive model adds the mean training label to the first map. Intervals are "
+        f"{LEVEL:.0%} bootstrap intervals: {DRAWS:,} draws of sessions, runs within them and blocks of time "
+        f"within those.{one}"
     )
 
 
@@ -183,7 +186,7 @@ def _table(found: Evaluation) -> Table:
         rows.append(["the paper's network", *network])
     if len(head) > MOST_COLUMNS:
         head, *rows = (list(line) for line in zip(head, *rows, strict=True))
-    note = "" if len(found.cases) < 3 else "mean: of the other paths, each counting the same."
+    note = "" if len(found.cases) < 3 else "mean: over the paths, with equal weights."
     return Table("Mean absolute errors", tuple(head), tuple(tuple(row) for row in rows), note)
 
 
@@ -217,9 +220,11 @@ def _intervals(found: Evaluation) -> Table:
                     f"{score.outside:.1%}",
                 )
             )
-    head = ("case", "model", "MAE [nT]", "from", "to", "ratio", "from", "to", "RMSE [nT]", "bias [nT]")
-    note = f"coverage: share of the readings within the predicted interval of {COVERED:.0%}. out of "
-    note += "distribution: share with an input beyond the training ranges. from, to: the interval."
+    head = ("path", "model", "MAE [nT]", "from", "to", "ratio", "from", "to", "RMSE [nT]", "bias [nT]")
+    note = (
+        f"from, to: {LEVEL:.0%} interval. coverage: share of the readings within the predicted {COVERED:.0%} "
+    )
+    note += "interval. out of distribution: share with an input outside the training ranges."
     return Table("With intervals", (*head, "coverage", "out of distribution"), tuple(rows), note)
 
 
@@ -241,10 +246,17 @@ def _maps(found: Evaluation) -> Table:
         alone, centred = _alone(found, chart.field)
         own = ("unknown", "unknown") if np.isnan(mae) else (mae, rms)
         rows.append((chart.name, chart.field.method, *own, alone, centred))
-    head = ("map", "method", "own MAE [nT]", "own RMS [nT]", "map alone MAE [nT]", "less its mean [nT]")
+    head = (
+        "map",
+        "method",
+        "expected MAE [nT]",
+        "expected RMS [nT]",
+        "map alone, MAE [nT]",
+        "less its mean [nT]",
+    )
     note = (
-        "own: what the map's own variances say that its error is on these readings, the noise floor of its "
-        "labels. map alone: the map without any model of the robot, and less the mean of what it misses here."
+        "expected: the map's error on these readings, according to its own variances; the noise floor of its "
+        "labels. map alone: the map without a model of the robot, before and after its mean error is removed."
     )
     return Table("Maps", head, tuple(rows), note)
 
@@ -258,8 +270,8 @@ def _alone(found: Evaluation, field_: AnomalyMap) -> tuple[float, float]:
 
 def _left_out(found: Evaluation) -> Table:
     rows = tuple(found.left_out.items())
-    note = "Models are judged on common readings." if rows else "None: every reading can be judged on."
-    return Table("Readings left out", ("those that", "readings"), rows, note)
+    note = "All models are evaluated on the same readings." if rows else "None."
+    return Table("Readings left out", ("reason", "readings"), rows, note)
 
 
 def _ranks(found: Evaluation) -> Drawing | None:
@@ -285,7 +297,7 @@ def _ranks(found: Evaluation) -> Drawing | None:
         return None
     ranked = correlations(x, y, able, np.concatenate(groups))
     title = "Figure 2: Spearman's correlation of each input with the disturbance, beside the paper's"
-    return Drawing("figure_2", title, title, figure_of_correlations(ranked), tall=True)
+    return Drawing("figure_2", title, title, figure_of_correlations(ranked))
 
 
 def _every(one: Judged, rate_hz: float) -> int:
@@ -321,7 +333,7 @@ def _band(found: Evaluation) -> Drawing:
     t, kept = t[seen], one.kept[seen]
     measured = np.where(kept, one.measured_nt[seen], np.nan)
     rows = np.unique(np.linspace(0, len(t) - 1, 900).astype(int))
-    figure = new_figure(7.4, 0.7 + 2.6 * len(shown))
+    figure = new_figure(WIDTH_IN, 0.9 + 2.6 * len(shown))
     heights = [1.5, 1.0] * len(shown)
     axes = figure.subplots(2 * len(shown), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for k, m in enumerate(shown):
@@ -339,17 +351,17 @@ def _band(found: Evaluation) -> Drawing:
         _line(error_ax, t, error, color=ink(m), lw=0.9)
         error_ax.axhline(0, color=INK, lw=0.6)
         mae = np.nanmean(np.abs(error)) if np.isfinite(error).any() else np.nan
-        field_ax.set_title(f"{found.names[m]}: MAE {mae:.0f} nT in what is shown", fontsize=9, loc="left")
+        field_ax.set_title(f"{short_name(found.names[m], 40)}: MAE {mae:.0f} nT", fontsize=9, loc="left")
         field_ax.set_ylabel("field [µT]", fontsize=9)
         error_ax.set_ylabel("error [nT]", fontsize=9)
         for ax in (field_ax, error_ax):
             ax.margins(x=0)
-            ax.tick_params(labelsize=8)
+            ax.tick_params(labelsize=9)
     axes[-1].set_xlabel("time [s]", fontsize=9)
     told = {label: line for ax in axes for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(told.values(), told.keys(), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    figure.legend(told.values(), told.keys(), loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     title = f"Figure 5: total field of {one.name} ({one.path}), measured and predicted, and the errors"
-    return Drawing("figure_5", title, title, figure, tall=True)
+    return Drawing("figure_5", title, title, figure)
 
 
 def _floor_plan(found: Evaluation) -> Drawing | None:
@@ -362,15 +374,15 @@ def _floor_plan(found: Evaluation) -> Drawing | None:
     chart = found.contenders[best].chart.field
     known = np.where(chart.valid.all(axis=0), chart.values_nt.mean(axis=0), np.nan) / 1000
     x0, x1, y0, y1 = chart.extent
-    height = np.clip(3.3 * (y1 - y0) / (x1 - x0), 1.2, 5.0)
-    figure = new_figure(7.6, 0.9 + (height + 0.35) * len(shown))
+    height = np.clip(2.2 * (y1 - y0) / (x1 - x0), 0.9, 5.0)
+    figure = new_figure(WIDTH_IN, 1.0 + (height + 0.35) * len(shown))
     axes = figure.subplots(len(shown), 2, sharex=True, sharey=True, squeeze=False)
     fields = [np.where(one.kept, one.measured_nt, np.nan) / 1000 for one in shown]
     sizes = [np.where(one.kept, np.abs(one.total_nt[best] - one.measured_nt), np.nan) for one in shown]
     for column, (values, colours, label) in enumerate(
         (
             (fields, "viridis", "total field [µT]"),
-            (sizes, "magma_r", f"error of {found.names[best]}, its size [nT]"),
+            (sizes, "magma_r", f"|error| of {short_name(found.names[best], 16)} [nT]"),
         )
     ):
         every = np.concatenate(values)
@@ -392,26 +404,26 @@ def _floor_plan(found: Evaluation) -> Drawing | None:
             ax.add_collection(line)
             ax.set_aspect("equal")
             ax.set_title(one.case if one.case == one.path else f"{one.case} ({one.path})", fontsize=9)
-            ax.tick_params(labelsize=8)
+            ax.tick_params(labelsize=9)
         assert line is not None
         bar = figure.colorbar(
-            line, ax=axes[:, column].tolist(), orientation="horizontal", aspect=40, pad=0.02
+            line, ax=axes[:, column].tolist(), orientation="horizontal", aspect=30, pad=0.02
         )
         bar.set_label(label, fontsize=9)
-        bar.ax.tick_params(labelsize=8)
+        bar.ax.tick_params(labelsize=9)
     for ax in axes[-1]:
         ax.set_xlabel("x [m]", fontsize=9)
     for ax in axes[:, 0]:
         ax.set_ylabel("y [m]", fontsize=9)
     title = f"Figure 7: paths over the map {found.contenders[best].chart.name} (grey, mean over headings)"
-    return Drawing("figure_7", title, title, figure, "png", tall=True)
+    return Drawing("figure_7", title, title, figure, "png")
 
 
 def _bars(found: Evaluation) -> Drawing:
     """The paper's Figure 6 a and b: errors by path, with their intervals."""
     cases = [case for case in found.cases if case.name != "all"]
     count = len(found.contenders)
-    figure = new_figure(float(np.clip(1.6 + 0.14 * count * len(cases), 5.6, 7.4)), 2.9 + 0.1 * count)
+    figure = new_figure(WIDTH_IN, 2.9 + 0.13 * count)
     ax = figure.subplots()
     width = 0.84 / count
     for m, name in enumerate(found.names):
@@ -424,10 +436,10 @@ def _bars(found: Evaluation) -> Drawing:
     ax.set_xticks(np.arange(len(cases)), [case.name for case in cases], fontsize=9)
     ax.set_ylabel("mean absolute error [nT]", fontsize=9)
     ax.set_ylim(bottom=0)
-    ax.tick_params(axis="y", labelsize=8)
+    ax.tick_params(axis="y", labelsize=9)
     ax.grid(axis="y", color="0.9")
     ax.set_axisbelow(True)
-    figure.legend(loc="outside lower center", ncols=2 if count > 3 else 3, fontsize=7.5, frameon=False)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     title = f"Figure 6 a, b: errors by path, with {LEVEL:.0%} intervals"
     return Drawing("figure_6ab", title, title, figure)
 
@@ -437,7 +449,7 @@ def _curves(found: Evaluation, curves: Mapping[str, Sequence[Mapping[str, float]
     shown = {m: curves[name] for m, name in enumerate(found.names) if curves.get(name)}
     if not shown:
         return None
-    figure = new_figure(5.6, 3.6)
+    figure = new_figure(WIDTH_IN, 3.4)
     ax = figure.subplots()
     for m, rows in shown.items():
         for column, (what, style) in CURVES.items():
@@ -446,7 +458,7 @@ def _curves(found: Evaluation, curves: Mapping[str, Sequence[Mapping[str, float]
                 label = f"{found.names[m]}, {what}"
                 ax.plot(*zip(*points, strict=True), ls=style, color=ink(m), label=label)
     label_epochs(ax)
-    figure.legend(loc="outside lower center", ncols=2, fontsize=7.5, frameon=False)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     title = "Figure 6 c: error in training and on validation recordings over the epochs"
     return Drawing("figure_6c", title, title, figure)
 

@@ -147,6 +147,11 @@ def write_run(
     if unknown := sorted(options.keys() - format_.takes):
         raise RefusedError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
     check_clock(run, "the run to write")
+    if twin is not None and twin.stage is not None and "scene_file" in format_.takes:
+        raise RefusedError(
+            f"{path}: {format_.name} names the scene's file, and this scene has none; author it with "
+            "magtwin.usd.scene.author_scene and open that, or leave out twin"
+        )
     scene_file = None if twin is None else twin.scene_file
     known = {"twin": twin, "planned": planned, "scans": scans, "scene_file": scene_file}
     given = {name: value for name, value in known.items() if name in format_.takes}

@@ -35,7 +35,7 @@ def plot_learning_curve(
     Raises:
         RefusedError: `out` is no picture or exists.
     """
-    figure = new_figure(5.6, 3.4)
+    figure = new_figure(5.2, 3.4)
     ax = figure.subplots()
     numbers = [epoch.number for epoch in history]
     mark = "." if len(numbers) <= 60 else ""
@@ -49,7 +49,7 @@ def plot_learning_curve(
     ax.set_axisbelow(True)
     if title:
         ax.set_title(title, fontsize=10)
-    figure.legend(loc="outside lower center", ncols=4, fontsize=7.5, frameon=False)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     save(figure, out, force)
 
 
@@ -61,7 +61,7 @@ def label_epochs(ax: "Axes") -> None:
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("epoch", fontsize=9)
     ax.set_ylabel("RMSE [nT]", fontsize=9)
-    ax.tick_params(labelsize=8)
+    ax.tick_params(labelsize=9)
     ax.grid(color="0.9")
 
 

@@ -29,7 +29,10 @@ LARGEST_CHUNK = 1 << 30
 """Bytes of the largest chunk that is read."""
 
 MOST_RATIO = 1000
-"""Most bytes that a chunk may hold for each one that it has in the file, beside a first `CHUNK`."""
+"""Most bytes that a chunk may hold for each one that it has in the file, beside those of `SPARE`."""
+
+SPARE = 1 << 26
+"""Bytes that all chunks of a file together may hold beyond `MOST_RATIO`: blank images shrink to nothing."""
 
 LEVEL = 1
 """Of zstd's compression."""
@@ -102,6 +105,7 @@ class McapWriter:
 
     def close(self) -> None:
         """Write the summary; the file is whole then."""
+        self._put(self._pending)  # topics without a message: the summary may only repeat the data section
         self._put(_record(_DATA_END, struct.pack("<I", 0)))
         start = self._file.tell()
         first, last = self._span if any(self._counts.values()) else (0, 0)
@@ -152,15 +156,16 @@ class McapWriter:
             content = np.empty(len(pending) + int(ends[last - 1]) - before, np.uint8)
             content[: len(pending)] = np.frombuffer(pending, np.uint8)
             offsets = ends[first:last] - sizes[first:last] - before + len(pending)
-            index = {}
+            parts: dict[int, list[Any]] = {}
             for k, batch in enumerate(batches):
                 mine = offsets[which[first:last] == k]
                 if len(mine):
                     rows = batch.rows[done[k] : done[k] + len(mine)]
                     _scatter(rows, content, mine)
                     stamps = batch.received[done[k] : done[k] + len(mine)]
-                    index[batch.connection.id] = np.stack([stamps, mine], axis=1).astype("<u8")
+                    parts.setdefault(batch.connection.id, []).append(np.stack([stamps, mine], axis=1))
                     done[k] += len(mine)
+            index = {channel: _sorted(np.concatenate(part).astype("<u8")) for channel, part in parts.items()}
             yield _Chunk(int(times[first]), int(times[last - 1]), content, index)
             first = last
 
@@ -213,6 +218,11 @@ def _fill_heads(batch: Batch) -> None:
     batch.rows[:, :ROOM] = heads.view(np.uint8).reshape(count, ROOM)
 
 
+def _sorted(entries: Any) -> Any:
+    """Entries of a message index, (time, offset), in the order of their offsets."""
+    return entries[np.argsort(entries[:, 1], kind="stable")]
+
+
 def _scatter(rows: Bytes, out: Bytes, at: Index) -> None:
     """Put each row of (M, S) where it is to stand in `out`."""
     size = rows.shape[1]
@@ -227,6 +237,7 @@ class McapReader:
         topics: Its channels.
         notes: Records of metadata by name; of several of one name the last.
         whole: Whether it has its end.
+        unindexed: How many messages read so far are in a chunk and not in its index, by channel.
     """
 
     def __init__(self, path: Path) -> None:
@@ -235,6 +246,8 @@ class McapReader:
         self._size = path.stat().st_size
         self.notes: dict[str, dict[str, str]] = {}
         self.whole = False
+        self.unindexed: dict[int, int] = {}
+        self._spare = SPARE
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, tuple[int, str, str]] = {}
         self._chunks: list[tuple[int, int, dict[int, Any]]] = []
@@ -263,7 +276,8 @@ class McapReader:
         """The messages of some topics, as they were received."""
         parts: dict[int, list[tuple[Index, Index, Index]]] = {number: [] for number in ids}
         buffers: list[Bytes] = []
-        base = 0
+        base, self._spare = 0, SPARE
+        self.unindexed |= dict.fromkeys(ids, 0)
         for number, loose in self._loose.items():
             if number in parts:
                 received, starts, sizes = (np.array(a, np.int64) for a in zip(*loose, strict=True))
@@ -277,7 +291,12 @@ class McapReader:
             content = self._content(place, length)
             if content is None:
                 continue
-            found_here = _indexed(content, index, parts) if index else _walked(content, parts, self._tell)
+            if index:
+                found_here, lacking = _indexed(content, index, parts, self._tell)
+                for number, count in lacking.items():
+                    self.unindexed[number] += count
+            else:
+                found_here = _walked(content, parts, self._tell)
             for number, (received, start, size) in found_here.items():
                 parts[number].append((received, base + start, size))
             if found_here:
@@ -315,7 +334,10 @@ class McapReader:
                 count = struct.unpack_from("<I", content, 2)[0] // 16
                 if 6 + 16 * count == length:
                     entries = np.frombuffer(content, "<u8", 2 * count, 6).reshape(-1, 2)
-                    self._chunks[-1][2][struct.unpack_from("<H", content)[0]] = entries
+                    index, channel = self._chunks[-1][2], struct.unpack_from("<H", content)[0]
+                    index[channel] = (
+                        np.concatenate([index[channel], entries]) if channel in index else entries
+                    )
             elif opcode in (_SCHEMA, _CHANNEL, _METADATA):
                 self._tell(opcode, self._file.read(length))
             elif opcode == _FOOTER:
@@ -350,11 +372,12 @@ class McapReader:
         words.number("<QQ")
         size, crc, codec, stored = words.number("<Q"), words.number("<I"), words.text(), words.number("<Q")
         raw = words.rest()
-        most = min(LARGEST_CHUNK, CHUNK + MOST_RATIO * len(raw))
+        most = min(LARGEST_CHUNK, self._spare + MOST_RATIO * len(raw))
         if stored != len(raw) or size > most or codec not in ("", "zstd", "lz4"):
             raise RefusedError(
                 f"a chunk of {size} bytes, {codec[:8] or 'not'} compressed to {stored}, cannot be"
             )
+        self._spare -= max(0, size - MOST_RATIO * len(raw))
         try:
             content = pa.Codec(codec).decompress(raw, size) if codec else raw
         except (pa.ArrowException, OSError, ValueError) as error:
@@ -400,18 +423,26 @@ class _Words:
         return self._content[self._at - size : self._at]
 
 
+Found = dict[int, tuple[Index, Index, Index]]
+"""By channel: times [ns], places and sizes of messages, each of shape (M,)."""
+
+
 def _indexed(
-    content: Bytes, index: Mapping[int, Any], wanted: Collection[int]
-) -> dict[int, tuple[Index, Index, Index]]:
-    """Times, places and sizes of messages of wanted channels, by the chunk's index."""
-    found = {}
+    content: Bytes, index: Mapping[int, Any], wanted: Collection[int], tell: Any
+) -> tuple[Found, dict[int, int]]:
+    """Messages of wanted channels by the chunk's index, and how many the index lacks by channel.
+
+    Bytes of the chunk that no entry of the index covers are read record by record, so a message that the
+    index lacks is read too.
+    """
+    found: Found = {}
+    begins, ends = [np.array([len(content)])], [np.zeros(1, np.int64)]
     for channel, entries in index.items():
-        if channel not in wanted or not len(entries):
+        if not len(entries):
             continue
-        at = entries[:, 1]
-        if int(at.max()) + ROOM > len(content):
+        if int(entries[:, 1].max()) + ROOM > len(content):
             raise RefusedError("the index of a chunk points outside of it")
-        at = at.astype(np.int64)
+        at = np.unique(entries[:, 1]).astype(np.int64)
         lengths = _look("<u8", content, at + 1)
         right = (content[at] == _MESSAGE) & (_look("<u2", content, at + 9) == channel)
         if not right.all() or np.any(lengths < ROOM - 9) or np.any(lengths > len(content)):
@@ -419,8 +450,26 @@ def _indexed(
         sizes = lengths.astype(np.int64) - (ROOM - 9)
         if np.any(at + ROOM + sizes > len(content)):
             raise RefusedError("a message ends outside of its chunk")
-        found[channel] = (_look("<u8", content, at + 15).astype(np.int64), at + ROOM, sizes)
-    return found
+        begins.append(at)
+        ends.append(at + ROOM + sizes)
+        if channel in wanted:
+            found[channel] = (_look("<u8", content, at + 15).astype(np.int64), at + ROOM, sizes)
+    begin = np.concatenate(begins)
+    order = np.argsort(begin)
+    after, before = begin[order], np.concatenate([[0], np.concatenate(ends)[order][:-1]])
+    if np.any(before > after):
+        raise RefusedError("the index of a chunk points at messages that overlap")
+    lacking: dict[int, int] = {}
+    for gap in np.flatnonzero(before < after):
+        first = int(before[gap])
+        for channel, columns in _walked(content[first : int(after[gap])], wanted, tell).items():
+            more = (columns[0], columns[1] + first, columns[2])
+            lacking[channel] = lacking.get(channel, 0) + len(more[0])
+            known = found.get(channel, (np.zeros(0, np.int64),) * 3)
+            received, start, size = (np.concatenate(pair) for pair in zip(known, more, strict=True))
+            rank = np.argsort(start)
+            found[channel] = (received[rank], start[rank], size[rank])
+    return found, lacking
 
 
 def _look(kind: str, content: Bytes, at: Index) -> Any:
@@ -428,8 +477,8 @@ def _look(kind: str, content: Bytes, at: Index) -> Any:
     return np.ndarray((len(content) - size + 1,), kind, content, 0, (1,))[at]
 
 
-def _walked(content: Bytes, wanted: Collection[int], tell: Any) -> dict[int, tuple[Index, Index, Index]]:
-    """The same by going from record to record; what is not a message is told."""
+def _walked(content: Bytes, wanted: Collection[int], tell: Any) -> Found:
+    """Messages of wanted channels by going from record to record; schemas and channels are told."""
     found: dict[int, list[tuple[int, int, int]]] = {}
     raw, at, size = content.data, 0, len(content)
     message = struct.Struct("<HIQ")

@@ -23,7 +23,7 @@ import magtwin
 from magtwin.compare import ERRORS, Agreement, Comparison, errors_of
 from magtwin.field.map import AnomalyMap
 from magtwin.files import output
-from magtwin.io.charts import Picture, pictures_of_comparison, pictures_of_run
+from magtwin.io.charts import Picture, pictures_of_comparison, pictures_of_run, short_names
 from magtwin.names import RefusedError
 from magtwin.run import COLUMNS, Run
 
@@ -33,7 +33,7 @@ LONGEST_TEXT = 500
 MOST_SPANS = 12
 """Times at which a flag was raised that a page lists; more are counted."""
 
-AGREEMENT_HEAD = ("mean", "RMS", "mean absolute", "greatest", "readings")
+AGREEMENT_HEAD = ("mean", "RMS", "mean absolute", "maximum", "readings")
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def page_of_runs(
         "RMS [nT]",
         "events",
     )
-    note = "MAE and RMS are of b_measured_nt against the exact field, where that is known."
+    note = "MAE and RMS: error of b_measured_nt against the exact field, where that is known."
     total = sum(one.run.rows for one in told)
     return Page(
         f"{len(told)} runs",
@@ -135,19 +135,19 @@ def page_of_runs(
 def page_of_comparison(a: Told, b: Told, found: Comparison) -> Page:
     """A page of two runs laid over each other."""
     how = {
-        "time": f"{b.name} was moved by {found.shift:+.4f} s, where the positions lie closest.",
-        "path": f"Place by place along the driven length; {b.name} was moved by {found.shift:+.4f} m.",
-        "none": "Clocks were compared as they stand.",
+        "time": f"{b.name} is shifted by {found.shift:+.4f} s, which brings the positions closest.",
+        "path": f"Aligned by distance driven; {b.name} is shifted by {found.shift:+.4f} m.",
+        "none": "Aligned by the clocks of the runs, unchanged.",
     }[found.align]
     rows = tuple(
         (one.name, one.unit, *_agreement(one), "" if one.correlation is None else f"{one.correlation:.4f}")
         for one in found.agreements()
     )
     table = Table(
-        f"{b.name} less {a.name}",
+        f"{b.name} minus {a.name}",
         ("quantity", "unit", *AGREEMENT_HEAD, "correlation"),
         rows,
-        "Along-track is ahead of the first run, cross-track to its left.",
+        "Along-track: ahead of the first run; cross-track: to its left.",
     )
     pictures = tuple(pictures_of_comparison(a.run, b.run, found, (a.name, b.name)))
     facts = sorted({*a.run.facts, *b.run.facts}, key=lambda name: (name not in a.run.facts, name))
@@ -158,10 +158,10 @@ def page_of_comparison(a: Told, b: Told, found: Comparison) -> Page:
     )
     tables = [table]
     if differ:
-        tables.append(Table("Facts that differ", ("fact", a.name, b.name), differ))
+        tables.append(Table("Metadata that differ", ("metadata", a.name, b.name), differ))
     return Page(
-        f"{a.name} and {b.name}",
-        f"{len(found.at):,} readings compared. {how}",
+        " and ".join(short_names((a.name, b.name))),
+        f"{a.name} and {b.name}: {len(found.at):,} readings compared. {how}",
         (Section("Comparison", "", pictures, tuple(tables)),),
         data={"a": a.name, "b": b.name, **found.summary(), "facts": [_facts(a.run), _facts(b.run)]},
     )
@@ -217,24 +217,24 @@ def _section(one: Told, pictures: bool) -> Section:
     figures = tuple(
         (f.name, f.value, "" if f.spread is None else f.spread, f.unit, f.note) for f in report.figures
     )
-    tables = [Table("Figures", ("", "value", "sd", "unit", ""), figures)]
+    tables = [Table("Figures", ("quantity", "value", "standard deviation", "unit", "note"), figures)]
     errors = errors_of(run)
     if errors:
         rows = tuple((name, ERRORS[name][2], *_agreement(errors[name])) for name in errors)
-        note = "Each is one column less another: " + "; ".join(
+        note = "Each error is the difference of columns: " + "; ".join(
             f"{name} = {' - '.join((ERRORS[name][0], *ERRORS[name][1]))}" for name in errors
         )
         coverage = _coverage(run)
         if coverage is not None:
-            note += f". {100 * coverage:.1f} % of the errors lie within 2 predicted standard deviations"
-        head = ("address", "what it is", *(f"{name} [nT]" for name in AGREEMENT_HEAD[:-1]), "readings")
-        tables.append(Table("Errors by their address", head, rows, note + "."))
+            note += f". {100 * coverage:.1f} % of the total errors lie within 2 predicted standard deviations"
+        head = ("source", "meaning", *(f"{name} [nT]" for name in AGREEMENT_HEAD[:-1]), "readings")
+        tables.append(Table("Errors by source", head, rows, note + "."))
     events = tuple((name, doc, count, times) for name, doc, count, times in _events(run))
     tables.append(
-        Table("Events", ("flag", "what it means", "readings", "when [s]"), events, "" if events else "None.")
+        Table("Events", ("flag", "meaning", "readings", "times [s]"), events, "" if events else "None.")
     )
     tables.append(
-        Table("Provenance", ("fact", ""), tuple(run.facts.items()), "" if run.facts else "No facts.")
+        Table("Provenance", ("metadata", ""), tuple(run.facts.items()), "" if run.facts else "No metadata.")
     )
     drawn = pictures_of_run(run, one.field, one.planned) if pictures else []
     lead = f"{one.name}. {one.note}".strip()
@@ -363,15 +363,18 @@ def _html_section(section: Section, k: int, *, titled: bool) -> str:
         parts.append(f"<h2>{_escaped(section.title)}</h2>")
     if section.lead:
         parts.append(f'<p class="lead">{_escaped(section.lead)}</p>')
-    parts.append('<div class="pictures">')
+    if section.pictures:
+        count = {1: " one", 2: " two"}.get(len(section.pictures), "")
+        parts.append(f'<div class="pictures{count}">')
     for picture in section.pictures:
         data = base64.b64encode(picture.data).decode("ascii")
-        tall = " class=tall" if picture.tall else ""
         parts.append(
-            f'<figure{tall}><img alt="{_escaped(picture.alt)}" src="data:image/{picture.kind};base64,{data}">'
+            f'<figure style="--aspect: {picture.aspect():.3f}"><img alt="{_escaped(picture.alt)}" '
+            f'src="data:image/{picture.kind};base64,{data}">'
             f"<figcaption>{_escaped(picture.title)}</figcaption></figure>"
         )
-    parts.append("</div>")
+    if section.pictures:
+        parts.append("</div>")
     parts += [_html_table(table) for table in section.tables]
     return "\n".join([*parts, "</section>"])
 
@@ -395,10 +398,13 @@ def _html_table(table: Table, links: Sequence[str] = ()) -> str:
             if links:
                 first = f'<a href="{links[k]}">{first}</a>'
             row = [f'<th scope="row">{first}</th>']
-            for value in cells:
+            for label, value in zip(table.head[1:], cells, strict=True):
                 number = _NUMBER if _is_number(value) and not fact else ""
                 number = number or _LONG * (not fact and len(str(value)) > 24)
-                row.append(f"<td{number}>{_escaped(_fact(value) if fact else _words(value))}</td>")
+                text = _escaped(_fact(value) if fact else _words(value))
+                if text and label:  # shown where a row is narrow, and the head is not
+                    text = f'<span class="label">{_escaped(label)}</span><span>{text}</span>'
+                row.append(f"<td{number}>{text}</td>")
             parts.append(f"<tr>{''.join(row)}</tr>")
         parts.append("</tbody></table></div>")
     if table.note:
@@ -406,7 +412,7 @@ def _html_table(table: Table, links: Sequence[str] = ()) -> str:
     return "\n".join(parts)
 
 
-_EXACT = ("Provenance", "Facts that differ")
+_EXACT = ("Provenance", "Metadata that differ")
 """Tables whose numbers are shown as they are."""
 
 
@@ -414,7 +420,13 @@ _NUMBER, _LONG = ' class="number"', ' class="long"'
 
 
 def _is_number(value: Any) -> bool:
+    """Whether a cell is aligned as numbers are: a number, or one in words such as "212.9 (0.493)"."""
+    if isinstance(value, str):
+        return _NUMERIC.fullmatch(value) is not None
     return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+_NUMERIC = re.compile(r"[+-]?\d{1,3}(,?\d{3})*(\.\d+)?( ?%| \(.*\))?")
 
 
 def _escaped(text: str) -> str:

@@ -1,6 +1,7 @@
 """Pictures: a stage as a PNG, drawn off screen, with or without a graphics card."""
 
 import ctypes
+import itertools
 import os
 import sys
 from collections.abc import Iterator
@@ -13,9 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.files import output
 from magtwin.frames import rotate
+from magtwin.io.cutaway import Cutaway
 from magtwin.names import RefusedError
 from magtwin.spec import Vec3
 from magtwin.usd.geometry import (
+    ColourScale,
     Shape,
     read_colour_scale,
     read_links,
@@ -26,6 +29,15 @@ from magtwin.usd.layers import open_stage
 
 MARGIN = 1.08
 """How much farther away the camera stands than what is seen would need."""
+
+AROUND_M = 0.7
+"""How far around and above a heat-map, or a run's path, a camera over the lab sees at least [m]."""
+
+LAB_ELEVATION_DEG = 36.0
+"""Height of a camera over a lab above its target's horizon [deg]."""
+
+BAR_SHARE = 0.12
+"""Share of a picture's width, at its right, that the colour bar takes."""
 
 GL_PACKAGES = "libegl1 libgl1-mesa-dri libx11-6"
 """Debian's packages that draw without a screen: EGL, Mesa's drivers for it, and what VTK loads first."""
@@ -92,7 +104,8 @@ def picture_of_stage(
         path: USD file.
         out: PNG to write.
         size: Width and height [pixel].
-        camera: Where from; by default three quarters from the front, everything in view.
+        camera: Where from; by default three quarters from the front, with everything in view, or, in a lab,
+            its heat-map. What stands between the camera and a heat-map or robot is drawn as a veil.
         title: A line at the top.
         legend: Whether a stage with an anomaly map gets the colour bar of its heat-map.
         ground: Whether to draw a floor below everything; by default where the stage has nothing but
@@ -111,12 +124,12 @@ def picture_of_stage(
     with output(out, force=force) as aside:
         plotter = plotter_of(size)
         try:
-            _draw(plotter, path, size, camera or Camera(), legend=legend, ground=ground)
+            drawn = _draw(plotter, path, size, camera, legend=legend, ground=ground)
             if title:
                 plotter.add_text(
                     title, position=(0.02, 0.93), viewport=True, font_size=round(size[1] / 80), color=INK
                 )
-            plotter.screenshot(str(aside), window_size=list(size))
+            write_png(Cutaway(plotter, size, drawn.screens).image(), aside)
         finally:
             plotter.close()
     return out
@@ -136,23 +149,52 @@ def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1
         raise RefusedError(f"{path}: there is no display to show it on; magtwin picture draws it to a file")
     plotter = plotter_of(size, window=True)
     try:
-        _draw(plotter, path, size, Camera())
+        _draw(plotter, path, size, None)
         plotter.show(title=str(path))
     finally:
         plotter.close()
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What `_draw` put before the camera."""
+
+    around: NDArray[np.float64]
+    """Points that a camera without a distance of its own keeps in view [m], shape (N, 3)."""
+
+    screens: list[Any]
+    """Actors that may hide the subject of the picture."""
+
+    bar: bool
+    """Whether there is a colour bar."""
+
+
+def is_subject(shape: Shape, scale: ColourScale | None) -> bool:
+    """Whether a shape must not be hidden: a heat-map, or a part of a robot."""
+    return bool(shape.link) or (scale is not None and shape.prim == scale.prim)
+
+
+def room_above(points: ArrayLike) -> NDArray[np.float64]:
+    """Corners of the box around points, `AROUND_M` more on all sides and above [m], shape (8, 3)."""
+    points = np.asarray(points, float)
+    low, high = points.min(axis=0), points.max(axis=0)
+    low[:2] -= AROUND_M
+    high[:2] += AROUND_M
+    ends = zip((*low[:2], min(low[2], 0.0)), (*high[:2], max(low[2] + AROUND_M, high[2])), strict=True)
+    return np.array(list(itertools.product(*ends)))
 
 
 def _draw(
     plotter: Any,
     path: str | os.PathLike[str],
     size: tuple[int, int],
-    camera: Camera,
+    camera: Camera | None,
     *,
     legend: bool = True,
     ground: bool | None = None,
     soft: bool = True,
-) -> NDArray[np.float64]:
-    """A stage as it stands, lit, before a camera; arguments as for `picture_of_stage`. Returns its points."""
+) -> "_Drawn":
+    """Draw a stage as it stands, lit, before a camera; arguments as for `picture_of_stage`."""
     stage = open_stage(path)
     shapes = read_shapes(stage)
     if not shapes:
@@ -164,19 +206,27 @@ def _draw(
         else s.vertices.astype(float)
         for s in shapes
     ]
-    everything = np.vstack(worlds)
-    for shape, vertices in zip(shapes, worlds, strict=True):
-        _add(plotter, shape, vertices)
+    everything, scale = np.vstack(worlds), read_colour_scale(stage)
+    subject = [is_subject(s, scale) for s in shapes]
+    around = everything
+    if scale is not None and any(s.prim == scale.prim for s in shapes):
+        camera = camera or Camera(elevation_deg=LAB_ELEVATION_DEG)
+        around = room_above(np.vstack([v for v, chosen in zip(worlds, subject, strict=True) if chosen]))
+    camera, screens = camera or Camera(), []
+    for shape, vertices, chosen in zip(shapes, worlds, subject, strict=True):
+        actor = _add(plotter, shape, vertices)
+        if not chosen and any(subject):
+            screens.append(actor)
     if ground is None:
         ground = camera.elevation_deg > 0 and all(s.link for s in shapes)
     if ground:
         _add_ground(plotter, everything)
     light(plotter, everything, soft=soft)
-    aim(plotter, camera, everything, size)
-    scale = read_colour_scale(stage) if legend else None
-    if scale is not None:
+    bar = scale is not None and legend
+    aim(plotter, camera, around, size, bar=bar)
+    if scale is not None and legend:
         add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
-    return everything
+    return _Drawn(around, screens, bar)
 
 
 def turntable(
@@ -201,11 +251,12 @@ def turntable(
     cameras = [replace(first, azimuth_deg=first.azimuth_deg + 360 * k / count) for k in range(count)]
     plotter = plotter_of(size)
     try:
-        everything = _draw(plotter, path, size, first, soft=False)
-        farthest = max(distance_of(camera, everything, size) for camera in cameras)
+        drawn = _draw(plotter, path, size, first, soft=False)
+        farthest = max(distance_of(camera, drawn.around, size, bar=drawn.bar) for camera in cameras)
+        cutaway = Cutaway(plotter, size, drawn.screens)
         for camera in cameras:
-            aim(plotter, replace(camera, distance_m=farthest), everything, size)
-            yield plotter.screenshot(return_img=True, window_size=list(size))
+            aim(plotter, replace(camera, distance_m=farthest), drawn.around, size)
+            yield cutaway.image()
     finally:
         plotter.close()
 
@@ -330,10 +381,10 @@ def bake(mesh: Any) -> None:
     mesh["rgb"] = np.minimum(mesh["rgb"] * shade[:, None], 255).round().astype(np.uint8)
 
 
-def _add(plotter: Any, shape: Shape, vertices: NDArray) -> None:
-    """One shape in its colours, shaded smooth but for its creases."""
+def _add(plotter: Any, shape: Shape, vertices: NDArray) -> Any:
+    """One shape in its colours, shaded smooth but for its creases; returns its actor."""
     flat = shape.vertex_colours is not None
-    plotter.add_mesh(mesh_of(shape, vertices), opacity=shape.colour[3], **style_of(flat))
+    return plotter.add_mesh(mesh_of(shape, vertices), opacity=shape.colour[3], **style_of(flat))
 
 
 def _add_ground(plotter: Any, everything: NDArray) -> None:
@@ -363,20 +414,32 @@ def light(plotter: Any, everything: NDArray, *, soft: bool = True) -> None:
         plotter.enable_ssao(radius=0.08 * reach, bias=0.002 * reach, kernel_size=64, blur=True)
 
 
-def aim(plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int]) -> None:
-    """Set the camera, at the distance from which everything is seen unless it gives its own."""
+def aim(
+    plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int], *, bar: bool = False
+) -> None:
+    """Set the camera, at the distance from which everything is seen unless it gives its own.
+
+    Args:
+        plotter: Plotter whose camera is set.
+        camera: Where it stands.
+        everything: Points to keep in view [m], shape (N, 3).
+        size: Width and height [pixel].
+        bar: Whether to keep the points to the left of a colour bar; a camera that gives its distance has
+            its target in the middle all the same.
+    """
     target, axes = _target(camera, everything), _axes(camera)
-    plotter.camera.position = target + distance_of(camera, everything, size) * axes[2]
+    plotter.camera.position = target + distance_of(camera, everything, size, bar=bar) * axes[2]
+    plotter.camera.SetWindowCenter(BAR_SHARE if bar and camera.distance_m is None else 0.0, 0.0)
     plotter.camera.focal_point = target
     plotter.camera.up = axes[1]
     plotter.camera.view_angle = camera.view_angle_deg
     plotter.renderer.ResetCameraClippingRange()
 
 
-def distance_of(camera: Camera, everything: NDArray, size: tuple[int, int]) -> float:
-    """How far from its target a camera stands [m]: so that everything is seen unless it says."""
+def distance_of(camera: Camera, everything: NDArray, size: tuple[int, int], *, bar: bool = False) -> float:
+    """Distance of a camera from its target [m]; where it gives none, everything is just seen."""
     v = np.radians(camera.view_angle_deg) / 2
-    h = np.arctan(np.tan(v) * size[0] / size[1])
+    h = np.arctan(np.tan(v) * size[0] / size[1] * (1 - BAR_SHARE * bar))
     target, axes = _target(camera, everything), _axes(camera)
     return camera.distance_m or MARGIN * view_distance(everything, target, axes, (h, v))
 

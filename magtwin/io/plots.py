@@ -20,7 +20,6 @@ from magtwin.field.difference import TOLD, MapDifference
 from magtwin.field.map import AnomalyMap
 from magtwin.files import output
 from magtwin.names import RefusedError, find
-from magtwin.run import Run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,6 +62,22 @@ def plot_map(
     headings: Sequence[float] | None = None,
     force: bool = False,
 ) -> None:
+    """Write the picture of a map that `draw_map` makes.
+
+    Args:
+        field: As for `draw_map`, and so `what` and `headings`.
+        out: PNG or SVG to write.
+        what: What of the map to draw.
+        headings: Headings to show [rad].
+        force: Whether a file that exists is replaced.
+
+    Raises:
+        RefusedError: As for `draw_map`; or `out` is no picture or exists.
+    """
+    save(draw_map(field, what=what, headings=headings), out, force)
+
+
+def draw_map(field: AnomalyMap, *, what: str = "field", headings: Sequence[float] | None = None) -> "Figure":
     """Draw a map as filled contours, a panel a heading, all on one scale of colours.
 
     Where a node is masked its cell is hatched. The scale leaves out the outermost 0.5 % of the nodes at
@@ -71,17 +86,14 @@ def plot_map(
 
     Args:
         field: The map.
-        out: PNG or SVG to write.
         what: "field"; "gradient", the slope of the magnitude along the floor by central differences;
             "variance", its root, the standard deviation; "mask", which nodes hold field; "headings",
             each heading minus the mean over all of them.
         headings: Headings to show [rad], interpolated between layers; the map's own unless given, of more
             than eight four.
-        force: Whether a file that exists is replaced.
 
     Raises:
-        RefusedError: No heading is to be shown, nothing is known of what is to be, `out` is no picture
-            or exists.
+        RefusedError: No heading is to be shown, or nothing is known of what is to be.
     """
     from matplotlib.colors import ListedColormap
 
@@ -124,7 +136,7 @@ def plot_map(
         legend.append(_patch(quantity.unknown, facecolor=MASKED, hatch=HATCH, edgecolor=MASKED_INK))
     _legend(figure, legend)
     figure.suptitle(_summary(field, 112 if len(shown) > 1 else 52), fontsize=11)
-    save(figure, out, force)
+    return figure
 
 
 def plot_difference(found: MapDifference, out: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -177,53 +189,6 @@ def plot_difference(found: MapDifference, out: str | os.PathLike[str], *, force:
     save(figure, out, force)
 
 
-def plot_run(
-    run: Run,
-    field: AnomalyMap | None,
-    out: str | os.PathLike[str],
-    planned: ArrayLike | None = None,
-    *,
-    force: bool = False,
-) -> None:
-    """Draw a run: the path over the map, and its readings, speed and battery against time.
-
-    Args:
-        run: A run with pose, field, speed and battery columns.
-        field: The map below the path, as the mean over its headings; none for a bare floor.
-        out: PNG or SVG to write.
-        planned: The planned path in world [m], shape (M, 2); none leaves it out.
-        force: Whether a file that exists is replaced.
-
-    Raises:
-        RefusedError: The run has no rows or lacks a column, or `out` exists.
-    """
-    if not run.rows:
-        raise RefusedError("the run has no rows to draw")
-    t, total = run["t"], run["b_total_nt"] / 1000
-    figure = new_figure(13.5, 7.0)
-    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.15, 1))[0]
-    ax = left.subplots()
-    ax.set_title(_title(run), fontsize=11)
-    draw_path(ax, run["p_world_base"][:, :2], total, field, planned)
-    axes = right.subplots(4, 1, sharex=True, height_ratios=(2, 2, 1, 1))
-    axes[0].plot(t, run["b_map_nt"] / 1000, color=MAP_INK, lw=1.2, label="map")
-    axes[0].plot(t, total, color=INK, lw=0.8, label="total")
-    axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, fontsize=8, frameon=False)
-    axes[1].plot(t, run["b_disturbance_nt"], color=INK, lw=0.8)
-    axes[1].axhline(0, color="0.7", lw=0.6, zorder=0)
-    axes[2].plot(t, run["v_base"][:, 0], color=INK, lw=0.8)
-    axes[3].plot(t, run["battery_v"], color=INK, lw=0.8)
-    labels = ("field\n[µT]", "disturbance\n[nT]", "speed\n[m/s]", "battery\n[V]")
-    for ax, label in zip(axes, labels, strict=True):
-        ax.set_ylabel(label, fontsize=9)
-        ax.margins(x=0)
-        ax.tick_params(labelsize=8)
-        shade(ax, t, run["lidar_on"])
-    right.align_ylabels(axes)
-    axes[3].set_xlabel("time [s]; shaded while the LiDAR is on", fontsize=9)
-    save(figure, out, force)
-
-
 def draw_path(
     ax: "Axes", p_xy: Array, total: Array, field: AnomalyMap | None, planned: ArrayLike | None
 ) -> None:
@@ -238,7 +203,8 @@ def draw_path(
         _flat_bar(ax, mesh, "map, mean over headings [µT]")
     keep = np.unique(np.linspace(0, len(p_xy) - 1, PATH_SEGMENTS + 1).astype(int))
     points, colour = p_xy[keep], total[keep]
-    ax.plot(*points.T, color="white", lw=4.5, solid_capstyle="round")
+    for colour_of_edge, width in ((INK, 5.4), ("white", 4.5)):  # one of the two differs from the map
+        ax.plot(*points.T, color=colour_of_edge, lw=width, solid_capstyle="round")
     low, high = colour_limits(total, 0)
     driven = LineCollection(
         list(np.stack([points[:-1], points[1:]], axis=1)),
@@ -530,12 +496,6 @@ def _summary(field: AnomalyMap, width: int) -> str:
     if masked:
         words.append(f"{masked} nodes masked")
     return "\n".join([field.name or "map", *textwrap.wrap(", ".join(words), width)])
-
-
-def _title(run: Run) -> str:
-    facts = [str(run.facts[key]) for key in ("scene", "path", "network") if run.facts.get(key)]
-    length = np.linalg.norm(np.diff(run["p_world_base"][:, :2], axis=0), axis=1).sum()
-    return f"{', '.join(facts) or 'run'}\n{run.rows:,} readings, {run.duration_s:.1f} s, {length:.1f} m"
 
 
 def shade(ax: "Axes", t: Array, on: NDArray[np.bool_]) -> None:

@@ -271,7 +271,7 @@ def _driven(run: Run, near: str | FilePath | None) -> Any:
             place = locate(file, near)
             if place is None:
                 raise RefusedError(f"{file}: the file that the run drove is not there; put it back")
-            return read(place)
+            return _placed(read(place), run)
     name = str(facts.get("path", ""))
     if "replay_sha256" in facts or "commands_sha256" in facts:
         raise RefusedError(
@@ -281,7 +281,19 @@ def _driven(run: Run, near: str | FilePath | None) -> Any:
         return name
     if name not in PATHS and name not in CASES:
         raise RefusedError(f"the run drove the path {name!r}, which came from no file; it cannot be repeated")
-    return path_named(name)
+    return _placed(path_named(name), run)
+
+
+def _placed(driven: Any, run: Run) -> Any:
+    """A path as the run drove it: scaled and moved as its facts tell."""
+    placing = str(run.facts.get("path_placing", ""))
+    if not placing or not isinstance(driven, Path):
+        return driven
+    try:
+        numbers = tuple(map(float, placing.split()))
+        return driven.placed(numbers)  # type: ignore[arg-type]
+    except ValueError as error:
+        raise RefusedError(f"the run's fact path_placing is not four numbers: {placing!r}") from error
 
 
 def _read_run(file: FilePath) -> Run:

@@ -2,8 +2,9 @@
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
+from glob import has_magic
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.grid import Grid
-from magtwin.field.readings import FARTHEST_M, SHAPES, Readings
-from magtwin.field.survey import NT_PER, check_unit, read_grid
+from magtwin.field.readings import FARTHEST_M, SHAPES, TAKEN, Readings
+from magtwin.field.survey import read_grid
+from magtwin.field.units import check_unit, nt_per, unit_by_size
 from magtwin.files import existing, output, sha256
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
-from magtwin.io.columns import FIELDS, HEADINGS, Columns
+from magtwin.io.columns import FIELDS, HEADINGS, TIMES, VECTORS, Columns
 from magtwin.io.sheet import Sheet, read_csv, read_parquet_sheet
 from magtwin.names import RefusedError
 from magtwin.run import Run
@@ -33,6 +35,12 @@ LARGEST_TURN = 2 * np.pi + 0.01
 
 APART = 2.0
 """Times that vectors may be longer or shorter than magnitudes read beside them, in the median."""
+
+TURNED = 0.7
+"""Length of the mean of the headings' unit vectors above which a survey hardly turned."""
+
+ALIGNED = 0.8
+"""Part of the level field that its mean keeps, above which it keeps one direction."""
 
 _SURVEY = b"magtwin_readings"
 _PARTS = {"p_xy": ("x", "y"), "b_body_nt": ("x", "y", "z"), "node": ("heading", "row", "column")}
@@ -60,7 +68,9 @@ def read_readings(
     A source is a folder of one CSV a heading (`magtwin.field.survey`); a table of readings, CSV or
     Parquet; several files whose rows belong together, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`;
     those after the first are looked for beside it); a Run's Parquet; Readings' own Parquet; or a
-    rosbag2, its folder or its storage file. Several sources are several runs of one survey.
+    rosbag2, its folder or its storage file. Several sources are several runs of one survey; so are the
+    files that match a pattern (`drives/*.parquet`), and the Parquet files of a folder, in the order of
+    their names.
 
     Args:
         sources: One or more of them.
@@ -80,14 +90,15 @@ def read_readings(
         left out, and `source` tells how many.
 
     Raises:
-        RefusedError: A source is missing, damaged, or of no known form; a column is not there (the
+        RefusedError: A source is missing, damaged, or of no known form; no file matches a pattern; a column
+            is not there (the
             near one is named); a cell is no number, with file and line; the unit cannot be.
     """
     columns = Columns() if columns is None else columns
     if not sources:
         raise RefusedError("no source of readings given")
     parts = []
-    for source in sources:
+    for source in _each(sources):
         path = _first(source)
         if path.is_dir() or path.suffix in BAGS:
             _only_unit(path, columns)
@@ -95,10 +106,18 @@ def read_readings(
             from magtwin.io.rosbag import read_bag_readings
 
             parts.append(
-                read_bag_readings(path, pose_topic=pose_topic, field_topic=field_topic, unit=columns.unit)
+                read_bag_readings(
+                    path,
+                    pose_topic=pose_topic,
+                    field_topic=field_topic,
+                    unit=columns.unit,
+                    scale=columns.scale,
+                )
             )
         elif path.is_dir():
-            parts.append(read_grid(path, headings_deg=headings_deg, unit=columns.unit or "nT"))
+            parts.append(
+                read_grid(path, headings_deg=headings_deg, unit=columns.unit or "nT", scale=columns.scale)
+            )
         else:
             parts.append(_of_file(str(source), path, columns))
     readings = parts[0] if len(parts) == 1 else _together(parts)
@@ -223,6 +242,36 @@ def load_readings(path: Source) -> Readings:
         raise RefusedError(f"{path}: {error}") from error
 
 
+def is_pattern(source: Source) -> bool:
+    """Whether a source is a pattern, not a file whose name has such characters."""
+    return has_magic(str(source)) and not Path(source).exists()
+
+
+def _each(sources: Sequence[Source]) -> Iterator[Source]:
+    """The sources, with the files of patterns and of folders of Parquet files in their place.
+
+    Raises:
+        RefusedError: Nothing matches a pattern.
+    """
+    for source in sources:
+        path = Path(source)
+        if is_pattern(source):
+            root = Path(path.anchor)
+            found = root.glob(str(path.relative_to(path.anchor)))
+            matches = sorted(match for match in found if not match.name.startswith("."))
+            if not matches:
+                raise RefusedError(f"no file or folder matches {str(source)!r}; check the pattern")
+            yield from matches
+        elif path.is_dir() and not (path / "metadata.yaml").is_file():
+            tables = sorted(file for file in path.iterdir() if file.suffix in PARQUET)
+            if tables:
+                yield from tables
+            else:
+                yield source
+        else:
+            yield source
+
+
 def _first(source: Source) -> Path:
     """The path of a source, or of the first of its joined files."""
     path = Path(source)
@@ -233,7 +282,7 @@ def _first(source: Source) -> Path:
 
 def _only_unit(path: Path, columns: Columns) -> None:
     """Refuse columns that are named for a source that has none to choose from."""
-    if replace(columns, unit=None) != Columns():
+    if replace(columns, unit=None, scale=None) != Columns():
         raise RefusedError(f"{path}: its columns are known; columns are named for tables of your own")
 
 
@@ -246,7 +295,9 @@ def _of_file(source: str, path: Path, columns: Columns) -> Readings:
     if path.suffix in PARQUET and path == Path(source):
         metadata = _metadata(path)
         if _SURVEY in metadata or b"magtwin_facts" in metadata:
-            _only_unit(path, replace(columns, unit=None))
+            _only_unit(path, columns)
+            if columns.scale is not None:
+                raise RefusedError(f"{path}: its field is in nT already; leave out --scale")
         if _SURVEY in metadata:
             return load_readings(path)
         if b"magtwin_facts" in metadata:
@@ -274,6 +325,7 @@ def _sheet(path: Path) -> Sheet:
 
 def _of_sheet(sheet: Sheet, paths: list[Path], columns: Columns) -> Readings:
     """The readings in a table."""
+    columns, taken = _told(sheet, columns)
     p = np.column_stack([sheet.numbers(columns.x), sheet.numbers(columns.y)])
     turn = _turn(sheet, columns)
     vector, b = _field(sheet, columns)
@@ -313,21 +365,80 @@ def _of_sheet(sheet: Sheet, paths: list[Path], columns: Columns) -> Readings:
         _magnitude(sheet, columns).name or columns.field or columns.vector,
         columns.unit or "nT",
         lambda k: _magnitude(sheet, columns).where(int(np.flatnonzero(known)[k])),
+        columns.scale,
     )
     if vector is not None:
         _check_sizes(vector[known], b[known], sheet, columns)
+        _check_axes(vector[known], yaw[known], sheet, columns)
     run, runs = _runs(sheet, columns, paths[0].stem, known)
     return Readings(
         p_xy=p[known],
         yaw=yaw[known],
         b_nt=b[known],
-        b_body_nt=None if vector is None else levelled(vector, turn, columns.axes)[known],
+        b_body_nt=None if vector is None else levelled(vector, turn, columns.axes or "body")[known],
         t=None if t is None else t[known],
         run=run,
         runs=runs,
         name=paths[0].stem,
-        source="; ".join(map(_sum, paths)) + _left_out(known),
+        source="; ".join([*map(_sum, paths)]) + _left_out(known) + "".join(f"; {TAKEN}{t}" for t in taken),
     )
+
+
+def _told(sheet: Sheet, columns: Columns) -> tuple[Columns, list[str]]:
+    """The columns and the unit, those that are not given found by their names and size; what was found so."""
+    taken = list[str]()
+    lower: dict[str, str] = {}
+    for label in sheet.names:
+        lower.setdefault(label.strip().lower(), label)
+    if not (columns.heading or columns.quaternion):
+        label = next((name for name in HEADINGS if name in sheet.names), "")
+        columns = replace(columns, heading=label or next((lower[n] for n in HEADINGS if n in lower), ""))
+    if not columns.time and (label := next((lower[name] for name in TIMES if name in lower), "")):
+        columns = replace(columns, time=label)
+    if not columns.field and not columns.vector:
+        three = next((names for names in VECTORS if set(names) <= lower.keys()), ())
+        if label := next((lower[name] for name in FIELDS if name in lower), ""):
+            columns = replace(columns, field=label)
+        elif three:
+            columns = replace(columns, vector=",".join(lower[name] for name in three))
+            if columns.axes is None:
+                taken.append(f"{columns.vector} as the field in the robot's axes, forward, left, up (--axes)")
+        else:
+            named = [label for label in sheet.names if not label.isdigit()]
+            known = (
+                f"columns: {', '.join(named)}" if named else f"{len(sheet.columns)} columns without a header"
+            )
+            raise RefusedError(
+                f"{sheet.path}: no column of the field was found by its name ({known}); name the magnitude "
+                "with --field NAME, or the components with --vector BX,BY,BZ"
+            )
+    if columns.unit is None and columns.scale is None:
+        _, b = _field(sheet, replace(columns, unit="nT"))
+        unit = unit_by_size(b)
+        if unit not in (None, "nT"):
+            columns = replace(columns, unit=unit)  # type: ignore[arg-type]
+            taken.append(f"{columns.field or columns.vector} in {unit}, as its size tells (--unit)")
+    return columns, taken
+
+
+def _check_axes(vector_nt: Array, yaw: Array, sheet: Sheet, columns: Columns) -> None:
+    """Refuse vectors whose level part keeps its direction in the other axes than those that were said."""
+    if np.hypot(np.cos(yaw).mean(), np.sin(yaw).mean()) > TURNED:
+        return  # one heading: nothing tells the axes apart
+    level = vector_nt[:, 0] + 1j * vector_nt[:, 1]
+    size = np.abs(level).mean()
+    if not size > 0:
+        return
+    as_world, as_body = abs(level.mean()) / size, abs((level * np.exp(1j * yaw)).mean()) / size
+    said = columns.axes or "body"
+    here, there = (as_body, as_world) if said == "body" else (as_world, as_body)
+    if there > ALIGNED and here < ALIGNED / 2:
+        other = "world" if said == "body" else "body"
+        raise RefusedError(
+            f"{sheet.path}: {columns.vector} are taken to be in {said} axes, but they keep one direction "
+            f"({100 * there:.0f} % of them) in {other} axes, as the Earth's field does: give --axes {other}, "
+            "or correct the headings or the order of the components"
+        )
 
 
 def levelled(vector_nt: Array, turn: Array, axes: str) -> Array:
@@ -380,14 +491,12 @@ def _magnitude(sheet: Sheet, columns: Columns) -> Any:
 
 def _field(sheet: Sheet, columns: Columns) -> tuple[Array | None, Array]:
     """Vectors, where there are, and magnitudes [nT], shapes (N, 3) and (N,)."""
-    vector = None
+    vector, factor = None, nt_per(columns.unit, columns.scale)
     if columns.vector:
         names = columns.several("vector")
-        vector = NT_PER[columns.unit or "nT"] * np.column_stack([sheet.numbers(name) for name in names])
+        vector = factor * np.column_stack([sheet.numbers(name) for name in names])
     if columns.field or vector is None:
-        return vector, NT_PER[columns.unit or "nT"] * sheet.numbers(
-            _magnitude(sheet, columns).name or columns.field
-        )
+        return vector, factor * sheet.numbers(_magnitude(sheet, columns).name or columns.field)
     return vector, np.linalg.norm(vector, axis=1)
 
 

@@ -1,6 +1,5 @@
 """Scenery: a run set up to be drawn: the lab that stands still, the robot that moves in it, and its trail."""
 
-import itertools
 import math
 import os
 import re
@@ -15,24 +14,31 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.compare import FIELDS, HEADINGS, POSITIONS
 from magtwin.field.colours import COLOUR_MAP, colour_limits
+from magtwin.files import output
 from magtwin.frames import matrix_from_quat, quat_from_yaw
+from magtwin.io.cutaway import Cutaway
 from magtwin.io.pictures import (
     BACKGROUND,
     INK,
+    LAB_ELEVATION_DEG,
     Camera,
     add_bar,
     aim,
     bake,
+    check_png,
     check_size,
+    is_subject,
     light,
     mesh_of,
     plotter_of,
+    room_above,
     style_of,
+    write_png,
 )
 from magtwin.names import RefusedError
 from magtwin.run import Run
 from magtwin.spec import Vec3
-from magtwin.usd.geometry import Link, Shape, read_colour_scale, read_links, read_shapes
+from magtwin.usd.geometry import ColourScale, Link, Shape, read_colour_scale, read_links, read_shapes
 from magtwin.usd.layers import open_stage
 from magtwin.usd.scene import read_scene
 
@@ -49,17 +55,20 @@ CHASE_ANGLE_DEG = 50.0
 CHASE_S = 0.7
 """Time over which the camera that follows evens out turns, before and after [s]."""
 
-WALL_M = 0.1
-"""How near to the ends of the lab the camera that follows comes [m]."""
+WALL_M, WALL_LENGTH_M = 0.1, 1.0
+"""How near the camera that follows comes to the ends of the lab and to what is as high as itself and at least
+so long [m]; narrower things are seen through."""
 
-TRAIL_STEP_M, TRAIL_HALF_M, CASING_HALF_M = 0.01, 0.03, 0.045
-"""Step of the trail, and half its width with and without its white edge [m]."""
+TRAIL_STEP_M = 0.01
+"""Step of the trail [m]."""
 
-TRAIL_Z_M, CASING_Z_M = 0.010, 0.006
-"""Height of the trail and of its edge above the floor [m]."""
+TRAIL = ((0.065, 0.008, (32, 38, 45)), (0.05, 0.011, (255, 255, 255)), (0.026, 0.014, None))
+"""Half the width of the trail's dark edge, of its white edge and of its middle [m], their heights above the
+floor [m], and their colours; the middle has the field's. The map below has the field's colours too, and one
+of the two edges differs from each of them."""
 
-AROUND_M = 0.7
-"""How far around and above a run's path a camera over the lab sees at least [m]."""
+TRAIL_SPAN_M = 6.0
+"""Length of a path from which on its trail is drawn wider, so that it stays visible from farther away [m]."""
 
 UNKNOWN = (150, 150, 150)
 """Colour of the trail where the field is not known."""
@@ -115,7 +124,7 @@ class View:
                 target=self.target,
                 view_angle_deg=40.0,
             )
-        return Camera(azimuth_deg=40.0 + ORBIT_DEG_S * seen_s, elevation_deg=36.0)
+        return Camera(azimuth_deg=40.0 + ORBIT_DEG_S * seen_s, elevation_deg=LAB_ELEVATION_DEG)
 
 
 KINDS: Mapping[str, str] = MappingProxyType(
@@ -175,8 +184,8 @@ class Scenery:
             raise RefusedError(f"{scene_file}: shows nothing")
         self.plotter = plotter_of(size)
         try:
-            self._put_up(still, links, [s for s in shapes if s.link in moving], moving, fine)
             scale = read_colour_scale(stage)
+            self._put_up(still, links, [s for s in shapes if s.link in moving], moving, fine, scale)
             self._put_up_trail(run, (scale.least, scale.greatest) if scale else None)
             light(self.plotter, self._everything, soft=fine)
             if not fine:
@@ -186,8 +195,7 @@ class Scenery:
                 " ", position=(0.02, 0.93), viewport=True, font_size=max(8, round(size[1] / 60)), color=INK
             )
             self._label.prop.background_color, self._label.prop.background_opacity = BACKGROUND, 0.7
-            self.plotter.screenshot(return_img=True, window_size=list(size))  # sets the window up
-            self._grab = _grabber(self.plotter.render_window)
+            self._cutaway = Cutaway(self.plotter, size, self._screens)
         except BaseException:
             self.close()
             raise
@@ -206,10 +214,16 @@ class Scenery:
         """Number of frames, one a time."""
         return len(self._times)
 
-    def frame(self, k: int) -> NDArray[np.uint8]:
-        """What is seen at the k-th time, shape (height, width, 3); it is overwritten by the next."""
-        from vtkmodules.util.numpy_support import vtk_to_numpy
+    def frame(self, k: int, *, whole: bool = False) -> NDArray[np.uint8]:
+        """Draw the k-th time.
 
+        Args:
+            k: Number of the frame.
+            whole: Whether objects may hide the floor and the robot.
+
+        Returns:
+            Image, shape (height, width, 3).
+        """
         for name, T_world_link in self.poses(k).items():
             self._actors[name].user_matrix = T_world_link
         quads = max(0, int(np.searchsorted(self._trail_t, self._times[k], side="right")) - 1)
@@ -219,12 +233,7 @@ class Scenery:
                 mesh.faces = faces[:quads].ravel()
         self._label.input = self._words[k]
         self._aim(k)
-        self.plotter.render_window.Render()
-        self._grab.Modified()
-        self._grab.Update()
-        seen = self._grab.GetOutput().GetPointData().GetScalars()
-        image: NDArray[np.uint8] = vtk_to_numpy(seen).reshape(self._size[1], self._size[0], 3)[::-1]
-        return image
+        return self._cutaway.image(whole=whole)
 
     def poses(self, k: int) -> dict[str, Array]:
         """Where the robot's visible bodies are at the k-th time: T_world_link (4, 4) by the link's name."""
@@ -260,12 +269,13 @@ class Scenery:
             if not np.isfinite(values).all():
                 raise RefusedError(f"the run does not know {name} all the time that is to be shown")
         self._wheels = seen["wheel_angle"] if "wheel_angle" in seen else np.zeros((len(self._times), 2))
-        fast = f"   x{self._speed:g}" if self._speed != 1 else ""
+        fast = f"   x{self._speed:.3g}" if self._speed != 1 else ""
         words = [f"{t - run['t'][0]:.1f} s" for t in self._times]
         if field:
             words = [f"{w}   {b / 1000:.2f} µT" for w, b in zip(words, seen[field], strict=True)]
         if "v_base" in seen:
-            words = [f"{w}   {v:.2f} m/s" for w, v in zip(words, seen["v_base"][:, 0], strict=True)]
+            speeds = np.round(seen["v_base"][:, 0], 2) + 0.0  # no "-0.00"
+            words = [f"{w}   {v:.2f} m/s" for w, v in zip(words, speeds, strict=True)]
         self._words = [w + fast for w in words]
 
     def _put_up(
@@ -275,19 +285,23 @@ class Scenery:
         carried: Sequence[Shape],
         moving: Mapping[str, Link],
         fine: bool,
+        scale: ColourScale | None,
     ) -> None:
         """What stands still, one body a look; and each of the robot's links."""
-        bodies: dict[tuple[bool, float], list[Any]] = {}
+        bodies: dict[tuple[bool, bool, float], list[Any]] = {}
         placed = [_placed(shape, links[shape.link]) if shape.link else shape.vertices for shape in still]
         for shape, vertices in zip(still, placed, strict=True):
             mesh, flat = mesh_of(shape, vertices), shape.vertex_colours is not None
             if not flat and not fine:  # half the work of a frame would be to light what does not change
                 bake(mesh)
                 flat = True
-            bodies.setdefault((flat, shape.colour[3]), []).append(mesh)
-        for (flat, opacity), meshes in bodies.items():
+            bodies.setdefault((is_subject(shape, scale), flat, shape.colour[3]), []).append(mesh)
+        self._screens = []
+        for (subject, flat, opacity), meshes in bodies.items():
             whole = meshes[0] if len(meshes) == 1 else meshes[0].append_polydata(*meshes[1:])
-            self.plotter.add_mesh(whole, opacity=opacity, **style_of(flat))
+            actor = self.plotter.add_mesh(whole, opacity=opacity, **style_of(flat))
+            if not subject:
+                self._screens.append(actor)
         self._actors: dict[str, Any] = {}
         self._links: dict[str, Link] = {}
         for name, link in moving.items():
@@ -298,19 +312,21 @@ class Scenery:
             self._actors[name] = self.plotter.add_mesh(whole, **style_of(False))
             self._links[name] = link
         self._everything = np.vstack([*placed, self._p]).astype(float)
+        boxes = np.array([(v.min(axis=0), v.max(axis=0)) for v in placed]).reshape(-1, 2, 3)
+        self._walls = boxes[np.ptp(boxes[..., :2], axis=1).max(axis=1) >= WALL_LENGTH_M]
 
     def _put_up_trail(self, run: Run, limits: tuple[float, float] | None) -> None:
-        """The trail, white-edged and coloured by the field, whole; frames show the part that was driven."""
+        """The whole trail, edged and coloured by the field; a frame shows the part driven until then."""
         import pyvista
         from matplotlib import colormaps
 
         p_xy = run[self._position][:, :2]
         rows = _steps(p_xy)
-        low_xy, high_xy = p_xy[rows].min(axis=0) - AROUND_M, p_xy[rows].max(axis=0) + AROUND_M
-        ends = zip((*low_xy, 0.0), (*high_xy, AROUND_M), strict=True)
-        self._around = np.array(list(itertools.product(*ends)))
+        self._around = room_above(np.column_stack([p_xy[rows], np.zeros(len(rows))]))
+        wider = max(1.0, float(np.max(np.ptp(p_xy[rows], axis=0))) / TRAIL_SPAN_M)
         rows = rows[: int(np.searchsorted(run["t"][rows], self._times[-1], side="right"))]
         self._trail_t, self._ribbons = run["t"][rows], []
+        self._bar = len(rows) >= 2 and self._field is not None
         if len(rows) < 2:
             return
         colours = np.tile(np.array(UNKNOWN, np.uint8), (len(rows), 1))
@@ -326,28 +342,29 @@ class Scenery:
         left = np.column_stack([-along[:, 1], along[:, 0]])
         first = 2 * np.arange(len(rows) - 1)[:, None]
         faces = np.hstack([np.full_like(first, 4), first, first + 2, first + 3, first + 1])
-        for half, z, rgb in (
-            (CASING_HALF_M, CASING_Z_M, np.full_like(colours, 255)),
-            (TRAIL_HALF_M, TRAIL_Z_M, colours),
-        ):
-            edges = np.stack([p_xy[rows] + half * left, p_xy[rows] - half * left], axis=1).reshape(-1, 2)
-            mesh = pyvista.PolyData(np.column_stack([edges, np.full(len(edges), z)]), faces=faces.ravel())
-            mesh["rgb"] = np.repeat(rgb, 2, axis=0)
+        for half_m, z_m, rgb in TRAIL:
+            half = wider * half_m * left
+            edges = np.stack([p_xy[rows] + half, p_xy[rows] - half], axis=1).reshape(-1, 2)
+            points = np.column_stack([edges, np.full(len(edges), wider * z_m)])
+            mesh = pyvista.PolyData(points, faces=faces.ravel())
+            mesh["rgb"] = np.repeat(colours if rgb is None else np.full_like(colours, rgb), 2, axis=0)
             actor = self.plotter.add_mesh(mesh, scalars="rgb", rgb=True, lighting=False)
             self._ribbons.append((mesh, actor, faces))
 
     def _aim(self, k: int) -> None:
         if self._view.kind != "chase":
             seen_s = (self._times[k] - self._times[0]) / self._speed
-            aim(self.plotter, self._view.camera(seen_s), self._around, self._size)
+            camera = self._view.camera(seen_s)
+            aim(self.plotter, camera, self._around, self._size, bar=self._bar)
             return
         near = np.abs(self._times - self._times[k]) <= CHASE_S * self._speed
         ahead = matrix_from_quat(self._q[near])[:, :2, 0].mean(axis=0)
         ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
         low, high = self._everything[:, :2].min(axis=0) + WALL_M, self._everything[:, :2].max(axis=0) - WALL_M
-        p = self._p[k]
-        camera = self.plotter.camera
-        camera.position = (*np.clip(p[:2] - CHASE_BACK_M * ahead, low, high), p[2] + CHASE_UP_M)
+        p, camera = self._p[k], self.plotter.camera
+        eye, back = np.array([p[0], p[1], p[2] + CHASE_UP_M]), np.array([*(-CHASE_BACK_M * ahead), 0.0])
+        back *= _free_share(eye, back, self._walls)
+        camera.position = (*np.clip((eye + back)[:2], low, high), eye[2])
         camera.focal_point = (*(p[:2] + CHASE_AHEAD_M * ahead), p[2] + 0.2)
         camera.up = (0.0, 0.0, 1.0)
         camera.view_angle = CHASE_ANGLE_DEG
@@ -378,9 +395,6 @@ def picture_of_run(
     Raises:
         RefusedError: As for `Scenery`; or `out` is no PNG or is there already.
     """
-    from magtwin.files import output
-    from magtwin.io.pictures import check_png, write_png
-
     out, view = check_png(out), View.of(camera)
     if not run.rows or "t" not in run:
         raise RefusedError("the run has no readings, so there is nothing to show")
@@ -395,18 +409,6 @@ def picture_of_run(
     ):
         write_png(scenery.frame(0), aside)
     return out
-
-
-def _grabber(window: Any) -> Any:
-    """What takes the image of a window as it was last drawn; pyvista's own would draw it once more."""
-    from vtkmodules.vtkRenderingCore import vtkWindowToImageFilter
-
-    grab = vtkWindowToImageFilter()
-    grab.SetInput(window)
-    grab.SetInputBufferTypeToRGB()
-    grab.ReadFrontBufferOff()
-    grab.ShouldRerenderOff()
-    return grab
 
 
 def _position(run: Run) -> str:
@@ -431,6 +433,22 @@ def _links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dic
         raise RefusedError(f"the run does not say of which robot it is; the scene has {', '.join(robots)}")
     base = bases[robots.index(name)] if len(robots) == len(bases) and name in robots else bases[0]
     return {name: link for name, link in links.items() if link.base == base}
+
+
+def _free_share(p: Array, d: Array, boxes: Array) -> float:
+    """Share of a segment before it comes within `WALL_M` of the first box.
+
+    Args:
+        p: Start in world [m], shape (3,).
+        d: Way to the end [m], shape (3,).
+        boxes: Least and greatest corners of boxes along the world's axes [m], shape (N, 2, 3).
+    """
+    low, high = boxes[:, 0] - WALL_M, boxes[:, 1] + WALL_M
+    d = np.where(np.abs(d) < 1e-12, 1e-12, d)
+    ends = np.sort(np.stack([(low - p) / d, (high - p) / d]), axis=0)  # slab by slab
+    enters, leaves = ends[0].max(axis=1), ends[1].min(axis=1)
+    met = (enters <= leaves) & (enters > 0) & (enters < 1)
+    return float(enters[met].min()) if met.any() else 1.0
 
 
 def _steps(p_xy: Array) -> NDArray[np.intp]:

@@ -5,6 +5,7 @@ import math
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,9 @@ SAID = 60
 
 _NUMBER = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 _NOTHING = {"", "nan", "na", "null", "none"}
+
+_REMARK = re.compile(r"\s*#\s*\w+:\s")
+"""A comment line `# KEY: VALUE`, as maps that are written as CSVs have them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +141,9 @@ class Sheet:
 def read_csv(path: str | os.PathLike[str]) -> Sheet:
     """The sheet of a text file: values between commas, semicolons, tabs or blanks.
 
-    The first line is the header where any of its words is no number, with or without a `#` before
-    it. Other lines that begin with `#`, and empty ones, are passed over.
+    The header is the first line where any of its words is no number; else the last comment line above the
+    rows that has as many words as they have. Other lines that begin with `#`, such as `# KEY: VALUE`, and
+    empty ones are passed over.
 
     Raises:
         RefusedError: The file is missing, no text, empty, has lines too long or of uneven width.
@@ -147,9 +152,11 @@ def read_csv(path: str | os.PathLike[str]) -> Sheet:
     if path.is_dir():
         raise RefusedError(f"{path}: a folder; name the file in it")
     lines = list(_lines(path))
-    header: str | None = None
+    above: list[tuple[int, str]] = []
     while lines and lines[0][1].lstrip().startswith("#"):
-        header = lines.pop(0)[1].lstrip().lstrip("#")
+        number, line = lines.pop(0)
+        if not _REMARK.match(line):
+            above.append((number, line.lstrip().lstrip("#")))
     lines = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
     if not lines:
         raise RefusedError(f"{path}: empty; expected a row of numbers for every reading")
@@ -159,9 +166,11 @@ def read_csv(path: str | os.PathLike[str]) -> Sheet:
     if any(math.isinf(_number(word)) for word in words[0]):
         names = [word.strip() for word in words.pop(0)]
         lines.pop(0)
-    elif header is not None:
-        said = _words(path, [(1, header)], between)[0]
-        names = [word.strip() for word in said] if len(said) == len(words[0]) else []
+    else:
+        for comment in above:
+            with suppress(RefusedError):  # a remark in words, with quotes of its own
+                (said,) = _words(path, [comment], between)
+                names = [word.strip() for word in said] if len(said) == len(words[0]) else names
     if not words:
         raise RefusedError(f"{path}: no rows below the header; expected one for every reading")
     width = len(names) or len(words[0])

@@ -16,15 +16,25 @@ from pathlib import Path
 from typing import IO
 
 import rerun_cli  # type: ignore[import-untyped]
-from rerun.experimental import ViewerClient
+from rerun.experimental import Timeline, View, ViewerClient
 
 from magtwin.files import existing, output
 from magtwin.io.series import TIMELINE
 from magtwin.names import RefusedError
 
 LOCALHOST = "127.0.0.1"
+
+MAGIC = b"RRF"
+"""First bytes of a recording, before the number of its format."""
+
+LEAST_SIZE, MOST_SIZE = 200, 8000
+"""Sides of a picture between which the viewer still lays out its views, and fits in a texture [pixels]."""
+
 START_S = 60.0
 """How long the viewer may take to start on a busy machine without a graphics card [s]."""
+
+NOTHING_S = 10.0
+"""How long a file that was loaded may show nothing [s]."""
 
 TITLE_BAR = 36
 """Height of the bar that the viewer keeps for its window, without anything in it [pixels]."""
@@ -71,31 +81,66 @@ def screenshot(
     Args:
         rrd: The recording.
         png: The picture to make.
-        time_s: Where on the timeline `sim_time` [s]; none for where the viewer starts.
+        time_s: Moment on the timeline `sim_time` [s]. Default: where the viewer starts.
         size: Width and height of the picture [pixels].
         force: Whether a picture that exists is replaced.
 
     Returns:
-        What views report to be amiss, a line each; empty when all is well.
+        The warnings and errors of the recording's views, a line each; empty when all is well.
 
     Raises:
-        RefusedError: The recording is missing or the picture exists, or the machine has no Vulkan.
+        RefusedError: The recording is missing, cannot be read or has no such moment; the size is out of
+            range; the picture exists; or the machine has no Vulkan.
     """
-    rrd = existing(rrd, "recording").resolve()
+    path = existing(rrd, "recording")
+    if path.is_dir():
+        raise RefusedError(f"{rrd}: a folder; name the .rrd file in it")
+    if not (min(size) >= LEAST_SIZE and max(size) <= MOST_SIZE):
+        limits = f"{LEAST_SIZE}..{MOST_SIZE} pixels each way"
+        raise RefusedError(f"size of a recording's picture must lie in {limits}, got {size[0]} x {size[1]}")
+    check_decodes(path, rrd)
     window = (size[0], size[1] + TITLE_BAR)
     with output(png, force=force) as aside, headless_viewer(window) as client:
-        client.open(str(rrd))
-        _wait_until(lambda: _loaded(client), f"{rrd}: the viewer did not load it")
-        if time_s is not None:
-            client.set_time(TIMELINE, duration=time_s, play_state="paused")
-        client.run_command("ui.toggle_top_panel")
-        end = time.monotonic() + TOASTS_S
-        while time.monotonic() < end:  # its clock goes on only while it draws
-            client.take_screenshot(max_size=64)
-        client.save_screenshot(str(aside))
-        _crop(aside)
-        views = client.get_state().views
-    return [f"{v.name}: {r.severity}: {r.summary} {r.details or ''}" for v in views for r in v.reports]
+        try:
+            views = _draw(client, path.resolve(), rrd, aside, time_s)
+        except (ConnectionError, RuntimeError) as error:
+            raise RefusedError(
+                f"{rrd}: the Rerun viewer ended before the picture was drawn ({error})"
+            ) from error
+    return [
+        f"{v.name}: {r.severity}: {r.summary} {r.details or ''}".strip() for v in views for r in v.reports
+    ]
+
+
+def _draw(
+    client: ViewerClient, path: Path, said: str | os.PathLike[str], png: Path, time_s: float | None
+) -> list[View]:
+    """Open a recording, go to a moment, save what is shown; returns the state of the views."""
+    client.open(str(path))
+    _wait_until(lambda: not client.get_state().loading, f"{said}: the viewer did not load it")
+    nothing = f"{said}: holds nothing that the viewer shows; if the recording was cut short, write it again"
+    _wait_until(lambda: _timelines(client) != [], nothing, NOTHING_S)
+    if time_s is not None:
+        timelines = _timelines(client)
+        line = next((one for one in timelines if one.name == TIMELINE), None)
+        if line is None or line.start is None or line.end is None:
+            raise RefusedError(
+                f"{said}: has no timeline {TIMELINE!r} to find a time on; it has "
+                f"{', '.join(one.name for one in timelines)}"
+            )
+        first, last = line.start / 1e9, line.end / 1e9
+        if not first <= time_s <= last:
+            raise RefusedError(
+                f"{said}: the recording goes from {first:g} to {last:g} s; there is no {time_s:g} s in it"
+            )
+        client.set_time(TIMELINE, duration=time_s, play_state="paused")
+    client.run_command("ui.toggle_top_panel")
+    end = time.monotonic() + TOASTS_S
+    while time.monotonic() < end:  # its clock goes on only while it draws
+        client.take_screenshot(max_size=64)
+    client.save_screenshot(str(png))
+    _crop(png)
+    return client.get_state().views
 
 
 @contextmanager
@@ -179,6 +224,11 @@ def check_decodes(rrd: Path, said: str | os.PathLike[str]) -> None:
     Raises:
         RefusedError: It is no recording, was cut short, or its bytes were changed.
     """
+    with rrd.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise RefusedError(
+                f"{said}: not a Rerun recording that can be read (it does not start with RRF); write it again"
+            )
     done = subprocess.run([_binary(), "rrd", "verify", str(rrd)], capture_output=True, text=True, check=False)
     told = [line for line in done.stderr.splitlines() if "Missing RRD footer" not in line and line.strip()]
     endless = done.returncode == 1 and [line.rpartition(" with ")[2] for line in told] == ["1 errors"]
@@ -207,17 +257,17 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _loaded(client: ViewerClient) -> bool:
-    state = client.get_state()
-    return not state.loading and any(recording.timelines for recording in state.recordings)
+def _timelines(client: ViewerClient) -> list[Timeline]:
+    """The timelines of what a viewer has open."""
+    return [line for recording in client.get_state().recordings for line in recording.timelines]
 
 
-def _wait_until(done: Callable[[], bool], refusal: str) -> None:
-    """Ask again and again; refuse after `START_S`."""
-    end = time.monotonic() + START_S
+def _wait_until(done: Callable[[], bool], refusal: str, limit_s: float = START_S) -> None:
+    """Ask again and again; refuse after some time."""
+    end = time.monotonic() + limit_s
     while not done():
         if time.monotonic() > end:
-            raise RefusedError(f"{refusal} within {START_S:g} s")
+            raise RefusedError(f"{refusal} (waited {limit_s:g} s)")
         time.sleep(0.1)
 
 

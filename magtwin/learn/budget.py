@@ -37,6 +37,7 @@ from magtwin.names import RefusedError
 from magtwin.run import Run
 from magtwin.sim.interference import level_field_nt, platform_field_nt, sensor_places
 from magtwin.spec import Scene
+from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 
@@ -78,8 +79,8 @@ class Term:
     """MAE with this term and those before it closed [nT]."""
 
 
-@dataclass(frozen=True)
-class Budget:
+@dataclass(frozen=True, repr=False)
+class Budget(Summarized):
     """A model's error by what makes it."""
 
     name: str
@@ -120,6 +121,17 @@ class Budget:
                 for term, bought in zip(self.terms, self.bought, strict=True)
             ],
         }
+
+    def _summary(self) -> Summary:
+        terms = sorted(self.terms, key=lambda term: -term.rms_nt)
+        return Summary(
+            f"Budget of {self.name}: MAE {self.mae_nt:.4g} nT over {self.rows:,} readings, naive "
+            f"{self.naive_mae_nt:.4g} nT",
+            tuple(
+                (term.name, f"rms {term.rms_nt:.4g} nT, MAE {term.alone_nt:.4g} nT with it closed")
+                for term in terms
+            ),
+        )
 
 
 @dataclass(frozen=True)

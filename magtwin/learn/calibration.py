@@ -8,12 +8,10 @@ from numpy.typing import NDArray
 
 from magtwin.learn.inputs import Array
 from magtwin.names import RefusedError
+from magtwin.verdict import Z_90
 
 WITHIN = 0.9
 """Share of rows that an interval is to hold."""
-
-Z_90 = 1.6448536269514722
-"""Half the width of the interval that holds 90 % of a normal distribution, in standard deviations."""
 
 MOST_FACTOR = 3.0
 """By which few recordings may widen or narrow an interval at most."""
@@ -167,9 +165,3 @@ def _numbered(groups: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.in
     """Groups numbered from 0, shape (N,), and how many rows each has."""
     _, number, counts = np.unique(groups, return_inverse=True, return_counts=True)
     return number, counts
-
-
-def coverage(error_nt: Array, sd_nt: Array) -> float:
-    """Share of rows whose error lies in its 90 % interval; nan where no standard deviation is known."""
-    known = np.isfinite(sd_nt) & np.isfinite(error_nt)
-    return float(np.mean(np.abs(error_nt[known]) <= Z_90 * sd_nt[known])) if known.any() else math.nan

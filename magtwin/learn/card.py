@@ -52,6 +52,7 @@ def card_of(trained: "Trained", name: str, checksum: str) -> str:
         "## Data",
         _data(trained),
         "## Errors",
+        _wrapped(f"**{trained.verdict()}**"),
         _wrapped(_how(trained)),
         _table(trained),
         _wrapped(_spread(net.kind)),

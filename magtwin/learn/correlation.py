@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
+from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 
@@ -18,8 +19,8 @@ PAPER: Mapping[str, float] = MappingProxyType(
 """What the paper's Figure 2 shows; all other inputs are within 0.04 of 0 there."""
 
 
-@dataclass(frozen=True)
-class Correlations:
+@dataclass(frozen=True, repr=False)
+class Correlations(Summarized):
     """Spearman's rank correlations of inputs with labels."""
 
     features: tuple[str, ...]

@@ -33,6 +33,7 @@ from magtwin.learn.split import Part, Split
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
 from magtwin.run import Facts, Run
+from magtwin.summary import Summarized, Summary, listed, span
 from magtwin.version import __version__
 
 Array = NDArray[np.float64]
@@ -60,8 +61,8 @@ KEPT = tuple(
 """Columns of a recording that a data set keeps, of those that it has."""
 
 
-@dataclass(frozen=True)
-class Dataset:
+@dataclass(frozen=True, repr=False)
+class Dataset(Summarized):
     """Recordings with labels on one map; see the module."""
 
     folder: Path
@@ -282,6 +283,39 @@ class Dataset:
     def _run(self, table: pa.Table, one: Recording) -> Run:
         return run_of(table, self.folder / RUNS / f"{one.name}.parquet")
 
+    def _summary(self) -> Summary:
+        """Folder and rows; sessions and paths; map and alignment; spread of the labels."""
+        rows, labelled = (sum(getattr(one, name) for one in self.recordings) for name in ("rows", "labelled"))
+        seconds = sum(one.duration_s for one in self.recordings)
+        (x, y), latency = self.alignment.lever_arm_m, self.alignment.latency_s
+        means = [one.label_mean_nt for one in self.recordings if one.labelled]
+        sessions, paths = ({getattr(one, name) for one in self.recordings} for name in ("session", "path"))
+        return Summary(
+            f"Dataset {self.folder.name}: {len(self.recordings):,} recordings, {rows:,} rows, "
+            f"{seconds / 60:.4g} min",
+            (
+                ("from", f"{len(sessions):,} sessions, {len(paths):,} paths: {listed(sorted(paths))}"),
+                ("map", f"{self.map_name}; lever arm ({x:.3g}, {y:.3g}) m, latency {latency:.3g} s"),
+                (
+                    "labels",
+                    f"{labelled:,} rows"
+                    + (f", means of recordings {span(min(means), max(means), 'nT')}" if means else ""),
+                ),
+                ("columns", f"{len(self.columns)}: {listed(self.columns)}"),
+            ),
+            ("recording", "session", "path", "rows", "labels: mean +- sd"),
+            [
+                (
+                    one.name,
+                    one.session,
+                    one.path,
+                    f"{one.rows:,}",
+                    f"{one.label_mean_nt:,.0f} +- {one.label_sd_nt:,.0f} nT",
+                )
+                for one in self.recordings
+            ],
+        )
+
 
 def build_dataset(
     recordings: Mapping[str, Run] | Sequence[Source],
@@ -324,7 +358,13 @@ def build_dataset(
             tell(i, total, f"{source.name}: aligning")
             run = read(source)
             runs.append(thinned(run.select(*(c for c in _ALIGNED if c in run)), 25.0))
-        alignment = fit_alignment(runs, field)
+        alignment = fit_alignment(
+            runs,
+            field,
+            progress=lambda k, n, what: tell(
+                len(sources), total, f"lever arm and latency: {k} of {n} {what}"
+            ),
+        )
         del runs
     elif alignment is not None and not isinstance(alignment, Alignment):
         raise RefusedError(f'alignment must be "fit", an Alignment or None, got {alignment!r}')

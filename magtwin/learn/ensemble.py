@@ -62,7 +62,7 @@ class Members(torch.nn.Module):
         return h
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, repr=False)
 class Ensemble(heads.Headed):
     """The mean of the members' means, with what each says of its error and how far they differ."""
 

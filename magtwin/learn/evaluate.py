@@ -31,6 +31,8 @@ from magtwin.learn.split import split
 from magtwin.names import RefusedError
 from magtwin.path import CASES
 from magtwin.run import Run
+from magtwin.summary import Summarized, Summary, listed
+from magtwin.verdict import SEPARATOR, recordings_text, verdict
 
 Array = NDArray[np.float64]
 
@@ -88,8 +90,8 @@ class Mean:
         return [Read(np.full(n, self.mean_nt), np.full(n, self.sd_nt), np.zeros(n, bool)) for n in counts]
 
 
-@dataclass(frozen=True, eq=False)
-class Chart:
+@dataclass(frozen=True, eq=False, repr=False)
+class Chart(Summarized):
     """A map that models are judged on."""
 
     name: str
@@ -100,9 +102,12 @@ class Chart:
     checksums: frozenset[str]
     """Those that may name it: of its file, and of its values."""
 
+    def _summary(self) -> Summary:
+        return Summary(f"Chart {self.name}", self.field._summary().rows)
 
-@dataclass(frozen=True, eq=False)
-class Contender:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Contender(Summarized):
     """A model with the map, lever arm and latency that it learned with."""
 
     name: str
@@ -111,6 +116,16 @@ class Contender:
     alignment: Alignment = field(default_factory=Alignment)
     facts: Mapping[str, Any] = field(default_factory=dict)
     """What its file tells, or how it was made."""
+
+    def _summary(self) -> Summary:
+        (x, y), latency = self.alignment.lever_arm_m, self.alignment.latency_s
+        return Summary(
+            f"Contender {self.name}: on map {self.chart.name}",
+            (
+                ("inputs", f"{len(self.model.features)}: {listed(self.model.features)}"),
+                ("alignment", f"lever arm ({x:.3g}, {y:.3g}) m, latency {latency:.3g} s"),
+            ),
+        )
 
 
 @dataclass(frozen=True)
@@ -125,8 +140,8 @@ class Trial:
     """What was driven; what its run says, else its name, unless given."""
 
 
-@dataclass(frozen=True, eq=False)
-class Judged:
+@dataclass(frozen=True, eq=False, repr=False)
+class Judged(Summarized):
     """What every model made of a recording; M models, N readings."""
 
     name: str
@@ -174,9 +189,25 @@ class Judged:
             self.outside[:, kept],
         )
 
+    def _summary(self) -> Summary:
+        kept = int(self.kept.sum())
+        error = np.abs(self.total_nt - self.measured_nt)[:, self.kept]
+        return Summary(
+            f"Judged {self.name}: {kept:,} of {len(self.kept):,} readings, case {self.case}",
+            (
+                ("from", f"session {self.session}, path {self.path}"),
+                (
+                    "MAE",
+                    listed([f"{mae:.4g}" for mae in error.mean(axis=1)]) + " nT, one per model"
+                    if kept
+                    else "",
+                ),
+            ),
+        )
 
-@dataclass(frozen=True)
-class Case:
+
+@dataclass(frozen=True, repr=False)
+class Case(Summarized):
     """A row of the table."""
 
     name: str
@@ -185,9 +216,21 @@ class Case:
     scores: tuple[Score, ...]
     """One a model, the naive one first."""
 
+    def _summary(self) -> Summary:
+        return Summary(
+            f"Case {self.name}: {self.recordings:,} recordings, {self.sessions:,} sessions",
+            (
+                (
+                    "MAE",
+                    listed([f"{one.mae_nt:.4g}" for one in self.scores]) + " nT, one per model, naive first",
+                ),
+                ("of naive", listed([f"{one.ratio:.3g}" for one in self.scores])),
+            ),
+        )
 
-@dataclass(frozen=True, eq=False)
-class Evaluation:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Evaluation(Summarized):
     """Models against recordings."""
 
     contenders: tuple[Contender, ...]
@@ -219,6 +262,27 @@ class Evaluation:
         """The row of all readings."""
         return next(case for case in self.cases if case.name == "all")
 
+    def verdicts(self) -> dict[str, str]:
+        """Whether each model from a weights file is better than the naive one, in one line a model."""
+        every, sessions = self.every, {one.session for one in self.judged}
+        naive, paths = every.scores[0].mae_nt, {one.path for one in self.judged}
+        found = {}
+        for one, score in zip(self.contenders[1:], every.scores[1:], strict=True):
+            if "sha256" not in one.facts:
+                continue
+            learned = [
+                None if fact not in one.facts else str(one.facts[fact]).split(SEPARATOR)
+                for fact in ("training_sessions", "training_paths")
+            ]
+            found[one.name] = verdict(
+                score.mae_nt,
+                naive,
+                interval=score.ratio_interval,
+                coverage=score.coverage,
+                judged_on=recordings_text(len(self.judged), sessions, paths, *learned),
+            )
+        return found
+
     def floor(self, chart: Chart) -> tuple[float, float]:
         """What a map's own variances say that its error is: MAE and RMS over the readings judged on [nT].
 
@@ -234,6 +298,7 @@ class Evaluation:
     def summary(self) -> dict[str, Any]:
         """Everything in plain figures, for JSON."""
         return {
+            "verdicts": self.verdicts(),
             "errors_against": "b_truth_nt" if self.truth else "b_measured_nt",
             "models": [
                 {
@@ -281,6 +346,26 @@ class Evaluation:
             ],
             "left_out": dict(self.left_out),
         }
+
+    def _summary(self) -> Summary:
+        """Every model over all readings; a notebook also shows them case by case."""
+        every = self.every
+        models = [
+            (name, f"MAE {one.mae_nt:.4g} nT, {one.ratio:.3g} of naive, {_covered(one)}")
+            for name, one in zip(self.names, every.scores, strict=True)
+        ]
+        return Summary(
+            f"Evaluation: {len(self.names) - 1} models, {every.recordings:,} recordings, "
+            f"{every.sessions:,} sessions, {every.scores[0].rows:,} readings",
+            (*models[1:4], models[0], *models[4:]),
+            ("case", *self.names),
+            [(case.name, *(f"{one.mae_nt:.4g} nT" for one in case.scores)) for case in self.cases],
+        )
+
+
+def _covered(score: Score) -> str:
+    """Share of the readings in the predicted intervals, in words."""
+    return "no interval" if math.isnan(score.coverage) else f"{100 * score.coverage:.3g} % in 90 % intervals"
 
 
 def evaluate(

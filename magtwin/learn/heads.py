@@ -43,7 +43,7 @@ def moments(out: Array, y_mean: float, y_scale: float) -> tuple[Array, Array]:
     return y_mean + y_scale * out[..., 0], y_scale**2 * np.exp(log)
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, repr=False)
 class Headed(Regressor):
     """A network with the two heads, of labels scaled to a mean of 0 and a standard deviation of 1."""
 

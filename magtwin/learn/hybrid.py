@@ -18,7 +18,7 @@ from magtwin.names import RefusedError
 from magtwin.report import Figure
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, repr=False)
 class Hybrid(Regressor):
     """A disturbance y = base(x) + net(x clipped to the training ranges), or the base alone.
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.learn.features import feature_names
 from magtwin.names import RefusedError
+from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 
@@ -23,8 +24,8 @@ _BLOCK = 512
 """Rows compared at once, so that what is compared stays in a core's cache."""
 
 
-@dataclass(frozen=True)
-class Inputs:
+@dataclass(frozen=True, repr=False)
+class Inputs(Summarized):
     """The features of a row in order, with the scaler and the ranges of the training rows."""
 
     features: tuple[str, ...]

@@ -1,7 +1,7 @@
 """Labels: what a magnetometer read beyond the map, and how well that is known."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -14,6 +14,7 @@ from magtwin.frames import into_base, wrap_angle, yaw_from_quat
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
 from magtwin.run import Column, Run
+from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 
@@ -53,8 +54,8 @@ LABEL_COLUMNS: Mapping[str, Column] = MappingProxyType(
 """Columns that `labelled` adds to a run beside those that `magtwin.run.COLUMNS` has."""
 
 
-@dataclass(frozen=True)
-class Alignment:
+@dataclass(frozen=True, repr=False)
+class Alignment(Summarized):
     """Where and when a reading was taken, seen from the pose that bears its stamp."""
 
     lever_arm_m: tuple[float, float] = (0.0, 0.0)
@@ -72,7 +73,7 @@ class Alignment:
     def __post_init__(self) -> None:
         figures = (*self.lever_arm_m, self.latency_s, *self.lever_arm_sd_m, self.latency_sd_s)
         if not np.all(np.isfinite(figures)):
-            raise RefusedError(f"an alignment must be finite, got {self}")
+            raise RefusedError(f"an alignment must be finite, got {figures}")
 
     def report(self, title: str = "Alignment") -> Report:
         """Lever arm and latency, with their spreads."""
@@ -82,9 +83,19 @@ class Alignment:
         ]
         return Report(title, (*arm, Figure("latency", self.latency_s, "s", self.latency_sd_s)))
 
+    def _summary(self) -> Summary:
+        (x, y), (sx, sy) = self.lever_arm_m, self.lever_arm_sd_m
+        return Summary(
+            "Alignment",
+            (
+                ("lever arm", f"{x:.4g} +- {sx:.2g} m forward, {y:.4g} +- {sy:.2g} m left"),
+                ("latency", f"{self.latency_s:.4g} +- {self.latency_sd_s:.2g} s"),
+            ),
+        )
 
-@dataclass(frozen=True)
-class Labels:
+
+@dataclass(frozen=True, repr=False)
+class Labels(Summarized):
     """What each reading of a run says of the disturbance."""
 
     value_nt: Array
@@ -185,6 +196,7 @@ def fit_alignment(
     latency: bool = True,
     rounds: int = 20,
     prior_sd: tuple[float, float] = (LEVER_ARM_PRIOR_M, LATENCY_PRIOR_S),
+    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
 ) -> Alignment:
     """Lever arm and latency that make readings agree best with a map.
 
@@ -209,6 +221,7 @@ def fit_alignment(
         latency: Whether the latency is fitted; otherwise it is 0.
         rounds: Relinearisations at most.
         prior_sd: Standard deviations of the prior, of a lever arm [m] and of a latency [s].
+        progress: Called as progress(done, total, what), once a linearisation; `total` is the most there are.
 
     Raises:
         RefusedError: Fewer than `LEAST_ROWS` readings have a label, or nothing is to be fitted.
@@ -230,10 +243,20 @@ def fit_alignment(
     if latency:
         tried = np.zeros((len(LATENCIES_S), 3))
         tried[:, 2] = LATENCIES_S
-        left = [fit.at(one).promised for one in tried]
+        left = []
+        for k, one in enumerate(tried):
+            progress(k, len(tried) + STARTS * rounds, "latencies")
+            left.append(fit.at(one).promised)
         starts = [tried[i] for i in np.argsort(left)[:STARTS]]
     fit.alike = fit.at(starts[0]).alike
-    best = min((_descend(fit, start, rounds) for start in starts), key=lambda one: one.cost)
+    before, most = (len(LATENCIES_S) if latency else 0), len(starts) * rounds
+
+    def descended(k: int, start: Array) -> _Linearised:
+        done = before + k * rounds
+        return _descend(fit, start, rounds, lambda j: progress(done + j, before + most, "rounds"))
+
+    best = min((descended(k, start) for k, start in enumerate(starts)), key=lambda one: one.cost)
+    progress(before + most, before + most, "rounds")
     sd = np.zeros(3)
     sd[free] = np.sqrt(np.diag(best.covariance))
     forward, left_of, late = best.place.tolist()
@@ -257,10 +280,11 @@ class _Linearised:
     """How many readings err as one."""
 
 
-def _descend(fit: "_Fit", start: Array, rounds: int) -> _Linearised:
+def _descend(fit: "_Fit", start: Array, rounds: int, told: Callable[[int], Any]) -> _Linearised:
     """The alignment that is reached from another, step by step; a step that leads up is halved."""
     here = fit.at(start)
-    for _ in range(rounds):
+    for k in range(rounds):
+        told(k)
         step = here.wanted - here.place
         sd = np.sqrt(np.diag(here.covariance))
         if np.all(np.abs(step[fit.free]) < 1e-3 * sd):

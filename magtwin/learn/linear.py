@@ -33,7 +33,7 @@ MOST_FOLDS = 10
 Weighting = Literal["auto", "label_sd", "none"]
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, repr=False)
 class Linear(Regressor):
     """A disturbance constant + sum_j c_j z_j with z = (x - mean) / scale, and the spread of its errors."""
 

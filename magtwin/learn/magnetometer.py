@@ -11,10 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin import files
 from magtwin.learn.features import columns_of, features
 from magtwin.learn.predictor import Predictor, load_predictor
+from magtwin.learn.regressor import summary_of
 from magtwin.learn.weights import Fact
 from magtwin.names import RefusedError
 from magtwin.run import Run
 from magtwin.sim.model_error import ModelError
+from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 
@@ -22,8 +24,8 @@ STEPS_ALIKE = 0.1
 """By what share times between rows may differ, for a network that looks back over them."""
 
 
-@dataclass(frozen=True)
-class Read:
+@dataclass(frozen=True, repr=False)
+class Read(Summarized):
     """What a predictor says of a run, row by row."""
 
     disturbance_nt: Array
@@ -36,7 +38,7 @@ class Read:
     """Whether an input left the range of the training rows, shape (N,); none where nobody asked."""
 
 
-class NeuralMagnetometer:
+class NeuralMagnetometer(Summarized):
     """Runs a predictor of any kind on runs; what one gives does not depend on the others beside it."""
 
     def __init__(self, net: Predictor, *, name: str = "", sha256: str = "") -> None:
@@ -102,13 +104,18 @@ class NeuralMagnetometer:
 
     @property
     def facts(self) -> Mapping[str, Fact]:
-        """What a run says of its network: file, checksum, layers, parameters; its kind if no perceptron."""
+        """Facts of a run about its network: file, checksum, layers, parameters; its kind if no perceptron.
+
+        The mean training label too, where the weights have it.
+        """
         facts: dict[str, Fact] = {
             "network": self.name,
             "network_sha256": self.sha256,
             "network_layers": self.net.layers_text,
             "network_parameters": self.net.parameters_count,
         }
+        if "label_mean_nt" in self.net.facts:
+            facts["network_label_mean_nt"] = float(self.net.facts["label_mean_nt"])
         return facts if self.net.kind == "mlp" else facts | {"network_kind": self.net.kind}
 
     def disturbance_nt(self, run: Run) -> Array:
@@ -177,3 +184,6 @@ class NeuralMagnetometer:
     def predict_with_sd(self, x: ArrayLike) -> tuple[Array, Array]:
         """Disturbances and the standard deviations of their errors [nT], each (N,); `x` as for `predict`."""
         return self.net.predict(x)
+
+    def _summary(self) -> Summary:
+        return summary_of(self.net, f"NeuralMagnetometer {self.name}".rstrip())

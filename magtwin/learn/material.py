@@ -19,10 +19,11 @@ from magtwin.learn.recording import Recording, Rows
 from magtwin.learn.split import PARTS, Part, Split
 from magtwin.learn.temporal import Track
 from magtwin.names import RefusedError
+from magtwin.summary import Summarized
 
 
-@dataclass(frozen=True)
-class Material:
+@dataclass(frozen=True, repr=False)
+class Material(Summarized):
     """Rows of training, validation and test, and of which group each of them is."""
 
     dataset: Dataset

@@ -16,16 +16,18 @@ from magtwin.learn.checkpoint import read_checkpoint
 from magtwin.learn.features import FULL, feature_names
 from magtwin.learn.inputs import Inputs, inputs_of
 from magtwin.learn.perceptron import outputs
+from magtwin.learn.regressor import summary_of
 from magtwin.learn.weights import Fact, Weights, is_checkpoint, read_weights, say, shown, write_weights
 from magtwin.names import RefusedError
 from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 
 _SCALERS = ("x_mean", "x_scale", "x_min", "x_max", "y_mean", "y_scale")
 
 
-class FieldNet(torch.nn.Module):
+class FieldNet(Summarized, torch.nn.Module):
     """Disturbance of the field's magnitude [nT] from features of a Run, (B, F) -> (B,).
 
     A multilayer perceptron between two scalers:
@@ -202,6 +204,9 @@ class FieldNet(torch.nn.Module):
         if not math.isnan(self.residual_sd_nt):
             figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out runs"))
         return Report(title, tuple(figures), shown(self.facts))
+
+    def _summary(self) -> Summary:
+        return summary_of(self, "FieldNet")
 
 
 def load_net(path: str | os.PathLike[str]) -> FieldNet:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from magtwin.names import RefusedError
 from magtwin.run import Run
+from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 
@@ -84,8 +85,8 @@ class Recording:
             raise RefusedError(f"sha256 of recording {self.name!r} is not one: {self.sha256[:80]!r}")
 
 
-@dataclass(frozen=True)
-class Rows:
+@dataclass(frozen=True, repr=False)
+class Rows(Summarized):
     """What a network learns from: inputs and labels, row by row."""
 
     x: Array

@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.learn.inputs import Inputs
 from magtwin.learn.weights import Fact, shown, write_weights
 from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary, listed
 
 
-@dataclass(kw_only=True)
-class Regressor(ABC):
+@dataclass(kw_only=True, repr=False)
+class Regressor(Summarized, ABC):
     """A predictor that is kept as tensors and settings; a kind tells which, and its figures."""
 
     inputs: Inputs
@@ -69,3 +70,32 @@ class Regressor(ABC):
         if not math.isnan(self.residual_sd_nt):
             figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out recordings"))
         return Report(title, tuple(figures), shown(self.facts))
+
+    def _summary(self) -> Summary:
+        return summary_of(self, type(self).__name__)
+
+
+def summary_of(net: Any, title: str, *facts: tuple[str, str]) -> Summary:
+    """Kind, layers, inputs, error and provenance of a predictor."""
+    error = (
+        "unknown"
+        if math.isnan(net.residual_sd_nt)
+        else f"{net.residual_sd_nt:.4g} nT rms on held-out recordings"
+    )
+    trained = [
+        f"{name} {net.facts[name]}"
+        for name in ("dataset", "map", "created", "licence", "source")
+        if name in net.facts
+    ]
+    return Summary(
+        f"{title}: {net.kind}, {net.parameters_count:,} parameters",
+        (
+            ("layers", net.layers_text),
+            ("inputs", f"{len(net.features)}: {listed(net.features)}"),
+            ("error", error),
+            *facts,
+            ("facts", ", ".join(trained) or listed(tuple(net.facts))),
+        ),
+        ("fact", "value"),
+        [(name, str(value)) for name, value in net.facts.items()],
+    )

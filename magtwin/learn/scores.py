@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.names import RefusedError
+from magtwin.summary import Summarized
 
 Array = NDArray[np.float64]
 Interval = tuple[float, float]
@@ -63,8 +64,8 @@ class Score:
     """Share of the readings with an input beyond the training ranges."""
 
 
-@dataclass(frozen=True, eq=False)
-class Errors:
+@dataclass(frozen=True, eq=False, repr=False)
+class Errors(Summarized):
     """Errors of several models on the readings of one run."""
 
     session: str

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary, listed
 
 By = Literal["session", "run", "path", "row"]
 Part = Literal["train", "validation", "test"]
@@ -57,8 +58,8 @@ _KEYS: Mapping[str, Callable[[Recorded], str]] = MappingProxyType(
 )
 
 
-@dataclass(frozen=True)
-class Split:
+@dataclass(frozen=True, repr=False)
+class Split(Summarized):
     """Recordings by what they are for; by row, every recording is in each part with rows of its own."""
 
     train: tuple[str, ...]
@@ -124,6 +125,15 @@ class Split:
         if self.leak:
             facts["warning"] = self.leak
         return Report(title, tuple(figures), facts)
+
+    def _summary(self) -> Summary:
+        return Summary(
+            f"Split by {self.by}",
+            (
+                *((part, f"{len(self.names(part)):,}: {listed(self.names(part), 70)}") for part in PARTS),
+                ("caution", self.leak),
+            ),
+        )
 
 
 def split(

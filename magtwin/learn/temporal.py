@@ -74,7 +74,7 @@ class Convolutions(torch.nn.Module):
         return self.last(z)
 
 
-@dataclass(kw_only=True)
+@dataclass(kw_only=True, repr=False)
 class Temporal(heads.Headed):
     """A disturbance with its standard deviation from a row and those before it."""
 

@@ -27,6 +27,7 @@ from magtwin.sim.interference import (
     wheel_torques_nm,
 )
 from magtwin.spec import PlatformFieldSpec, RobotSpec, Scene
+from magtwin.verdict import verdict
 
 Array = NDArray[np.float64]
 
@@ -318,7 +319,14 @@ def compensate_run(run: Run, model: TollesLawson) -> tuple[Run, Report]:
     )
     compensated = run.with_columns(b_measured_nt=run["b_measured_nt"] - interference)
     told = {"terms": list(model.terms), "vector": VECTORS[model.vector]}
-    return compensated.with_facts(tolles_lawson=" ".join(model.terms)), Report("Compensation", figures, told)
+    line = verdict(
+        float(after.std()),
+        float(before.std()),
+        than="no compensation",
+        judged_on="the spread of measured less map in this run",
+    )
+    facts = {"tolles_lawson": " ".join(model.terms)}
+    return compensated.with_facts(**facts), Report("Compensation", figures, told, line)
 
 
 def fit_platform(

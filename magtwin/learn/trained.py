@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 
 from magtwin.files import sha256
-from magtwin.learn.calibration import coverage
 from magtwin.learn.card import card_of
 from magtwin.learn.config import TrainConfig
 from magtwin.learn.dataset import MANIFEST, Dataset
@@ -23,6 +22,8 @@ from magtwin.learn.residuals import Held, held_of, residuals
 from magtwin.learn.split import PARTS, Part, Split
 from magtwin.learn.weights import Fact, shown
 from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary
+from magtwin.verdict import SEPARATOR, coverage, recordings_text, verdict
 from magtwin.version import __version__
 
 Array = NDArray[np.float64]
@@ -65,8 +66,8 @@ class Judged:
         return self.mae_nt / self.naive_mae_nt if self.naive_mae_nt else math.inf
 
 
-@dataclass(frozen=True)
-class Trained:
+@dataclass(frozen=True, repr=False)
+class Trained(Summarized):
     """A network with all that its card tells."""
 
     net: Predictor
@@ -95,6 +96,9 @@ class Trained:
 
     rows: int
     """Training rows."""
+
+    judged_on: str
+    """What the test is of, and how much of it was not in the training."""
 
     @property
     def best(self) -> Epoch | None:
@@ -133,11 +137,36 @@ class Trained:
             if not math.isnan(one.before_mae_nt):
                 figures.append(Figure(f"{one.name} MAE before", one.before_mae_nt, "nT"))
         facts = {name: fact for name, fact in shown(self.net.facts).items() if name != "config"}
-        return Report(title, tuple(figures), facts)
+        return Report(title, tuple(figures), facts, self.verdict())
+
+    def verdict(self) -> str:
+        """Whether it is better than the naive mean on the test, in one line."""
+        test = self.parts[-1]
+        return verdict(
+            test.mae_nt, test.naive_mae_nt, coverage=test.coverage, judged_on=f"the test, {self.judged_on}"
+        )
 
     def card(self, name: str, checksum: str) -> str:
         """The model card, in Markdown; see `magtwin.learn.card`."""
         return card_of(self, name, checksum)
+
+    def _summary(self) -> Summary:
+        """The model, what it was trained on, and its errors."""
+        scores = [
+            (
+                one.name,
+                f"MAE {one.mae_nt:.4g} nT, {one.ratio:.3g} of naive, "
+                f"{100 * one.coverage:.3g} % in 90 % intervals, "
+                f"{one.rows:,} rows of {one.recordings:,} recordings",
+            )
+            for one in self.parts
+        ]
+        return Summary(
+            f"Trained: {self.net.kind}, {self.net.layers_text}, {self.rows:,} training rows",
+            (("split", f"by {self.split.by}"), *scores),
+            ("path", "MAE", "of naive", "rows"),
+            [(one.name, f"{one.mae_nt:.4g} nT", f"{one.ratio:.3g}", f"{one.rows:,}") for one in self.paths],
+        )
 
 
 def fit(
@@ -203,8 +232,25 @@ def fit(
             net.facts[f"{one.name}_coverage_90"] = one.coverage
     if (found := residuals(_held_out(of, made))) is not None:
         net.facts.update(found.facts())
+    known = {one.name: one for one in dataset.recordings}
+    mine, tested = ([known[name] for name in split.names(part)] for part in ("train", "test"))
+    sessions, driven = ({one.session: None for one in mine}, {one.path: None for one in mine})
+    net.facts.update(training_sessions=SEPARATOR.join(sessions), training_paths=SEPARATOR.join(driven))
+    judged_on = recordings_text(
+        len(tested), [one.session for one in tested], [one.path for one in tested], sessions, driven
+    )
     return Trained(
-        net, config, made.history, made.choice, split, parts, tuple(paths), mean, sd, len(learned.y)
+        net,
+        config,
+        made.history,
+        made.choice,
+        split,
+        parts,
+        tuple(paths),
+        mean,
+        sd,
+        len(learned.y),
+        judged_on,
     )
 
 

@@ -19,6 +19,7 @@ from magtwin.ros.diagnostics import Reporter, Status
 from magtwin.ros.network import Following
 from magtwin.ros.topics import READ, SAMPLED, TICKS
 from magtwin.run import Run
+from magtwin.sim.exact import check_field
 from magtwin.sim.online import Online
 from magtwin.sim.online_sensors import Samples
 from magtwin.twin import Session, Twin, in_session, model_error_of
@@ -175,6 +176,7 @@ class Simulator:
 
     def _online(self) -> Online:
         twin = self._twin
+        check_field(twin.scene, twin.field)
         return Online(
             twin.scene,
             anomaly_map=twin.field,

@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 from magtwin.files import existing, output
 from magtwin.names import RefusedError
 from magtwin.spec import DriveSpec
+from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
 
 HEADER = "t,v,w"
 
 
-@dataclass(frozen=True, eq=False)
-class Commands:
+@dataclass(frozen=True, eq=False, repr=False)
+class Commands(Summarized):
     """What a robot is commanded, row by row; a command holds until the next, or until it is too old."""
 
     name: str
@@ -40,6 +41,19 @@ class Commands:
                     f"{over} of {len(size)} commands have |{name}| above {most:g} {unit} (to {size.max():g})"
                 )
         return f"{self.name}: {', and '.join(parts)}; the drive limits them" if parts else ""
+
+    def _summary(self) -> Summary:
+        t, v, w = self.rows.T
+        return Summary(
+            f"Commands {self.name}: {len(t):,} rows, {t[-1] - t[0]:.4g} s"
+            if len(t)
+            else f"Commands {self.name}",
+            (
+                ("v", f"{v.min(initial=np.inf):.3g} to {v.max(initial=-np.inf):.3g} m/s" if len(t) else ""),
+                ("w", f"{w.min(initial=np.inf):.3g} to {w.max(initial=-np.inf):.3g} rad/s" if len(t) else ""),
+                ("file", self.file),
+            ),
+        )
 
 
 def read_commands(file: str | os.PathLike[str]) -> Commands:

@@ -33,8 +33,9 @@ from magtwin.sim.battery import SECONDS_PER_HOUR, current_a, open_voltage
 from magtwin.sim.controllers import guide_by_commands
 from magtwin.sim.course import Course, fence_of
 from magtwin.sim.drive import Moment, Pose, draw_wheel_errors, wheel_rates
+from magtwin.sim.exact import ExactField, check_truth
 from magtwin.sim.follow import CONTROL_RATE_HZ
-from magtwin.sim.interference import TORQUE_S, field_at_sensor_nt, platforms_of_rows
+from magtwin.sim.interference import TORQUE_S, platforms_of_rows
 from magtwin.sim.lidar import lidar_on
 from magtwin.sim.magnetometer import rounded
 from magtwin.sim.model_error import ModelError
@@ -110,10 +111,13 @@ class Fleet:
                 f"step_s must be a multiple of the control step, {1 / CONTROL_RATE_HZ:g} s, below the "
                 f"drive's command_timeout_s, {timeout:g} s; got {step_s!r}"
             )
-        if disturbance_nt is None and (kind == "neural" or (kind == "physical" and scene.earth is None)):
+        if disturbance_nt is None:
+            check_truth(scene, anomaly_map)
+        if disturbance_nt is None and kind == "neural":
             raise RefusedError(f"nothing gives the disturbance of scene {scene.name!r}, of the kind {kind!r}")
         self.scene, self.count, self.step_s = scene, count, step_s
         self._map, self._obstacles, self._disturbance_nt = anomaly_map, obstacles, disturbance_nt
+        self._exact = ExactField(scene=scene, anomaly_map=anomaly_map, outside="clamp")
         self._model_error = model_error
         self._begun = [0] * count
         self._error_rngs: list[np.random.Generator] = [np.random.default_rng(0)] * count
@@ -388,15 +392,17 @@ class Fleet:
             disturbance, error = mean, self._error_nt(which, sd, moved=moved)
         elif spec.kind == "physical":
             early = max(self._steps - 1 - round(TORQUE_S * CONTROL_RATE_HZ), 0)
-            field = field_at_sensor_nt(
+            field = self._exact.at_sensor_nt(
                 self._scene_of(which),
                 _Before(self._moment(which, early)),
                 np.maximum(self._t[which], TORQUE_S),  # rows are robots, whose times come in no order
                 true=now,
                 lidar_on=table["lidar_on"],
                 supply_a=self._supply_a[which],
+                at_rest_nt=b_map,
             )
             disturbance = np.sqrt(np.sum(field * field, axis=1)) - b_map
+            disturbance = np.nan_to_num(disturbance)  # a map of one heading is read beside b_map's place
         else:
             disturbance = np.zeros(len(which))
         noise = spec.noise_density_nt * math.sqrt(spec.rate_hz / 2) * white

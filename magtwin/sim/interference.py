@@ -41,6 +41,7 @@ as the floor of a lab."""
 
 DRAWN = (
     "hard_iron_nt",
+    "hard_iron_change_nt",
     "left_motor_nt_nm",
     "right_motor_nt_nm",
     "lidar_nt",
@@ -336,10 +337,40 @@ def field_at_sensor_nt(
     vy = true.v * sin + true.w * (p_world[:, 0] - true.pose[:, 0])
     b_world, slopes = level_field_nt(scene, p_world[:, :2], p_world[0, 2])
     change = vx[:, None] * slopes[:, 0] + vy[:, None] * slopes[:, 1]
-    b_base = _into_base(b_world, cos, sin)
-    b_rate = _into_base(change, cos, sin)
+    b_base = into_base_axes(b_world, cos, sin)
+    b_rate = into_base_axes(change, cos, sin)
     b_rate[:, 0] += true.w * b_base[:, 1]
     b_rate[:, 1] -= true.w * b_base[:, 0]
+    return own_field_nt(robot, motion, t, b_base, b_rate, true=true, lidar_on=lidar_on, supply_a=supply_a)
+
+
+def own_field_nt(
+    robot: RobotSpec,
+    motion: Moving,
+    t: ArrayLike,
+    b_base: Array,
+    b_rate: ArrayLike,
+    *,
+    true: Moment,
+    lidar_on: ArrayLike,
+    supply_a: ArrayLike,
+) -> Array:
+    """The field at the magnetometer of a robot that drives, from the ambient field there.
+
+    Args:
+        robot: The robot.
+        motion: What it did.
+        t: Times of the readings [s], shape (N,).
+        b_base: Ambient field in base_link axes [nT], shape (N, 3).
+        b_rate: Its rate of change in base_link axes [nT/s], shape (N, 3).
+        true: The motion at these times.
+        lidar_on: Whether the LiDAR spins, shape (N,).
+        supply_a: Current drawn from the battery [A], shape (N,).
+
+    Returns:
+        Field in base_link axes [nT], shape (N, 3).
+    """
+    t = np.asarray(t, float)
     field = platform_field_nt(
         robot.platform,
         b_base,
@@ -385,6 +416,7 @@ def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> Plat
 
     Returns:
         The platform with these figures drawn; its own drift and spreads are 0 then: it is that of the day.
+        `hard_iron_change_nt` is what changed since the survey.
     """
     hard_iron = np.add(platform.hard_iron_nt, platform.hard_iron_drift_nt)
     hard_iron += platform.hard_iron_std_nt * rng.standard_normal(3)
@@ -403,6 +435,9 @@ def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> Plat
     return replace(
         platform,
         hard_iron_nt=tuple(hard_iron.tolist()),
+        hard_iron_change_nt=tuple(
+            (hard_iron - platform.hard_iron_nt + platform.hard_iron_change_nt).tolist()
+        ),
         hard_iron_drift_nt=ZERO3,
         hard_iron_std_nt=0.0,
         current_std=0.0,
@@ -434,7 +469,7 @@ def _torques(robot: RobotSpec, motion: Moving, t: Array, true: Moment) -> Array:
     return wheel_torques_nm(robot.battery, robot.drive, rate, acceleration)
 
 
-def _into_base(b_world: Array, cos: Array, sin: Array) -> Array:
+def into_base_axes(b_world: Array, cos: Array, sin: Array) -> Array:
     """Vectors (N, 3) turned from world into base_link axes, headings given by cos and sin (N,)."""
     bx, by, bz = b_world.T
     return np.column_stack([cos * bx + sin * by, cos * by - sin * bx, bz])

@@ -12,6 +12,7 @@ from magtwin.obstacles import Obstacles
 from magtwin.run import Run
 from magtwin.sim.sensors import check_count
 from magtwin.spec import LidarSpec, RobotSpec
+from magtwin.summary import Summarized, Summary, span
 
 Array = NDArray[np.float64]
 
@@ -77,8 +78,8 @@ def scan(
     return _told(_cast(cuts, spec.rays), spec, rng)
 
 
-@dataclass(frozen=True, eq=False)
-class Scans:
+@dataclass(frozen=True, eq=False, repr=False)
+class Scans(Summarized):
     """The scans of a run, a row each."""
 
     t: Array
@@ -103,6 +104,15 @@ class Scans:
         hits = [np.isfinite(row) for row in self.ranges_m]
         rows = zip(hits, self.ranges_m, self.p_world_lidar, self.q_world_lidar_xyzw, strict=True)
         return [p + (unit[hit] * row[hit, None]) @ matrix_from_quat(q).T for hit, row, p, q in rows]
+
+    def _summary(self) -> Summary:
+        scans, rays = self.ranges_m.shape
+        hits = self.ranges_m[np.isfinite(self.ranges_m)]
+        return Summary(
+            f"Scans: {scans:,} of {rays:,} rays"
+            + (f", {self.t[0]:.4g} to {self.t[-1]:.4g} s" if scans else ""),
+            (("ranges", f"{span(hits.min(), hits.max(), 'm', form='.3g')}" if hits.size else "no hit"),),
+        )
 
 
 def scans_of(run: Run, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Generator) -> Scans:

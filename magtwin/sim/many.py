@@ -25,6 +25,7 @@ from magtwin.sim.engine import Kinematic, Travel
 from magtwin.sim.follow import check_arrived, course_along, course_by
 from magtwin.sim.simulate import Sensed, check_run, sense, streams, travel
 from magtwin.spec import DriveSpec, Scene
+from magtwin.summary import Summarized, Summary, listed
 
 BLOCK = 16
 """Runs made at a time: 130,000 readings of a minute each, 0.1 GB, and work for every thread."""
@@ -70,7 +71,7 @@ class Conditions:
     outside: Literal["nan", "clamp", "raise"] = "nan"
 
 
-class Runs(Sequence[Run]):
+class Runs(Summarized, Sequence[Run]):
     """Runs that are made when they are asked for.
 
     `runs[i]` makes one, `for run in runs` all, block by block, so that memory stays bounded however many
@@ -231,6 +232,7 @@ class Runs(Sequence[Run]):
         return check_run(
             job.scene,
             job.path,
+            anomaly_map=common.anomaly_map,
             rate_hz=common.rate_hz,
             duration_s=common.duration_s,
             lidar=common.lidar,
@@ -289,3 +291,19 @@ class Runs(Sequence[Run]):
             yield
         except RefusedError as error:
             raise RefusedError(f"run {index} of {len(self)}, counted from 0: {error}") from error
+
+    def _summary(self) -> Summary:
+        """How many runs, along what, with which seeds."""
+        names = dict.fromkeys(
+            getattr(job.path, "name", job.path) if not isinstance(job.path, Run) else "a run once more"
+            for job in self._jobs
+        )
+        seeds = [job.seed for job in self._jobs]
+        return Summary(
+            f"Runs: {len(self):,}, made when they are asked for",
+            (
+                ("paths", listed([str(name) for name in names])),
+                ("seeds", listed([str(seed) for seed in seeds])),
+                ("columns", listed([name for name in COLUMNS if name in self._columns])),
+            ),
+        )

@@ -19,8 +19,9 @@ from magtwin.run import COLUMNS, Run
 from magtwin.sim.commands import Commands
 from magtwin.sim.course import Chassis
 from magtwin.sim.drive import Moment, advance, draw_wheel_errors, wheel_rates
+from magtwin.sim.exact import ExactField
 from magtwin.sim.follow import CONTROL_RATE_HZ
-from magtwin.sim.interference import field_at_sensor_nt, level_gradient_nt_m, sensor_places
+from magtwin.sim.interference import level_gradient_nt_m, sensor_places
 from magtwin.sim.lidar import Scans, lidar_on, scan
 from magtwin.sim.magnetometer import LOCK_RATE_HZ, rounded
 from magtwin.sim.manual import at_start
@@ -126,7 +127,13 @@ class Online:
         robot, obstacles = scene.robot, obstacles or Obstacles()
         still = Commands("online", np.zeros((1, 3)))
         self.rate_hz = check_run(
-            scene, still, rate_hz=rate_hz, duration_s=None, lidar=lidar, network=network is not None
+            scene,
+            still,
+            anomaly_map=anomaly_map,
+            rate_hz=rate_hz,
+            duration_s=None,
+            lidar=lidar,
+            network=network is not None,
         )
         self.step_s = 1.0 / CONTROL_RATE_HZ
         draws = streams(rng)
@@ -146,9 +153,13 @@ class Online:
         self._scanner = Scanner(scene, obstacles, self._lidar_on, draws["lidar"])
         self._readings, self._looks, self._steep = 0, 0, False
         self._rows: list[tuple[float, float, float]] = []
+        self._exact = ExactField(scene=scene, anomaly_map=anomaly_map, outside=outside)
+        physical = network is None and robot.magnetometer.kind == "physical"
+        self._known = self._exact.of == "sources" or (self._exact.of == "map" and physical)
         self._facts: dict[str, str | int | float | bool]
         self._facts = {"scene": scene.name, "controller": "commands", "rate_hz": float(self.rate_hz)}
         self._facts |= {"lidar": lidar, "magnetometer": "neural" if network else robot.magnetometer.kind}
+        self._facts |= self._exact.facts if physical else {}
 
     @property
     def t(self) -> float:
@@ -221,13 +232,18 @@ class Online:
         columns |= mapped(self._map, true.pose[:, :2], columns["yaw"], self._outside, gradient=True)
         vector = np.full((count, 3), np.nan)
         columns["b_truth_nt"] = np.full(count, np.nan)
-        if scene.earth is not None and count:
-            exact = field_at_sensor_nt(
-                scene, track, t, true=true, lidar_on=columns["lidar_on"], supply_a=supply_a
+        if self._known and count:
+            exact = self._exact.at_sensor_nt(
+                scene,
+                track,
+                t,
+                true=true,
+                lidar_on=columns["lidar_on"],
+                supply_a=supply_a,
+                at_rest_nt=columns["b_map_nt"],
             )
             vector = into_sensor(exact, robot.q_base_magnetometer_xyzw)
-            x, y, z = exact.T
-            columns["b_truth_nt"] = np.sqrt(x * x + y * y + z * z)
+            columns["b_truth_nt"] = self._exact.magnitude_nt(exact, columns["b_map_nt"])
         columns["b_vector_nt"] = vector
         columns["b_vector_measured_nt"], lost = self._magnetometer.axes(vector, self._steepness(t))
         dropped = self._magnetometer.dropped(count)
@@ -271,7 +287,7 @@ class Online:
     def _look(self, t: float) -> None:
         spec, scene = self._scene.robot.magnetometer, self._scene
         pose = self._track.at(np.array([t])).pose
-        if scene.earth is None:
+        if self._exact.of != "sources":
             gradient = float(np.hypot(*self._map.gradient(pose[:, :2], pose[:, 2])[0, :2]))
         else:
             places = sensor_places(scene.robot, pose)

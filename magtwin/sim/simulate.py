@@ -22,9 +22,10 @@ from magtwin.sim.controllers import Controller
 from magtwin.sim.drive import Moment, draw_wheel_errors
 from magtwin.sim.driver import Driver
 from magtwin.sim.engine import Engine, Kinematic, Travel
+from magtwin.sim.exact import ExactField, check_truth
 from magtwin.sim.follow import follow, play
 from magtwin.sim.imu import sense_imu
-from magtwin.sim.interference import field_at_sensor_nt, level_gradient_nt_m, sensor_places
+from magtwin.sim.interference import level_gradient_nt_m, sensor_places
 from magtwin.sim.lidar import lidar_on
 from magtwin.sim.magnetometer import (
     LOCK_RATE_HZ,
@@ -100,9 +101,10 @@ def simulate(
     b_total = b_map + b_disturbance, b_map at base_link's pose, and b_measured = b_total + b_noise, and of a
     neural magnetometer b_model_error besides. The
     disturbance is what `disturbance_nt` predicts, for a neural magnetometer; without it, for a physical
-    one, b_truth - b_map: the exact field of the Earth, the scene's sources and the robot itself at the
-    magnetometer, less the map; for one of the kind "map-only" it is 0. Where the scene's Earth field is
-    known, b_truth and b_vector are given whatever the kind.
+    one, b_truth - b_map: the exact field of the lab and of the robot itself at the magnetometer, less the
+    map; for one of the kind "map-only" it is 0. `magtwin.sim.exact` says what makes the exact field. Where
+    Earth and sources do, b_truth and b_vector are given whatever the kind; where the map does, for a physical
+    magnetometer alone.
 
     Args:
         scene: Lab, robot and sensors.
@@ -134,7 +136,13 @@ def simulate(
             gives the disturbance. Nothing has been computed then.
     """
     rate = check_run(
-        scene, path, rate_hz=rate_hz, duration_s=duration_s, lidar=lidar, network=disturbance_nt is not None
+        scene,
+        path,
+        anomaly_map=anomaly_map,
+        rate_hz=rate_hz,
+        duration_s=duration_s,
+        lidar=lidar,
+        network=disturbance_nt is not None,
     )
     draws = streams(rng)
     motion, facts = travel(
@@ -208,6 +216,7 @@ def check_run(
     scene: Scene,
     path: Path | Commands | Run | str,
     *,
+    anomaly_map: AnomalyMap,
     rate_hz: float | None,
     duration_s: float | None,
     lidar: Literal["schedule", "on", "off"],
@@ -224,6 +233,7 @@ def check_run(
         raise RefusedError(f"rate_hz of the magnetometer must be above 0 Hz and finite, got {rate!r}")
     if not network:
         _check_kind(scene)
+        check_truth(scene, anomaly_map)
     lidar_on(robot.lidar, 0.0, lidar)  # refuses an unknown mode before anything is computed
     if isinstance(path, Path):
         check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
@@ -355,13 +365,17 @@ def sense(
     needed = wanted | frozenset(inputs if network else ())
     read = bool(wanted & _READ)
     felt = network and "b_vector_measured_nt" in needed
+    beside_others = bool(companions and scene.earth is not None)
     exact = bool(
         felt
         or wanted & _EXACT
         or (not network and robot.magnetometer.kind == "physical")
         or (read and feels_direction(robot.magnetometer))
-        or (companions and scene.earth is not None)
+        or beside_others
     )
+    field = ExactField(scene=scene, anomaly_map=anomaly_map, outside=outside)
+    physical = not network and robot.magnetometer.kind == "physical"
+    known = field.of == "sources" or (field.of == "map" and (physical or beside_others))
     end = motion.duration_s if duration_s is None else duration_s
     _check_readings(end, rate_hz)
     t = np.arange(max(1, math.ceil(end * rate_hz - 1e-9))) / rate_hz
@@ -381,13 +395,15 @@ def sense(
         columns |= sense_battery(robot.battery, pack, t, draws["battery"])
         if exact:
             supply_a = pack.current_a[pack.index(t)]
-            columns |= _exact_field(scene, motion, t, true, columns["lidar_on"], supply_a)
-            if companions and scene.earth is not None:
+            columns |= _exact_field(field if known else None, scene, motion, t, true, columns, supply_a)
+            if beside_others:
                 added = companions_field_nt(scene, companions, motion, t, true)
-                alone = columns["b_truth_nt"]
+                before = columns["b_truth_nt"]
                 columns |= _with(columns["b_vector_nt"], into_sensor(added, robot.q_base_magnetometer_xyzw))
-                beside = columns["b_truth_nt"] - alone
-    steep = _steep(scene, anomaly_map, motion, t) if read or felt else np.zeros(len(t), bool)
+                beside = columns["b_truth_nt"] - before
+            if field.of == "map" and not physical:  # the robot's spec is no measurement to judge a network by
+                columns |= _exact_field(None, scene, motion, t, true, columns, supply_a)
+    steep = _steep(field, motion, t) if read or felt else np.zeros(len(t), bool)
     if felt:
         columns["b_vector_measured_nt"] = sense_axes(
             robot.magnetometer, columns["b_vector_nt"], draws["magnetometer"], rate_hz=rate_hz, steep=steep
@@ -405,6 +421,7 @@ def sense(
         "outside": outside,
         "lidar": lidar,
         "magnetometer": "neural" if network else robot.magnetometer.kind,
+        **(field.facts if physical else {}),
     }
     return Sensed(
         run=Run(columns, told),
@@ -443,12 +460,6 @@ def _check_kind(scene: Scene) -> None:
         raise RefusedError(
             f"scene {scene.name!r} has a neural magnetometer, and no network predicts its disturbance; open "
             'it as a twin that names one, or take the kind "physical" or "map-only"'
-        )
-    if kind == "physical" and scene.earth is None:
-        raise RefusedError(
-            f"scene {scene.name!r} has neither a network nor an Earth field, so nothing gives the "
-            "disturbance; name a network's weights, give the scene an Earth field, or take the "
-            'kind "map-only"'
         )
 
 
@@ -502,16 +513,29 @@ def mapped(
 
 
 def _exact_field(
-    scene: Scene, motion: Moving, t: Array, true: Moment, on: NDArray[np.bool_], supply_a: Array
+    field: ExactField | None,
+    scene: Scene,
+    motion: Moving,
+    t: Array,
+    true: Moment,
+    columns: Mapping[str, NDArray[Any]],
+    supply_a: Array,
 ) -> dict[str, NDArray[Any]]:
-    """Field at the magnetometer, vector in its axes and magnitude; nan where the Earth's is not known."""
-    if scene.earth is None:
+    """Field at the magnetometer, vector in its axes and magnitude; nan where it is not known."""
+    if field is None or field.of == "none":
         return {"b_vector_nt": np.full((len(t), 3), np.nan), "b_truth_nt": np.full(len(t), np.nan)}
-    vector = field_at_sensor_nt(scene, motion, t, true=true, lidar_on=on, supply_a=supply_a)
-    x, y, z = vector.T
+    vector = field.at_sensor_nt(
+        scene,
+        motion,
+        t,
+        true=true,
+        lidar_on=columns["lidar_on"],
+        supply_a=supply_a,
+        at_rest_nt=columns["b_map_nt"],
+    )
     return {
         "b_vector_nt": into_sensor(vector, scene.robot.q_base_magnetometer_xyzw),
-        "b_truth_nt": np.sqrt(x * x + y * y + z * z),
+        "b_truth_nt": field.magnitude_nt(vector, columns["b_map_nt"]),
     }
 
 
@@ -522,15 +546,15 @@ def _with(b_vector_nt: Array, added_nt: Array) -> dict[str, NDArray[Any]]:
     return {"b_vector_nt": vector, "b_truth_nt": np.sqrt(x * x + y * y + z * z)}
 
 
-def _steep(scene: Scene, anomaly_map: AnomalyMap, motion: Moving, t: Array) -> NDArray[np.bool_]:
+def _steep(field: ExactField, motion: Moving, t: Array) -> NDArray[np.bool_]:
     """Where the magnetometer has lost lock to the gradient: the exact one, or the map's where that is all."""
-    spec = scene.robot.magnetometer
+    scene, spec = field.scene, field.scene.robot.magnetometer
     if not spec.gradient_max_nt_m:
         return np.zeros(len(t), bool)
     seen = (t * LOCK_RATE_HZ + 1e-9).astype(int)
     pose = motion.at(np.arange(seen[-1] + 1) / LOCK_RATE_HZ).pose
-    if scene.earth is None:
-        gradient = np.hypot(*anomaly_map.gradient(pose[:, :2], pose[:, 2])[:, :2].T)
+    if field.of != "sources":
+        gradient = np.hypot(*field.anomaly_map.gradient(pose[:, :2], pose[:, 2])[:, :2].T)
     else:
         places = sensor_places(scene.robot, pose)
         gradient = level_gradient_nt_m(scene, places[:, :2], places[0, 2])

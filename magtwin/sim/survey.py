@@ -127,8 +127,9 @@ def _visit(
     source: str = "",
     licence: str = "",
     created: str = "",
+    blocked: Callable[[Array], NDArray[np.bool_]] | None = None,
 ) -> tuple[Readings, NDArray[np.bool_]]:
-    """The readings, and at which nodes the sensor had lost lock, shape (H, Y, X)."""
+    """The readings, and the nodes without one, shape (H, Y, X): lock was lost, or something stands there."""
     if readings < 1:
         raise RefusedError(f"readings must be at least 1, got {readings!r}")
     for name, sd in {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}.items():
@@ -153,14 +154,19 @@ def _visit(
     if heading_error_rad:
         yaw = nominal + heading_error_rad * rng.standard_normal(nominal.shape)
     sensor, latch = scene.robot.magnetometer, rng.spawn(1)[0]
-    exact, lost = np.empty(grid.shape), np.zeros(grid.shape, bool)
+    exact, lost = np.zeros(grid.shape), np.zeros(grid.shape, bool)
     for k in range(len(grid.headings_rad)):
-        progress(k, len(grid.headings_rad), "surveying")
-        exact[k] = field_at_rest_nt(scene, stands[k], yaw[k], height_m=height_m)
+        progress(k, len(grid.headings_rad), "")
+        closed = np.zeros(grid.shape[1:], bool) if blocked is None else blocked(node[k])
+        here = (slice(None), slice(None)) if not closed.any() else np.nonzero(~closed)
+        lost[k] = closed
+        exact[k][here] = field_at_rest_nt(scene, stands[k][here], yaw[k][here], height_m=height_m)
         if sensor.gradient_max_nt_m:
-            gradient = ambient_gradient_nt_m(scene, _sensor_places(scene, stands[k], yaw[k], height))
-            lost[k] = lost_in(sensor, gradient.ravel()).reshape(exact[k].shape)
-    progress(len(grid.headings_rad), len(grid.headings_rad), "surveying")
+            gradient = ambient_gradient_nt_m(
+                scene, _sensor_places(scene, stands[k][here], yaw[k][here], height)
+            )
+            lost[k][here] = lost_in(sensor, gradient.ravel()).reshape(gradient.shape)
+    progress(len(grid.headings_rad), len(grid.headings_rad), "")
     total = np.zeros_like(exact)
     for _ in range(readings):
         total += _read(exact, sensor.noise_std_nt, sensor.resolution_nt, rng)
@@ -207,10 +213,11 @@ def survey(
         heading_error_rad: As there; the map takes each heading for the node's own.
         position_error_m: As there.
         name: Name of the map; that of the scene unless given.
-        options: The others of `survey_readings`.
+        options: The others of `survey_readings`; and `blocked`, which tells for nodes of shape (Y, X, 2) at
+            which of them the robot cannot stand.
 
     Returns:
-        The map, with its variance; nodes at which the sensor had lost lock are not valid.
+        The map, with its variance; nodes at which the sensor had lost lock or that are blocked are not valid.
 
     Raises:
         RefusedError: As for `survey_readings`.
@@ -221,7 +228,8 @@ def survey(
     assert read.height_m is not None
     sensor, grid = scene.robot.magnetometer, read.grid
     variance = (sensor.noise_std_nt**2 + sensor.resolution_nt**2 / 12) / readings
-    missed = pose_error_nt2(scene, grid, read.height_m, **errors)
+    with np.errstate(invalid="ignore", divide="ignore"):  # in what stands at a blocked node
+        missed = pose_error_nt2(scene, grid, read.height_m, **errors)
     return AnomalyMap(
         values_nt=read.b_nt.reshape(grid.shape),
         origin_m=grid.origin_m,

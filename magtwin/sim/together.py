@@ -84,6 +84,7 @@ def simulate_together(
             rates[name] = check_run(
                 led[name],
                 way,
+                anomaly_map=anomaly_map,
                 rate_hz=rate_hz,
                 duration_s=duration_s,
                 lidar=lidar,

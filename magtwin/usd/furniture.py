@@ -1,9 +1,13 @@
 """Furniture on a stage: what each piece looks like, what of it collides, and what of it is magnetised."""
 
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 from pxr import Kind, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from magtwin.frames import IDENTITY_XYZW
-from magtwin.furniture import Part, parts_of
+from magtwin.furniture import BODY, GENERIC, Part, parts_of
 from magtwin.names import RefusedError
 from magtwin.spec import FurnitureSpec, SourceSpec
 from magtwin.usd.figures import check_prim_name, plain_value, write_pose
@@ -14,6 +18,7 @@ from magtwin.usd.sources import (
     LOOKS,
     SOURCES,
     define_source,
+    define_triangles,
     placement,
     read_source,
     source_prims,
@@ -21,6 +26,8 @@ from magtwin.usd.sources import (
 
 FURNITURE = WORLD.AppendChild("Furniture")
 KIND = attribute_name("furniture", "kind")
+MATERIAL = attribute_name("furniture", "material")
+SIZE = attribute_name("furniture", "size_m")
 
 
 def define_furniture(stage: Usd.Stage, furniture: tuple[FurnitureSpec, ...]) -> None:
@@ -41,7 +48,10 @@ def define_furniture(stage: Usd.Stage, furniture: tuple[FurnitureSpec, ...]) -> 
         turn = None if spec.q_world_xyzw == IDENTITY_XYZW else spec.q_world_xyzw
         write_pose(piece, spec.p_world, turn)
         apply_api(piece, "furniture").GetAttribute(KIND).Set(spec.kind)
-        parts = parts_of(spec.kind)
+        if spec.kind in GENERIC:
+            piece.GetAttribute(MATERIAL).Set(spec.material)
+            piece.GetAttribute(SIZE).Set(spec.size_m)
+        parts = spec.parts
         define_looks(stage, path.AppendChild(LOOKS), dict.fromkeys(part.look for part in parts))
         steel = {source.name.removeprefix(f"{spec.name}_"): source for source in spec.sources(in_world=False)}
         for part in parts:
@@ -56,6 +66,12 @@ def _define_part(stage: Usd.Stage, piece: Sdf.Path, part: Part, source: SourceSp
         return define_source(stage, piece, _named(source, part.name), look=part.look)
     if part.shape == "cuboid":
         return define_box(stage, path, part.p, part.size_m, look)
+    if part.shape == "mesh":
+        mesh = UsdGeom.Mesh.Define(stage, path)
+        define_triangles(mesh, part.vertices_m, part.faces)
+        write_pose(mesh.GetPrim(), part.p)
+        wear(mesh, look)
+        return mesh.GetPrim()
     cylinder = UsdGeom.Cylinder.Define(stage, path)
     radius, half = part.size_m[0] / 2, part.size_m[2] / 2
     cylinder.CreateRadiusAttr(radius)
@@ -104,15 +120,17 @@ def _whole(root: Usd.Prim, prims: list[Usd.Prim]) -> FurnitureSpec | None:
     if max(abs(s - 1) for s in scale) > 1e-9 or any(prim.GetParent() != root for prim in own):
         return None
     kind = plain_value(root.GetAttribute(KIND))
-    found = [read_source(prim, local=True) for prim in own]
-    along = {part.name: part.along for part in parts_of(kind) if part.steel}
-    strength = tuple(source.magnetization[along.get(source.name, 0)] for source in found)
+    if kind not in GENERIC:
+        parts_of(kind)  # refuses a kind that magtwin does not know
     try:
-        spec = FurnitureSpec(
-            name=root.GetName(),
-            kind=kind,
-            p_world=p,
-            q_world_xyzw=q,
+        bare = FurnitureSpec(
+            name=root.GetName(), kind=kind, p_world=p, q_world_xyzw=q, **_generic(root, kind)
+        )
+        along = {part.name: part.along for part in bare.parts if part.steel}
+        found = [read_source(prim, local=True) for prim in own]
+        strength = tuple(source.magnetization[along.get(source.name, 0)] for source in found)
+        spec = replace(
+            bare,
             magnetization=strength if any(strength) else (),
             susceptibility=found[0].susceptibility if found else 0.0,
         )
@@ -122,6 +140,26 @@ def _whole(root: Usd.Prim, prims: list[Usd.Prim]) -> FurnitureSpec | None:
         _named(source, source.name.removeprefix(f"{spec.name}_")) for source in spec.sources(in_world=False)
     ]
     return spec if found == wanted else None
+
+
+def _generic(root: Usd.Prim, kind: str) -> dict[str, Any]:
+    """Material and size of a generic piece, or vertices and faces; nothing for the other kinds."""
+    if kind not in GENERIC:
+        return {}
+    given: dict[str, Any] = {"material": plain_value(root.GetAttribute(MATERIAL))}
+    if kind != "mesh":
+        return given | {"size_m": plain_value(root.GetAttribute(SIZE))}
+    mesh = UsdGeom.Mesh(root.GetStage().GetPrimAtPath(root.GetPath().AppendChild(BODY)))
+    if not mesh:
+        raise RefusedError(f"{place(root)}: a mesh without its {BODY}")
+    points = np.array(mesh.GetPointsAttr().Get() or [], float).reshape(-1, 3)
+    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], int)
+    if (mesh.GetFaceVertexCountsAttr().Get() or [0]) != [3] * (len(faces) // 3):
+        raise RefusedError(f"{place(root)}: its {BODY} is not of triangles")
+    return given | {
+        "vertices_m": tuple(map(tuple, points.tolist())),
+        "faces": tuple(map(tuple, faces.reshape(-1, 3).tolist())),
+    }
 
 
 def _named(source: SourceSpec, name: str) -> SourceSpec:

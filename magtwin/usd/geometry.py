@@ -94,6 +94,9 @@ class ColourScale:
     unit: str
     """Unit of both."""
 
+    prim: str = ""
+    """Path of the heat-map's mesh."""
+
 
 def read_shapes(stage: Usd.Stage | str | os.PathLike[str], *, purposes: Sequence[str] = SHOWN) -> list[Shape]:
     """Everything that a viewer shows of a stage, as triangles, in order of the prims.
@@ -197,7 +200,8 @@ def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
     for prim in _prims(stage):
         facts = prim.GetCustomDataByKey("magtwin") or {}
         if "colourMap" in facts and UsdGeom.Imageable(prim).ComputeVisibility() != "invisible":
-            return ColourScale(facts["colourMap"], facts["least"], facts["greatest"], facts["unit"])
+            name, least, greatest, unit = (facts[key] for key in ("colourMap", "least", "greatest", "unit"))
+            return ColourScale(name, least, greatest, unit, str(prim.GetPath()))
     return None
 
 

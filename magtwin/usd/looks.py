@@ -39,6 +39,9 @@ LOOKS: Mapping[str, Look] = MappingProxyType(
         "Chrome": Look((0.55, 0.56, 0.57), 0.2, 1.0, friction=0.3),
         "Wood": Look((0.50, 0.33, 0.17), 0.55, friction=0.4),  # beech
         "Concrete": Look((0.42, 0.41, 0.39), 0.85, friction=0.6),
+        "Enamel": Look((0.80, 0.80, 0.78), 0.35, friction=0.4),  # white, as radiators have
+        "Brick": Look((0.40, 0.16, 0.10), 0.9, friction=0.6),
+        "Aluminium": Look((0.70, 0.71, 0.73), 0.35, 1.0, friction=0.4),
         "Plastic": Look((0.02, 0.02, 0.02), 0.6, friction=0.4),
     }
 )

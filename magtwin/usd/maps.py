@@ -24,7 +24,7 @@ from magtwin.field.map import AnomalyMap
 from magtwin.names import RefusedError
 from magtwin.usd.geometry import linear_from_srgb
 from magtwin.usd.layers import WORLD, new_stage, open_stage
-from magtwin.usd.schema import NOUNS, apply_api, attribute_name, only_prim_with, place
+from magtwin.usd.schema import NOUNS, apply_api, attribute_name, only_prim_with, place, prims_with
 
 MAP = WORLD.AppendChild("AnomalyMap")
 HEAT_MAP = MAP.AppendChild("HeatMap")
@@ -100,6 +100,12 @@ def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = No
             together, or they are not what the checksum was taken of; or the day is none, or before the
             first or after the last epoch.
     """
+    if Path(path).suffix in (".csv", ".txt", ".parquet", ".pq", ".mcap", ".db3"):
+        fitted = Path(path).with_suffix(".usdc").name
+        raise RefusedError(
+            f"{path}: a table of readings or a recording, not a map; fit a map to it first: "
+            f"magtwin map fit {Path(path).name} --out {fitted}"
+        )
     if date is not None:
         return at_date(load_epochs(path), date)
     stage = open_stage(path)
@@ -128,6 +134,17 @@ def load_epochs(path: str | os.PathLike[str]) -> tuple[AnomalyMap, ...]:
                 f"{ORIGIN}, got {attribute_name('anomalyMap', 'created')} {day}; make the map anew"
             )
     return epochs
+
+
+def is_map_layer(path: str | os.PathLike[str]) -> bool:
+    """Whether a USD file holds an anomaly map and no robot, so that it is a map and no scene.
+
+    Raises:
+        RefusedError: The file is missing or no stage.
+    """
+    stage = open_stage(path)
+    root = stage.GetPseudoRoot()
+    return len(prims_with(root, "anomalyMap")) == 1 and not prims_with(root, "robot")
 
 
 def read_map(prim: Usd.Prim) -> AnomalyMap:

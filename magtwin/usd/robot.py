@@ -34,8 +34,10 @@ from magtwin.usd.sensors import (
     define_magnetometer,
     define_mocap,
     define_platform,
+    read_drive,
     read_robot_prim,
 )
+from magtwin.usd.shape import drive_of, footprint_of, stand_on_floor
 from magtwin.usd.urdf.convert import convert_with_report
 from magtwin.usd.urdf.options import DEFAULTS, Options
 from magtwin.usd.urdf.report import ConversionReport
@@ -55,8 +57,8 @@ class RobotSettings(Spec):
     name: str = ""
     """Name that the URDF must give the robot; "" takes any."""
 
-    footprint_radius_m: float = _DEFAULTS.footprint_radius_m
-    """Radius of the circle that must stay clear of walls [m]."""
+    footprint_radius_m: float | None = None
+    """Radius of the circle that must stay clear of walls [m]; that of the robot's shape unless given."""
 
     drive: DriveSpec | None = None
     battery: BatterySpec = field(default_factory=BatterySpec)
@@ -71,7 +73,8 @@ class RobotSettings(Spec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._above_zero("footprint_radius_m")
+        if self.footprint_radius_m is not None:
+            self._above_zero("footprint_radius_m")
 
 
 def build_robot(
@@ -162,6 +165,12 @@ def read_description(asset: str | os.PathLike[str]) -> str:
     return reroot(text, BASE_LINK, source)
 
 
+def notes_of(asset: str | os.PathLike[str]) -> list[str]:
+    """What was repaired, guessed or left out when an asset was converted."""
+    stage = open_stage(existing(asset, "robot asset"))
+    return [str(note) for note in stage.GetRootLayer().customLayerData.get("magtwin", {}).get("notes", [])]
+
+
 def description_of(asset: str | os.PathLike[str]) -> Path | None:
     """The URDF that an asset was converted from, if it still lies beside it, unchanged."""
     stage = open_stage(
@@ -189,9 +198,16 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
     """Author what settings say at a converted robot's prim and on its links; notes of what was guessed."""
     stage, links, notes = robot.GetStage(), _links(robot), list[str]()
     robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set("Wheeled")
-    define_footprint(robot, settings.footprint_radius_m)
+    radius = settings.footprint_radius_m
+    if radius is None:
+        radius = footprint_of(robot) or _DEFAULTS.footprint_radius_m
+        notes.append(f"footprint_radius_m not given: {radius:g} m, from the robot's shape")
+    define_footprint(robot, radius)
     if settings.drive is not None or not prims_with(robot, "drive"):
-        define_drive(robot, settings.drive or DriveSpec())
+        drive, found = drive_of(robot, settings.drive or DriveSpec())
+        define_drive(robot, drive)
+        notes += found
+    notes += stand_on_floor(robot, read_drive(robot))
     define_platform(robot, settings.platform)
     define_mocap(robot, settings.mocap)
     define_battery(stage, _free(links, _base(robot), "battery"), settings.battery)
@@ -204,7 +220,7 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
             continue
         if given is None and spec.link not in links:
             base = _base(robot)
-            notes.append(f"no {name} is told of: one is thought to sit at {base.name}'s origin")
+            notes.append(f"no {name} given: placed at the origin of {base.name}")
             define(stage, _free(links, base, name), replace(spec, link=base.name))
         else:
             path = _mount(links, name, given or spec)

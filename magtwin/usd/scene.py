@@ -1,19 +1,20 @@
 """A Scene as layered USD: authored from its spec or its TOML, and read back from the composed stage."""
 
 import os
-import re
 import shutil
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 
-from magtwin.files import existing, from_table, output, read_toml, sha256
+from magtwin.files import existing, from_table, output, read_toml, refused_at, sha256
 from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.names import RefusedError
+from magtwin.obstacles import Obstacles
 from magtwin.path import resolve_path
+from magtwin.placement import Room, path_in
 from magtwin.spec import (
     ZERO3,
     EarthFieldSpec,
@@ -23,6 +24,7 @@ from magtwin.spec import (
     RobotSpec,
     Scene,
     SourceSpec,
+    SurveySpec,
     Vec3,
 )
 from magtwin.usd.earth import checked, define_earth, read_earth
@@ -32,6 +34,17 @@ from magtwin.usd.lab import LAB, PHYSICS_SCENE, define_lab, read_lab
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, open_stage, relative_asset
 from magtwin.usd.maps import MAP, load_map, read_map
 from magtwin.usd.robot import RobotSettings, build_robot, description_of, read_robot, robot_of
+from magtwin.usd.room import (
+    FurnitureTable,
+    asset_named,
+    check_name,
+    check_names,
+    check_start,
+    lab_of,
+    no_map,
+    obstacles_in,
+    placed_furniture,
+)
 from magtwin.usd.schema import only_prim_with, place, prims_with, require_api
 from magtwin.usd.sensors import (
     MAP_CHECKSUM,
@@ -90,7 +103,7 @@ def author_scene(
     with output(folder, force=force) as aside:
         aside.mkdir()
         placed = scene if by_reference else _with_copies(scene, aside)
-        sublayers = [_write_room(scene.lab, aside), *_write_furniture(scene, aside)]
+        sublayers = [_write_room(scene, aside), *_write_furniture(scene, aside)]
         sublayers += [*_write_magnetics(scene, aside), placed.map_layer]
         root = Sdf.Layer.CreateNew(str(aside / f"{scene.name}.usda"))
         stage = Usd.Stage.Open(root)
@@ -219,27 +232,40 @@ def _placed(prim: Usd.Prim, check_network: bool) -> PlacedRobot:
 
 @dataclass(frozen=True, kw_only=True)
 class _RobotTable(RobotSettings):
-    """[robot] of a scene's TOML: an asset, or a URDF with what a URDF cannot say.
+    """The robot: an asset, or a URDF and what a URDF cannot say. For several robots, write [[robot]] each."""
 
-    Of several, a [[robot]] each, `name` is that of its prim.
-    """
+    name: str = ""
+    """Name of its prim, required for each of several robots. With urdf, the name that the URDF must give."""
 
     start: Vec3 | None = None
+    """Where it stands at first: x [m], y [m] and yaw [rad]. By default that of the scene or, of several
+    robots, where its path begins. Refused inside of furniture; the refusal names the nearest free place."""
+
     path: str = ""
-    """What it drives: the name of a path, "random", or a CSV file."""
+    """What it drives unless told otherwise: the name of a path, "random", or a CSV file of x,y. Default:
+    figure8."""
 
     asset: Path | None = None
+    """Robot that ships, by its name ("turtlebot4"), or USD file made by `magtwin robot`."""
+
     urdf: Path | None = None
+    """URDF or xacro file to convert, in place of an asset."""
+
     network: Path | None = None
+    """Weights that predict the robot's disturbance, for a neural magnetometer."""
+
     kind: Literal["physical", "neural", "map-only"] | None = None
-    """Of its magnetometer; "neural" where a network is named, unless given."""
+    """What its magnetometer reads: the exact field, the map and the network's prediction, or the map. By
+    default neural with a network, else physical."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _EarthTable(EarthFieldSpec):
-    """[earth] of a scene's TOML: its field may be left out, and then follows from the rest."""
+    """The Earth's field, uniform over the room. It follows from place and date by the IGRF-14, to 2030."""
 
     b_world_nt: Vec3 = ZERO3
+    """Field in world axes [nT], where it was measured. Unless measured is true, it must be the model's within
+    1 nT."""
 
     @property
     def spec(self) -> EarthFieldSpec:
@@ -248,41 +274,41 @@ class _EarthTable(EarthFieldSpec):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _FurnitureTable(FurnitureSpec):
-    """[[furniture]] of a scene's TOML: it stands upright, its front turned by `yaw`."""
-
-    yaw: float = 0.0
-    """Angle of its front from world x, counter-clockwise seen from above [rad]."""
-
-    @property
-    def spec(self) -> FurnitureSpec:
-        """What it says."""
-        given = {name: value for name, value in vars(self).items() if name != "yaw"}
-        if self.yaw:
-            given["q_world_xyzw"] = tuple(map(float, quat_from_yaw(self.yaw)))
-        return FurnitureSpec(**given)
-
-
-@dataclass(frozen=True, kw_only=True)
 class _SourcesTable:
-    """[sources] of a scene's TOML."""
+    """Furniture and sources in a file of their own."""
 
     file: Path
+    """TOML with [[furniture]] and [[source]] tables, which are added to those of the scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class _SceneFile:
-    """A scene's TOML; its tables have the keys of their specs."""
+class SceneFile:
+    """A scene's TOML; docs/scenes.md is made from it."""
 
     name: str
+    """Name of the scene and of its root layer: any that a file can have on every system."""
+
     robot: tuple[_RobotTable, ...]
+
     map: Path | None = None
+    """USD layer of the magnetic map. By default the scene is surveyed, see above."""
+
     start: Vec3 = ZERO3
+    """Where the robot stands at first: x [m], y [m] and yaw [rad]. A path begins where it begins."""
+
+    seed: int = 0
+    """Seed of the magnetization of furniture that gives none, and of the survey's noise."""
+
     lab: LabSpec = field(default_factory=LabSpec)
     earth: _EarthTable | None = None
+    survey: SurveySpec | None = None
     sources: _SourcesTable | None = None
     source: tuple[SourceSpec, ...] = ()
-    furniture: tuple[_FurnitureTable, ...] = ()
+    furniture: tuple[FurnitureTable, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise RefusedError(f"seed must not be below 0, got {self.seed}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,7 +316,7 @@ class _SourceFile:
     """A TOML of what is magnetised, one [[source]] or [[furniture]] each."""
 
     source: tuple[SourceSpec, ...] = ()
-    furniture: tuple[_FurnitureTable, ...] = ()
+    furniture: tuple[FurnitureTable, ...] = ()
 
 
 def scene_from_toml(
@@ -300,18 +326,21 @@ def scene_from_toml(
     network: str | os.PathLike[str] | None = None,
     workshop: str | os.PathLike[str] | None = None,
     inputs_of: Callable[[Path], tuple[str, ...]] = lambda weights: (),
+    survey_of: Callable[[Scene, SurveySpec, int, Obstacles], Path] | None = None,
 ) -> Scene:
-    """The scene that a TOML describes, as scenes/lab.toml does.
+    """The scene that a TOML describes, as scenes/lab.toml does; docs/scenes.md has every key.
 
     Args:
         path: The TOML; files that it names are taken from its folder.
-        map_layer: Map to use in place of the one that it names. Its Earth's field and sources are
-            those of its own map, and are left out.
+        map_layer: Map to use in place of the one that it names. The Earth's field, sources and furniture stay
+            as the TOML has them; `magtwin.twin.scene_from_toml` refuses a map that contradicts them.
         network: Weights to use in place of those that it names.
         workshop: Folder in which the asset is built of a robot that the TOML names by its URDF; a
             self-contained scene copies it from there.
         inputs_of: Gives the names of the inputs of a weights file, which this room cannot read; see
             `magtwin.twin.scene_from_toml`. Without it the scene leaves them open.
+        survey_of: Surveys a scene that names no map, whose `map_layer` is not there yet, and gives the map
+            layer; called with the scene, how to survey it, the seed and what stands in the room.
 
     Raises:
         RefusedError: A key is misspelt or missing, or a file is not there; with file and line.
@@ -320,45 +349,67 @@ def scene_from_toml(
     alone = isinstance(table.get("robot"), dict)  # [robot], not [[robot]]
     if alone:
         table = table | {"robot": [table["robot"]]}
-    given = from_table(_SceneFile, table, path)
+    given = from_table(SceneFile, table, path)
     if not given.robot:
         raise RefusedError(f"{path}: has no robot; add a [robot] table")
+    try:
+        check_name(given.name)
+    except RefusedError as error:
+        raise refused_at(path, "name", str(error)) from error
     layer = Path(map_layer).resolve() if map_layer is not None else given.map
-    if layer is None:
-        raise RefusedError(f'{path}: names no map; add map = "FILE.usdc" to it, or give --map FILE.usdc')
+    lab = lab_of(given.lab, table, path, None if layer is None else existing(layer, "map layer"))
+    pieces = placed_furniture(given.furniture, lab, path, seed=given.seed)
+    sources = given.source
+    if given.sources:
+        listed = read_sources(given.sources.file, seed=given.seed, lab=lab)
+        sources, pieces = (*listed[0], *sources), (*listed[1], *pieces)
+    if layer is None and (given.earth is None or survey_of is None):
+        raise no_map(path, furnished=bool(pieces or sources))
+    check_names(pieces, path)
+    standing = obstacles_in(lab, pieces)
     robots: list[PlacedRobot] = []
-    for one, keys in zip(given.robot, table["robot"], strict=True):
+    for number, (one, keys) in enumerate(zip(given.robot, table["robot"], strict=True)):
         where = f"{path}: [robot]" if alone else f"{path}: [[robot]] {one.name!r}"
         robot = _robot(one, keys, where, workshop, named=not alone)
         robot = _with_network(robot, one, network, where, inputs_of)
         way = _way(one.path, Path(path).parent, where)
-        start = one.start
+        start, of_robot = one.start, True
         if start is None:
-            start = given.start if alone or (not robots and "start" in table) else _beginning(way)
+            of_robot = not (alone or (not robots and "start" in table))
+            room = Room(lab.floor_m, robot.footprint_radius_m, standing)
+            start = _beginning(way, room) if of_robot else given.start
         robots.append(PlacedRobot(robot=robot, start=start, path=way))
-    own_map = map_layer is None
-    sources, furniture = given.source, tuple(table.spec for table in given.furniture)
-    if given.sources and own_map:
-        listed = read_sources(given.sources.file)
-        sources, furniture = (*listed[0], *sources), (*listed[1], *furniture)
-    return Scene(
+        try:
+            check_start(robots[-1], lab, standing)
+        except RefusedError as error:
+            section = {"section": "robot", "number": number} if of_robot else {}
+            raise refused_at(path, "start", str(error), **section) from error  # type: ignore[arg-type]
+    scene = Scene(
         name=given.name,
-        map_layer=existing(layer, "map layer"),
-        map_sha256=sha256(layer),
+        map_layer=Path("surveyed") if layer is None else existing(layer, "map layer"),
+        map_sha256="" if layer is None else sha256(layer),
         robot=robots[0].robot,
-        lab=given.lab,
-        earth=_earth(given.earth, path) if given.earth and own_map else None,
-        sources=sources if own_map else (),
-        furniture=furniture if own_map else (),
+        lab=lab,
+        earth=_earth(given.earth, path) if given.earth else None,
+        sources=sources,
+        furniture=pieces,
         start=robots[0].start,
         path=robots[0].path,
         others=tuple(robots[1:]),
     )
+    if layer is None and survey_of is not None:
+        _check_things(scene)
+        try:
+            surveyed = survey_of(scene, given.survey or SurveySpec(), given.seed, standing)
+        except RefusedError as error:
+            raise RefusedError(f"{path}: cannot be surveyed: {error}") from error
+        scene = replace(scene, map_layer=surveyed, map_sha256=sha256(surveyed))
+    return scene
 
 
 def _robot(
     table: _RobotTable,
-    keys: Collection[str],
+    keys: Mapping[str, Any],
     where: str,
     workshop: str | os.PathLike[str] | None,
     *,
@@ -371,7 +422,7 @@ def _robot(
         known = {"asset", "network", "kind", "start", "path", *(["name"] if named else [])}
         if others := sorted(set(keys) - known):
             raise RefusedError(f"{where} {others[0]} goes with urdf; the asset says it already")
-        robot = read_robot(table.asset)
+        robot = read_robot(asset_named(table.asset, keys["asset"], where))
         return replace(robot, name=table.name) if named else robot
     if table.urdf is None or table.asset is not None:
         raise RefusedError(f'{where} needs asset = "FILE.usda" or urdf = "FILE.urdf", one of the two')
@@ -430,11 +481,11 @@ def _way(path: str, folder: Path, where: str) -> str | Path:
     return path if named else file
 
 
-def _beginning(way: str | Path) -> Vec3:
+def _beginning(way: str | Path, room: Room) -> Vec3:
     """Where a path begins and whither it goes, so that robots of one scene do not stand in each other."""
     if way in ("", "random"):
         return ZERO3
-    path = resolve_path(way)
+    path = path_in(room, way)
     x, y = path.p_xy[0].tolist()
     return x, y, float(path.heading(0.0))
 
@@ -447,24 +498,42 @@ def _earth(table: _EarthTable, path: str | os.PathLike[str]) -> EarthFieldSpec:
 
 
 def read_sources(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str], *, seed: int = 0, lab: LabSpec | None = None
 ) -> tuple[tuple[SourceSpec, ...], tuple[FurnitureSpec, ...]]:
     """The sources and the furniture of a TOML such as maps/lab/sources.toml.
 
+    Args:
+        path: The TOML.
+        seed: Seed of the magnetization of furniture that gives none.
+        lab: Room whose slab the furniture must stand on; None does not check.
+
     Raises:
-        RefusedError: A key is misspelt or missing, or a figure is out of range; with file and line.
+        RefusedError: A key is misspelt or missing, a figure is out of range, or a piece stands beside the
+            slab; with file and line.
     """
     listed = from_table(_SourceFile, read_toml(path), path)
-    return listed.source, tuple(table.spec for table in listed.furniture)
+    return listed.source, placed_furniture(listed.furniture, lab, path, seed=seed)
 
 
 def _check(scene: Scene) -> None:
     """Refuse what would come out broken, before anything is written, by the names that the caller knows."""
-    if not re.fullmatch(r"\w[\w .-]*", scene.name):
-        raise RefusedError(f"scene {scene.name!r} cannot name a file; use letters, digits, - and _")
+    check_name(scene.name)
     for placed in scene.robots:
         if check_prim_name(placed.robot.name, "robot") in TAKEN:
             raise RefusedError(f"robot {placed.robot.name!r} has the name of a part of the scene; rename it")
+    _check_things(scene)
+    load_map(scene.map_layer)
+    _check_map(scene)
+    for placed in scene.robots:
+        read_robot(placed.robot.asset)
+        if placed.robot.magnetometer.network is not None:
+            existing(placed.robot.magnetometer.network, "weights file")
+        if isinstance(placed.path, Path):
+            existing(placed.path, "path file")
+
+
+def _check_things(scene: Scene) -> None:
+    """Refuse sources and furniture that cannot stand on one stage, or whose field cannot be computed."""
     for what, things in (("sources", scene.sources), ("pieces of furniture", scene.furniture)):
         names = [thing.name for thing in things]
         if twice := sorted({name for name in names if names.count(name) > 1}):
@@ -474,14 +543,6 @@ def _check(scene: Scene) -> None:
     for source in scene.magnets:
         if source.susceptibility and scene.earth is None:
             source.body()  # refuses
-    load_map(scene.map_layer)
-    _check_map(scene)
-    for placed in scene.robots:
-        read_robot(placed.robot.asset)
-        if placed.robot.magnetometer.network is not None:
-            existing(placed.robot.magnetometer.network, "weights file")
-        if isinstance(placed.path, Path):
-            existing(placed.path, "path file")
 
 
 def _check_map(scene: Scene, where: str = "") -> None:
@@ -561,16 +622,23 @@ def _copied_asset(asset: Path, folder: Path) -> Path:
     return folder / asset.relative_to(common)
 
 
-def _write_room(lab: LabSpec, folder: Path) -> Path:
-    with new_stage(folder / "room.usda", "The room, its lights and its physics, by magtwin") as stage:
-        define_lab(stage, lab)
-    return folder / "room.usda"
+def _part(scene: Scene, folder: Path, name: str) -> Path:
+    """A layer of a scene, under a name that its root layer does not have."""
+    taken = scene.name.casefold() == name
+    return folder / (f"{name}_layer.usda" if taken else f"{name}.usda")
+
+
+def _write_room(scene: Scene, folder: Path) -> Path:
+    path = _part(scene, folder, "room")
+    with new_stage(path, "The room, its lights and its physics, by magtwin") as stage:
+        define_lab(stage, scene.lab)
+    return path
 
 
 def _write_magnetics(scene: Scene, folder: Path) -> list[Path]:
     if scene.earth is None and not scene.sources:
         return []
-    path = folder / "magnetics.usda"
+    path = _part(scene, folder, "magnetics")
     with new_stage(path, "What makes the magnetic field: the Earth and magnetised things") as stage:
         if scene.earth is not None:
             define_earth(stage, EARTH, scene.earth)
@@ -582,9 +650,10 @@ def _write_magnetics(scene: Scene, folder: Path) -> list[Path]:
 def _write_furniture(scene: Scene, folder: Path) -> list[Path]:
     if not scene.furniture:
         return []
-    with new_stage(folder / "furniture.usda", "Furniture and columns, and how they are magnetised") as stage:
+    path = _part(scene, folder, "furniture")
+    with new_stage(path, "Furniture and columns, and how they are magnetised") as stage:
         define_furniture(stage, scene.furniture)
-    return [folder / "furniture.usda"]
+    return [path]
 
 
 def _define_robot(stage: Usd.Stage, placed: PlacedRobot, map_sha256: str) -> None:

@@ -93,14 +93,20 @@ def _define_shape(prim: Usd.Prim, spec: SourceSpec) -> None:
     elif spec.shape == "sphere":
         UsdGeom.Sphere(prim).CreateRadiusAttr(x / 2)
     else:
-        points = np.array(spec.vertices_m, np.float32)
-        mesh = UsdGeom.Mesh(prim)
-        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-        mesh.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(spec.faces)))
-        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.array(spec.faces, np.int32).ravel()))
-        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        extent = [Gf.Vec3f(*map(float, corner)) for corner in (points.min(axis=0), points.max(axis=0))]
+        define_triangles(UsdGeom.Mesh(prim), spec.vertices_m, spec.faces)
+        return
     UsdGeom.Gprim(prim).CreateExtentAttr(Vt.Vec3fArray(extent))
+
+
+def define_triangles(mesh: UsdGeom.Mesh, vertices_m: Any, faces: Any) -> None:
+    """A mesh's geometry: vertices [m], shape (V, 3), in single precision, and triangles, shape (F, 3)."""
+    points = np.array(vertices_m, np.float32)
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(faces)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.array(faces, np.int32).ravel()))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    extent = [Gf.Vec3f(*map(float, corner)) for corner in (points.min(axis=0), points.max(axis=0))]
+    mesh.CreateExtentAttr(Vt.Vec3fArray(extent))
 
 
 def source_prims(stage: Usd.Stage) -> list[Usd.Prim]:

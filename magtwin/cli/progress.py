@@ -1,0 +1,311 @@
+"""Progress of commands on stderr: a bar on a terminal, a plain line now and then elsewhere.
+
+A thread watches each command. Where nothing has been printed for `FIRST_S`, it prints what is being done,
+with counts, rate and time left as far as they are known, and again every `EVERY_S`. So a command reports
+progress even while it waits for a library that does not.
+"""
+
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from threading import Event, Lock, Thread
+from typing import Any, Protocol, TextIO
+
+FIRST_S = 1.5
+"""Silence after which the first line is printed [s]."""
+
+EVERY_S = 10.0
+"""Time between two lines of progress, at least [s]."""
+
+TICK_S = 0.1
+"""Time between two looks at the clock [s]."""
+
+WINDOW_S = 30.0
+"""Rates are means over this time [s]."""
+
+LATE_S = 5.0
+"""Time without a report after which the rate counts as unknown [s], at least ..."""
+
+LATE = 3.0
+"""... and so many times the usual time between reports."""
+
+
+class Advance(Protocol):
+    """What commands call, and hand down to libraries as `progress`."""
+
+    def __call__(self, done: float, total: float | None, what: str = "") -> None:
+        """Report `done` of `total`, and in a word what comes next or how it goes."""
+
+
+class Step:
+    """Something that is being done, and how far it has got.
+
+    Attributes:
+        title: What is being done, such as "Drawing frames".
+        unit: What is counted, such as "frames"; may be empty.
+        done: How many are done.
+        total: Of how many; None or 0 if that is unknown.
+        what: A detail for people.
+    """
+
+    def __init__(self, title: str, unit: str, now: float) -> None:
+        """Begin at a time `now` [s]."""
+        self.title, self.unit = title, unit
+        self.done: float = 0
+        self.total: float | None = None
+        self.what = ""
+        self._began = now
+        self._seen: deque[tuple[float, float]] = deque()
+
+    def advance(self, now: float, done: float, total: float | None, what: str = "") -> None:
+        """Take a report at a time `now` [s]."""
+        if done < self.done:
+            self._seen.clear()  # another loop has begun
+        self.done, self.total, self.what = done, total, what
+        seen = self._seen
+        if not seen or now - seen[-1][0] > TICK_S or len(seen) == 1:
+            seen.append((now, done))
+        else:
+            seen[-1] = (now, done)
+        while len(seen) > 2 and now - seen[1][0] > WINDOW_S:
+            seen.popleft()
+
+    def rate(self, now: float) -> float | None:
+        """How many are done a second; None while that is unknown, or no report came for long."""
+        if len(self._seen) < 2:
+            return None
+        (first, before), (last, after) = self._seen[0], self._seen[-1]
+        if after <= before or last <= first:
+            return None
+        rate = (after - before) / (last - first)
+        return rate if now - last < max(LATE_S, LATE * (last - first) / (len(self._seen) - 1)) else None
+
+    def left_s(self, now: float) -> float | None:
+        """Time left at a time `now` [s], None while that is unknown."""
+        rate = self.rate(now)
+        if rate is None or not self.total or self.done >= self.total:
+            return None
+        return max(0.0, (self.total - self.done) / rate - (now - self._seen[-1][0]))
+
+    def line(self, now: float) -> str:
+        """The step in a line, at a time `now` [s]."""
+        parts = []
+        if self.total:
+            counts = f"{self.done:,.0f} of {self.total:,.0f}"
+            parts.append(f"{counts} {self.unit}".strip())
+        elif self.done:
+            parts.append(f"{self.done:,.0f} {self.unit}".strip())
+        parts.append(self.speed(now))
+        left, gone = self.left_s(now), now - self._began
+        if left is not None:
+            parts.append(f"{in_words(left)} left")
+        elif gone >= 1:
+            parts.append(f"{in_words(gone)} so far")
+        text = ", ".join(part for part in (*parts, self.what) if part)
+        return f"{self.title}: {text}" if text else f"{self.title} ..."
+
+    def speed(self, now: float) -> str:
+        """The rate in words, empty while it is unknown."""
+        rate = self.rate(now)
+        if rate is None:
+            return ""
+        number = f"{rate:,.0f}" if rate >= 100 else f"{rate:.2g}"
+        if self.unit == "s":
+            return f"{number} x real time"
+        return f"{number} {self.unit}/s" if self.unit else f"{number}/s"
+
+
+def in_words(seconds: float) -> str:
+    """A time for people: 12 s, 1 min 20 s, 2 h 5 min."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
+class Watch:
+    """What one command is doing, and when it last printed a line about it."""
+
+    def __init__(
+        self,
+        *,
+        stream: TextIO | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        terminal: bool | None = None,
+    ) -> None:
+        """Begin to watch.
+
+        Args:
+            stream: Where lines go. None: stderr as it is at that time.
+            clock: Gives the time [s].
+            terminal: Whether bars can be drawn. None: whether stderr is a terminal.
+        """
+        self._stream, self._clock = stream, clock
+        self._terminal = (sys.stderr.isatty() if stream is None else False) if terminal is None else terminal
+        self._printed = clock()
+        self._reported = -float("inf")
+        self._base = Step("Starting", "", self._printed)
+        self._steps: list[Step] = []
+        self._bar: Any = None
+        self._silent = 0
+        self._lock = Lock()
+        self._end = Event()
+        self._thread: Thread | None = None
+
+    def start(self) -> None:
+        """Watch from a thread of its own."""
+        self._thread = Thread(target=self._run, name="magtwin-progress", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Print nothing any more."""
+        self._end.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def step(self, text: str, *, quiet: bool = False) -> None:
+        """Say what is done next, whose length is unknown; `quiet` prints it only where it takes long."""
+        now = self._clock()
+        with self._lock:
+            self._base = Step(text, "", now)
+            if not quiet:
+                self._print(f"  {text} ...")
+                self._printed = now
+
+    @contextmanager
+    def silence(self) -> Iterator[None]:
+        """Print no lines while a viewer is shown or the command waits for people."""
+        self._silent += 1
+        try:
+            yield
+        finally:
+            self._silent -= 1
+            self._printed = self._clock()
+
+    @contextmanager
+    def progress(self, title: str, unit: str = "") -> Iterator[Advance]:
+        """A step of known length; gives the function that reports how far it is."""
+        step = Step(title, unit, self._clock())
+        self._steps.append(step)
+        try:
+            with self._drawn(step) if self._terminal else nullcontext() as draw:
+
+                def advance(done: float, total: float | None, what: str = "") -> None:
+                    step.advance(self._clock(), done, total, what)
+                    if draw is not None:
+                        draw()
+                    self.tick()  # a library that keeps the interpreter to itself starves the thread
+
+                yield advance
+        finally:
+            self._steps.remove(step)
+            self._base = Step("Finishing", "", self._clock())
+
+    def tick(self) -> None:
+        """Print a line if one is due."""
+        with self._lock:
+            now = self._clock()
+            if self._silent or self._bar is not None or self._end.is_set():
+                return
+            if now - self._printed < FIRST_S or now - self._reported < EVERY_S:
+                return
+            step = self._steps[-1] if self._steps else self._base
+            self._print(f"  {step.line(now)}")
+            self._printed = self._reported = now
+
+    def _run(self) -> None:
+        while not self._end.wait(TICK_S):
+            self.tick()
+
+    def _print(self, line: str) -> None:
+        with suppress(OSError, ValueError):  # stderr is closed
+            print(line, file=self._stream or sys.stderr, flush=True)
+
+    @contextmanager
+    def _drawn(self, step: Step) -> Iterator[Callable[[], None]]:
+        """A bar for a step, below those that are drawn already; gives what draws it anew."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        mine = self._bar is None
+        if mine:
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[rate]}"),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[what]}"),
+            )
+            console = Console(file=self._stream, stderr=self._stream is None, force_terminal=True)
+            self._bar = Progress(*columns, console=console, redirect_stdout=False)
+            self._bar.start()
+        bar = self._bar
+        task = bar.add_task(f"  {step.title}", total=None, rate="", what="")
+        try:
+            yield lambda: bar.update(
+                task,
+                completed=step.done,
+                total=step.total or None,
+                rate=step.speed(self._clock()),
+                what=step.what,
+            )
+        finally:
+            if mine:
+                bar.stop()
+                self._bar = None
+                self._printed = self._clock()
+            else:
+                bar.remove_task(task)
+
+
+_watches: list[Watch] = []
+"""Those of the commands that are under way, the innermost last; there is one but for tests."""
+
+
+@contextmanager
+def watched() -> Iterator[Watch]:
+    """Watch a command until its end."""
+    watch = Watch()
+    _watches.append(watch)
+    watch.start()
+    try:
+        yield watch
+    finally:
+        watch.stop()
+        _watches.remove(watch)
+
+
+def current() -> Watch:
+    """The watch of the command that is under way; one that no thread looks at where there is none."""
+    return _watches[-1] if _watches else Watch()
+
+
+def announcer(*, quiet: bool) -> Callable[[str], None]:
+    """A function that says what is being done, on stderr; `quiet` says it only where it takes long."""
+    watch = current()
+    return lambda text: watch.step(text, quiet=quiet)
+
+
+def step(text: str) -> None:
+    """Name what is done next; it is printed where it takes long."""
+    current().step(text, quiet=True)
+
+
+def progress(title: str, unit: str = "") -> Any:
+    """Report progress with rate and time left; gives `advance(done, total, what)`.
+
+    Args:
+        title: What is being done.
+        unit: What is counted, such as "runs".
+    """
+    return current().progress(title, unit)
+
+
+def silence() -> Any:
+    """Report nothing for a time: a viewer is shown, or the command waits for people."""
+    return current().silence()

@@ -1,0 +1,88 @@
+"""What a Run shows of itself: size, origin, path, range of the field, and flags."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.summary import Summary, listed, rectangle, span
+
+Columns = Mapping[str, NDArray[Any]]
+
+
+def run_summary(columns: Columns, facts: Mapping[str, Any], described: Sequence[tuple[str, ...]]) -> Summary:
+    """The summary of a run.
+
+    Args:
+        columns: Arrays by column name, shape (N,) or (N, width).
+        facts: What produced the run.
+        described: Name, unit, frame and meaning of each column.
+    """
+    flags = _flags(columns)
+    return Summary(
+        _title(columns),
+        (
+            ("from", _origin(facts)),
+            ("path", _driven(columns)),
+            ("field", _field_range(columns)),
+            ("flags" if flags else "columns", flags or listed(columns)),
+        ),
+        ("column", "unit", "frame", "what it is"),
+        described,
+    )
+
+
+def _title(columns: Columns) -> str:
+    """Rows, columns, duration and rate."""
+    rows = len(next(iter(columns.values()))) if columns else 0
+    size = f"Run: {rows:,} rows x {len(columns)} columns"
+    t = columns.get("t", np.array([]))
+    if t.dtype.kind not in "fiu" or t.ndim != 1 or len(t) < 2:
+        return size
+    step = float(np.median(np.diff(t)))
+    rate = f" at {1 / step:.4g} Hz" if step > 0 else ""
+    return f"{size}, {float(t[-1] - t[0]):.4g} s{rate}"
+
+
+def _origin(facts: Mapping[str, Any]) -> str:
+    """Scene, path, robot and seed of a run, as far as its facts name them."""
+    parts = [
+        f"{name} {facts[name]}" for name in ("scene", "path", "robot", "seed", "session") if name in facts
+    ]
+    if "magnetometer" in facts:
+        parts.append(f"{facts['magnetometer']} magnetometer")
+        if "network" in facts:
+            parts[-1] += f" ({facts['network']})"
+    return ", ".join(parts)
+
+
+def _driven(columns: Columns) -> str:
+    """Length and extent of what was driven, by the best position that the run has."""
+    for name in ("p_world_base", "mocap_p", "odom_p"):
+        p = columns.get(name, np.array([]))
+        p = p[np.isfinite(p).all(axis=1)] if p.ndim == 2 else np.empty((0, 3))
+        if len(p):
+            length = float(np.hypot(*np.diff(p[:, :2], axis=0).T).sum())
+            (x0, y0), (x1, y1) = p[:, :2].min(axis=0), p[:, :2].max(axis=0)
+            return f"{length:.4g} m in {rectangle(x0, x1, y0, y1)} ({name})"
+    return ""
+
+
+def _field_range(columns: Columns) -> str:
+    """Range and mean of the reading, or of the best field that the run has."""
+    for name in ("b_measured_nt", "b_total_nt", "b_truth_nt", "b_map_nt"):
+        values = columns.get(name, np.array([]))
+        known = values[np.isfinite(values)]
+        if len(known):
+            lost = f", {len(values) - len(known):,} nan" if len(known) < len(values) else ""
+            return f"{span(known.min(), known.max(), 'nT')}, mean {known.mean():,.0f} nT ({name}{lost})"
+    return ""
+
+
+def _flags(columns: Columns) -> str:
+    """Flags that are set, and in how many rows."""
+    raised = {
+        n: int(v.sum()) for n, v in columns.items() if n.startswith("flag_") and v.dtype == bool and v.any()
+    }
+    return listed([f"{name} in {count:,} rows" for name, count in raised.items()], 80)

@@ -1,0 +1,141 @@
+"""Contradiction: how far a map is from the field that a scene's Earth and magnetised things make."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magtwin.field.map import AnomalyMap
+from magtwin.names import RefusedError
+from magtwin.sim.interference import ambient_gradient_nt_m
+from magtwin.sim.room_survey import in_steel
+from magtwin.sim.survey import field_at_rest_nt, sensor_height_m
+from magtwin.spec import Scene
+
+LEAST_NT = 500.0
+"""Difference (rms) up to which a map and sources always agree [nT]: a fit's error, a change of hard iron."""
+
+PART = 0.3
+"""Difference (rms) up to which they agree, as a part of the map's own standard deviation: a coarse survey of
+the same field errs by a fifth of it, the map of another room by 1.4 times it."""
+
+MOST_NODES = 20_000
+"""Nodes that are compared; of a larger map every second one, every third one, and so on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contradiction:
+    """Map minus exact field, over the valid nodes of the map."""
+
+    rms_nt: float
+    """Root mean square [nT]."""
+
+    largest_nt: float
+    """The difference with the largest magnitude, with its sign [nT]."""
+
+    x_m: float
+    y_m: float
+    """Where it is largest, in world [m]."""
+
+    yaw: float
+    """Heading there [rad]."""
+
+    allowed_nt: float
+    """Root mean square up to which map and sources agree [nT]."""
+
+    nodes: int
+    """How many nodes were compared."""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the map can be one of these sources."""
+        return self.rms_nt <= self.allowed_nt
+
+    def __str__(self) -> str:
+        return (
+            f"{self.rms_nt:,.0f} nT rms over {self.nodes:,} nodes, at most {abs(self.largest_nt):,.0f} nT, "
+            f"at x {self.x_m:.2f} m, y {self.y_m:.2f} m, heading {np.degrees(self.yaw):.0f} deg"
+        )
+
+
+def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
+    """Compare a map with the exact field of a scene, as its robot at rest would read it at each node.
+
+    Nodes at which the robot would stand in something magnetised, or at which its magnetometer would lose
+    lock, are left out: a survey has no reading there, and a map has filled them from their neighbours.
+
+    Args:
+        scene: A scene with the Earth's field; its own map is not read.
+        anomaly_map: The map.
+
+    Returns:
+        The difference. `agrees` is true up to `LEAST_NT`, or `PART` of the map's standard deviation.
+
+    Raises:
+        RefusedError: The scene has no Earth's field, or the map no valid node where a robot can stand.
+    """
+    p_xy, yaw = anomaly_map.grid.poses()
+    read = anomaly_map.recorded_yaw
+    if read is not None:
+        yaw = np.where(np.isfinite(read), read, yaw)
+    valid = np.flatnonzero(anomaly_map.valid)
+    if not len(valid):
+        raise RefusedError(f"map {anomaly_map.name!r} has no valid node, so nothing to compare")
+    valid = valid[:: -(-len(valid) // MOST_NODES)]
+    p_xy, yaw, values = p_xy.reshape(-1, 2)[valid], yaw.ravel()[valid], anomaly_map.values_nt.ravel()[valid]
+    height = sensor_height_m(scene) if anomaly_map.height_m is None else anomaly_map.height_m
+    clear = ~in_steel(scene, p_xy, height)
+    p_xy, yaw, values = p_xy[clear], yaw[clear], values[clear]
+    off = values - field_at_rest_nt(scene, p_xy, yaw, height_m=anomaly_map.height_m)
+    kept = _in_lock(scene, p_xy, height, np.abs(off) > LEAST_NT)
+    p_xy, yaw, values, off = p_xy[kept], yaw[kept], values[kept], off[kept]
+    if not len(off):
+        raise RefusedError(
+            f"map {anomaly_map.name!r} has no node that is clear of what scene {scene.name!r} has there"
+        )
+    worst = int(np.argmax(np.abs(off)))
+    return Contradiction(
+        rms_nt=float(np.sqrt(np.mean(off * off))),
+        largest_nt=float(off[worst]),
+        x_m=float(p_xy[worst, 0]),
+        y_m=float(p_xy[worst, 1]),
+        yaw=float(yaw[worst]),
+        allowed_nt=max(LEAST_NT, PART * float(values.std())),
+        nodes=len(off),
+    )
+
+
+def _in_lock(scene: Scene, p_xy: np.ndarray, height_m: float, asked: np.ndarray) -> np.ndarray:
+    """Whether the magnetometer keeps lock at points (N, 2), shape (N,); true where that is not asked."""
+    steepest = scene.robot.magnetometer.gradient_max_nt_m
+    kept = np.ones(len(p_xy), bool)
+    if steepest and asked.any():
+        at = np.column_stack([p_xy[asked], np.full(np.count_nonzero(asked), height_m)])
+        kept[asked] = ambient_gradient_nt_m(scene, at) <= steepest
+    return kept
+
+
+def check_agrees(scene: Scene, anomaly_map: AnomalyMap, where: str) -> Contradiction | None:
+    """Refuse a scene whose map is not of its Earth and sources.
+
+    Args:
+        scene: The scene. Without the Earth's field, or without sources and furniture, it has nothing that a
+            map could contradict: there the map is the truth.
+        anomaly_map: Its map.
+        where: What to call the two, such as "lab.toml with the map F.usdc".
+
+    Returns:
+        The difference, if it is small enough; None if there is nothing to contradict.
+
+    Raises:
+        RefusedError: They differ by more than `contradiction_nt` allows.
+    """
+    if scene.earth is None or not scene.magnets:
+        return None
+    found = contradiction_nt(scene, anomaly_map)
+    if not found.agrees:
+        raise RefusedError(
+            f"{where}: the map differs from the field of the scene's Earth, sources and furniture by {found} "
+            f"({found.allowed_nt:,.0f} nT rms would do); if the map is right, remove the sources and the "
+            "furniture (or their magnetization); if they are, survey them: magtwin map survey"
+        )
+    return found

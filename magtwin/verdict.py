@@ -1,0 +1,135 @@
+"""Verdict: a judgement of a magnetometer model in one plain line."""
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+EVEN = 0.03
+"""Relative difference of errors below which two models are called equal, where no interval is known."""
+
+HOLDS = (0.8, 0.97)
+"""Share of readings that 90 % intervals may hold before they are called too narrow or too wide."""
+
+Z_90 = 1.6448536269514722
+"""Half the width of the interval that holds 90 % of a normal distribution, in standard deviations."""
+
+SEPARATOR = ", "
+"""Between the names of sessions and paths in the facts of weights."""
+
+
+def coverage(error_nt: NDArray[Any], sd_nt: NDArray[Any]) -> float:
+    """Share of readings whose error lies in its 90 % interval; nan where no standard deviation is known."""
+    known = np.isfinite(sd_nt) & np.isfinite(error_nt)
+    return float(np.mean(np.abs(error_nt[known]) <= Z_90 * sd_nt[known])) if known.any() else math.nan
+
+
+def verdict(
+    mae_nt: float,
+    naive_mae_nt: float,
+    *,
+    than: str = "the naive mean",
+    interval: tuple[float, float] | None = None,
+    coverage: float = math.nan,
+    judged_on: str = "",
+) -> str:
+    """Whether a model is better than a naive one, by how much, and whether its intervals hold.
+
+    Args:
+        mae_nt: Mean absolute error of the model [nT].
+        naive_mae_nt: That of the naive model on the same readings [nT].
+        than: What to call the naive model.
+        interval: Confidence interval of the ratio of the two errors. The models are called equal if it holds
+            1; without an interval, if the ratio is within `EVEN` of 1.
+        coverage: Share of readings within the model's 90 % intervals, 0 to 1; nan where none are predicted.
+        judged_on: What the figures are of, such as "3 sessions that it never saw".
+
+    Returns:
+        One line.
+    """
+    if not (mae_nt >= 0 and naive_mae_nt > 0):
+        return "No verdict: no reading has a known error."
+    ratio = mae_nt / naive_mae_nt
+    least, most = ratio - EVEN, ratio + EVEN
+    if interval is not None and all(map(math.isfinite, interval)):
+        least, most = interval
+    sizes = f"{mae_nt:,.0f} nT against {naive_mae_nt:,.0f} nT"
+    if most < 1:
+        text = f"Better than {than}: {ratio:.2f} of its error ({sizes})."
+    elif least > 1:
+        text = f"WORSE than {than}: {ratio:.2f} times its error ({sizes})."
+    else:
+        text = f"No better than {than}: {ratio:.2f} of its error ({sizes})."
+    if not math.isnan(coverage):
+        text += f" Its 90 % intervals hold {coverage:.0%} of the readings"
+        if coverage < HOLDS[0]:
+            text += ": they are TOO NARROW"
+        elif coverage > HOLDS[1]:
+            text += ": they are too wide"
+        text += "."
+    return f"{text} Judged on {judged_on}." if judged_on else text
+
+
+@dataclass
+class Tally:
+    """Errors of a model and of the naive one, summed over runs."""
+
+    than: str = "the naive mean"
+    """What to call the naive model."""
+
+    readings: int = 0
+    error_nt: float = 0.0
+    naive_nt: float = 0.0
+    within: int = 0
+    with_sd: int = 0
+
+    def add(self, error_nt: NDArray[Any], naive_error_nt: NDArray[Any], sd_nt: NDArray[Any]) -> None:
+        """Add the readings of a run, each an array of shape (N,); readings without an error are left out."""
+        known = np.isfinite(error_nt) & np.isfinite(naive_error_nt)
+        error, sd = np.abs(error_nt[known]), sd_nt[known]
+        self.readings += len(error)
+        self.error_nt += float(error.sum())
+        self.naive_nt += float(np.abs(naive_error_nt[known]).sum())
+        self.with_sd += int(np.isfinite(sd).sum())
+        self.within += int(np.count_nonzero(error <= Z_90 * sd))
+
+    def verdict(self, judged_on: str) -> str:
+        """As `verdict`; "" if no reading was added."""
+        if not self.readings:
+            return ""
+        held = self.within / self.with_sd if self.with_sd else math.nan
+        error, naive = self.error_nt / self.readings, self.naive_nt / self.readings
+        return verdict(error, naive, than=self.than, coverage=held, judged_on=judged_on)
+
+
+def recordings_text(
+    recordings: int,
+    sessions: Collection[str],
+    paths: Collection[str],
+    learned_sessions: Collection[str] | None,
+    learned_paths: Collection[str] | None,
+) -> str:
+    """What a model was judged on, and how much of it was not in its training.
+
+    Args:
+        recordings: Number of recordings that it was judged on.
+        sessions: Their sessions.
+        paths: Their paths.
+        learned_sessions: Sessions of its training; None where unknown.
+        learned_paths: Paths of its training; None where unknown.
+    """
+    sessions, paths = set(sessions), set(paths)
+    text = f"{recordings} recordings"
+    if learned_sessions is None or learned_paths is None:
+        return (
+            f"{text} of {len(sessions)} sessions and {len(paths)} paths; the weights do not say what they "
+            "were trained on"
+        )
+    new_sessions, new_paths = (len(sessions - set(learned_sessions)), len(paths - set(learned_paths)))
+    return (
+        f"{text}: {new_sessions} of {len(sessions)} sessions and {new_paths} of {len(paths)} paths were not "
+        "in its training"
+    )

@@ -1,0 +1,286 @@
+"""What objects show of themselves: at a prompt, in a notebook, as a picture, as a DataFrame."""
+
+import dataclasses
+import pickle
+import re
+from html.parser import HTMLParser
+from pathlib import Path as FilePath
+
+import numpy as np
+import pytest
+
+import magtwin
+from magtwin.compare import compare
+from magtwin.field.difference import difference
+from magtwin.field.fit import fit
+from magtwin.field.readings import Readings
+from magtwin.files import shipped
+from magtwin.learn.config import TrainConfig
+from magtwin.learn.dataset import build_dataset
+from magtwin.learn.evaluate import Contender, Mean, Trial, chart_of, evaluate
+from magtwin.learn.labels import Alignment
+from magtwin.learn.magnetometer import NeuralMagnetometer
+from magtwin.learn.predictor import load_predictor
+from magtwin.learn.split import split
+from magtwin.learn.trained import fit as train
+from magtwin.names import RefusedError
+from magtwin.path import path_named
+from magtwin.report import Figure, Report
+from magtwin.run import Column, Run
+from magtwin.sim.commands import Commands
+from magtwin.spec import PlacedRobot, Scene, SourceSpec, spelled
+from magtwin.summary import LINES, WIDTH, Summarized
+from magtwin.twin import open_twin, scan, simulate, simulate_many
+
+HOSTILE = '<script>alert("1")</script>&amp;\x1b[31m\n\u2028name'
+WEIGHTS = sorted(shipped("weights").glob("*.safetensors"))
+
+
+@pytest.fixture(scope="module")
+def twin(lab_scene):
+    return open_twin(lab_scene)
+
+
+@pytest.fixture(scope="module")
+def run(twin):
+    return simulate(twin, "figure8", duration_s=50.0)
+
+
+@pytest.fixture(scope="module")
+def learnt(twin, run, tmp_path_factory):
+    """A data set of three drives, a model trained on it, and an evaluation."""
+    physical = open_twin(twin.scene_file, magnetometer="physical")
+    drives = list(simulate_many(physical, "figure8", range(6), duration_s=20.0, rate_hz=20.0))
+    runs = {f"d{k}": drive for k, drive in enumerate(drives)}
+    data = build_dataset(runs, twin.field, tmp_path_factory.mktemp("learnt") / "set")
+    config = TrainConfig(model="linear", features="circular")
+    parts = split(data.recordings, config.split, rng=np.random.default_rng(0))
+    trained = train(config, data, parts, rng=np.random.default_rng(0))
+    chart = chart_of("lab", twin.field)
+    models = [
+        Contender("naive", Mean(0.0, 1.0), chart),
+        Contender("net", NeuralMagnetometer(trained.net), chart),
+    ]
+    trials = [Trial(name, lambda run=run: run) for name, run in runs.items()]
+    return data, parts, trained, evaluate(models, trials, rng=np.random.default_rng(0), truth=True)
+
+
+def nouns(twin, run, learnt):
+    """Objects that a user holds at a prompt, by what they are."""
+    data, parts, trained, evaluation = learnt
+    field, rng = twin.field, np.random.default_rng(0)
+    p, yaw = rng.uniform(-1, 1, (200, 2)), rng.uniform(-3, 3, 200)
+    readings = Readings(p_xy=p, yaw=yaw, b_nt=field.lookup(p, yaw), runs=("a",), name="walk")
+    named = {
+        "run": run,
+        "empty run": Run({}),
+        "run of texts": Run({"t": np.arange(3.0), "a": np.array(["x"] * 3)}),
+        "run of nan": Run({"t": np.arange(3.0), "b_total_nt": np.full(3, np.nan)}),
+        "twin": twin,
+        "scene": twin.scene,
+        "robot": twin.scene.robot,
+        "placed": twin.scene.robots[0],
+        "source": twin.scene.sources[0],
+        "map": field,
+        "masked map": dataclasses.replace(field, valid=np.zeros_like(field.valid)),
+        "grid": field.grid,
+        "readings": readings,
+        "difference": difference(field, dataclasses.replace(field, created="2027-01-01")),
+        "gp": fit(readings, "gp"),
+        "cubic": fit(readings, "cubic"),
+        "obstacles": twin.obstacles,
+        "path": path_named("A"),
+        "commands": Commands("mine", np.array([[0.0, 0.1, 0.0], [2.0, 0.2, 0.1]])),
+        "scans": scan(twin, run),
+        "runs": simulate_many(twin, "figure8", range(100), duration_s=5.0),
+        "report": run.report(),
+        "comparison": compare(run, run),
+        "magnetometer": twin.magnetometer,
+        "read": twin.magnetometer.read([run])[0],
+        "alignment": Alignment((0.1, -0.02), 0.013, (0.001, 0.002), 0.004),
+        "data set": data,
+        "split": parts,
+        "trained": trained,
+        "net": trained.net,
+        "inputs": trained.net.inputs,
+        "evaluation": evaluation,
+        "judged": evaluation.judged[0],
+        "case": evaluation.cases[0],
+        "contender": evaluation.contenders[1],
+        "chart": evaluation.charts[0],
+    }
+    return named | {file.stem: load_predictor(file) for file in WEIGHTS}
+
+
+class Tags(HTMLParser):
+    """The tags of an HTML text."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.open = set(), []
+        self.feed(text)
+        assert not self.open, self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_every_noun_shows_itself_in_five_lines_and_in_html(twin, run, learnt):
+    for name, noun in nouns(twin, run, learnt).items():
+        text = repr(noun)
+        assert isinstance(noun, Summarized), name
+        assert len(text.splitlines()) <= LINES, f"{name}: {text}"
+        assert len(text) <= 500, f"{name}: {text}"
+        assert max(map(len, text.splitlines())) <= WIDTH, f"{name}: {text}"
+        assert type(noun).__name__ in text or name in ("report", "split"), f"{name}: {text}"
+        assert "array(" not in text, f"{name}: {text}"
+        allowed = {"div", "strong", "table", "tr", "th", "td", "details", "summary", "p"}
+        assert Tags(noun._repr_html_()).tags <= allowed, name
+
+
+def test_a_run_tells_rows_duration_rate_scene_path_and_range(run):
+    b = run["b_measured_nt"]
+    text = repr(run)
+    assert "6,750 rows x 37 columns, 49.99 s at 135 Hz" in text
+    assert "scene lab, path figure8, seed 0" in text
+    assert f"{b.min():,.0f} to {b.max():,.0f} nT, mean {b.mean():,.0f} nT (b_measured_nt)" in text
+    flagged = run.with_columns(flag_bump=np.arange(run.rows) < 7)
+    assert "flag_bump in 7 rows" in repr(flagged)
+
+
+def test_a_map_tells_extent_spacing_headings_method_height_day_and_range(twin):
+    text = repr(twin.field)
+    for words in (
+        "25 x 15, 0.25 x 0.25 m apart, x -3.00 to 3.00 m, y -1.75 to 1.75 m",
+        "4: 0, 90, 180, 270 deg",
+        f"{twin.field.created}, sensor at 0.405 m",
+        "survey of the twin",
+        f"{twin.field.values_nt.min():,.0f} to {twin.field.values_nt.max():,.0f} nT",
+    ):
+        assert words in text
+
+
+def test_hostile_names_stay_in_their_line_and_are_escaped_in_html(twin, run):
+    field = dataclasses.replace(twin.field, name=HOSTILE, method=HOSTILE, source=HOSTILE)
+    named = {
+        "run": run.with_facts(scene=HOSTILE, path=HOSTILE, network=HOSTILE).with_columns(
+            **{HOSTILE: run["t"]}
+        ),
+        "spec": Run({"t": run["t"], "a": run["t"]}, {}, {"a": Column(HOSTILE, HOSTILE, HOSTILE)}),
+        "map": field,
+        "twin": dataclasses.replace(twin, field=field, scene_file=FilePath(HOSTILE)),
+        "scene": dataclasses.replace(twin.scene, name=HOSTILE),
+        "magnetometer": NeuralMagnetometer(twin.magnetometer.net, name=HOSTILE),
+        "report": Report(HOSTILE, (Figure(HOSTILE, HOSTILE, HOSTILE, note=HOSTILE),), {HOSTILE: HOSTILE}),
+        "path": dataclasses.replace(path_named("A"), name=HOSTILE, file=HOSTILE),
+    }
+    for name, noun in named.items():
+        text, html = repr(noun), noun._repr_html_()
+        assert len(text.splitlines()) <= LINES, name
+        assert len(text) <= 500, name
+        assert "\x1b" not in text + html, name
+        assert "script" not in Tags(html).tags, name
+        assert "&lt;script&gt;" in html, name
+        assert "<script" not in html, name
+
+
+def test_columns_complete_as_keys_and_not_as_attributes(run):
+    assert run._ipython_key_completions_() == list(run)
+    assert "b_total_nt" not in dir(run)
+    own = run.with_columns(mine=run["t"])
+    assert own._ipython_key_completions_()[-1] == "mine"
+    assert dir(own) == dir(run)
+
+
+def test_the_whole_repr_of_a_long_run_takes_no_longer_than_a_look(run):
+    long = Run(
+        {"t": np.arange(2e6), "b_total_nt": np.full(2_000_000, 5e4), "p_world_base": np.zeros((2_000_000, 3))}
+    )
+    assert "2,000,000 rows" in repr(long)
+    assert len(long._repr_html_()) < 5_000
+
+
+def test_to_pandas_tells_units_and_frames(run):
+    frame = run.to_pandas()
+    assert len(frame) == run.rows
+    assert (frame.attrs["units"]["imu_w_x"], frame.attrs["frames"]["imu_w_x"]) == ("rad/s", "imu_link")
+    assert frame.attrs["units"].keys() == frame.attrs["frames"].keys() == set(frame.columns)
+    assert frame.attrs["facts"]["scene"] == "lab"
+
+
+def labels_of(figure):
+    return [ax.get_xlabel() for ax in figure.axes], [ax.get_ylabel() for ax in figure.axes]
+
+
+def test_a_run_is_drawn_with_units_on_every_axis(run, twin):
+    figure = run.plot(twin.field)
+    x, y = labels_of(figure)
+    words = {text.replace("\n", " ") for text in (*x, *y) if text}
+    assert {"x [m]", "y [m]", "field [µT]", "disturbance [nT]", "speed [m/s]", "battery [V]"} <= words
+    assert {"total field along the path [µT]", "map, mean over headings [µT]"} <= words
+    assert "time [s]; shaded while the LiDAR is on" in words
+    assert figure._repr_png_().startswith(b"\x89PNG")
+    pickle.dumps(figure)
+
+
+def test_the_same_run_gives_the_same_picture(run):
+    few = run.take(slice(0, 500))
+    assert few.plot()._repr_png_() == few.plot()._repr_png_()
+
+
+def test_a_run_is_drawn_by_the_columns_that_it_has(run):
+    few = run.select("mocap_p", "b_measured_nt").plot()
+    x, y = labels_of(few)
+    assert ("x [m]" in x, "measured field\n[µT]" in y, len(y)) == (True, True, 3)
+    own = Run({"t": np.arange(9.0), "mine": np.arange(9)}, {}, {"mine": Column("K", "", "warmth")}).plot()
+    assert labels_of(own) == (["time [s]"], ["mine\n[K]"])
+    with pytest.raises(RefusedError, match="the run has no rows"):
+        run.take(slice(0)).plot()
+    with pytest.raises(RefusedError, match="neither positions nor columns of numbers"):
+        Run({"t": np.arange(3.0)}).plot()
+
+
+@pytest.mark.parametrize(
+    ("quantity", "label"), [("field", "total field [µT]"), ("variance", "standard deviation [nT]")]
+)
+def test_a_map_is_drawn_a_panel_a_heading(twin, quantity, label):
+    figure = twin.field.plot(quantity)
+    x, y = labels_of(figure)
+    assert (x.count("x [m]"), y.count("y [m]"), label in y) == (2, 2, True)
+    assert [ax.get_title() for ax in figure.axes[:4]] == [f"heading {h}°" for h in (0, 90, 180, 270)]
+    assert len(twin.field.plot(headings=[0.5]).axes) == 2
+
+
+def test_plot_refuses_what_it_cannot_draw():
+    with pytest.raises(RefusedError, match="plot draws a Run or an AnomalyMap, got int"):
+        magtwin.plot(3)
+
+
+def plain(value):
+    """A value with every dataclass in it as a plain one of the same name, whose repr is Python's own."""
+    if dataclasses.is_dataclass(value):
+        made = dataclasses.make_dataclass(
+            type(value).__qualname__, [f.name for f in dataclasses.fields(value)]
+        )
+        return made(**{f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)})
+    return tuple(map(plain, value)) if type(value) is tuple else value
+
+
+def test_checksums_of_scenes_rest_on_what_a_plain_dataclass_shows(twin):
+    scene = twin.scene
+    one = dataclasses.replace(scene, sources=scene.sources[:1], furniture=())
+    other = PlacedRobot(robot=dataclasses.replace(scene.robot, name="second"), path=FilePath("a b.csv"))
+    for case in (
+        scene,
+        one,
+        dataclasses.replace(scene, others=(other,)),
+        scene.robot,
+        SourceSpec(name="a'b", p_world=(0.0, -0.0, 1e-300), m_world=(1.0, 2.0, 3.0)),
+    ):
+        assert spelled(case) == repr(plain(case))
+    assert isinstance(scene, Scene)
+    assert not re.search(r"\n", spelled(scene))
