@@ -16,7 +16,7 @@ from magtwin.report import Figure, Report
 from magtwin.resample import RULES, Interpolation, bracket, check_instants, grid
 from magtwin.run_summary import run_summary
 from magtwin.summary import Summarized, Summary
-from magtwin.verdict import Tally
+from magtwin.verdict import HOLDS_ONE, Tally
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -492,7 +492,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         """How well a network predicted the exact field of a simulated run; "" where none did."""
         tally = Tally()
         self.add_to(tally)
-        return tally.verdict("the exact field of this run")
+        return tally.verdict("the exact field of this run, one session", holds=HOLDS_ONE)
 
     def add_to(self, tally: Tally) -> None:
         """Add the errors of a simulated run's network against the exact field, where it has both."""

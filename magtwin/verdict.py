@@ -17,6 +17,10 @@ HOLDS = (0.8, 0.97)
 Z_90 = 1.6448536269514722
 """Half the width of the interval that holds 90 % of a normal distribution, in standard deviations."""
 
+HOLDS_ONE = (0.5, 1.0)
+"""The same for readings of one session, whose errors have an offset in common: a session that is two standard
+deviations off its mean holds 70 %."""
+
 SEPARATOR = ", "
 """Between the names of sessions and paths in the facts of weights."""
 
@@ -34,6 +38,7 @@ def verdict(
     than: str = "the naive mean",
     interval: tuple[float, float] | None = None,
     coverage: float = math.nan,
+    holds: tuple[float, float] = HOLDS,
     judged_on: str = "",
 ) -> str:
     """Whether a model is better than a naive one, by how much, and whether its intervals hold.
@@ -45,6 +50,7 @@ def verdict(
         interval: Confidence interval of the ratio of the two errors. The models are called equal if it holds
             1; without an interval, if the ratio is within `EVEN` of 1.
         coverage: Share of readings within the model's 90 % intervals, 0 to 1; nan where none are predicted.
+        holds: Bounds of `coverage` that are called right: `HOLDS`, or `HOLDS_ONE` for one session.
         judged_on: What the figures are of, such as "3 sessions that it never saw".
 
     Returns:
@@ -65,9 +71,9 @@ def verdict(
         text = f"No better than {than}: {ratio:.2f} of its error ({sizes})."
     if not math.isnan(coverage):
         text += f" Its 90 % intervals hold {coverage:.0%} of the readings"
-        if coverage < HOLDS[0]:
+        if coverage < holds[0]:
             text += ": they are TOO NARROW"
-        elif coverage > HOLDS[1]:
+        elif coverage > holds[1]:
             text += ": they are too wide"
         text += "."
     return f"{text} Judged on {judged_on}." if judged_on else text
@@ -96,13 +102,13 @@ class Tally:
         self.with_sd += int(np.isfinite(sd).sum())
         self.within += int(np.count_nonzero(error <= Z_90 * sd))
 
-    def verdict(self, judged_on: str) -> str:
+    def verdict(self, judged_on: str, *, holds: tuple[float, float] = HOLDS) -> str:
         """As `verdict`; "" if no reading was added."""
         if not self.readings:
             return ""
         held = self.within / self.with_sd if self.with_sd else math.nan
         error, naive = self.error_nt / self.readings, self.naive_nt / self.readings
-        return verdict(error, naive, than=self.than, coverage=held, judged_on=judged_on)
+        return verdict(error, naive, than=self.than, coverage=held, holds=holds, judged_on=judged_on)
 
 
 def recordings_text(

@@ -101,7 +101,7 @@ def runs(
     from magtwin.sim.session import draw_speed
     from magtwin.sim.way import way_of
     from magtwin.twin import in_session, open_twin, room_of, simulate_many
-    from magtwin.verdict import Tally
+    from magtwin.verdict import HOLDS, HOLDS_ONE, Tally
 
     existing(scene, "scene")
     for name, value, least in (("count", count, 1), ("sessions", sessions, 1), ("seed", seed, 0)):
@@ -171,7 +171,10 @@ def runs(
             "paths": ", ".join(getattr(one, "name", "random") for one in paths),
             "sessions": session or len(drawn),
         },
-        tally.verdict(f"the exact field of {count} runs in {len(drawn)} sessions"),
+        tally.verdict(
+            f"the exact field of {count} runs in {len(drawn)} sessions",
+            holds=HOLDS_ONE if len(drawn) == 1 else HOLDS,
+        ),
     )
     print_report(report, json)
     if not json:
