@@ -181,8 +181,13 @@ def open_twin(
 
 
 def _platform_sha256(robot: RobotSpec) -> str:
-    """Checksum of what makes a robot's own field."""
-    return hashlib.sha256(spelled(robot.platform).encode()).hexdigest()
+    """Checksum of what makes a robot's own field: of the figures that are not their default, so that a figure
+    which a later magtwin adds changes nothing.
+    """
+    spec = robot.platform
+    figures = [(one.name, getattr(spec, one.name), one.default) for one in dataclasses.fields(spec)]
+    told = sorted((name, value) for name, value, default in figures if value != default)
+    return hashlib.sha256(repr(told).encode()).hexdigest()
 
 
 def _platform_of(twin: Twin, robot: RobotSpec) -> str:

@@ -109,6 +109,8 @@ def runs(
             raise RefusedError(f"--{name} must be a whole number from {least} up, got {value}")
     if sessions is not None and session is not None:
         raise RefusedError("--session survey is one session; drop --sessions")
+    for name in path or MIXTURE:
+        way_of(name)  # refuses a name or file that is none before the scene is opened
     steps = announcer(quiet=json)
     with output(out, force=force) as folder:
         steps("Opening the scene")

@@ -55,7 +55,7 @@ def scene(
     steps = announcer(quiet=json)
     with TemporaryDirectory() as workshop:
         steps(f"Reading {file}")
-        with progress("Surveying", "nodes") as advance:
+        with progress("Surveying", "headings") as advance:
             scene = scene_from_toml(
                 file, map_layer=map, network=net, workshop=workshop, report=told.append, progress=advance
             )

@@ -23,12 +23,12 @@ from magtwin.sim.exact import ExactField
 from magtwin.sim.follow import CONTROL_RATE_HZ
 from magtwin.sim.interference import level_gradient_nt_m, sensor_places
 from magtwin.sim.lidar import Scans, lidar_on, scan
-from magtwin.sim.magnetometer import LOCK_RATE_HZ
+from magtwin.sim.magnetometer import LOCK_RATE_HZ, rounded
 from magtwin.sim.manual import at_start
 from magtwin.sim.model_error import ModelError
 from magtwin.sim.online_sensors import Battery, Imu, Magnetometer, Markov, Mocap, Odometry, Samples
 from magtwin.sim.sensors import into_sensor
-from magtwin.sim.simulate import check_run, flags, mapped, streams, truth
+from magtwin.sim.simulate import add_error, check_run, flags, mapped, streams, truth
 from magtwin.spec import DriveSpec, Scene
 
 Array = NDArray[np.float64]
@@ -254,7 +254,7 @@ class Online:
             disturbance, sd, beyond = self._network(Run(columns, self._facts))
             if self._model_error is not None:
                 process = self._wandering.next(self._error_rng.standard_normal(count))
-                error = self._model_error.error_nt(sd, process)
+                error = rounded(self._model_error.error_nt(sd, process), robot.magnetometer.resolution_nt)
             density = robot.magnetometer.noise_density_nt
             columns["b_sd_nt"] = np.hypot(sd, density * np.sqrt(self.rate_hz / 2))
             if beyond is not None:
@@ -266,9 +266,10 @@ class Online:
         columns["b_disturbance_nt"] = np.asarray(disturbance, float)
         columns["b_total_nt"] = columns["b_map_nt"] + columns["b_disturbance_nt"]
         columns["b_model_error_nt"] = error
-        columns |= self._magnetometer.read(columns["b_total_nt"] + error, vector, lost)
+        columns |= self._magnetometer.read(columns["b_total_nt"], vector, lost)
         columns["b_measured_nt"][dropped] = np.nan
-        columns["b_noise_nt"] = columns["b_measured_nt"] - (columns["b_total_nt"] + error)
+        columns["b_noise_nt"] = columns["b_measured_nt"] - columns["b_total_nt"]
+        add_error(columns)
         return Run({name: columns[name] for name in COLUMNS if name in columns}, self._facts)
 
     def _steepness(self, t: Array) -> NDArray[np.bool_]:

@@ -27,7 +27,14 @@ from magtwin.sim.follow import follow, play
 from magtwin.sim.imu import sense_imu
 from magtwin.sim.interference import level_gradient_nt_m, sensor_places
 from magtwin.sim.lidar import lidar_on
-from magtwin.sim.magnetometer import LOCK_RATE_HZ, feels_direction, lost_in, sense_axes, sense_magnetometer
+from magtwin.sim.magnetometer import (
+    LOCK_RATE_HZ,
+    feels_direction,
+    lost_in,
+    rounded,
+    sense_axes,
+    sense_magnetometer,
+)
 from magtwin.sim.mocap import sense_mocap
 from magtwin.sim.model_error import ModelError
 from magtwin.sim.odometry import sense_odometry
@@ -235,6 +242,16 @@ def check_run(
     return rate
 
 
+def add_error(columns: dict[str, NDArray[Any]]) -> None:
+    """Add the model error to readings, but to those that latched, in place.
+
+    It was estimated from readings, so it does not go through the sensor's low-pass.
+    """
+    error, lost = columns["b_model_error_nt"], columns["flag_lost_lock"]
+    columns["b_measured_nt"] = columns["b_measured_nt"] + np.where(lost, 0.0, error)
+    columns["b_noise_nt"] = columns["b_noise_nt"] - np.where(lost, error, 0.0)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sensed:
     """A run in which every sensor has been read but the magnetometer."""
@@ -286,6 +303,7 @@ class Sensed:
             if model_error is not None and sd is not None:
                 white = self.error_rng.standard_normal(rows)
                 error = model_error.error_nt(sd, model_error.process(white, self.rate_hz))
+                error = rounded(error, spec.resolution_nt)
             if disturbance.shape != (rows,):
                 raise RefusedError(f"disturbance_nt must give shape {(rows,)}, got {disturbance.shape}")
             disturbance = disturbance + self.beside_nt
@@ -295,13 +313,14 @@ class Sensed:
         if self.wanted & _READ:
             columns |= sense_magnetometer(
                 spec,
-                columns["b_total_nt"] + error,
+                columns["b_total_nt"],
                 columns["b_vector_nt"] if "b_vector_nt" in columns else np.full((rows, 3), np.nan),
                 self.rng,
                 rate_hz=self.rate_hz,
                 steep=self.steep,
                 axes="b_vector_measured_nt" in self.wanted,
             )
+            add_error(columns)
         return Run({name: columns[name] for name in COLUMNS if name in self.wanted}, self.run.facts)
 
 
