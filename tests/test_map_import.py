@@ -11,7 +11,7 @@ from test_latch import gridded
 from test_rosbag import at_middle, drive, write_bag
 
 from magtwin.cli import main
-from magtwin.cli.map import _earth_nt
+from magtwin.cli.map_input import earth_nt
 from magtwin.field.earth import earth_field_nt
 from magtwin.field.survey import import_survey
 from magtwin.io.readings import load_readings, save_readings
@@ -214,10 +214,10 @@ def test_runs_under_several_licences_keep_all_of_them(tmp_path, capsys):
 
 
 def test_the_earths_field_is_taken_from_a_place_and_day_as_numbers_or_from_a_scene(lab_scene):
-    place = _earth_nt("29.64, -82.35, 50, 2024-06-01")
+    place = earth_nt("29.64, -82.35, 50, 2024-06-01")
     assert place == earth_field_nt(29.64, -82.35, 50.0, "2024-06-01")
-    assert _earth_nt("-2700,24000,-38400") == (-2700.0, 24000.0, -38400.0)
-    assert _earth_nt(str(lab_scene)) == read_scene(lab_scene, check_network=False).earth.b_world_nt
+    assert earth_nt("-2700,24000,-38400") == (-2700.0, 24000.0, -38400.0)
+    assert earth_nt(str(lab_scene)) == read_scene(lab_scene, check_network=False).earth.b_world_nt
 
 
 def test_a_survey_of_a_twin_knows_the_earths_field_and_keeps_it(tmp_path, capsys, lab_scene):

@@ -7,6 +7,13 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
+from magtwin.cli.map_input import (
+    headings_rad,
+    is_survey_folder,
+    method_options,
+    read_sources,
+    worth_a_map,
+)
 from magtwin.cli.terminal import Force, Json, Seed, check_suffix, print_report, progress, say, step
 from magtwin.io.columns import Columns
 from magtwin.names import RefusedError
@@ -103,7 +110,7 @@ def map_import(
     check_suffix(out, (".usdc", ".usd", ".parquet"), "a map layer, or a file of readings,")
     check_free(out, force=force)
     given = about.given(out)
-    if out.suffix != ".parquet" and len(sources) == 1 and _is_survey_folder(sources[0], columns):
+    if out.suffix != ".parquet" and len(sources) == 1 and is_survey_folder(sources[0], columns):
         field: Any
         field, report = read_survey(
             sources[0],
@@ -113,7 +120,7 @@ def map_import(
             keep_latched=keep_latched,
         )
     else:
-        readings, found = _read(sources, columns, given, keep_latched, pose_topic, field_topic)
+        readings, found = read_sources(sources, columns, given, keep_latched, pose_topic, field_topic)
         readings = readings.with_(name=given["name"])
         field = None if out.suffix == ".parquet" else node_map(readings)
         report = _joined((field or readings).report(), found)
@@ -188,13 +195,13 @@ def map_fit(
 
     check_suffix(out, (".usdc", ".usd"), "a map layer")
     check_free(out, force=force)
-    angles = None if headings is None else _headings_rad(headings)
+    angles = None if headings is None else headings_rad(headings)
     given = about.given(out)
-    options = _options([method], kernel, earth).get(method, {})
-    readings, found = _read(sources, columns, given, keep_latched, pose_topic, field_topic)
+    options = method_options([method], kernel, earth).get(method, {})
+    readings, found = read_sources(sources, columns, given, keep_latched, pose_topic, field_topic)
     from magtwin.field.fit import fit, grid_report, raster
 
-    found = _worth_a_map(readings, found, sources[0])
+    found = worth_a_map(readings, found, sources[0])
 
     with progress(f"Fitting {method}") as advance:
         model = fit(readings, method, progress=advance, **options)
@@ -255,8 +262,8 @@ def map_check(
     from magtwin.field.fit import METHODS
 
     methods = list(method or METHODS)
-    options = {**FILLED, **_options(methods, kernel, earth)}
-    readings, _ = _read(sources, columns, {}, keep_latched, pose_topic, field_topic)
+    options = {**FILLED, **method_options(methods, kernel, earth)}
+    readings, _ = read_sources(sources, columns, {}, keep_latched, pose_topic, field_topic)
     if split is None:
         split = "checkerboard" if readings.grid is not None else "run" if len(readings.runs) > 1 else "block"
     with progress("Checking") as advance:
@@ -343,7 +350,7 @@ def map_survey(
     about: dict[str, Any] = {
         "rng": np.random.default_rng(seed),
         "spacing_m": spacing,
-        "headings_rad": _headings_rad(headings),
+        "headings_rad": headings_rad(headings),
         "readings": readings,
         "height_m": height,
         "heading_error_rad": radians(heading_error),
@@ -406,7 +413,7 @@ def map_plot(
 
     check_suffix(out, (".png", ".svg"), "a picture")
     check_free(out, force=force)
-    angles = None if headings is None else _headings_rad(headings)
+    angles = None if headings is None else headings_rad(headings)
     step("Drawing the map")
     plot_map(_open_map(file, date), out, what=what, headings=angles, force=force)
     say(f"Wrote {out}")
@@ -561,133 +568,6 @@ def map_epochs(*files: Path, out: Path, force: Force = False, json: Json = False
     print_report(drift(maps), json)
     if not json:
         say(f"Wrote {out}")
-
-
-def _is_survey_folder(source: Path, columns: Columns) -> bool:
-    """Whether a source is a folder of one CSV a heading, whose columns need no names."""
-    from magtwin.io.readings import is_pattern
-
-    if (source / "metadata.yaml").is_file() or is_pattern(source) or any(source.glob("*.parquet")):
-        return False
-    named = replace(columns, unit=None, scale=None) != Columns()
-    return (source.is_dir() or not source.exists()) and not named
-
-
-def _read(
-    sources: tuple[Path, ...],
-    columns: Columns,
-    about: dict[str, Any],
-    keep_latched: bool,
-    pose_topic: str | None,
-    field_topic: str | None,
-) -> Any:
-    """The readings of the sources, and the report of what was found latched, stuck or outlying in them."""
-    from magtwin.field.latch import mask_latched
-    from magtwin.field.readings import TAKEN
-    from magtwin.io.readings import read_readings
-
-    step("Reading the survey")
-    readings = read_readings(
-        *sources, columns=columns, pose_topic=pose_topic, field_topic=field_topic, **{**about, "name": None}
-    )  # refusals name the survey, not the file to be written
-    masked, found = mask_latched(readings)
-    taken = [part for part in readings.source.split("; ") if part.startswith(TAKEN)]
-    if taken:
-        found = replace(found, facts={**found.facts, "taken": [part.removeprefix(TAKEN) for part in taken]})
-    if not (keep_latched or masked.good.any()):
-        raise RefusedError(
-            f"{sources[0]}: all {len(readings)} readings are those of a sensor that was stuck; "
-            "survey again, or give --keep-latched to take them as they are"
-        )
-    return (readings if keep_latched else masked), found
-
-
-LEAST_READINGS = 8
-"""Good readings of a drive that a map needs at least."""
-
-USUAL_READINGS = 100
-"""Good readings of a drive below which the summary says that a map of them tells little."""
-
-
-def _worth_a_map(readings: Any, found: Any, source: Path) -> Any:
-    """The report with what makes a map of these readings doubtful; refused where they are too few."""
-    import numpy as np
-
-    from magtwin.field.problem import ONE_HEADING
-
-    count, yaw, notes = int(readings.good.sum()), readings.yaw[readings.good], list[str]()
-    if readings.grid is None and count < LEAST_READINGS:
-        raise RefusedError(
-            f"{source}: {count} of {len(readings)} readings are good; a map needs {LEAST_READINGS} at least, "
-            "and some hundred to be of use"
-        )
-    if readings.grid is None and count < USUAL_READINGS:
-        notes.append(f"only {count} good readings: the map holds next to them alone")
-    way = np.exp(1j * yaw).mean()
-    if np.abs(way) >= ONE_HEADING:
-        notes.append(
-            f"one heading only, {np.degrees(np.angle(way)):.0f} deg: nothing tells the robot's own field "
-            "from the room's, and a simulated robot adds its whole platform field; survey in all headings"
-        )
-    return replace(found, facts={**found.facts, "doubts": notes}) if notes else found
-
-
-def _options(methods: list[str], kernel: str | None, earth: str | None) -> dict[str, dict[str, Any]]:
-    """Options of methods, by name; refused where none of them takes what was given."""
-    options: dict[str, dict[str, Any]] = {}
-    for flag, value, method in (("--kernel", kernel, "gp"), ("--earth", earth, "harmonic")):
-        if value is not None and method not in methods:
-            raise RefusedError(f"{flag} is for --method {method} alone; leave it out of a {methods[0]} fit")
-    if kernel is not None:
-        options["gp"] = {"kernel": kernel}
-    if earth is not None:
-        options["harmonic"] = {"earth_nt": _earth_nt(earth)}
-    return options
-
-
-def _earth_nt(text: str) -> tuple[float, float, float]:
-    """The Earth's field in world axes [nT], of a scene, of a place and a day, or as it stands."""
-    words = [word.strip() for word in text.split(",")]
-    forms = "a scene; latitude,longitude,height,date; or x,y,z in nT"
-    if len(words) in (3, 4) and not Path(text).exists():
-        from magtwin.field.earth import earth_field_nt
-        from magtwin.field.readings import checked_earth_nt
-        from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT
-
-        try:
-            x, y, z = (float(word) for word in words[:3])
-        except ValueError as error:
-            raise RefusedError(f"--earth is {forms}; got {text!r}") from error
-        if len(words) == 4:
-            return earth_field_nt(x, y, z, words[3])
-        size = sum(c * c for c in checked_earth_nt((x, y, z))) ** 0.5
-        if not LEAST_MEAN_NT <= size <= GREATEST_MEAN_NT:
-            raise RefusedError(
-                f"--earth {text} is a field of {size:.6g} nT, and the Earth's is some 22,000 to 67,000; give "
-                "it in nT, or its place with the day, latitude,longitude,height,date"
-            )
-        return x, y, z
-    from magtwin.usd.scene import read_scene
-
-    if not Path(text).is_file():
-        raise RefusedError(f"--earth is {forms}; there is no file {text!r}")
-    known = read_scene(text, check_network=False).earth
-    if known is None:
-        raise RefusedError(f"--earth {text}: this scene does not know the Earth's field; give it as {forms}")
-    return known.b_world_nt
-
-
-def _headings_rad(text: str) -> list[float]:
-    """Headings as 0,90,180,270 [deg] in radians, each once, ascending."""
-    from math import radians
-
-    try:
-        degrees = sorted({float(word) % 360 for word in text.split(",")})
-    except ValueError:
-        degrees = []
-    if not degrees or any(h != h for h in degrees):
-        raise RefusedError(f"headings are degrees with commas between, such as 0,90,180,270; got {text!r}")
-    return [radians(h) for h in degrees]
 
 
 def _joined(report: Any, found: Any) -> Any:
