@@ -234,7 +234,8 @@ def _grid(
         )
     errors = zip(ERRORS, (chosen.nodes_nt, chosen.turn_nt), strict=True)
     known = {name: round(error, 2) for name, error in errors if np.isfinite(error)}
-    return Grid.over(extent, chosen.spacing_m, chosen.headings_rad), known
+    lay = Grid.filling if spacing is None else Grid.over
+    return lay(extent, chosen.spacing_m, chosen.headings_rad), known
 
 
 def _only_heading(readings: Readings) -> tuple[float, ...] | None:

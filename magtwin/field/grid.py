@@ -93,6 +93,25 @@ class Grid(Summarized):
             columns=columns,
         )
 
+    @classmethod
+    def filling(cls, extent: ArrayLike, widest_m: float, headings_rad: ArrayLike) -> "Grid":
+        """A grid with nodes on the borders of a rectangle, and cells as wide as possible up to `widest_m`.
+
+        Args:
+            extent: Least x, greatest x, least y, greatest y [m].
+            widest_m: Largest distance between nodes [m].
+            headings_rad: Headings [rad], ascending in [0, 2 pi).
+        """
+        x0, x1, y0, y1 = (float(v) for v in np.asarray(extent, float))
+        across, along = (max(1, int(np.ceil(length / widest_m - 1e-9))) for length in (x1 - x0, y1 - y0))
+        return cls(
+            origin_m=(x0, y0),
+            cell_m=((x1 - x0) / across, (y1 - y0) / along),
+            headings_rad=tuple(np.asarray(headings_rad, float).ravel().tolist()),
+            rows=along + 1,
+            columns=across + 1,
+        )
+
     @property
     def shape(self) -> tuple[int, int, int]:
         """Number of headings, rows (y) and columns (x)."""

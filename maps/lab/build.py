@@ -43,6 +43,9 @@ DATE = "2026-11-21"
 APRON_M = 2.0
 """Slab outside of the walls, which the furniture stands on."""
 
+SPACING_M, HEADING_STEP_DEG = 0.05, 15.0
+"""Of the map's nodes: finer than the fit's own resolution, so that interpolation adds next to nothing."""
+
 READINGS = 135
 """Readings averaged at a node: the robot stands for a second."""
 
@@ -227,7 +230,12 @@ def survey(scene: Scene) -> Readings:
 def lab_map(scene: Scene) -> AnomalyMap:
     """The map fitted to the survey, in numbers that single precision holds, as its layer does."""
     readings = survey(scene)
-    field = raster(fit(readings, "harmonic"), readings)
+    field = raster(
+        fit(readings, "harmonic"),
+        readings,
+        spacing_m=SPACING_M,
+        headings_rad=np.radians(np.arange(0.0, 360.0, HEADING_STEP_DEG)),
+    )
     variance = field.variance_nt2
     return replace(
         field,
