@@ -469,7 +469,7 @@ def test_a_scale_that_cannot_be_is_refused_with_one_that_could(tmp_path):
     path = file(tmp_path, "x,y,yaw,b\n0,0,0,0.9\n1,0,1,1.1\n")
     with pytest.raises(RefusedError, match=r"normalised sensor give --scale, the factor to nT \(50000 would"):
         read_readings(path, columns=Columns(field="b"))
-    with pytest.raises(RefusedError, match=r"mean of b is 3 nT with scale 3, .*; --scale 50000 would give"):
+    with pytest.raises(RefusedError, match=r"mean of b is 3 nT with scale 3, .*; --scale 50000 would make"):
         read_readings(path, columns=Columns(field="b", scale=3.0))
     with pytest.raises(RefusedError, match="the field's unit or its scale"):
         Columns(scale=3.0, unit="uT")

@@ -20,6 +20,7 @@ SPECS = (
     spec.LidarSpec(),
     spec.BatterySpec(),
     spec.MocapSpec(),
+    spec.SurveySpec(),
     spec.DriveSpec(),
     spec.PlatformFieldSpec(),
     ROBOT,

@@ -145,7 +145,7 @@ def test_every_noun_shows_itself_in_five_lines_and_in_html(twin, run, learnt):
 def test_a_run_tells_rows_duration_rate_scene_path_and_range(run):
     b = run["b_measured_nt"]
     text = repr(run)
-    assert "6,750 rows x 37 columns, 49.99 s at 135 Hz" in text
+    assert "6,750 rows x 38 columns, 49.99 s at 135 Hz" in text
     assert "scene lab, path figure8, seed 0" in text
     assert f"{b.min():,.0f} to {b.max():,.0f} nT, mean {b.mean():,.0f} nT (b_measured_nt)" in text
     flagged = run.with_columns(flag_bump=np.arange(run.rows) < 7)
@@ -155,7 +155,7 @@ def test_a_run_tells_rows_duration_rate_scene_path_and_range(run):
 def test_a_map_tells_extent_spacing_headings_method_height_day_and_range(twin):
     text = repr(twin.field)
     for words in (
-        "25 x 15, 0.25 x 0.25 m apart, x -3.00 to 3.00 m, y -1.75 to 1.75 m",
+        "121 x 71, 0.05 x 0.05 m apart, x -3.00 to 3.00 m, y -1.75 to 1.75 m",
         "4: 0, 90, 180, 270 deg",
         f"{twin.field.created}, sensor at 0.405 m",
         "survey of the twin",
