@@ -37,7 +37,8 @@ LEFT_OUT = {
 CHANGES = (
     (r"^(magtwin drive .*)$", r"printf wwwaq | \1 --no-view"),
     (r"^(magtwin ros sim .*)$", r"\1 --duration 40 > sim.txt 2>&1 & sleep 5"),
-    (r"^(magtwin ros (?:magnetometer|follow|record) .*)$", r"\1 --duration 4"),
+    (r"^(magtwin ros (?:magnetometer|record) .*)$", r"\1 --duration 4"),
+    (r"^(magtwin ros follow .*)$", r"timeout -s INT 6 \1; test $? = 124"),  # it drives until it is stopped
 )
 """Live commands: what is run in their place."""
 

@@ -277,6 +277,7 @@ class Evaluation(Summarized):
             found[one.name] = verdict(
                 score.mae_nt,
                 naive,
+                than=f"the naive mean on the map {self.contenders[0].chart.name}",
                 interval=score.ratio_interval,
                 coverage=score.coverage,
                 judged_on=recordings_text(len(self.judged), sessions, paths, *learned),
