@@ -203,7 +203,7 @@ def from_table(
             and spec.default is dataclasses.MISSING
             and spec.default_factory is dataclasses.MISSING
         ):
-            raise where.refused("", f"key {name!r} is missing")
+            raise where.refused("", f"key {name!r} is missing; add it")
     values = {key: _value(hints[key], value, where, key) for key, value in table.items()}
     try:
         return cls(**values)

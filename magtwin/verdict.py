@@ -135,7 +135,5 @@ def recordings_text(
             "were trained on"
         )
     new_sessions, new_paths = (len(sessions - set(learned_sessions)), len(paths - set(learned_paths)))
-    return (
-        f"{text}: {new_sessions} of {len(sessions)} sessions and {new_paths} of {len(paths)} paths were not "
-        "in its training"
-    )
+    new = f"{new_sessions} of {len(sessions)} sessions and {new_paths} of {len(paths)} paths"
+    return f"{text}; {new} are new to it"

@@ -107,7 +107,7 @@ def driven(
     twin: Twin, nodes: Callable[..., Bus], path: Path, *, clock: float, **how: object
 ) -> tuple[Follower, np.ndarray]:
     """A follower that has driven the twin along a path, and each step's true x, y, yaw."""
-    simulator = Simulator(twin, nodes("sim"), speed=clock)
+    simulator = Simulator(twin, nodes("sim"), session="survey", speed=clock)  # poses without an offset
     bus = nodes("follower", sim_time=True)
     node = Follower(path, twin.scene.robot.drive, bus, **how)  # type: ignore[arg-type]
     track: list[tuple[float, float, float]] = []

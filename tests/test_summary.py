@@ -156,9 +156,9 @@ def test_a_map_tells_extent_spacing_headings_method_height_day_and_range(twin):
     text = repr(twin.field)
     for words in (
         "121 x 71, 0.05 x 0.05 m apart, x -3.00 to 3.00 m, y -1.75 to 1.75 m",
-        "4: 0, 90, 180, 270 deg",
+        "headings  24: 0, 15, 30, 45, ",
         f"{twin.field.created}, sensor at 0.405 m",
-        "survey of the twin",
+        "method    harmonic",
         f"{twin.field.values_nt.min():,.0f} to {twin.field.values_nt.max():,.0f} nT",
     ):
         assert words in text

@@ -38,7 +38,7 @@ def test_coverage_of_normal_errors_is_ninety_per_cent():
 
 def test_what_a_model_never_saw_is_counted():
     text = recordings_text(15, ["0-1", "0-2", "0-1"], ["A", "B"], ["0-1", "7-1"], ["B"])
-    assert text == "15 recordings: 1 of 2 sessions and 1 of 2 paths were not in its training"
+    assert text == "15 recordings; 1 of 2 sessions and 1 of 2 paths are new to it"
     assert recordings_text(2, ["a"], ["A"], None, None).endswith(
         "the weights do not say what they were trained on"
     )

@@ -360,10 +360,10 @@ def map_survey(
         "created": day if created is None else created,
     }
     with progress(f"Surveying {twin.name}", "headings") as advance:
+        blocked = blocked_by(twin, read_obstacles(scene))
         if out.suffix == ".parquet":
-            read = survey_readings(twin, **about, progress=advance)
+            read = survey_readings(twin, **about, progress=advance, blocked=blocked)
         else:
-            blocked = blocked_by(twin, read_obstacles(scene))
             field = survey(twin, **about, name=name or out.stem, progress=advance, blocked=blocked)
     if out.suffix == ".parquet":
         from magtwin.io.readings import save_readings

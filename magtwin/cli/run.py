@@ -414,9 +414,9 @@ def _say_placing(path: Any, steps: Any) -> None:
     if path.placing:
         scale_x, scale_y, x, y = path.placing
         scale = f"{scale_x:.2g}" if scale_x == scale_y else f"{scale_x:.2g} in x and {scale_y:.2g} in y"
-        how = [f"scaled by {scale}"] if (scale_x, scale_y) != (1, 1) else []
+        how = [f"scaled by {scale} from its 6 x 3.5 m floor"] if (scale_x, scale_y) != (1, 1) else []
         how += [f"moved by ({x:.2f}, {y:.2f}) m"] if max(abs(x), abs(y)) >= 0.005 else []
-        steps(f"Path {path.name} is {' and '.join(how)} to fit the floor")
+        steps(f"Path {path.name} is {' and '.join(how)} to fit this floor and what stands on it")
 
 
 def _run_together(

@@ -179,7 +179,9 @@ def _map_mismatch(facts: Facts, name: str, field: AnomalyMap, map_sha256: str) -
             rms = float(np.sqrt(np.mean(difference[both] ** 2)))
             if rms < SAME_NT:
                 return None
-            effect = f"the two differ by {rms:.0f} nT RMS over the floor, by which its field errs"
+            effect = (
+                f"the two differ by {rms:.0f} nT RMS over the floor, so its predictions may not fit this map"
+            )
     return Mismatch(
         f"{name} learned on the map {learned}, and the scene's map is {here}: {effect}; use that map, or "
         "train on this one"
@@ -197,7 +199,11 @@ def _frame_mismatch(facts: Facts, name: str, field: AnomalyMap, residual_sd_nt: 
     return Mismatch(
         f"{name} was trained on labels that took the map {away:.1f} cm and {late:.0f} ms off the robot's "
         f"pose, an error of about {effect:.0f} nT RMS at {TYPICAL_M_S:g} m/s; its stated error includes it. "
-        "To avoid it, train on labels with fitted lever arm and latency (magtwin dataset build --align fit)"
+        + (
+            "Their fit of lever arm and latency is that far off: record more turns at several speeds"
+            if facts.get("alignment") == "fitted"
+            else "To avoid it, train on labels with fitted lever arm and latency (dataset build --align fit)"
+        )
     )
 
 

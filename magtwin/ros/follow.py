@@ -39,6 +39,9 @@ MAX_AGE_S = 0.3
 COASTED_M = 0.3
 """Way that a robot may drive on after its pose is lost [m]."""
 
+BEGINS_M = 0.1
+"""Distance from the first point of a path within which a robot begins it where it stands [m]."""
+
 STAND_S = 1.0
 """For how long a stand is commanded at the end [s]."""
 
@@ -167,6 +170,7 @@ class Follower:
         self._tell("driving")
         if self._begin_ns is None:
             self._begin_ns = now
+            self._begin_here(x, y)
         yaw = float(yaw_from_quat(fresh[self._q])[0])
         twist = self._twist.fresh(now)
         v, w = self._last if twist is None else (float(twist["odom_v"][0, 0]), float(twist["odom_w"][0, 2]))
@@ -185,6 +189,17 @@ class Follower:
         self._guide = self._guided(self.path)
         self._begin_ns, self._stand_s = None, STAND_S
         self._laps, self._squares, self._count, self._off = 0, 0.0, 0, math.nan
+
+    def _begin_here(self, x: float, y: float) -> None:
+        """Take the beginning of the path for reached if the robot stands there.
+
+        Markers that were put on a few centimetres off turn with the robot, so that a robot which turns on the
+        spot never sees itself closer than that.
+        """
+        guide = self._guide
+        begins = guide.law != RELEASE and guide.node == 0 and guide.table.shape[1] > 1
+        if begins and math.hypot(guide.table[0, 0] - x, guide.table[1, 0] - y) < BEGINS_M:
+            guide.node = 1
 
     def _rejoin(self, x: float, y: float) -> None:
         """Go on where the robot stands now: it drove on for a while before it stood."""

@@ -154,12 +154,12 @@ def _visit(
     if heading_error_rad:
         yaw = nominal + heading_error_rad * rng.standard_normal(nominal.shape)
     sensor, latch = scene.robot.magnetometer, rng.spawn(1)[0]
-    exact, lost = np.zeros(grid.shape), np.zeros(grid.shape, bool)
+    exact, lost, stood = np.zeros(grid.shape), np.zeros(grid.shape, bool), np.ones(grid.shape, bool)
     for k in range(len(grid.headings_rad)):
         progress(k, len(grid.headings_rad), "")
         closed = np.zeros(grid.shape[1:], bool) if blocked is None else blocked(node[k])
         here = (slice(None), slice(None)) if not closed.any() else np.nonzero(~closed)
-        lost[k] = closed
+        lost[k], stood[k] = closed, ~closed
         exact[k][here] = field_at_rest_nt(scene, stands[k][here], yaw[k][here], height_m=height_m)
         if sensor.gradient_max_nt_m:
             gradient = ambient_gradient_nt_m(
@@ -174,6 +174,7 @@ def _visit(
         value = rounded(latched_nt(sensor, lost.ravel(), latch), sensor.resolution_nt).reshape(grid.shape)
         total[lost] = value[lost] * readings
     read = Readings(
+        good=stood.ravel(),
         p_xy=node.reshape(-1, 2),
         yaw=yaw.ravel(),
         b_nt=(total / readings).ravel(),
