@@ -29,7 +29,8 @@ magtwin scene room.toml --out room
 magtwin run room/room.usda
 ```
 
-The one table that a scene must have is `[robot]`. Lengths are in metres, angles in radians unless a name ends in `_deg`, fields in nT, magnetization in A/m.
+The one table that a scene must have is `[robot]`. Lengths are in metres, angles in radians unless a name
+ends in `_deg`, fields in nT, magnetization in A/m.
 The world's origin is the middle of the floor; x and y run along its sides, z points up. File names are
 relative to the TOML. An unknown key is refused with the nearest known one, a wrong value with file and
 line.

@@ -236,6 +236,8 @@ def _with_magnetometer(robot: RobotSpec, net: str | FilePath | None, kind: Kind 
         of, weights = ("physical", None) if str(net) == "none" else ("neural", FilePath(net).resolve())
         spec = dataclasses.replace(spec, kind=of, network=weights, network_sha256="", inputs=())  # type: ignore[arg-type]
     if kind is not None:
+        if kind != "neural" and net is not None and str(net) != "none":
+            raise RefusedError(f"net is for a neural magnetometer, not for {kind!r}; give one of the two")
         spec = dataclasses.replace(spec, kind=kind)
     return dataclasses.replace(robot, magnetometer=spec)
 

@@ -366,3 +366,9 @@ def test_a_desk_that_was_moved_is_marked_and_the_rest_of_the_lab_is_not(lab, sur
     assert found.changed[~near].sum() <= 0.1 * found.changed.sum() + 3
     assert max(abs(r.peak_m[0] - desk[0]) for r in found.regions[:2]) < 1.0
     assert min(r.peak_m[1] for r in found.regions[:2]) > 1.0
+
+
+def test_readings_where_the_robot_cannot_stand_are_not_good():
+    read = survey_readings(scene(), rng=rng(), spacing_m=0.5, blocked=lambda p: p[..., 0] > 1.0)
+    assert 0 < read.good.sum() < len(read)
+    assert np.array_equal(read.good, read.p_xy[:, 0] <= 1.0)

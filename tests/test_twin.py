@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from magtwin.cli import main
+from magtwin.files import shipped
 from magtwin.names import RefusedError
 from magtwin.twin import in_session, open_twin, simulate, simulate_many
 
@@ -32,3 +34,17 @@ def test_a_session_that_is_none_is_refused(lab_scene):
         simulate(in_session(twin, 2), session="survey")
     with pytest.raises(RefusedError, match="give robots or session, not both"):
         simulate_many(twin, "figure8", [1], session=1, robots=twin.scene.robot)
+
+
+def test_a_network_for_a_magnetometer_that_reads_none_is_refused(lab_scene):
+    with pytest.raises(RefusedError, match="net is for a neural magnetometer, not for 'physical'"):
+        open_twin(lab_scene, net=shipped("weights", "turtlebot4_paper.safetensors"), magnetometer="physical")
+
+
+def test_a_survey_in_millimetres_is_doubted(tmp_path, capsys):
+    rng = np.random.default_rng(1)
+    p, yaw = rng.uniform(-2500, 2500, (300, 2)), rng.uniform(-3, 3, 300)
+    rows = np.column_stack([p, yaw, 45_000 + 50 * np.sin(p[:, 0] / 400)])
+    np.savetxt(tmp_path / "mm.csv", rows, delimiter=",", header="x,y,yaw,b", comments="")
+    main(["map", "fit", str(tmp_path / "mm.csv"), "--method", "trilinear", "--out", str(tmp_path / "m.usdc")])
+    assert "are their positions in metres?" in capsys.readouterr().out

@@ -51,6 +51,9 @@ def read_sources(
 LEAST_READINGS = 8
 """Good readings of a drive that a map needs at least."""
 
+USUAL_SPAN_M = 300.0
+"""Extent of a survey above which the summary asks for the unit of its positions [m]."""
+
 USUAL_READINGS = 100
 """Good readings of a drive below which the summary says that a map of them tells little."""
 
@@ -69,6 +72,8 @@ def worth_a_map(readings: Any, found: Any, source: Path) -> Any:
         )
     if readings.grid is None and count < USUAL_READINGS:
         notes.append(f"only {count} good readings: the map holds next to them alone")
+    if (span := float(np.ptp(readings.p_xy, axis=0).max())) > USUAL_SPAN_M:
+        notes.append(f"the readings span {span:,.0f} m: are their positions in metres?")
     way = np.exp(1j * yaw).mean()
     if np.abs(way) >= ONE_HEADING:
         notes.append(

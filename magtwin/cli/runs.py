@@ -127,6 +127,7 @@ def runs(
         if session is None and speed is None:
             draws = np.random.default_rng((seed, 1)).spawn(2)[1]  # which no run draws from
             speeds = [draw_speed(robot.drive, rng) for rng in draws.spawn(count)]
+        steps(f"Driving {count} runs")
         made = simulate_many(
             twin,
             [paths[k % len(paths)] for k in range(count)],

@@ -78,6 +78,7 @@ def survey_readings(
     licence: str = "",
     created: str = "",
     progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
+    blocked: Callable[[Array], NDArray[np.bool_]] | None = None,
 ) -> Readings:
     """What the robot reads that stands at each node of a grid in each heading.
 
@@ -101,14 +102,15 @@ def survey_readings(
         licence: SPDX name of the survey's licence.
         created: Day of the survey, YYYY-MM-DD.
         progress: Called with headings done, headings in all, and what is being done.
+        blocked: For nodes of shape (Y, X, 2), whether the robot cannot stand there. Default: it can.
 
     Returns:
-        A row a node, in the order of `Grid.poses`, with magnitudes.
+        A row for each node, in the order of `Grid.poses`, with magnitudes; `good` where the robot can stand.
 
     Raises:
         RefusedError: The Earth's field is unknown, the grid has no cell, or a figure is out of range.
     """
-    about: dict[str, Any] = {"source": source, "licence": licence, "created": created}
+    about: dict[str, Any] = {"source": source, "licence": licence, "created": created, "blocked": blocked}
     about |= {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
     return _visit(scene, rng, spacing_m, headings_rad, readings, height_m, progress, **about)[0]
 
