@@ -29,8 +29,8 @@ def compare(
     b
         The other.
     align
-        time finds the offset of the clocks at which the positions lie closest; path lays them over each
-        other by driven length, for runs of different speeds; none takes the clocks as they stand.
+        time finds the offset of the clocks at which the positions lie closest; path aligns them by
+        distance driven, for runs of different speeds; none takes the clocks as they stand.
     out
         Page (.html, .md, .json) or picture (.png, .svg) to write: readings as recorded and aligned, the
         distance between the two, and both paths.

@@ -145,7 +145,7 @@ def correlate(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """How each input goes with the disturbance: Spearman's rank correlation, as in the paper's Figure 2.
+    """Correlate each input with the disturbance: Spearman's rank correlation, as in the paper's Figure 2.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ def evaluate(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Judge weights by recordings, each on its own map, beside the naive model and Tolles and Lawson's.
+    """Measure the error of models on recordings, beside the naive model and Tolles and Lawson's.
 
     Errors are of the total field at the sensor. The report, DIR/evaluation.html, .md and .json, has Table
     1 with intervals, and the paper's Figures 2, 5, 6 and 7 of these recordings.
@@ -61,7 +61,7 @@ def evaluate(
         In place of runs, a data set: the recordings of it that no weights learned from.
     map
         Maps that the weights were trained on, each found by its checksum; the first, the paper's trilinear
-        one, is the naive model's, and that of weights which name none. That of the scene unless given.
+        one, is the naive model's, and that of weights which record no map. Default: that of the scene.
     train
         Data set that the naive mean and the Tolles-Lawson baselines are fitted to, labelled on each map anew.
         Without it the mean is that of weights trained on the first map, and there are no baselines.

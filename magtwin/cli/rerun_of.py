@@ -17,7 +17,7 @@ def rerun_of(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Make a run once more from what it says of itself, and say whether it is equal, to the bit.
+    """Reproduce a run from its metadata and report whether the bytes match.
 
     What changed since (scene, map, network, versions) is named first, then every column that differs and by
     how much. Exit status 0 where all columns are equal, 1 where not.

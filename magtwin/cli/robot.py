@@ -43,7 +43,7 @@ def robot(
     out
         Folder to make; it will hold NAME.usda and the layers it refers to.
     to_urdf
-        URDF to make of a stage, in place of --out: the other way about, with equal kinematics and inertia.
+        URDF to write from a stage, in place of --out, with equal kinematics and inertia.
         It takes --force and --json alone.
     settings
         TOML with drive, battery, platform field, sensor mounts and conversion, such as

@@ -121,7 +121,7 @@ def sim(
     rate_hz
         Readings of the magnetometer a second [Hz]; the scene's unless given.
     profile
-        Whose habits: ros, fields in tesla; aprilab, in nT, for programs written against APRILab's release.
+        Conventions: ros, fields in tesla; aprilab, in nT, for programs written against APRILab's release.
     units
         Unit of fields, T or nT; the profile's unless given.
     lidar
@@ -177,7 +177,8 @@ def magnetometer(
     """Read a robot's sensors through map and network: the magnetometer alone, for any robot or simulator.
 
     It takes pose (/robot/enu/pose), odometry, IMU, battery and scans, as far as the network reads them, and
-    says qtfm/magnitude and qtfm/total_field_nt wherever they are fresh; /diagnostics says how it fares.
+    publishes qtfm/magnitude and qtfm/total_field_nt while its inputs are fresh, and its state in
+    /diagnostics.
     Inputs may come and go. Settings are those of ROS, name:=value: rate_hz (135), units (T or nT),
     use_sim_time, max_age_s (0.5), battery_max_age_s (30), lidar (scan, on or off), outside (silent or clamp).
 
@@ -192,8 +193,8 @@ def magnetometer(
     net
         Weights to use in place of the scene's.
     profile
-        Whose habits, unless settings say otherwise: ros, fields in tesla; aprilab, in nT, as programs want
-        that were written against APRILab's release.
+        Conventions, unless settings say otherwise: ros, fields in tesla; aprilab, in nT, for programs written
+        against APRILab's release.
     duration
         How long, by the wall [s]; without an end unless given.
     """
@@ -227,7 +228,7 @@ def follow(
     sim_time: bool = False,
     stamped_commands: bool = False,
 ) -> None:
-    """Drive a robot along a path, by where it says it is; it stands at the end, and where its pose is lost.
+    """Drive a robot along a path by its reported pose; it stops at the end, and while the pose is lost.
 
     Parameters
     ----------
@@ -414,7 +415,7 @@ def replay(
     speed: float = 1.0,
     units: Literal["T", "nT"] = "T",
 ) -> None:
-    """Say a run again on the topics of its robot, in real time.
+    """Publish a recorded run on its robot's ROS topics, in real time.
 
     Parameters
     ----------

@@ -96,8 +96,8 @@ def train(
     licence
         Licence of the weights, an SPDX identifier such as MIT.
     split
-        What is never on two sides of training, validation and test: session, unless given, run or path;
-        row shows what a split by row hides.
+        Unit kept whole when splitting into training, validation and test: session (default), run or path;
+        row leaks between them, and is for comparison only.
     hold_out
         Sessions, runs or paths that are all in the test.
     threads

@@ -47,7 +47,8 @@ def validate(
     fix
         Mend first what is safe: the default prim, units that nobody says, absolute paths, extents, bindings.
     fix_also
-        Mend checksums too, by name: map-checksum, map-file, network-file. They then vouch for what is there.
+        Mend checksums too, by name: map-checksum, map-file, network-file. They then accept the
+        files as they are.
     out
         Where to write it all, a .json file.
     force
