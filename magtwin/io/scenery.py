@@ -290,6 +290,7 @@ class Scenery:
         """What stands still, one body a look; and each of the robot's links."""
         bodies: dict[tuple[bool, bool, float], list[Any]] = {}
         placed = [_placed(shape, links[shape.link]) if shape.link else shape.vertices for shape in still]
+        self._subjects = [v for s, v in zip(still, placed, strict=True) if is_subject(s, scale)]
         for shape, vertices in zip(still, placed, strict=True):
             mesh, flat = mesh_of(shape, vertices), shape.vertex_colours is not None
             if not flat and not fine:  # half the work of a frame would be to light what does not change
@@ -354,8 +355,10 @@ class Scenery:
     def _aim(self, k: int) -> None:
         if self._view.kind != "chase":
             seen_s = (self._times[k] - self._times[0]) / self._speed
-            camera = self._view.camera(seen_s)
-            aim(self.plotter, camera, self._around, self._size, bar=self._bar)
+            camera, around = self._view.camera(seen_s), self._around
+            if self._view.kind == "top":  # the whole map, as a picture of the stage shows it
+                around = np.vstack([around, *self._subjects])
+            aim(self.plotter, camera, around, self._size, bar=self._bar)
             return
         near = np.abs(self._times - self._times[k]) <= CHASE_S * self._speed
         ahead = matrix_from_quat(self._q[near])[:, :2, 0].mean(axis=0)
