@@ -131,7 +131,8 @@ def test_map_and_network_in_newton_are_the_kinematic_simulators_within_150_nt_at
         "w_cmd": driven["w_cmd"],
     }
     twin = open_twin(lab_scene)
-    run = simulate(twin, Run(poses), seed=seed, rate_hz=50)  # its readings are at those poses, to rounding
+    # the stage is the robot of the survey; its readings are at those poses, to rounding
+    run = simulate(twin, Run(poses), seed=seed, session="survey", rate_hz=50)
     assert len(run["t"]) == len(driven)
     assert rms(run["b_map_nt"] - driven["b_map_nt"]) < 0.1
     assert np.ptp(driven["b_disturbance_nt"]) > 1000
