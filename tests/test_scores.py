@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from magtwin.learn.scores import HALF_WIDTH, Errors, scores
+from magtwin.learn.scores import Errors, scores
 from magtwin.names import RefusedError
+from magtwin.verdict import Z_90
 
 
 def some_errors(error, session="a", group="A", sd=np.nan, rate_hz=10.0):
@@ -42,7 +43,7 @@ def test_the_mean_of_cases_counts_each_path_alike():
 
 
 def test_coverage_is_the_share_within_the_predicted_interval_and_unknown_without_one():
-    error = np.array([[0.0, 0.9, 1.1, -0.9, -1.1, 5.0]]) * HALF_WIDTH
+    error = np.array([[0.0, 0.9, 1.1, -0.9, -1.1, 5.0]]) * Z_90
     (with_sd,), (without,) = scored([some_errors(error, sd=1.0)])[1], scored([some_errors(error)])[1]
     assert with_sd.coverage == pytest.approx(3 / 6)
     assert np.isnan(without.coverage)

@@ -9,9 +9,11 @@ from cyclopts import Parameter
 
 from magtwin.cli.progress import announcer, progress, silence, step
 from magtwin.names import RefusedError
+from magtwin.summary import printable
 
 __all__ = [
     "announcer",
+    "printable",
     "progress",
     "silence",
     "step",
@@ -125,11 +127,6 @@ def print_report(report: Any, as_json: bool) -> None:
         entries = fact.items() if isinstance(fact, dict) else (("", entry) for entry in fact)
         for key, entry in entries:
             _print_entry(console, printable(str(key)), printable(str(entry)))
-
-
-def printable(text: str) -> str:
-    """A file's own text, with its control characters written out: a terminal would obey them."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _rounded(spread: float) -> str:

@@ -11,9 +11,9 @@ from magtwin.field.bins import spacing_m
 from magtwin.field.fit import METHODS, fit
 from magtwin.field.interpolation import check_readings
 from magtwin.field.readings import Readings
-from magtwin.field.roughness import NINETY
 from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
+from magtwin.verdict import Z_90
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
@@ -204,7 +204,7 @@ def _figures(
         yield Figure(f"{method} predicted", 0.0, "%")
         return
     e, v = error[known], np.maximum(variance[known], np.finfo(float).tiny)
-    inside = np.abs(e) <= NINETY * np.sqrt(v)
+    inside = np.abs(e) <= Z_90 * np.sqrt(v)
     score = -0.5 * (np.log(2 * np.pi * v) + e**2 / v)
     yield Figure(f"{method} RMSE", _nt(np.sqrt(np.mean(e**2))), "nT")
     yield Figure(f"{method} MAE", _nt(np.mean(np.abs(e))), "nT")

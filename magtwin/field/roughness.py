@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.verdict import Z_90
+
 Array = NDArray[np.float64]
 
 FOLDS = 5
@@ -15,9 +17,6 @@ cells around it is left out with it."""
 
 NEIGHBOURS = 16
 """Residuals that make the local mean square."""
-
-NINETY = 1.6448536269514722
-"""Half the width of a normal distribution's 90 % interval, in standard deviations."""
 
 PRIOR = 4
 """Residuals that the mean square of the whole survey counts as, beside the local ones."""
@@ -131,8 +130,8 @@ def _stretch(square: Array, rough: Array, noise: Array) -> float:
     known = rough > 0
     if not known.any():
         return 1.0
-    factor = (square[known] / NINETY**2 - noise[known]) / rough[known]
-    missed = np.count_nonzero(square[~known] > NINETY**2 * noise[~known])  # whatever the factor
+    factor = (square[known] / Z_90**2 - noise[known]) / rough[known]
+    missed = np.count_nonzero(square[~known] > Z_90**2 * noise[~known])  # whatever the factor
     inside = (0.9 * len(square) - (np.count_nonzero(~known) - missed)) / np.count_nonzero(known)
     return max(float(np.quantile(factor, min(max(inside, 0.0), 1.0))), 0.0)
 
@@ -148,4 +147,4 @@ def tail(tree: Any, squares: Array, each: Array, place: NDArray[np.intp] | None 
     """
     variance = local_mean(tree, squares, np.asarray(tree.data), skip=1)
     ratio = each / np.maximum(variance if place is None else variance[place], np.finfo(float).tiny)
-    return float(np.quantile(ratio, 0.9)) / NINETY**2
+    return float(np.quantile(ratio, 0.9)) / Z_90**2

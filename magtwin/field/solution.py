@@ -13,7 +13,7 @@ from magtwin.field.headings import between, surveyed
 from magtwin.field.posterior import Posterior
 from magtwin.field.problem import Problem
 from magtwin.field.readings import Readings
-from magtwin.field.roughness import NINETY
+from magtwin.verdict import Z_90
 
 Array = NDArray[np.float64]
 
@@ -266,7 +266,7 @@ class Solution:
         for h, part in enumerate(groups):
             beyond += float(np.sum((off[part] ** 2 - field[part] - 1) / root[part] ** 2))
             away += len(part) * float(between(np.delete(heading, h), heading[h : h + 1])[0])
-        few = float(stdtrit(len(heading), 0.95)) / NINETY  # so many headings tell it: Student's t
+        few = float(stdtrit(len(heading), 0.95)) / Z_90  # so many headings tell it: Student's t
         return heading, max(beyond / away, 0.0) * few**2
 
     def _parameters(self, learnt: Array, width: float, count: int) -> dict[str, Any]:

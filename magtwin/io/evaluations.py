@@ -20,8 +20,9 @@ from magtwin.io.plots import INK, drawn, new_figure
 from magtwin.learn.correlation import correlations
 from magtwin.learn.evaluate import PAPER, Case, Evaluation, Judged
 from magtwin.learn.features import FEATURES, FULL, features
-from magtwin.learn.scores import COVERED, DRAWS, HALF_WIDTH, LEVEL
+from magtwin.learn.scores import COVERED, DRAWS, LEVEL
 from magtwin.names import RefusedError
+from magtwin.verdict import Z_90
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -339,7 +340,7 @@ def _band(found: Evaluation) -> Drawing:
     for k, m in enumerate(shown):
         field_ax, error_ax = axes[2 * k : 2 * k + 2]
         total, alone = (np.where(kept, values[m, seen], np.nan) for values in (one.total_nt, one.map_nt))
-        half = HALF_WIDTH * one.sd_nt[m, seen]
+        half = Z_90 * one.sd_nt[m, seen]
         _line(field_ax, t, measured / 1000, color=INK, lw=1.8, label="measured")
         _line(field_ax, t, alone / 1000, color="0.55", lw=1.0, label="map alone")
         _line(field_ax, t, total / 1000, color=ink(m), lw=1.0, label="map and model")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from magtwin.names import RefusedError
 from magtwin.summary import Summarized
+from magtwin.verdict import Z_90
 
 Array = NDArray[np.float64]
 Interval = tuple[float, float]
@@ -25,9 +26,6 @@ LEVEL = 0.95
 
 COVERED = 0.9
 """Share of the errors that a predicted interval is to hold."""
-
-HALF_WIDTH = 1.6448536269514722
-"""Standard deviations to either side that hold `COVERED` of a normal distribution."""
 
 _ABS, _SQUARE, _SUM, _KNOWN, _WITHIN, _OUTSIDE = range(6)
 
@@ -92,7 +90,7 @@ class Errors(Summarized):
         block = np.unique(block, return_inverse=True)[1]
         size = np.abs(self.error_nt)
         known = np.isfinite(self.sd_nt)
-        within = known & (size <= HALF_WIDTH * np.where(known, self.sd_nt, 0.0))
+        within = known & (size <= Z_90 * np.where(known, self.sd_nt, 0.0))
         parts = (size, size**2, self.error_nt, known, within, self.outside)
         count = int(block.max()) + 1
         made: Array = np.array([[np.bincount(block, row, count) for row in part] for part in parts], float)

@@ -27,8 +27,7 @@ from magtwin.sim.magnetometer import LOCK_RATE_HZ, rounded
 from magtwin.sim.manual import at_start
 from magtwin.sim.model_error import ModelError
 from magtwin.sim.online_sensors import Battery, Imu, Magnetometer, Markov, Mocap, Odometry, Samples
-from magtwin.sim.sensors import into_sensor
-from magtwin.sim.simulate import add_error, check_run, flags, mapped, streams, truth
+from magtwin.sim.simulate import add_error, check_run, exact_field, flags, mapped, streams, truth
 from magtwin.spec import DriveSpec, Scene
 
 Array = NDArray[np.float64]
@@ -230,21 +229,9 @@ class Online:
         supply_a = columns.pop("supply_a")
         columns["lidar_on"] = self._lidar_on(t)
         columns |= mapped(self._map, true.pose[:, :2], columns["yaw"], self._outside, gradient=True)
-        vector = np.full((count, 3), np.nan)
-        columns["b_truth_nt"] = np.full(count, np.nan)
-        if self._known and count:
-            exact = self._exact.at_sensor_nt(
-                scene,
-                track,
-                t,
-                true=true,
-                lidar_on=columns["lidar_on"],
-                supply_a=supply_a,
-                at_rest_nt=columns["b_map_nt"],
-            )
-            vector = into_sensor(exact, robot.q_base_magnetometer_xyzw)
-            columns["b_truth_nt"] = self._exact.magnitude_nt(exact, columns["b_map_nt"])
-        columns["b_vector_nt"] = vector
+        known = self._exact if self._known and count else None
+        columns |= exact_field(known, scene, track, t, true, columns, supply_a)
+        vector = columns["b_vector_nt"]
         columns["b_vector_measured_nt"], lost = self._magnetometer.axes(vector, self._steepness(t))
         dropped = self._magnetometer.dropped(count)
         columns["b_vector_measured_nt"][dropped] = np.nan

@@ -395,14 +395,14 @@ def sense(
         columns |= sense_battery(robot.battery, pack, t, draws["battery"])
         if exact:
             supply_a = pack.current_a[pack.index(t)]
-            columns |= _exact_field(field if known else None, scene, motion, t, true, columns, supply_a)
+            columns |= exact_field(field if known else None, scene, motion, t, true, columns, supply_a)
             if beside_others:
                 added = companions_field_nt(scene, companions, motion, t, true)
                 before = columns["b_truth_nt"]
                 columns |= _with(columns["b_vector_nt"], into_sensor(added, robot.q_base_magnetometer_xyzw))
                 beside = columns["b_truth_nt"] - before
             if field.of == "map" and not physical:  # the robot's spec is no measurement to judge a network by
-                columns |= _exact_field(None, scene, motion, t, true, columns, supply_a)
+                columns |= exact_field(None, scene, motion, t, true, columns, supply_a)
     steep = _steep(field, motion, t) if read or felt else np.zeros(len(t), bool)
     if felt:
         columns["b_vector_measured_nt"] = sense_axes(
@@ -512,7 +512,7 @@ def mapped(
     return {"b_map_nt": b, **columns, "flag_outside_map": off}
 
 
-def _exact_field(
+def exact_field(
     field: ExactField | None,
     scene: Scene,
     motion: Moving,
