@@ -28,10 +28,10 @@ readme: $(VENV)/.dev  ## Type README's commands in an empty folder and check the
 simready: $(VENV)/.dev  ## Hold robots against NVIDIA's SimReady profiles, in an environment of its own
 	test -x build/simready/bin/simready-validate || $(PYTHON) -m venv build/simready
 	build/simready/bin/python -m pip --disable-pip-version-check -q install 'simready-validate>=2026.8' 'simready-foundation-tier-core>=2026.8' 'simready-foundation-tier-sensors>=2026.8'
-	MAGTWIN_SIMREADY=$(CURDIR)/build/simready/bin/simready-validate $(BIN)/python -m pytest tests/test_urdf_layout.py tests/test_validate.py -k "simready or layout"
+	MAGTWIN_SIMREADY=$(CURDIR)/build/simready/bin/simready-validate $(BIN)/python -m pytest tests/urdf/test_urdf_layout.py tests/export/test_validate.py -k "simready or layout"
 
 ros: $(VENV)/.dev build/ros-jazzy/.installed build/ros-kilted/.installed  ## Cross our nodes with rclpy of ROS 2 Jazzy and Kilted, in environments of their own
-	$(ONE_THREAD) $(BIN)/python -m pytest tests/test_ros_bus.py tests/test_ros_rclpy.py
+	$(ONE_THREAD) $(BIN)/python -m pytest tests/ros/test_ros_bus.py tests/ros/test_ros_rclpy.py
 
 build/ros-%/.installed:
 	$(PYTHON) -m venv build/ros-$*
@@ -47,7 +47,7 @@ lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies
 
 physics: $(VENV)/.dev  ## Drive converted robots in Newton (extra physics, 600 MB)
 	$(PIP) -e '.[dev,physics]'
-	$(BIN)/python -m pytest -m physics tests/test_newton.py tests/test_engine.py tests/test_engine_scripts.py tests/test_validate.py
+	$(BIN)/python -m pytest -m physics tests/sim/engines/test_newton.py tests/sim/engines/test_engine.py tests/export/test_engine_scripts.py tests/export/test_validate.py
 
 bench: $(VENV)/.dev  ## Compare with peers; prints ratios
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done

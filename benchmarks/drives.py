@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from magtwin.field.fit import fit
-from magtwin.field.latch import mask_latched
-from magtwin.io.readings import read_readings
+from magtwin.field.fit.fit import fit
+from magtwin.field.survey.stuck import mask_latched
+from magtwin.io.surveys.readings import read_readings
 
 SCENE = Path(__file__).resolve().parents[1] / "scenes" / "lab" / "lab.usda"
 NINETY = 1.6448536269514722

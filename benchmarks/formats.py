@@ -20,11 +20,11 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 import magtwin
+from magtwin.author.scene import author_scene
 from magtwin.files import shipped
 from magtwin.io.formats import read_run, write_run
 from magtwin.twin import open_twin, scene_from_toml, simulate
 from magtwin.usd.animation import sample
-from magtwin.usd.scene import author_scene
 
 DURATION_S = 600.0
 NAMES = ("run.parquet", "run.npz", "run.csv", "run.rrd", "run.mcap", "run.db3", "run.usdc")

@@ -1,7 +1,7 @@
 """A run as files: a recording against a call a row and against numpy's savez; every format of ten minutes.
 
 A table of 81,000 rows and 30 columns (ten minutes at 135 Hz) is written as a Rerun recording by
-`magtwin.io.rerun.write_rrd`, by `rerun.log` once a row and column as its quick start shows it (a part of
+`magtwin.io.rerun.file.write_rrd`, by `rerun.log` once a row and column as its quick start shows it (a part of
 the rows, scaled), and by `numpy.savez`, each to a file that is not there yet. All are measured in turn in
 one process, after a warm-up; ratios are medians over repetitions. Beside them stands what the Rerun SDK
 takes for the same columns with nothing around it, which no use of it can go below.
@@ -20,8 +20,8 @@ import numpy as np
 import rerun as rr
 
 from magtwin.files import shipped
-from magtwin.io.rerun import read_run, write_rrd
-from magtwin.run import Run
+from magtwin.io.rerun.file import read_run, write_rrd
+from magtwin.run.run import Run
 from magtwin.twin import Twin, open_twin, simulate
 
 ROWS, COLUMNS, RATE_HZ = 81_000, 30, 135.0

@@ -19,9 +19,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from magtwin.field import lookup
-from magtwin.field.lookup import Lookup, warm_up
-from magtwin.field.map import AnomalyMap
+from magtwin.field.maps import lookup
+from magtwin.field.maps.lookup import Lookup, warm_up
+from magtwin.field.maps.map import AnomalyMap
 
 WANTED = {1: 80, 1_000: None, 1_000_000: 50}
 """How many times faster than scipy, by number of poses."""

@@ -24,15 +24,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from magtwin.author.scene import author_scene
 from magtwin.files import shipped
-from magtwin.learn.model import FieldNet
+from magtwin.learn.models.network import FieldNet
 from magtwin.path import path_named
-from magtwin.sim.course import run_courses, warm_up
-from magtwin.sim.drive import draw_wheel_errors
-from magtwin.sim.follow import course_along
+from magtwin.sim.motion.course import run_courses, warm_up
+from magtwin.sim.motion.drive import draw_wheel_errors
+from magtwin.sim.motion.follow import course_along
 from magtwin.sim.session import draw_session
 from magtwin.twin import Twin, open_twin, scene_from_toml, simulate_many
-from magtwin.usd.scene import author_scene
 
 DURATION_S, RATE_HZ = 60.0, 135.0
 HIDDEN = (512, 512, 512, 512)

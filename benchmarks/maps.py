@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from magtwin.field.fit import METHODS, fit
-from magtwin.field.latch import mask_latched
-from magtwin.field.readings import Readings
-from magtwin.field.survey import read_grid
+from magtwin.field.fit.fit import METHODS, fit
+from magtwin.field.survey.gridded import read_grid
+from magtwin.field.survey.readings import Readings
+from magtwin.field.survey.stuck import mask_latched
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 EARTH_NT = (-2_700.0, 24_000.0, -38_400.0)  # IGRF-14, Gainesville, Florida

@@ -29,12 +29,12 @@ import torch
 from scipy.interpolate import RegularGridInterpolator
 from sklearn.preprocessing import StandardScaler
 
-from magtwin.field.map import AnomalyMap
-from magtwin.learn.features import FULL
-from magtwin.learn.model import FieldNet, load_net
-from magtwin.learn.perceptron import in_threads
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.learn.data.features import FULL
+from magtwin.learn.models.network import FieldNet, load_net
+from magtwin.learn.models.perceptron import in_threads
+from magtwin.learn.models.sparse import Skipping, warm_up
 from magtwin.learn.reading import Reader
-from magtwin.learn.sparse import Skipping, warm_up
 
 WANTED_MANY, GOAL_MANY = 0.90, 1.45
 WANTED_ONE, GOAL_ONE = 25, 50

@@ -14,10 +14,10 @@ import time
 import numpy as np
 import trimesh
 
-from magtwin.obstacles import Obstacles
-from magtwin.run import Run
-from magtwin.sim.lidar import ray_angles, scans_of
-from magtwin.spec import LidarSpec, RobotSpec
+from magtwin.run.run import Run
+from magtwin.sim.sensors.lidar import ray_angles, scans_of
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.scene import LidarSpec, RobotSpec
 
 POSES = 450
 """One minute at 7.5 turns a second."""

@@ -36,7 +36,7 @@ def walls():
     """Those of the lab, as obstacles."""
     import numpy as np
 
-    from magtwin.obstacles import Obstacles
+    from magtwin.spec.obstacles import Obstacles
 
     boxes = {
         "north": (-3, 1.75, 3, 1.8),
@@ -53,9 +53,9 @@ def magtwins() -> dict[str, Callable[[], int]]:
     import numpy as np
 
     from magtwin.path import path_named
-    from magtwin.sim import course, loop
-    from magtwin.sim.follow import course_along
-    from magtwin.spec import DriveSpec
+    from magtwin.sim.motion import course, loop
+    from magtwin.sim.motion.follow import course_along
+    from magtwin.spec.scene import DriveSpec
 
     course.warm_up()
     room = walls()
@@ -98,9 +98,9 @@ def mujocos() -> dict[str, Callable[[], int]]:
         print("MuJoCo is not installed: pip install -c constraints.txt mujoco")
         return {}
     from magtwin.path import path_named
-    from magtwin.sim.controllers import guide_along
-    from magtwin.sim.drive import limiter, wheel_rates
-    from magtwin.spec import DriveSpec
+    from magtwin.sim.motion.controllers import guide_along
+    from magtwin.sim.motion.drive import limiter, wheel_rates
+    from magtwin.spec.scene import DriveSpec
 
     drive = DriveSpec()
     spec = mujoco.MjSpec.from_file(str(ROBOT / "turtlebot4.urdf"))

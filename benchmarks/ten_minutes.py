@@ -22,16 +22,16 @@ import numpy as np
 import torch
 
 import magtwin
+from magtwin.author.scene import author_scene
 from magtwin.files import shipped
-from magtwin.io.rerun import write_rrd
+from magtwin.io.rerun.file import write_rrd
 from magtwin.io.tables import write_parquet
-from magtwin.learn.features import features
-from magtwin.learn.model import FieldNet
-from magtwin.learn.perceptron import in_threads
+from magtwin.learn.data.features import features
+from magtwin.learn.models.network import FieldNet
+from magtwin.learn.models.perceptron import in_threads
 from magtwin.path import path_named
-from magtwin.sim.course import warm_up
+from magtwin.sim.motion.course import warm_up
 from magtwin.twin import Twin, open_twin, scene_from_toml, simulate
-from magtwin.usd.scene import author_scene
 
 HIDDEN = (512, 512, 512, 512)
 DURATION_S = 600.0

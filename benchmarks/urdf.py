@@ -39,7 +39,7 @@ print(json.dumps(times[1:]))
 TOOLS = {
     "magtwin": {
         "python": Path(sys.executable),
-        "imports": "from magtwin.usd.urdf import convert_urdf",
+        "imports": "from magtwin.urdf import convert_urdf",
         "convert": "convert_urdf(urdf, out / 'robot.usda')",
     },
     "urdf-usd-converter": {

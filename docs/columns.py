@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from magtwin.run import COLUMNS
+from magtwin.run.run import COLUMNS
 
 HERE = Path(__file__).resolve().parent
 

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from magtwin.furniture import GENERIC, KINDS, MATERIALS, STEEL, parts_of
-from magtwin.usd.scene import SceneFile
+from magtwin.author.scene import SceneFile
+from magtwin.spec.furniture import GENERIC, KINDS, MATERIALS, STEEL, parts_of
 
 HERE = Path(__file__).resolve().parent
 

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 from magtwin.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from magtwin.field.map import AnomalyMap
-    from magtwin.io.plotting import plot
-    from magtwin.names import MismatchWarning, RefusedError
+    from magtwin.errors import InputError, MismatchWarning
+    from magtwin.field.maps.map import AnomalyMap
+    from magtwin.figures.plotting import plot
     from magtwin.path import Path
-    from magtwin.run import COLUMNS, Run
-    from magtwin.spec import Scene
+    from magtwin.run.run import COLUMNS, Run
+    from magtwin.spec.scene import Scene
     from magtwin.twin import (
         Twin,
         author_scene,
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     )
 
 _HOME = {
-    "AnomalyMap": "magtwin.field.map",
-    "COLUMNS": "magtwin.run",
-    "MismatchWarning": "magtwin.names",
+    "AnomalyMap": "magtwin.field.maps.map",
+    "COLUMNS": "magtwin.run.run",
+    "MismatchWarning": "magtwin.errors",
     "Path": "magtwin.path",
-    "RefusedError": "magtwin.names",
-    "Run": "magtwin.run",
-    "Scene": "magtwin.spec",
+    "InputError": "magtwin.errors",
+    "Run": "magtwin.run.run",
+    "Scene": "magtwin.spec.scene",
     "Twin": "magtwin.twin",
     "author_scene": "magtwin.twin",
     "open_twin": "magtwin.twin",
-    "plot": "magtwin.io.plotting",
+    "plot": "magtwin.figures.plotting",
     "scene_from_toml": "magtwin.twin",
     "simulate": "magtwin.twin",
     "simulate_many": "magtwin.twin",
@@ -47,9 +47,9 @@ _HOME = {
 __all__ = [
     "COLUMNS",
     "AnomalyMap",
+    "InputError",
     "MismatchWarning",
     "Path",
-    "RefusedError",
     "Run",
     "Scene",
     "Twin",

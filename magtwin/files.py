@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from magtwin.names import RefusedError, hint
+from magtwin.errors import InputError, hint
 
 T = TypeVar("T")
 
@@ -36,7 +36,7 @@ def shipped(*parts: str) -> Path:
     root = package / "_shipped"
     path = (root if root.is_dir() else package.parent).joinpath(*parts)
     if not path.exists():
-        raise RefusedError(f"{path}: not there; magtwin's own files are missing, install it again")
+        raise InputError(f"{path}: not there; magtwin's own files are missing, install it again")
     return path
 
 
@@ -44,13 +44,13 @@ def existing(path: str | os.PathLike[str], what: str) -> Path:
     """`path` if it is there.
 
     Raises:
-        RefusedError: It is not; the text says what was expected of it.
+        InputError: It is not; the text says what was expected of it.
     """
     path = Path(path)
     if not path.exists():
         siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
         near = difflib.get_close_matches(path.name, siblings, n=1)
-        raise RefusedError(f"{path}: no such {what}" + (f"; did you mean {near[0]!r}?" if near else ""))
+        raise InputError(f"{path}: no such {what}" + (f"; did you mean {near[0]!r}?" if near else ""))
     return path
 
 
@@ -58,11 +58,11 @@ def check_free(path: str | os.PathLike[str], *, force: bool = False) -> Path:
     """`path` if it may be written: nothing is there yet, or `force` was given.
 
     Raises:
-        RefusedError: It exists and `force` was not given.
+        InputError: It exists and `force` was not given.
     """
     path = Path(path)
     if path.exists() and not force:
-        raise RefusedError(f"{path}: exists already; give --force to replace it, or another name")
+        raise InputError(f"{path}: exists already; give --force to replace it, or another name")
     return path
 
 
@@ -78,25 +78,25 @@ def output(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Pat
         force: Whether one that exists is replaced.
 
     Raises:
-        RefusedError: It exists and `force` was not given, its folder cannot be written, or the disk is full.
+        InputError: It exists and `force` was not given, its folder cannot be written, or the disk is full.
     """
     path = check_free(path, force=force)
     place = Path.cwd() / path  # the working folder may itself be renamed
     if place.resolve() in (Path.cwd(), *Path.cwd().parents):
-        raise RefusedError(f"{path}: is the working folder or holds it; name a folder inside it")
+        raise InputError(f"{path}: is the working folder or holds it; name a folder inside it")
     if path.exists() and not (path.is_file() or path.is_dir()):
-        raise RefusedError(f"{path}: a device or pipe, which cannot be replaced; name a file")
+        raise InputError(f"{path}: a device or pipe, which cannot be replaced; name a file")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(prefix=f".{place.name}.", dir=place.parent))
     except OSError as error:
-        raise RefusedError(f"{path}: cannot be written ({error.strerror})") from error
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
     new, old = aside / place.name, aside / ".old"
     try:
         yield new
         if place.exists() and place.is_dir() != new.is_dir():
             kind = "folder" if place.is_dir() else "file"
-            raise RefusedError(f"{path}: is a {kind}, which this output will not replace; remove it first")
+            raise InputError(f"{path}: is a {kind}, which this output will not replace; remove it first")
         if place.is_dir():
             place.rename(old)
             try:
@@ -109,7 +109,7 @@ def output(path: str | os.PathLike[str], *, force: bool = False) -> Iterator[Pat
     except OSError as error:
         if error.errno not in _FULL:
             raise
-        raise RefusedError(f"{path}: cannot be written ({os.strerror(error.errno)})") from error
+        raise InputError(f"{path}: cannot be written ({os.strerror(error.errno)})") from error
     finally:
         shutil.rmtree(aside, ignore_errors=True)
 
@@ -164,15 +164,15 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The tables of a TOML file.
 
     Raises:
-        RefusedError: The file is missing, or is not TOML; the text gives the line.
+        InputError: The file is missing, or is not TOML; the text gives the line.
     """
     path = existing(path, "TOML file")
     if path.is_dir():
-        raise RefusedError(f"{path}: a folder; give a TOML file")
+        raise InputError(f"{path}: a folder; give a TOML file")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise RefusedError(f"{path}: not TOML: {error}") from error
+        raise InputError(f"{path}: not TOML: {error}") from error
 
 
 def from_table(
@@ -188,7 +188,7 @@ def from_table(
         number: Which of several tables of that name it is, from 0.
 
     Raises:
-        RefusedError: A key that the class does not have (the nearest one is named), a missing key, or
+        InputError: A key that the class does not have (the nearest one is named), a missing key, or
             a value of the wrong type or range, each with file and line.
     """
     where = _Where(Path(path), section, number)
@@ -207,13 +207,13 @@ def from_table(
     values = {key: _value(hints[key], value, where, key) for key, value in table.items()}
     try:
         return cls(**values)
-    except RefusedError as error:
+    except InputError as error:
         raise where.refused(next((k for k in values if k in str(error)), ""), str(error)) from error
 
 
 def refused_at(
     path: str | os.PathLike[str], key: str, text: str, *, section: str = "", number: int = 0
-) -> RefusedError:
+) -> InputError:
     """A refusal that names the line of a key in a TOML file.
 
     Args:
@@ -234,9 +234,9 @@ class _Where:
     section: str
     number: int = 0
 
-    def refused(self, key: str, text: str) -> RefusedError:
+    def refused(self, key: str, text: str) -> InputError:
         table = f"[{self.section}] " if self.section else ""
-        return RefusedError(f"{self.path}{self._line(key)}: {table}{text}")
+        return InputError(f"{self.path}{self._line(key)}: {table}{text}")
 
     def _line(self, key: str) -> str:
         inside, seen = not self.section, -1

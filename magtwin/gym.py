@@ -19,15 +19,15 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.names import RefusedError, find
+from magtwin.errors import InputError, find
 from magtwin.path import Path, check_clear, check_on_floor
-from magtwin.run import COLUMNS, Run
+from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.exact import check_field
-from magtwin.sim.fleet import SENSED, Fleet
+from magtwin.sim.motion.way import way_of
+from magtwin.sim.runs.fleet import SENSED, Fleet
+from magtwin.sim.runs.simulate import Predict
 from magtwin.sim.session import draw_session
-from magtwin.sim.simulate import Predict
-from magtwin.sim.way import way_of
-from magtwin.spec import Scene
+from magtwin.spec.scene import Scene
 from magtwin.twin import Kind, Twin, open_twin, room_of, without_model_error
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class Transition:
     """What a reward is given for: a step of robots, arrays with a robot a row."""
 
     before: dict[str, NDArray[Any]]
-    """Columns before the step, as `magtwin.sim.fleet.Fleet.columns`."""
+    """Columns before the step, as `magtwin.sim.runs.fleet.Fleet.columns`."""
 
     after: dict[str, NDArray[Any]]
     """Columns after it."""
@@ -155,14 +155,14 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             render_mode: None: a Run is looked at in Rerun.
 
         Raises:
-            RefusedError: No scene is given, or one of these is out of range.
+            InputError: No scene is given, or one of these is out of range.
         """
         if scene is None:
-            raise RefusedError("MagNav needs a scene: gymnasium.make('magtwin/MagNav-v0', scene='lab.usda')")
+            raise InputError("MagNav needs a scene: gymnasium.make('magtwin/MagNav-v0', scene='lab.usda')")
         if render_mode is not None:
-            raise RefusedError(f"MagNav has no render_mode, got {render_mode!r}; write a Run and view that")
+            raise InputError(f"MagNav has no render_mode, got {render_mode!r}; write a Run and view that")
         if isinstance(scene, Twin) and (net is not None or magnetometer is not None):
-            raise RefusedError("net and magnetometer go to open_twin where scene is a Twin")
+            raise InputError("net and magnetometer go to open_twin where scene is a Twin")
         if isinstance(scene, Twin):
             twin = scene if model_error else without_model_error(scene)
         else:
@@ -173,18 +173,18 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         robot = twin.scene.robot
         way = way_of(path, room_of(twin))
         if not isinstance(way, Path):
-            raise RefusedError(f"path must be one to drive along, got {way!r}")
+            raise InputError(f"path must be one to drive along, got {way!r}")
         self.path = way
         check_on_floor(self.path, twin.scene.lab.floor_m, robot.footprint_radius_m)
         check_clear(self.path, twin.obstacles, robot.footprint_radius_m)
         if not callable(reward):
-            raise RefusedError(f"reward must be a function of a Transition, got {reward!r}")
+            raise InputError(f"reward must be a function of a Transition, got {reward!r}")
         if not step_s <= duration_s < math.inf:
-            raise RefusedError(f"duration_s must be at least step_s, {step_s:g} s, got {duration_s!r}")
+            raise InputError(f"duration_s must be at least step_s, {step_s:g} s, got {duration_s!r}")
         self.signals = tuple(signals)
         bounds = [find("signal", name, BOUNDS) for name in self.signals]
         if not bounds:
-            raise RefusedError("signals are empty; name at least one")
+            raise InputError("signals are empty; name at least one")
         widths = [COLUMNS[name].width for name in self.signals]
         self.fleet = Fleet(
             twin.scene,
@@ -228,7 +228,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         else:
             seeds = list(seed)
         if len(seeds) != self.num_envs:
-            raise RefusedError(f"seeds must be as many as robots, {self.num_envs}, got {len(seeds)}")
+            raise InputError(f"seeds must be as many as robots, {self.num_envs}, got {len(seeds)}")
         for i, own in enumerate(seeds):
             if own is not None or self._rngs[i] is None:
                 self._rngs[i] = seeding.np_random(None if own is None else operator.index(own))[0]
@@ -259,7 +259,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         step = Transition(before, after, action, self._s - s, off, self.fleet.step_s)
         rewards = np.asarray(self.reward(step), float)
         if rewards.shape != (self.num_envs,):
-            raise RefusedError(f"reward must give shape {(self.num_envs,)}, got {rewards.shape}")
+            raise InputError(f"reward must give shape {(self.num_envs,)}, got {rewards.shape}")
         self._made += 1
         ended = after["flag_bump"] & self.end_on_bump & ~again
         truncated = (self._made >= self._last_step) & ~ended & ~again
@@ -340,12 +340,12 @@ def _predictions(network: "NeuralMagnetometer") -> Predict:
 def _check_network(network: "NeuralMagnetometer") -> None:
     """Refuse a network that reads what robots that step together do not have."""
     if network.net.context:
-        raise RefusedError(
+        raise InputError(
             f"{network.name}: a {network.net.kind} looks at {network.net.context} earlier readings, which "
             "MagNav does not keep; give a network that reads one row at a time"
         )
     if missing := sorted(network.columns - SENSED):
-        raise RefusedError(
+        raise InputError(
             f"{network.name}: reads {', '.join(missing)}, which MagNav does not simulate; give a network of "
             'other inputs, such as those of the set "gradient", or take magnetometer="physical"'
         )

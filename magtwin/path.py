@@ -10,9 +10,9 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.errors import InputError, find, hint
 from magtwin.files import existing
-from magtwin.names import RefusedError, find, hint
-from magtwin.obstacles import Obstacles
+from magtwin.spec.obstacles import Obstacles
 from magtwin.summary import Summarized, Summary, rectangle
 
 Array = NDArray[np.float64]
@@ -53,15 +53,15 @@ class Path(Summarized):
     def __post_init__(self) -> None:
         p = np.array(self.p_xy, float)
         if p.ndim != 2 or p.shape[1] != 2:
-            raise RefusedError(f"path {self.name!r}: points must have shape (N, 2), got {p.shape}")
+            raise InputError(f"path {self.name!r}: points must have shape (N, 2), got {p.shape}")
         if not np.isfinite(p).all():
             row = int(np.flatnonzero(~np.isfinite(p).all(axis=1))[0])
-            raise RefusedError(f"path {self.name!r}: point {row} is not finite: {tuple(p[row].tolist())}")
+            raise InputError(f"path {self.name!r}: point {row} is not finite: {tuple(p[row].tolist())}")
         if self.closed and len(p) > 1 and math.dist(p[0], p[-1]) >= _SAME_M:
             p = np.vstack([p, p[:1]])
         p = _without_repeats(p)
         if len(p) < 2:
-            raise RefusedError(f"path {self.name!r}: two different points are needed, got {len(p)}")
+            raise InputError(f"path {self.name!r}: two different points are needed, got {len(p)}")
         if self.closed:
             p[-1] = p[0]
         s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p, axis=0).T))])
@@ -162,7 +162,7 @@ class Path(Summarized):
             placing: Scale in x and in y, above 0, then shift in x and in y [m].
         """
         if len(placing) != 4 or not (min(placing[:2]) > 0 and all(map(math.isfinite, placing))):
-            raise RefusedError(
+            raise InputError(
                 f"placing of path {self.name!r} must be two scales above 0 and two shifts, got {placing}"
             )
         points = self.p_xy * np.array(placing[:2]) + np.array(placing[2:])
@@ -233,7 +233,7 @@ def lawnmower(
         y_first_m: y0, y of the first point [m].
     """
     if not step_m > 0:
-        raise RefusedError(f"step_m of a lawnmower must be above 0 m, got {step_m}")
+        raise InputError(f"step_m of a lawnmower must be above 0 m, got {step_m}")
     sweeps = abs(x_last_m - x_first_m) / step_m + 1
     _check_points("lawnmower", 2 * sweeps, f"step_m {step_m:g} m from x {x_first_m:g} to {x_last_m:g} m")
     count = int(sweeps + 1e-9)
@@ -280,9 +280,9 @@ def curvilinear(
         depth: c, from 0, an ellipse, to below 1.
     """
     if not 0 <= depth < 1:
-        raise RefusedError(f"depth of a curvilinear path must be at least 0 and below 1, got {depth!r}")
+        raise InputError(f"depth of a curvilinear path must be at least 0 and below 1, got {depth!r}")
     if lobes % 1:
-        raise RefusedError(f"lobes of a curvilinear path must be a whole number, got {lobes!r}")
+        raise InputError(f"lobes of a curvilinear path must be a whole number, got {lobes!r}")
     u = np.linspace(0.0, 2 * np.pi, 2001)
     r = (1 + depth * np.cos(lobes * u)) / (1 + depth)
     points = np.column_stack([half_length_m * r * np.cos(u), half_width_m * r * np.sin(u)])
@@ -310,7 +310,7 @@ def split_lawnmower(
     """
     near, far = y_split_m - y_first_m, y_last_m - y_split_m
     if not (near * far > 0 and abs(near) > step_m and abs(far) > step_m):
-        raise RefusedError(
+        raise InputError(
             f"y_split_m of a split_lawnmower must lie between y_first_m {y_first_m:g} and y_last_m "
             f"{y_last_m:g}, more than step_m {step_m:g} from both, got {y_split_m:g}"
         )
@@ -357,15 +357,15 @@ def spline(p_xy: ArrayLike, *, closed: bool = False, spacing_m: float = 0.01, na
         name: What it is called.
 
     Raises:
-        RefusedError: There are fewer than three points, or `spacing_m` is not above 0 or makes too many.
+        InputError: There are fewer than three points, or `spacing_m` is not above 0 or makes too many.
     """
     from scipy.interpolate import CubicSpline  # takes half a second
 
     if not (math.isfinite(spacing_m) and spacing_m > 0):
-        raise RefusedError(f"spacing_m of a spline must be above 0 m, got {spacing_m!r}")
+        raise InputError(f"spacing_m of a spline must be above 0 m, got {spacing_m!r}")
     chords = Path(name, np.asarray(p_xy, float), closed)
     if len(chords.p_xy) < 3 + closed:
-        raise RefusedError(f"path {name!r}: a spline needs three points that differ, got {len(chords.p_xy)}")
+        raise InputError(f"path {name!r}: a spline needs three points that differ, got {len(chords.p_xy)}")
     curve = CubicSpline(chords.s, chords.p_xy, bc_type="periodic" if closed else "natural")
     points = chords.length / spacing_m + 1
     _check_points(name, points, f"spacing_m {spacing_m:g} m over {chords.length:g} m")
@@ -431,14 +431,14 @@ def path_of_points(p_xy: ArrayLike, name: str = "points", file: str = "") -> Pat
         file: The file that they were read from.
 
     Raises:
-        RefusedError: They are not finite numbers of that shape, or only one point.
+        InputError: They are not finite numbers of that shape, or only one point.
     """
     try:
         p = np.asarray(p_xy, float)
     except (TypeError, ValueError) as error:
-        raise RefusedError(f"path {name!r}: points must be numbers of shape (N, 2) [m] ({error})") from error
+        raise InputError(f"path {name!r}: points must be numbers of shape (N, 2) [m] ({error})") from error
     if p.ndim != 2 or p.shape[1] != 2 or not len(p):
-        raise RefusedError(f"path {name!r}: points must have shape (N, 2) [m], got {p.shape}")
+        raise InputError(f"path {name!r}: points must have shape (N, 2) [m], got {p.shape}")
     line = _without_repeats(p)
     return Path(name, p, len(line) > 2 and math.dist(line[0], line[-1]) < _SAME_M, file)
 
@@ -447,7 +447,7 @@ def resolve_path(path: "str | os.PathLike[str] | ArrayLike") -> Path:
     """A path from a name of `PATHS`, a case A to E of `CASES`, a CSV file, or points of shape (N, 2) [m].
 
     Raises:
-        RefusedError: It is none of these, or the file is not a path.
+        InputError: It is none of these, or the file is not a path.
     """
     if not isinstance(path, str | os.PathLike):
         return path_of_points(path)
@@ -457,7 +457,7 @@ def resolve_path(path: "str | os.PathLike[str] | ArrayLike") -> Path:
     file = FilePath(text)
     if file.exists() or file.suffix or file.name != text:
         return read_path_csv(file)
-    raise RefusedError(f"no path {text!r}; {hint(text, PATHS)}; or give a CSV file with x,y in metres")
+    raise InputError(f"no path {text!r}; {hint(text, PATHS)}; or give a CSV file with x,y in metres")
 
 
 def read_path_csv(file: str | os.PathLike[str]) -> Path:
@@ -466,13 +466,13 @@ def read_path_csv(file: str | os.PathLike[str]) -> Path:
     Neighbours that coincide are merged. A line that ends where it began is closed.
 
     Raises:
-        RefusedError: The file is missing, empty, or has a line that is not two numbers.
+        InputError: The file is missing, empty, or has a line that is not two numbers.
     """
     file = existing(file, "path file")
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise RefusedError(f"{file}: not a text file of x,y in metres ({error})") from error
+        raise InputError(f"{file}: not a text file of x,y in metres ({error})") from error
     points: list[tuple[float, float]] = []
     header_seen = False
     for number, line in enumerate(lines, 1):
@@ -480,23 +480,23 @@ def read_path_csv(file: str | os.PathLike[str]) -> Path:
         if cells == [""]:
             continue
         if len(cells) != 2:
-            raise RefusedError(f"{file}:{number}: a point is two numbers, x,y in metres; got {line!r}")
+            raise InputError(f"{file}:{number}: a point is two numbers, x,y in metres; got {line!r}")
         try:
             point = float(cells[0]), float(cells[1])
         except ValueError:
             if points or header_seen:
-                raise RefusedError(
+                raise InputError(
                     f"{file}:{number}: not a number in {line!r}; x,y in metres are wanted"
                 ) from None
             header_seen = True
             continue
         if not (math.isfinite(point[0]) and math.isfinite(point[1])):
-            raise RefusedError(f"{file}:{number}: a point must be finite, got {line!r}")
+            raise InputError(f"{file}:{number}: a point must be finite, got {line!r}")
         points.append(point)
     if not points:
-        raise RefusedError(f"{file}: no points in it; one x,y in metres a line is wanted")
+        raise InputError(f"{file}: no points in it; one x,y in metres a line is wanted")
     if len(_without_repeats(np.array(points))) < 2:
-        raise RefusedError(f"{file}: only one point in it; a path needs two that differ")
+        raise InputError(f"{file}: only one point in it; a path needs two that differ")
     return path_of_points(points, file.name, file.as_posix())
 
 
@@ -509,7 +509,7 @@ def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m:
         footprint_radius_m: Radius of the robot [m].
 
     Raises:
-        RefusedError: It does not; the text gives the first such point and how far it is outside.
+        InputError: It does not; the text gives the first such point and how far it is outside.
     """
     beyond = np.max(np.abs(path.p_xy) + footprint_radius_m - np.array(floor_m) / 2, axis=1)
     outside = np.flatnonzero(beyond > 1e-9)
@@ -517,7 +517,7 @@ def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m:
         i = int(outside[0])
         x, y = path.p_xy[i]
         needs = np.ptp(path.p_xy, axis=0) + 2 * footprint_radius_m
-        raise RefusedError(
+        raise InputError(
             f"path {path.name} leaves the floor at point {i + 1} of {len(beyond)}, ({x:.3f}, {y:.3f}) m, by "
             f"{beyond[i]:.3f} m: with a robot of radius {footprint_radius_m:g} m it needs {needs[0]:.2f} x "
             f"{needs[1]:.2f} m, the floor is {floor_m[0]:g} x {floor_m[1]:g} m; "
@@ -548,7 +548,7 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
         footprint_radius_m: Radius of the robot [m].
 
     Raises:
-        RefusedError: It touches one; the text gives the first such point and the obstacle.
+        InputError: It touches one; the text gives the first such point and the obstacle.
     """
     step = max(footprint_radius_m / 4, path.length / 100_000)  # a straight segment may be long
     s = np.union1d(np.linspace(0.0, path.length, math.ceil(path.length / step) + 1), path.s)
@@ -557,7 +557,7 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
     touched = np.flatnonzero(distance < footprint_radius_m - 1e-9)
     if len(touched):
         i = int(touched[0])
-        raise RefusedError(
+        raise InputError(
             f"path {path.name} runs into {obstacles.names[which[i]]}: {s[i]:.3f} m along it, at "
             f"({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, a robot of radius {footprint_radius_m:g} m is "
             f"{footprint_radius_m - distance[i]:.3f} m too near; give --fit, or move the path or the obstacle"
@@ -567,7 +567,7 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
 def _check_points(name: str, points: float, what: str) -> None:
     """Refuse a path of more points than there is room for, or of no number of them."""
     if not points <= MOST_POINTS:
-        raise RefusedError(f"path {name!r}: {what} would make {points:.3g} points, more than {MOST_POINTS:,}")
+        raise InputError(f"path {name!r}: {what} would make {points:.3g} points, more than {MOST_POINTS:,}")
 
 
 def _without_repeats(p: Array) -> Array:

@@ -8,9 +8,9 @@ from pathlib import Path as FilePath
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.names import RefusedError
-from magtwin.obstacles import Obstacles
+from magtwin.errors import InputError
 from magtwin.path import CASES, PATHS, Path, check_clear, check_on_floor, path_named, resolve_path
+from magtwin.spec.obstacles import Obstacles
 
 Array = NDArray[np.float64]
 
@@ -49,12 +49,12 @@ class Room:
     obstacles: Obstacles
     """What stands in the room."""
 
-    def refusal(self, path: Path) -> RefusedError | None:
+    def refusal(self, path: Path) -> InputError | None:
         """Why a robot cannot drive the path here; None if it can."""
         try:
             check_on_floor(path, self.floor_m, self.footprint_radius_m)
             check_clear(path, self.obstacles, self.footprint_radius_m)
-        except RefusedError as error:
+        except InputError as error:
             return error
         return None
 
@@ -76,7 +76,7 @@ def path_in(room: Room, way: str | os.PathLike[str]) -> Path:
         way: A name of `PATHS`, a case A to E, or a CSV file.
 
     Raises:
-        RefusedError: There is no such path, or no room for it.
+        InputError: There is no such path, or no room for it.
     """
     text = os.fspath(way)
     if text not in PATHS and text not in CASES:
@@ -86,7 +86,7 @@ def path_in(room: Room, way: str | os.PathLike[str]) -> Path:
         return path
     made_for = np.asarray(FLOOR_M) / 2 - RADIUS_M
     if min(room.reach_m) <= 0:
-        raise RefusedError(f"path {path.name} does not fit: {_too_small(room)}")
+        raise InputError(f"path {path.name} does not fit: {_too_small(room)}")
     return _placed(path, room, room.reach_m / made_for, each_way=True)
 
 
@@ -98,12 +98,12 @@ def fitted(path: Path, room: Room) -> Path:
         room: Where it is driven.
 
     Raises:
-        RefusedError: It does not fit at a quarter of what the empty floor would take.
+        InputError: It does not fit at a quarter of what the empty floor would take.
     """
     if room.refusal(path) is None:
         return path
     if min(room.reach_m) <= 0:
-        raise RefusedError(f"path {path.name} does not fit: {_too_small(room)}")
+        raise InputError(f"path {path.name} does not fit: {_too_small(room)}")
     half = np.ptp(path.p_xy, axis=0) / 2
     with np.errstate(divide="ignore"):
         whole = min(1.0, float(np.min(room.reach_m / half)))
@@ -136,7 +136,7 @@ def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
                 found = path.placed(numbers)
                 if room.refusal(found) is None:
                     return found
-    raise RefusedError(
+    raise InputError(
         f"path {path.name} does not fit between what stands on the floor of {room.floor_m[0]:g} x "
         f"{room.floor_m[1]:g} m, not even at a quarter of its size; move the furniture, or give points of "
         "your own in a CSV file"

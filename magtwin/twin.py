@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-import magtwin
-from magtwin.field.map import AnomalyMap
+from magtwin.errors import InputError, MismatchWarning, find
+from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import existing, git_revision, sha256
-from magtwin.names import MismatchWarning, RefusedError, find
-from magtwin.obstacles import Obstacles
 from magtwin.path import Path
 from magtwin.placement import Room
-from magtwin.run import Run
-from magtwin.sim.way import way_of, ways_of
-from magtwin.spec import MagnetometerSpec, RobotSpec, Scene, SurveySpec, spelled
+from magtwin.run.run import Run
+from magtwin.sim.motion.way import way_of, ways_of
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.scene import MagnetometerSpec, RobotSpec, Scene, SurveySpec, spelled
 from magtwin.summary import Summarized, Summary
+from magtwin.version import __version__
 
 Kind = Literal["physical", "neural", "map-only"]
 Session = int | Literal["survey"]
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
 
     from magtwin.learn.magnetometer import NeuralMagnetometer, Read
     from magtwin.placement import Room
-    from magtwin.sim.commands import Commands
-    from magtwin.sim.controllers import Controller
-    from magtwin.sim.engine import Engine
-    from magtwin.sim.lidar import Scans
-    from magtwin.sim.many import Runs
-    from magtwin.sim.model_error import ModelError
-    from magtwin.sim.simulate import Predict, Sensed
+    from magtwin.sim.motion.commands import Commands
+    from magtwin.sim.motion.controllers import Controller
+    from magtwin.sim.motion.engine import Engine
+    from magtwin.sim.runs.many import Runs
+    from magtwin.sim.runs.simulate import Predict, Sensed
+    from magtwin.sim.sensors.lidar import Scans
+    from magtwin.sim.sensors.model_error import ModelError
 
 
 @dataclass(frozen=True, repr=False)
@@ -112,7 +112,7 @@ def _twin_of_scene(
     scene: Scene, net: str | FilePath | None, magnetometer: Kind | None, model_error: bool
 ) -> Twin:
     """The twin of a scene that no file holds: authored as `author_scene` does, for as long as it is used."""
-    from magtwin.usd.scene import author_scene
+    from magtwin.author.scene import author_scene
 
     stage = _Stage()
     twin = open_twin(
@@ -144,18 +144,18 @@ def open_twin(
             neural magnetometer; or "none" for a physical one.
         magnetometer: Kind of magnetometer to use in place of the scene's: "physical", "neural" or "map-only".
         model_error: Whether the readings of a neural magnetometer are off what the network predicts, as they
-            were on recordings that it never saw; see `magtwin.sim.model_error`.
+            were on recordings that it never saw; see `magtwin.sim.sensors.model_error`.
 
     Raises:
-        RefusedError: The stage, its map or its weights are missing, broken, or not what the stage's
+        InputError: The stage, its map or its weights are missing, broken, or not what the stage's
             checksums say.
     """
     if isinstance(scene_file, Scene):
         return _twin_of_scene(scene_file, net, magnetometer, model_error)
+    from magtwin.author.scene import read_scene
     from magtwin.usd.layers import stage_sha256
     from magtwin.usd.maps import load_map
     from magtwin.usd.obstacles import read_obstacles
-    from magtwin.usd.scene import read_scene
 
     scene_file = FilePath(scene_file)
     scene = read_scene(scene_file, check_network=net is None and magnetometer in (None, "neural"))
@@ -200,7 +200,7 @@ def _with_network(twin: Twin) -> Twin:
     network, robot = twin.magnetometer, twin.scene.robot
     if network is None:
         return twin
-    from magtwin.learn.origin import mismatches
+    from magtwin.learn.data.origin import mismatches
 
     found = mismatches(
         network.net.facts,
@@ -232,12 +232,12 @@ def _with_magnetometer(robot: RobotSpec, net: str | FilePath | None, kind: Kind 
     spec = robot.magnetometer
     if net is not None:
         if FilePath(net).is_dir():
-            raise RefusedError(f"{net}: a folder; name the weights file in it")
+            raise InputError(f"{net}: a folder; name the weights file in it")
         of, weights = ("physical", None) if str(net) == "none" else ("neural", FilePath(net).resolve())
         spec = dataclasses.replace(spec, kind=of, network=weights, network_sha256="", inputs=())  # type: ignore[arg-type]
     if kind is not None:
         if kind != "neural" and net is not None and str(net) != "none":
-            raise RefusedError(f"net is for a neural magnetometer, not for {kind!r}; give one of the two")
+            raise InputError(f"net is for a neural magnetometer, not for {kind!r}; give one of the two")
         spec = dataclasses.replace(spec, kind=kind)
     return dataclasses.replace(robot, magnetometer=spec)
 
@@ -254,7 +254,7 @@ def twin_of(
         check: Whether what is found must be what the run came from, by the checksums of its facts.
 
     Raises:
-        RefusedError: The facts name no scene, or it or its network is not there, or is not what it was.
+        InputError: The facts name no scene, or it or its network is not there, or is not what it was.
     """
     facts, scene = run.facts, scene_of(run, scene, near=near)
     kind: Any = facts.get("magnetometer")
@@ -267,7 +267,7 @@ def twin_of(
     )
     for name, what in _CHECKSUMS.items() if check else ():
         if facts.get(name, "") != twin.facts.get(name, ""):
-            raise RefusedError(
+            raise InputError(
                 f"{scene}: {what} is not what the run came from: {name} is "
                 f"{twin.facts.get(name, 'none')}, the run says {facts.get(name, 'none')}"
             )
@@ -292,19 +292,19 @@ def in_session(twin: Twin, session: Session | None = None, *, seed: int = 0) -> 
         A twin whose `session` says which session it is. Several robots are drawn independently.
 
     Raises:
-        RefusedError: `session` is neither, or the twin is in a session already.
+        InputError: `session` is neither, or the twin is in a session already.
     """
     from magtwin.sim.session import session_of
 
     if twin.session:
         if session is None:
             return twin
-        raise RefusedError(f"the twin is in session {twin.session['session']!r} already; open another")
+        raise InputError(f"the twin is in session {twin.session['session']!r} already; open another")
     if session == "survey":
         return dataclasses.replace(twin, session={"session": "survey"})
     number = 0 if session is None else session
     if not isinstance(number, int | np.integer) or isinstance(number, bool) or number < 0:
-        raise RefusedError(f'session must be a whole number from 0 up, or "survey", got {session!r}')
+        raise InputError(f'session must be a whole number from 0 up, or "survey", got {session!r}')
     number, seed = int(number), _seed(seed)
     scene = dataclasses.replace(
         twin.scene,
@@ -325,14 +325,14 @@ def in_session_of(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> 
         facts: Those of the run. Without `session_seed`, the run is of the robot as it was surveyed.
 
     Raises:
-        RefusedError: The facts do not say which session it was.
+        InputError: The facts do not say which session it was.
     """
     if "session_seed" not in facts:
         return in_session(twin, "survey")
     try:
         seed, session = int(facts["session_seed"]), int(facts["session"])
     except (KeyError, ValueError) as error:
-        raise RefusedError(f"the facts of the run do not say which session it was of: {error}") from error
+        raise InputError(f"the facts of the run do not say which session it was of: {error}") from error
     return in_session(twin, session, seed=seed)
 
 
@@ -345,11 +345,11 @@ def check_figures(scene: Scene, facts: Mapping[str, str | int | float | bool], n
         name: What to call the run.
 
     Raises:
-        RefusedError: Its figures have another checksum, or the run tells none.
+        InputError: Its figures have another checksum, or the run tells none.
     """
     found, said = _config_sha256(scene), facts.get("config_sha256", "none")
     if found != said:
-        raise RefusedError(
+        raise InputError(
             f"{name}: came from a scene whose figures have the sha256 {said}, those of {scene.name!r} in its "
             f"session have {found}; name the scene that it was made in"
         )
@@ -361,15 +361,15 @@ def scene_of(
     """The file of the scene that a run came from; arguments as for `twin_of`.
 
     Raises:
-        RefusedError: The facts name none, or it is not there.
+        InputError: The facts name none, or it is not there.
     """
     if scene is not None:
         return existing(scene, "scene")
     if "scene_file" not in run.facts:
-        raise RefusedError("the run does not say which scene it came from; name it (--scene)")
+        raise InputError("the run does not say which scene it came from; name it (--scene)")
     found = locate(str(run.facts["scene_file"]), near)
     if found is None:
-        raise RefusedError(f"{run.facts['scene_file']}: the scene of the run is not there; name it (--scene)")
+        raise InputError(f"{run.facts['scene_file']}: the scene of the run is not there; name it (--scene)")
     return found
 
 
@@ -409,13 +409,13 @@ def scene_from_toml(
         progress: Called in a survey with headings done, headings in all, and what is being done.
 
     Raises:
-        RefusedError: A key is misspelt or missing, a file is not there or not what it should be, there is
+        InputError: A key is misspelt or missing, a file is not there or not what it should be, there is
             neither a map nor a field to survey, or the map contradicts the Earth's field, sources and
             furniture; the text says by how much.
     """
+    from magtwin.author.scene import scene_from_toml as scene_of
     from magtwin.sim.contradiction import check_agrees
     from magtwin.usd.maps import load_map
-    from magtwin.usd.scene import scene_from_toml as scene_of
 
     if workshop is None:
         import tempfile
@@ -424,7 +424,7 @@ def scene_from_toml(
         workshop = _WORKSHOPS[-1].name
 
     def inputs_of(weights: FilePath) -> tuple[str, ...]:
-        from magtwin.learn.predictor import load_predictor
+        from magtwin.learn.models.predictor import load_predictor
 
         return load_predictor(weights).features
 
@@ -468,10 +468,10 @@ def new_scene(file: str | FilePath, *, force: bool = False) -> FilePath:
         The file.
 
     Raises:
-        RefusedError: The file exists and `force` was not given, or its name cannot name a scene.
+        InputError: The file exists and `force` was not given, or its name cannot name a scene.
     """
+    from magtwin.author.room import check_name
     from magtwin.files import output, shipped
-    from magtwin.usd.room import check_name
 
     name = FilePath(file).stem
     check_name(name)
@@ -510,12 +510,12 @@ def author_scene(
         The root layer, `folder/<name>.usda`.
 
     Raises:
-        RefusedError: The folder exists, or as for `scene_from_toml`.
+        InputError: The folder exists, or as for `scene_from_toml`.
     """
     import tempfile
 
+    from magtwin.author.scene import author_scene as author
     from magtwin.files import check_free
-    from magtwin.usd.scene import author_scene as author
 
     check_free(folder, force=force)
     if isinstance(scene, Scene):
@@ -531,7 +531,7 @@ def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
     if spec.kind != "neural":
         return None
     if spec.network is None:
-        raise RefusedError(
+        raise InputError(
             f"scene {scene.name!r} has a neural magnetometer that names no network; name one "
             'with net, or take the kind "physical" or "map-only"'
         )
@@ -539,7 +539,7 @@ def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
 
     magnetometer = NeuralMagnetometer.load(spec.network, sha256=spec.network_sha256)
     if spec.inputs and spec.inputs != magnetometer.features:
-        raise RefusedError(
+        raise InputError(
             f"{spec.network}: takes {', '.join(magnetometer.features)}, but the scene's magnetometer names "
             f"{', '.join(spec.inputs)}; author the scene anew with this network"
         )
@@ -558,10 +558,10 @@ def engine_named(
             time on the robot's clock in words.
 
     Raises:
-        RefusedError: No such engine, or it is not installed; the text says how to get it.
+        InputError: No such engine, or it is not installed; the text says how to get it.
     """
-    from magtwin.sim.engine import Kinematic
-    from magtwin.sim.newton import Newton, check_installed
+    from magtwin.sim.engines.newton import Newton, check_installed
+    from magtwin.sim.motion.engine import Kinematic
 
     find("engine", name, {"kinematic": None, "newton": None})
     if name == "kinematic":
@@ -615,20 +615,20 @@ def simulate(
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
         outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
         controller: What drives: "follower", "release", "stanley" or "pure_pursuit", or a
-            `magtwin.sim.controllers.Controller` of one's own.
+            `magtwin.sim.motion.controllers.Controller` of one's own.
         engine: What moves the robot: "kinematic"; "newton", physics in the stage itself (extra `physics`); or
-            a `magtwin.sim.engine.Engine` of one's own.
+            a `magtwin.sim.motion.engine.Engine` of one's own.
         progress: As for `engine_named`.
 
     Returns:
         A Run with every column of `magtwin.COLUMNS`; its facts tell how it came about.
 
     Raises:
-        RefusedError: The path leaves the floor or touches an obstacle, an option is out of range, the scene's
+        InputError: The path leaves the floor or touches an obstacle, an option is out of range, the scene's
             field is constant, or the path leaves the map so that there is nothing to read.
     """
     from magtwin.sim.exact import check_field, check_read
-    from magtwin.sim.simulate import simulate as run_scene
+    from magtwin.sim.runs.simulate import simulate as run_scene
 
     seed = _seed(seed)
     twin = in_session(_opened(twin, net, magnetometer, model_error, "simulate"), session, seed=seed)
@@ -701,7 +701,7 @@ def simulate_robots(
 ) -> dict[str, Run]:
     """Drive every robot of a scene at one time, a Run each.
 
-    They feel each other's iron, and must not run into each other; see `magtwin.sim.together`. The first
+    They feel each other's iron, and must not run into each other; see `magtwin.sim.runs.together`. The first
     robot draws what `simulate` draws with the seed, each other one from a generator of its own, by its place
     in the scene.
 
@@ -722,17 +722,17 @@ def simulate_robots(
         model_error: As for `simulate`.
         lidar: As for `simulate`.
         outside: As for `simulate`.
-        controller: A name of `magtwin.sim.controllers.CONTROLLERS`.
+        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`.
 
     Returns:
         Runs by the robots' names, in the scene's order. Beside what `simulate` says, facts name the robot,
         and the one that came nearest with time and clearance.
 
     Raises:
-        RefusedError: A name is none of a robot's, robots would meet, or `simulate` would refuse one.
+        InputError: A name is none of a robot's, robots would meet, or `simulate` would refuse one.
     """
     from magtwin.sim.exact import check_field, check_read
-    from magtwin.sim.together import simulate_together
+    from magtwin.sim.runs.together import simulate_together
 
     seed = _seed(seed)
     twin = in_session(_opened(twin, net, magnetometer, model_error, "simulate_robots"), session, seed=seed)
@@ -790,7 +790,7 @@ def led_by(twin: Twin, name: str) -> Twin:
     """A twin with the robot of that name as the first of its scene, and what runs its magnetometer.
 
     Raises:
-        RefusedError: No robot is called so, or its weights cannot be used.
+        InputError: No robot is called so, or its weights cannot be used.
     """
     scene = twin.scene.led_by(name)
     ours, its = twin.scene.robot.magnetometer, scene.robot.magnetometer
@@ -851,30 +851,30 @@ def simulate_many(
         model_error: As for `simulate`.
         lidar: As for `simulate`.
         outside: As for `simulate`.
-        controller: A name of `magtwin.sim.controllers.CONTROLLERS`.
+        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`.
 
     Returns:
         A sequence of runs, made when they are asked for.
 
     Raises:
-        RefusedError: There is no seed, numbers of paths, speeds, robots and seeds differ, a seed is no whole
+        InputError: There is no seed, numbers of paths, speeds, robots and seeds differ, a seed is no whole
             number from 0 up, a robot's magnetometer is not the twin's, or `simulate` would refuse a run.
     """
     from magtwin.sim.exact import check_field, check_read
-    from magtwin.sim.many import BLOCK, Conditions, Job, Runs
+    from magtwin.sim.runs.many import BLOCK, Conditions, Job, Runs
 
     twin = _opened(twin, net, magnetometer, model_error, "simulate_many")
     check_field(twin.scene, twin.field)
     numbers = [_seed(seed) for seed in seeds]
     if not isinstance(controller, str):
-        raise RefusedError(
+        raise InputError(
             f"controller of many runs must be a name, got {type(controller).__name__}; one of your own "
             "remembers a single run: give it to simulate"
         )
     count = len(numbers)
     given = _each("paths", ways_of(paths, room_of(twin)), count)
     if robots is not None and session is not None:
-        raise RefusedError("robots are taken as they are; give robots or session, not both")
+        raise InputError("robots are taken as they are; give robots or session, not both")
     jobs, of = [], {}
     drawn: dict[object, Scene] = {}
     for seed, path, speed, robot in zip(
@@ -940,7 +940,7 @@ def _opened(
     if not isinstance(twin, Twin):
         return open_twin(twin, net=net, magnetometer=magnetometer, model_error=model_error)
     if net is not None or magnetometer is not None:
-        raise RefusedError(f"net and magnetometer go to open_twin where a Twin is given to {what}")
+        raise InputError(f"net and magnetometer go to open_twin where a Twin is given to {what}")
     return twin if model_error else without_model_error(twin)
 
 
@@ -954,7 +954,7 @@ def _seed(seed: object) -> int:
     """A seed, if it is one; NumPy's whole numbers are."""
     if isinstance(seed, int | np.integer) and not isinstance(seed, bool) and seed >= 0:
         return int(seed)
-    raise RefusedError(f"seed must be a whole number from 0 up, got {seed!r}")
+    raise InputError(f"seed must be a whole number from 0 up, got {seed!r}")
 
 
 def _each(name: str, values: Any, count: int) -> Sequence[Any]:
@@ -963,7 +963,7 @@ def _each(name: str, values: Any, count: int) -> Sequence[Any]:
         return [values] * count
     values = list(values)
     if len(values) != count:
-        raise RefusedError(f"{name} and seeds must be equally many, got {len(values)} and {count}")
+        raise InputError(f"{name} and seeds must be equally many, got {len(values)} and {count}")
     return values
 
 
@@ -973,7 +973,7 @@ def _check_commands(way: "Path | Commands | Run | str", network: "NeuralMagnetom
         return
     for column in ("v_cmd", "w_cmd"):
         if column in network.columns and column not in way:
-            raise RefusedError(
+            raise InputError(
                 f"the run to drive once more has no {column!r}, and the network {network.name} reads what is "
                 "commanded beyond what is driven; take one that does not, such as the paper's, or none"
             )
@@ -983,7 +983,7 @@ def _check_magnetometer(twin: Twin, robot: RobotSpec) -> None:
     """Refuse a robot whose magnetometer the twin's network does not run."""
     ours, its = twin.scene.robot.magnetometer, robot.magnetometer
     if (its.kind, its.network) != (ours.kind, ours.network):
-        raise RefusedError(
+        raise InputError(
             f"robot {robot.name!r} has a magnetometer of the kind {its.kind!r} with the network "
             f"{its.network}, the twin's is {ours.kind!r} with {ours.network}; open a twin for each"
         )
@@ -1003,7 +1003,7 @@ def _facts(
     twin: Twin, seed: int, path: "Path | Commands | Run | str", duration_s: float | None, config_sha256: str
 ) -> Facts:
     """What a twin adds to the facts of a run, beside what its motion and sensors say of themselves."""
-    facts: Facts = {"magtwin": magtwin.__version__, "numpy": np.__version__, "seed": seed}
+    facts: Facts = {"magtwin": __version__, "numpy": np.__version__, "seed": seed}
     if duration_s is not None:
         facts["asked_duration_s"] = float(duration_s)
     return facts | dict(twin.session) | path_facts(path) | dict(twin.facts) | {"config_sha256": config_sha256}
@@ -1056,8 +1056,8 @@ def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Sc
         run: What `simulate` gave, or any run with t, p_world_base, yaw and lidar_on.
         seed: Seed of its noise; that of the run, unless another draw is wanted.
     """
-    from magtwin.sim.lidar import scans_of
-    from magtwin.sim.simulate import streams
+    from magtwin.sim.runs.simulate import streams
+    from magtwin.sim.sensors.lidar import scans_of
 
     if not isinstance(twin, Twin):
         twin = in_session_of(open_twin(twin, magnetometer="map-only"), run.facts)

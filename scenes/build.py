@@ -6,8 +6,8 @@ makes one that stands alone.
 
 from pathlib import Path
 
+from magtwin.author.scene import author_scene
 from magtwin.twin import scene_from_toml
-from magtwin.usd.scene import author_scene
 
 HERE = Path(__file__).resolve().parent
 

@@ -18,9 +18,9 @@ def real_data() -> Path:
 @pytest.fixture(scope="session")
 def lab_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Root layer of the default lab, authored once into a folder of its own; not to be changed."""
+    from magtwin.author.scene import author_scene
     from magtwin.files import shipped
     from magtwin.twin import scene_from_toml
-    from magtwin.usd.scene import author_scene
 
     return author_scene(
         scene_from_toml(shipped("scenes", "lab.toml")), tmp_path_factory.mktemp("lab") / "lab"

@@ -7,8 +7,8 @@ from typing import Literal
 
 import pytest
 
+from magtwin.errors import InputError
 from magtwin.files import check_free, existing, from_table, output, read_toml, sha256, shipped
-from magtwin.names import RefusedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +18,7 @@ class Wheel:
 
     def __post_init__(self):
         if self.radius_m <= 0:
-            raise RefusedError(f"radius_m must be above 0, got {self.radius_m}")
+            raise InputError(f"radius_m must be above 0, got {self.radius_m}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,13 +75,13 @@ def test_a_table_becomes_the_dataclass_with_nested_tables_and_paths_from_its_fol
     ],
 )
 def test_a_wrong_table_is_refused_with_file_line_and_what_was_seen(tmp_path, text, message):
-    with pytest.raises(RefusedError, match=message):
+    with pytest.raises(InputError, match=message):
         read_cart(tmp_path, text)
 
 
 def test_a_missing_file_is_refused_by_the_near_name(tmp_path):
     (tmp_path / "lab.toml").touch()
-    with pytest.raises(RefusedError, match=r"lav.toml: no such TOML file; did you mean 'lab.toml'"):
+    with pytest.raises(InputError, match=r"lav.toml: no such TOML file; did you mean 'lab.toml'"):
         read_toml(tmp_path / "lav.toml")
 
 
@@ -118,14 +118,14 @@ def test_a_folder_is_replaced_whole(tmp_path):
 
 def test_nothing_is_overwritten_unasked(tmp_path):
     (tmp_path / "a.txt").touch()
-    with pytest.raises(RefusedError, match=r"a.txt: exists already; give --force"):
+    with pytest.raises(InputError, match=r"a.txt: exists already; give --force"):
         check_free(tmp_path / "a.txt")
     assert check_free(tmp_path / "a.txt", force=True) == tmp_path / "a.txt"
 
 
 def test_an_output_below_a_file_is_refused(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(RefusedError, match="cannot be written"):
+    with pytest.raises(InputError, match="cannot be written"):
         write_and_fail(tmp_path / "file" / "a.txt")
 
 
@@ -136,7 +136,7 @@ def test_sha256_is_that_of_fips_180_abc(tmp_path):
 
 def test_shipped_files_are_found_and_missing_ones_refused():
     assert shipped("robots", "turtlebot4", "robot.toml").is_file()
-    with pytest.raises(RefusedError, match="install it again"):
+    with pytest.raises(InputError, match="install it again"):
         shipped("robots", "nobody")
 
 

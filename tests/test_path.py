@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from magtwin.names import RefusedError, UnknownNameError
-from magtwin.obstacles import Obstacles
+from magtwin.errors import InputError, UnknownNameError
 from magtwin.path import (
     CASES,
     PATHS,
@@ -26,6 +25,7 @@ from magtwin.path import (
     spline,
     split_lawnmower,
 )
+from magtwin.spec.obstacles import Obstacles
 
 FLOOR, FOOTPRINT = (6.0, 3.5), 0.171
 
@@ -163,13 +163,13 @@ def test_released_paths_are_read_and_lie_on_the_floor(real_data, file, closed):
 
 def test_a_released_path_that_leaves_the_floor_is_refused_with_the_point_and_how_far(real_data):
     path = read_path_csv(real_data / "aprilab/paths/lawnmower_path25.csv")
-    with pytest.raises(RefusedError, match=r"lawnmower_path25\.csv leaves the floor at point 8 of 240"):
+    with pytest.raises(InputError, match=r"lawnmower_path25\.csv leaves the floor at point 8 of 240"):
         check_on_floor(path, FLOOR, FOOTPRINT)
 
 
 def test_a_path_that_leaves_the_floor_says_by_how_much():
     path = Path("far", np.array([[0.0, 0.0], [2.0, 0.0], [3.0, 0.0]]))
-    with pytest.raises(RefusedError, match=r"at point 3 of 3, \(3\.000, 0\.000\) m, by 0\.171 m"):
+    with pytest.raises(InputError, match=r"at point 3 of 3, \(3\.000, 0\.000\) m, by 0\.171 m"):
         check_on_floor(path, FLOOR, FOOTPRINT)
 
 
@@ -204,17 +204,17 @@ def test_a_csv_is_read_with_or_without_a_header(tmp_path, text):
 def test_a_csv_that_is_no_path_is_refused_with_file_and_line(tmp_path, text, says):
     file = tmp_path / "p.csv"
     file.write_text(text)
-    with pytest.raises(RefusedError, match=says):
+    with pytest.raises(InputError, match=says):
         read_path_csv(file)
 
 
 def test_a_csv_that_is_not_text_or_not_there_is_refused(tmp_path):
     (tmp_path / "p.csv").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(RefusedError, match=r"p\.csv: not a text file"):
+    with pytest.raises(InputError, match=r"p\.csv: not a text file"):
         read_path_csv(tmp_path / "p.csv")
-    with pytest.raises(RefusedError, match=r"q\.csv: no such path file; did you mean 'p\.csv'"):
+    with pytest.raises(InputError, match=r"q\.csv: no such path file; did you mean 'p\.csv'"):
         read_path_csv(tmp_path / "q.csv")
-    with pytest.raises(RefusedError, match="not a text file"):
+    with pytest.raises(InputError, match="not a text file"):
         read_path_csv(tmp_path)
 
 
@@ -223,9 +223,9 @@ def test_resolve_takes_a_name_or_a_file_and_names_the_near_one(tmp_path):
     file.write_text("0,0\n1,2\n")
     assert resolve_path("figure8").name == "figure8"
     assert resolve_path(file).name == "p.csv"
-    with pytest.raises(RefusedError, match="did you mean 'figure8'"):
+    with pytest.raises(InputError, match="did you mean 'figure8'"):
         resolve_path("figure9")
-    with pytest.raises(RefusedError, match="no such path file"):
+    with pytest.raises(InputError, match="no such path file"):
         resolve_path(str(tmp_path / "absent.csv"))
     with pytest.raises(UnknownNameError, match="no path 'figure9'"):
         path_named("figure9")
@@ -241,12 +241,12 @@ def test_resolve_takes_a_name_or_a_file_and_names_the_near_one(tmp_path):
     ],
 )
 def test_points_that_are_no_path_are_refused(points, says):
-    with pytest.raises(RefusedError, match=says):
+    with pytest.raises(InputError, match=says):
         Path("bad", points)
 
 
 def test_a_lawnmower_without_a_step_is_refused():
-    with pytest.raises(RefusedError, match="step_m of a lawnmower must be above 0"):
+    with pytest.raises(InputError, match="step_m of a lawnmower must be above 0"):
         lawnmower(step_m=0.0)
 
 
@@ -265,7 +265,7 @@ def test_a_lawnmower_without_a_step_is_refused():
     ],
 )
 def test_a_path_of_no_size_that_could_be_driven_is_refused(make, says):
-    with pytest.raises(RefusedError, match=says):
+    with pytest.raises(InputError, match=says):
         make()
 
 
@@ -326,7 +326,7 @@ def test_a_split_lawnmower_mows_one_half_and_then_the_other_back():
 
 
 def test_a_split_line_outside_the_floor_is_refused():
-    with pytest.raises(RefusedError, match="y_split_m of a split_lawnmower must lie between"):
+    with pytest.raises(InputError, match="y_split_m of a split_lawnmower must lie between"):
         split_lawnmower(y_split_m=1.4)
 
 
@@ -361,7 +361,7 @@ def test_a_closed_spline_through_four_points_of_a_circle_is_nearly_round():
     ],
 )
 def test_a_spline_through_too_little_is_refused(points, options, says):
-    with pytest.raises(RefusedError, match=says):
+    with pytest.raises(InputError, match=says):
         spline(points, **options)
 
 
@@ -370,11 +370,11 @@ DESK = Obstacles(("/World/Desk",), (np.array([[0.5, -0.2], [1.0, -0.2], [1.0, 0.
 
 def test_a_path_through_a_desk_is_refused_with_the_place_and_the_prim():
     line = Path("line", np.array([[-2.0, 0.0], [2.0, 0.0]]))
-    with pytest.raises(RefusedError, match=r"path line runs into /World/Desk: 2\.3\d\d m along it"):
+    with pytest.raises(InputError, match=r"path line runs into /World/Desk: 2\.3\d\d m along it"):
         check_clear(line, DESK, 0.171)
 
 
 def test_a_path_that_passes_at_just_the_robot_s_radius_is_clear():
     check_clear(Path("line", np.array([[-2.0, 0.371], [2.0, 0.371]])), DESK, 0.171)
-    with pytest.raises(RefusedError, match=r"0\.001 m too near"):
+    with pytest.raises(InputError, match=r"0\.001 m too near"):
         check_clear(Path("line", np.array([[-2.0, 0.37], [2.0, 0.37]])), DESK, 0.171)

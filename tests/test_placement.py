@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magtwin.cli import main
-from magtwin.names import RefusedError
-from magtwin.obstacles import Obstacles
+from magtwin.errors import InputError
 from magtwin.path import CASES, PATHS, Path, check_clear, check_on_floor, path_named
 from magtwin.placement import FLOOR_M, RADIUS_M, Room, fitted, path_in
+from magtwin.spec.obstacles import Obstacles
 from magtwin.twin import open_twin, simulate
 
 
@@ -95,7 +95,7 @@ def test_a_fit_keeps_the_shape_and_only_moves_what_is_small_enough():
 )
 def test_a_path_that_does_not_fit_is_told_what_would(points, said):
     path = Path("own", np.array(points, float))
-    with pytest.raises(RefusedError, match=said):
+    with pytest.raises(InputError, match=said):
         check_on_floor(path, (4.0, 3.0), RADIUS_M)
     check_on_floor(fitted(path, room(4.0, 3.0)), (4.0, 3.0), RADIUS_M)
 
@@ -108,28 +108,28 @@ def test_what_the_refusal_says_is_true():
 
 
 def test_no_room_is_refused():
-    with pytest.raises(RefusedError, match=r"the floor of 0\.3 x 3 m is no wider than a robot"):
+    with pytest.raises(InputError, match=r"the floor of 0\.3 x 3 m is no wider than a robot"):
         path_in(room(0.3, 3.0), "sine")
-    with pytest.raises(RefusedError, match="does not fit between what stands on the floor of 2 x 2 m"):
+    with pytest.raises(InputError, match="does not fit between what stands on the floor of 2 x 2 m"):
         path_in(room(2.0, 2.0, box(0, 0, 1.6, 1.6)), "sine")
 
 
 @pytest.mark.parametrize("placing", [(0.0, 1.0, 0.0, 0.0), (1.0, 1.0), (1.0, 1.0, np.inf, 0.0)])
 def test_a_placing_that_is_none_is_refused(placing):
-    with pytest.raises(RefusedError, match="two scales above 0 and two shifts"):
+    with pytest.raises(InputError, match="two scales above 0 and two shifts"):
         path_named("sine").placed(placing)
 
 
 def test_a_fitted_run_is_repeated_to_the_bit(lab_scene, tmp_path, capsys):
     (tmp_path / "far.csv").write_text("0,0\n4,0\n4,1\n")
     run = ["run", str(lab_scene), "--path", str(tmp_path / "far.csv"), "--rate-hz", "5", "--net", "none"]
-    with pytest.raises(RefusedError, match=r"far\.csv leaves the floor .*give --fit"):
+    with pytest.raises(InputError, match=r"far\.csv leaves the floor .*give --fit"):
         main([*run, "--parquet", str(tmp_path / "run.parquet"), "--debug"])
     main([*run, "--parquet", str(tmp_path / "run.parquet"), "--fit"])
     assert "Path far.csv is moved by (" in capsys.readouterr().err
     main(["rerun-of", str(tmp_path / "run.parquet")])
     assert "yes, to the bit" in capsys.readouterr().out
-    with pytest.raises(RefusedError, match="--fit is for a path"):
+    with pytest.raises(InputError, match="--fit is for a path"):
         main([*run[:2], "--path", "random", "--fit", "--debug"])
 
 

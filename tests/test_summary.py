@@ -10,25 +10,25 @@ import numpy as np
 import pytest
 
 import magtwin
-from magtwin.compare import compare
-from magtwin.field.difference import difference
-from magtwin.field.fit import fit
-from magtwin.field.readings import Readings
+from magtwin.errors import InputError
+from magtwin.field.fit.fit import fit
+from magtwin.field.maps.difference import difference
+from magtwin.field.survey.readings import Readings
 from magtwin.files import shipped
-from magtwin.learn.config import TrainConfig
-from magtwin.learn.dataset import build_dataset
-from magtwin.learn.evaluate import Contender, Mean, Trial, chart_of, evaluate
-from magtwin.learn.labels import Alignment
+from magtwin.learn.data.dataset import build_dataset
+from magtwin.learn.data.labels import Alignment
+from magtwin.learn.data.split import split
+from magtwin.learn.evaluation.evaluate import Contender, Mean, Trial, chart_of, evaluate
 from magtwin.learn.magnetometer import NeuralMagnetometer
-from magtwin.learn.predictor import load_predictor
-from magtwin.learn.split import split
-from magtwin.learn.trained import fit as train
-from magtwin.names import RefusedError
+from magtwin.learn.models.predictor import load_predictor
+from magtwin.learn.training.config import TrainConfig
+from magtwin.learn.training.result import fit as train
 from magtwin.path import path_named
 from magtwin.report import Figure, Report
-from magtwin.run import Column, Run
-from magtwin.sim.commands import Commands
-from magtwin.spec import PlacedRobot, Scene, SourceSpec, spelled
+from magtwin.run.compare import compare
+from magtwin.run.run import Column, Run
+from magtwin.sim.motion.commands import Commands
+from magtwin.spec.scene import PlacedRobot, Scene, SourceSpec, spelled
 from magtwin.summary import LINES, WIDTH, Summarized
 from magtwin.twin import open_twin, scan, simulate, simulate_many
 
@@ -238,9 +238,9 @@ def test_a_run_is_drawn_by_the_columns_that_it_has(run):
     assert ("x [m]" in x, "measured field\n[µT]" in y, len(y)) == (True, True, 3)
     own = Run({"t": np.arange(9.0), "mine": np.arange(9)}, {}, {"mine": Column("K", "", "warmth")}).plot()
     assert labels_of(own) == (["time [s]"], ["mine\n[K]"])
-    with pytest.raises(RefusedError, match="the run has no rows"):
+    with pytest.raises(InputError, match="the run has no rows"):
         run.take(slice(0)).plot()
-    with pytest.raises(RefusedError, match="neither positions nor columns of numbers"):
+    with pytest.raises(InputError, match="neither positions nor columns of numbers"):
         Run({"t": np.arange(3.0)}).plot()
 
 
@@ -256,7 +256,7 @@ def test_a_map_is_drawn_a_panel_a_heading(twin, quantity, label):
 
 
 def test_plot_refuses_what_it_cannot_draw():
-    with pytest.raises(RefusedError, match="plot draws a Run or an AnomalyMap, got int"):
+    with pytest.raises(InputError, match="plot draws a Run or an AnomalyMap, got int"):
         magtwin.plot(3)
 
 

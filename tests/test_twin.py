@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from magtwin.cli import main
+from magtwin.errors import InputError
 from magtwin.files import shipped
-from magtwin.names import RefusedError
 from magtwin.twin import in_session, open_twin, simulate, simulate_many
 
 
@@ -28,16 +28,16 @@ def test_a_run_is_in_a_session_of_its_seed_unless_another_is_chosen(lab_scene):
 def test_a_session_that_is_none_is_refused(lab_scene):
     twin = open_twin(lab_scene, magnetometer="physical")
     for session in (-1, 0.5, "monday", True):
-        with pytest.raises(RefusedError, match='session must be a whole number from 0 up, or "survey"'):
+        with pytest.raises(InputError, match='session must be a whole number from 0 up, or "survey"'):
             in_session(twin, session)
-    with pytest.raises(RefusedError, match="in session 2 already"):
+    with pytest.raises(InputError, match="in session 2 already"):
         simulate(in_session(twin, 2), session="survey")
-    with pytest.raises(RefusedError, match="give robots or session, not both"):
+    with pytest.raises(InputError, match="give robots or session, not both"):
         simulate_many(twin, "figure8", [1], session=1, robots=twin.scene.robot)
 
 
 def test_a_network_for_a_magnetometer_that_reads_none_is_refused(lab_scene):
-    with pytest.raises(RefusedError, match="net is for a neural magnetometer, not for 'physical'"):
+    with pytest.raises(InputError, match="net is for a neural magnetometer, not for 'physical'"):
         open_twin(lab_scene, net=shipped("weights", "turtlebot4_paper.safetensors"), magnetometer="physical")
 
 

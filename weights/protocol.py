@@ -23,15 +23,15 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from magtwin.author.robot import read_robot
+from magtwin.author.scene import author_scene
 from magtwin.cli import main as magtwin
-from magtwin.field.fit import fit, raster
-from magtwin.field.survey import read_survey
+from magtwin.field.fit.fit import fit, raster
+from magtwin.field.survey.gridded import read_survey
 from magtwin.files import from_table, read_toml, shipped
-from magtwin.io.readings import read_readings
-from magtwin.spec import EarthFieldSpec, LabSpec, Scene, SourceSpec
+from magtwin.io.surveys.readings import read_readings
+from magtwin.spec.scene import EarthFieldSpec, LabSpec, Scene, SourceSpec
 from magtwin.usd.maps import save_map
-from magtwin.usd.robot import read_robot
-from magtwin.usd.scene import author_scene
 
 CONSOLE = Console()
 

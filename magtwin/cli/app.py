@@ -11,15 +11,15 @@ from cyclopts import App
 from cyclopts.config import Env, Toml
 from cyclopts.exceptions import CycloptsError
 
-import magtwin
 from magtwin.cli.progress import watched
-from magtwin.names import MismatchWarning, RefusedError
+from magtwin.errors import InputError, MismatchWarning
+from magtwin.version import __version__
 
 app = App(
     name="magtwin",
     help="Magnetic digital twins of robots: author labs and robots as USD, drive them, log what a "
     "neural-network magnetometer reads.",
-    version=magtwin.__version__,
+    version=__version__,
     config=[Env("MAGTWIN_", show=False), Toml("magtwin.toml", search_parents=False)],
     help_epilogue="Options also come from the environment (MAGTWIN_RUN_SEED=1) and from magtwin.toml. "
     "Exit status: 0 done, 1 an input was refused, 2 wrong usage. --debug shows the traceback of a refusal.",
@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> None:
     except Exception as error:
         if debug:
             raise
-        if isinstance(error, RefusedError):
+        if isinstance(error, InputError):
             _fail(str(error))
         if isinstance(error, OSError | MemoryError):
             _fail(f"{error} ({type(error).__name__})")

@@ -7,7 +7,7 @@ from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, check_suffix, say, stdout_console, step
 
 if TYPE_CHECKING:
-    from magtwin.compare import Comparison
+    from magtwin.run.compare import Comparison
 
 
 @app.command
@@ -39,9 +39,9 @@ def compare(
     json
         Print the figures as JSON.
     """
-    from magtwin.compare import compare as compare_runs
     from magtwin.files import check_free
     from magtwin.io.formats import read_run
+    from magtwin.run.compare import compare as compare_runs
 
     if out is not None:
         check_suffix(out, (".html", ".md", ".json", ".png", ".svg"), "a comparison")
@@ -53,11 +53,11 @@ def compare(
     step("Writing the comparison")
     names = (a.name, b.name) if a.name != b.name else (str(a), str(b))
     if out is not None and out.suffix in (".png", ".svg"):
-        from magtwin.io.charts import plot_comparison
+        from magtwin.figures.charts import plot_comparison
 
         plot_comparison(*runs, found, out, names=names, force=force)
     elif out is not None:
-        from magtwin.io.pages import Told, page_of_comparison, write_page
+        from magtwin.figures.pages import Told, page_of_comparison, write_page
 
         told = Told(names[0], runs[0]), Told(names[1], runs[1])
         write_page(page_of_comparison(*told, found), out, force=force)

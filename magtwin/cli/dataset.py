@@ -9,10 +9,10 @@ from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, print_report, progress, say, step
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 
 if TYPE_CHECKING:
-    from magtwin.learn.recording import Source
+    from magtwin.learn.data.recording import Source
 
 dataset_app = App(name="dataset", help="Data sets: recordings with labels on a map, to learn from.")
 app.command(dataset_app)
@@ -79,13 +79,13 @@ def build(
     from magtwin.cli.file import _named
     from magtwin.cli.map import _open_map
     from magtwin.files import check_free, sha256
-    from magtwin.learn.dataset import build_dataset
-    from magtwin.learn.labels import Alignment
+    from magtwin.learn.data.dataset import build_dataset
+    from magtwin.learn.data.labels import Alignment
 
     check_free(out, force=force)
     given = lever_arm is not None or latency is not None
     if given and align == "fit":
-        raise RefusedError("--align fit finds lever arm and latency; drop it, or --lever-arm and --latency")
+        raise InputError("--align fit finds lever arm and latency; drop it, or --lever-arm and --latency")
     options: dict[str, Any] = {"topics": _named(topic) if topic else None, "unit": field_unit}
     options["columns"] = _columns(column) if column else None
     options = {name: value for name, value in options.items() if value is not None}
@@ -122,7 +122,7 @@ def info(dataset: Path, *, json: Json = False) -> None:
     """
     from dataclasses import replace
 
-    from magtwin.learn.dataset import open_dataset
+    from magtwin.learn.data.dataset import open_dataset
 
     step("Checking the shards")
     found = open_dataset(dataset)
@@ -163,8 +163,8 @@ def correlate(
     import numpy as np
 
     from magtwin.files import check_free
-    from magtwin.learn.correlation import correlations
-    from magtwin.learn.dataset import open_dataset
+    from magtwin.learn.data.correlation import correlations
+    from magtwin.learn.data.dataset import open_dataset
 
     if out is not None:
         check_free(out, force=force)
@@ -178,7 +178,7 @@ def correlate(
     step("Ranking the inputs")
     result = correlations(rows.x, rows.y, rows.features, groups)
     if out is not None:
-        from magtwin.io.correlations import plot_correlations
+        from magtwin.figures.correlations import plot_correlations
 
         plot_correlations(result, out, title=f"{dataset}", force=force)
     print_report(result.report(f"Correlation with the disturbance in {dataset}"), json)
@@ -192,7 +192,7 @@ def _columns(given: Sequence[str]) -> dict[str, str]:
     for word in given:
         name, _, theirs = word.partition("=")
         if not (name and theirs) or name in found or theirs in found.values():
-            raise RefusedError(f"--column takes NAME=THEIRS, each once, such as yaw=heading, got {word!r}")
+            raise InputError(f"--column takes NAME=THEIRS, each once, such as yaw=heading, got {word!r}")
         found[name] = theirs
     return found
 
@@ -204,7 +204,7 @@ def _files(given: Sequence[Path]) -> list[Path]:
         if (path / "runs.csv").is_file():
             inside = sorted(path.glob("run_*.parquet"))
             if not inside:
-                raise RefusedError(f"{path}: its runs.csv stands alone, without run_*.parquet")
+                raise InputError(f"{path}: its runs.csv stands alone, without run_*.parquet")
             found += inside
         else:
             found.append(path)
@@ -217,7 +217,7 @@ def _sources(files: Sequence[Path], session_by: By, path_by: By, options: dict[s
 
     from magtwin.files import existing
     from magtwin.io.formats import read_run
-    from magtwin.learn.recording import Source
+    from magtwin.learn.data.recording import Source
 
     def named(word: str) -> str:
         return re.sub(r"\.\.+", ".", re.sub(r"[^A-Za-z0-9_.+-]", "_", word)).lstrip(".+-")[:180] or "_"

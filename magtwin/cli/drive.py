@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 from magtwin.cli.app import app
 from magtwin.cli.run import write_run
 from magtwin.cli.terminal import Force, Json, Seed, Session, announcer, print_report, say, silence
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 
 if TYPE_CHECKING:
-    from magtwin.sim.manual import Hand, Recorder
+    from magtwin.sim.motion.manual import Hand, Recorder
 
 STATUS_HZ = 10.0
 """Lines about pose and speed a second [Hz]."""
@@ -68,16 +68,16 @@ def drive(
     import numpy as np
 
     from magtwin.files import existing, output
-    from magtwin.sim.commands import write_commands
-    from magtwin.sim.drive import draw_wheel_errors
-    from magtwin.sim.follow import CONTROL_RATE_HZ
-    from magtwin.sim.manual import HELP, Gamepad, Keyboard, Recorder, at_start
-    from magtwin.sim.simulate import streams
+    from magtwin.sim.motion.commands import write_commands
+    from magtwin.sim.motion.drive import draw_wheel_errors
+    from magtwin.sim.motion.follow import CONTROL_RATE_HZ
+    from magtwin.sim.motion.manual import HELP, Gamepad, Keyboard, Recorder, at_start
+    from magtwin.sim.runs.simulate import streams
     from magtwin.twin import in_session, open_twin
 
     existing(scene, "scene")
     if gamepad is not None and existing(gamepad, "gamepad").is_dir():
-        raise RefusedError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
+        raise InputError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
     with output(out, force=force) as folder:
         twin = in_session(open_twin(scene, net=net, model_error=model_error), session, seed=seed)
         robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
@@ -90,11 +90,11 @@ def drive(
         with ExitStack() as stack:
             show = None
             if view:
-                from magtwin.io.live import live_view
+                from magtwin.io.rerun.live import live_view
 
                 try:
                     show = stack.enter_context(live_view(twin.scene, scene))
-                except RefusedError as error:
+                except InputError as error:
                     print(f"  no view: {error}", file=sys.stderr)  # noqa: T201
             source = stack.enter_context(device(gamepad))
             print(f"  {HELP if gamepad is None else 'left stick drives, Start ends'}\r", file=sys.stderr)  # noqa: T201
@@ -153,7 +153,7 @@ def device(gamepad: Path | None) -> Iterator[int]:
         try:
             pad = os.open(gamepad, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
-            raise RefusedError(f"{gamepad}: cannot be read ({error.strerror}); name a gamepad") from error
+            raise InputError(f"{gamepad}: cannot be read ({error.strerror}); name a gamepad") from error
         try:
             yield pad
         finally:

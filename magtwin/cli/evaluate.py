@@ -9,14 +9,14 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, Seed, progress, say, stdout_console, step
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 
 if TYPE_CHECKING:
-    from magtwin.io.pages import Section
-    from magtwin.learn.dataset import Dataset
-    from magtwin.learn.evaluate import Chart, Contender, Evaluation, Trial
-    from magtwin.run import Run
-    from magtwin.spec import Scene
+    from magtwin.figures.pages import Section
+    from magtwin.learn.data.dataset import Dataset
+    from magtwin.learn.evaluation.evaluate import Chart, Contender, Evaluation, Trial
+    from magtwin.run.run import Run
+    from magtwin.spec.scene import Scene
 
 Flag = Annotated[bool, Parameter(negative="")]
 Files = Annotated[list[Path] | None, Parameter(negative="", consume_multiple=True)]
@@ -88,13 +88,13 @@ def evaluate(
     """
     import numpy as np
 
+    from magtwin.figures.evaluations import page_of_evaluation, read_curve, write_evaluation
     from magtwin.files import check_free
-    from magtwin.io.evaluations import page_of_evaluation, read_curve, write_evaluation
-    from magtwin.learn import evaluate as room
+    from magtwin.learn.evaluation import evaluate as room
 
     check_free(out, force=force)
     if scene is not None and map and train is None and engine is None:
-        raise RefusedError(
+        raise InputError(
             "--scene adds an error budget, for which --train is needed too; give it, or no --scene"
         )
     step("Reading maps and weights")
@@ -134,7 +134,7 @@ def evaluate(
     page = page_of_evaluation(found, curves=curves, more=sections, data=data)
     write_evaluation(page, out, force=force)
     if json:
-        from magtwin.io.pages import to_json
+        from magtwin.figures.pages import to_json
 
         say(to_json(page).rstrip())
         return
@@ -146,15 +146,15 @@ def _charts(maps: Sequence[Path] | None, scene: Path | None) -> "list[Chart]":
     """The maps at hand; of a scene its own."""
     from magtwin.cli.map import _open_map
     from magtwin.files import existing, sha256
-    from magtwin.learn.evaluate import chart_of
+    from magtwin.learn.evaluation.evaluate import chart_of
 
     files = list(maps or ())
     if not files and scene is not None:
-        from magtwin.usd.scene import read_scene
+        from magtwin.author.scene import read_scene
 
         files = [read_scene(existing(scene, "scene"), check_network=False).map_layer]
     if not files:
-        raise RefusedError(
+        raise InputError(
             "no map: name those that the weights were trained on (--map), or the scene (--scene)"
         )
     found = []
@@ -171,7 +171,7 @@ def _short(files: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     twice = next(path for path in files if list(files).count(path) > 1)
-    raise RefusedError(f"{twice} is named twice; name each file once")
+    raise InputError(f"{twice} is named twice; name each file once")
 
 
 def _trials(
@@ -179,11 +179,11 @@ def _trials(
 ) -> "tuple[list[Trial], list[tuple[Dataset, tuple[str, ...]]]]":
     """Recordings to judge by; and the data set that baselines are fitted to, with its recordings for that."""
     from magtwin.cli.dataset import _files, _sources
-    from magtwin.learn.dataset import open_dataset
-    from magtwin.learn.evaluate import Trial, check_apart, trials_of, unlearned, unseen
+    from magtwin.learn.data.dataset import open_dataset
+    from magtwin.learn.evaluation.evaluate import Trial, check_apart, trials_of, unlearned, unseen
 
     if (runs is None) == (dataset is None):
-        raise RefusedError("judge by --runs or by a --dataset, one of the two")
+        raise InputError("judge by --runs or by a --dataset, one of the two")
     learning = None if train is None else open_dataset(train)
     learned = [] if learning is None else [(learning, learning.names)]
     if dataset is None:
@@ -205,8 +205,8 @@ def _baselines(
     """Tolles and Lawson's on each map: as it stands, with the weights' lever arm and latency, and with terms
     of the map's gradient.
     """
-    from magtwin.learn.evaluate import tolles_lawson
-    from magtwin.learn.labels import Alignment
+    from magtwin.learn.data.labels import Alignment
+    from magtwin.learn.evaluation.evaluate import tolles_lawson
 
     found = []
     for chart in charts:
@@ -223,8 +223,8 @@ def _budget(
     found: "Evaluation", scene: Path, train: "Dataset", names: Sequence[str], advance: Any
 ) -> "tuple[Section, dict[str, Any]]":
     """The error budget of a twin, as a section and in figures."""
-    from magtwin.io.budgets import section_of_budget
-    from magtwin.learn.budget import Truth, budgets, steps, true_errors
+    from magtwin.figures.budgets import section_of_budget
+    from magtwin.learn.evaluation.budget import Truth, budgets, steps, true_errors
     from magtwin.twin import Twin, check_figures, in_session_of, open_twin
 
     twins: dict[Any, Twin] = {}
@@ -255,13 +255,13 @@ def _traversals(
     found: "Evaluation", scene: Path | None, against: Path | None, engine: str | None
 ) -> "tuple[Section, dict[str, Any]]":
     """One path driven twice, as a section and in figures."""
-    from magtwin.compare import traversals
+    from magtwin.figures.traversals import section_of_traversals
     from magtwin.io.formats import read_run
     from magtwin.io.provenance import made_again
-    from magtwin.io.traversals import section_of_traversals
+    from magtwin.run.compare import traversals
 
     if against is not None and engine is not None:
-        raise RefusedError("--against and --engine both say what to lay over a recording; give one of them")
+        raise InputError("--against and --engine both say what to lay over a recording; give one of them")
     first = found.judged[0]
     if against is not None:
         other, name = read_run(against), against.stem
@@ -280,13 +280,13 @@ def _traversals(
 
 def _cases(given: Sequence[str] | None) -> dict[str, str]:
     """Rows by name from words such as D=lawnmower.csv."""
-    from magtwin.learn.evaluate import TOTALS
+    from magtwin.learn.evaluation.evaluate import TOTALS
 
     found: dict[str, str] = {}
     for word in given or ():
         name, equals, path = word.partition("=")
         if not (name and equals and path) or name in found or name in TOTALS:
-            raise RefusedError(f"--case is a row of the table and its path, as D=lawnmower.csv, got {word!r}")
+            raise InputError(f"--case is a row of the table and its path, as D=lawnmower.csv, got {word!r}")
         found[name] = path
     return found
 

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Literal
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, announcer, print_report, say
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 
 if TYPE_CHECKING:
-    from magtwin.run import Run
+    from magtwin.run.run import Run
 
 
 @app.command
@@ -73,13 +73,13 @@ def export(
 def _stage(scene: Path) -> Path:
     """A stage's file, or that of one that ships with magtwin."""
     if scene.suffix == ".toml":
-        raise RefusedError(
+        raise InputError(
             f"{scene}: says what a stage is to be; make it with `magtwin scene {scene} --out DIR`"
         )
     if scene.suffix or scene.exists():
         return scene
+    from magtwin.errors import find
     from magtwin.files import shipped
-    from magtwin.names import find
 
     return find(
         "scene",
@@ -100,7 +100,7 @@ def _read(run: Path) -> "Run":
 
 
 def _write_onnx(weights: Path, out: Path) -> None:
-    from magtwin.learn.onnx import export_onnx
+    from magtwin.learn.models.onnx import export_onnx
 
     export_onnx(weights, out)
 
@@ -113,6 +113,6 @@ def _has_onnx() -> bool:
 
 
 def _draw(stage: Path, out: Path) -> None:
-    from magtwin.io.pictures import picture_of_stage
+    from magtwin.figures.pictures import picture_of_stage
 
     picture_of_stage(stage, out, size=(256, 256), legend=False)  # whose numbers would not fit

@@ -8,10 +8,10 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, print_report, progress, say, silence, step
-from magtwin.names import RefusedError, hint
+from magtwin.errors import InputError, hint
 
 if TYPE_CHECKING:
-    from magtwin.run import Run
+    from magtwin.run.run import Run
     from magtwin.twin import Twin
 
 _STAGES = (".usd", ".usda", ".usdc", ".usdz")
@@ -37,15 +37,15 @@ def info(file: Path, *, json: Json = False) -> None:
     existing(file, "file")
     if not file.is_dir() and file.suffix not in {*FORMATS, *_STAGES, *_NETS}:
         kinds = hint(file.suffix, {*FORMATS, *_STAGES, *_NETS})
-        raise RefusedError(f"{file}: no kind of file {file.suffix!r} that magtwin knows; {kinds}")
+        raise InputError(f"{file}: no kind of file {file.suffix!r} that magtwin knows; {kinds}")
     step(f"Reading {file.name}")
     if file.suffix in _NETS:
         report = _info_of_net(file)
     elif file.suffix in _STAGES and not file.is_dir():
         report = _info_of_usd(file)
     elif file.is_dir() and any(file.glob("*_map.csv")):
-        from magtwin.field.card import map_card
-        from magtwin.field.survey import import_survey
+        from magtwin.field.maps.card import map_card
+        from magtwin.field.survey.gridded import import_survey
 
         report = map_card(import_survey(file))
     else:
@@ -70,11 +70,11 @@ def view(*files: Path, scene: Path | None = None, offset: list[float] | None = N
         Seconds to add to the times of a run among several, once a run, in their order.
     """
     if offset and (len(offset) != len(files) or len(files) < 2):
-        raise RefusedError(
+        raise InputError(
             f"--offset is given once for each of several runs, got {len(offset)} of {len(files)}"
         )
     if not files:
-        raise RefusedError("view needs a file; name a run or a stage")
+        raise InputError("view needs a file; name a run or a stage")
     if len(files) > 1:
         _view_together(files, scene, offset or [0.0] * len(files))
     elif files[0].suffix in _STAGES and not files[0].is_dir():
@@ -130,9 +130,9 @@ def convert(
         options["fps"] = None
     takes = format_of(out).takes
     if scene is not None and not takes & {"twin", "scene_file"}:
-        raise RefusedError(f"{out}: a table shows no scene; drop --scene")
+        raise InputError(f"{out}: a table shows no scene; drop --scene")
     if out.resolve() == run.resolve():
-        raise RefusedError(f"{out}: is the run itself; name another file")
+        raise InputError(f"{out}: is the run itself; name another file")
     named: dict[str, Any] = {"topics": _named(topic) if topic else None, "unit": field_unit}
     step("Reading the run")
     result = read_run(run, **{name: value for name, value in named.items() if value is not None})
@@ -177,7 +177,7 @@ def _named(topics: list[str]) -> dict[str, str]:
     pairs = [topic.partition("=") for topic in topics]
     wrong = [topic for topic, (name, _, theirs) in zip(topics, pairs, strict=True) if not (name and theirs)]
     if wrong:
-        raise RefusedError(f"--topic takes NAME=THEIRS, such as /robot/enu/pose=/vrpn/pose, got {wrong[0]!r}")
+        raise InputError(f"--topic takes NAME=THEIRS, such as /robot/enu/pose=/vrpn/pose, got {wrong[0]!r}")
     return {name: theirs for name, _, theirs in pairs}
 
 
@@ -195,7 +195,7 @@ def _info_of_usd(file: Path) -> Any:
     run = _info_of_run(file)
     try:
         return replace(run, figures=(*run.figures, *info_of_stage(file).figures))
-    except RefusedError as error:  # the run is whole without its scene
+    except InputError as error:  # the run is whole without its scene
         return replace(run, facts={**run.facts, "stage": str(error)})
 
 
@@ -203,7 +203,7 @@ def _info_of_map(file: Path) -> Any:
     """The map's card, and below it what any stage holds."""
     from dataclasses import replace
 
-    from magtwin.field.card import map_card
+    from magtwin.field.maps.card import map_card
     from magtwin.usd.info import info_of_stage
     from magtwin.usd.maps import load_epochs
 
@@ -235,10 +235,10 @@ def _info_of_run(file: Path) -> Any:
 
 def _info_of_net(file: Path) -> Any:
     if file.suffix == ".onnx":
-        from magtwin.learn.onnx import report_onnx
+        from magtwin.learn.models.onnx import report_onnx
 
         return report_onnx(file)
-    from magtwin.learn.predictor import load_predictor
+    from magtwin.learn.models.predictor import load_predictor
 
     return load_predictor(file).report(str(file))
 
@@ -251,7 +251,7 @@ def _twin(run: "Run", file: Path, scene: Path | None) -> "Twin | None":
         twin = open_twin(scene_of(run, scene, near=file), magnetometer="map-only")  # needs no network
         if "robot" in run.facts:
             twin = led_by(twin, str(run.facts["robot"]))
-    except RefusedError as error:
+    except InputError as error:
         if scene is not None:
             raise
         _note(f"without a scene: {error}")
@@ -271,9 +271,9 @@ def _view_run(file: Path, scene: Path | None) -> None:
 
     from magtwin.files import existing
     from magtwin.io.formats import read_run
-    from magtwin.io.rerun import view as view_recording
-    from magtwin.io.rerun import write_rrd
-    from magtwin.io.viewer import show
+    from magtwin.io.rerun.file import view as view_recording
+    from magtwin.io.rerun.file import write_rrd
+    from magtwin.io.rerun.viewer import show
 
     existing(file, "run")
     if file.suffix == ".rrd" and scene is None:
@@ -299,13 +299,13 @@ def _view_together(files: tuple[Path, ...], scene: Path | None, offsets: list[fl
     import tempfile
 
     from magtwin.io.formats import read_run
-    from magtwin.io.rerun import write_comparison
-    from magtwin.io.viewer import show
+    from magtwin.io.rerun.file import write_comparison
+    from magtwin.io.rerun.viewer import show
 
     alike = len({file.stem for file in files}) < len(files)
     runs = {str(file) if alike else file.stem: read_run(file) for file in files}
     if len(runs) < len(files):
-        raise RefusedError("one run is named twice; name each once")
+        raise InputError("one run is named twice; name each once")
     twin = _twin(next(iter(runs.values())), files[0], scene)
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder) / "runs.rrd"
@@ -326,11 +326,11 @@ def _view_stage(file: Path) -> None:
         with silence():
             result = subprocess.run([usdview, str(file)], check=False)
         if result.returncode:
-            raise RefusedError(f"{file}: usdview ended with status {result.returncode}")
+            raise InputError(f"{file}: usdview ended with status {result.returncode}")
     elif file.suffix != ".usdz" and is_animation(file):
         _view_run(file, file)
     else:
-        from magtwin.io.pictures import show_stage
+        from magtwin.figures.pictures import show_stage
 
         with silence():
             show_stage(file)

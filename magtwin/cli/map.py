@@ -15,8 +15,8 @@ from magtwin.cli.map_input import (
     worth_a_map,
 )
 from magtwin.cli.terminal import Force, Json, Seed, check_suffix, print_report, progress, say, step
-from magtwin.io.columns import Columns
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
+from magtwin.io.surveys.columns import Columns
 
 map_app = App(name="map", help="Make and look at anomaly maps.")
 app.command(map_app)
@@ -104,7 +104,7 @@ def map_import(
     json
         Print the summary as JSON.
     """
-    from magtwin.field.survey import node_map, read_survey
+    from magtwin.field.survey.gridded import node_map, read_survey
     from magtwin.files import check_free
 
     check_suffix(out, (".usdc", ".usd", ".parquet"), "a map layer, or a file of readings,")
@@ -125,7 +125,7 @@ def map_import(
         field = None if out.suffix == ".parquet" else node_map(readings)
         report = _joined((field or readings).report(), found)
     if field is None:
-        from magtwin.io.readings import save_readings
+        from magtwin.io.surveys.readings import save_readings
 
         save_readings(readings, out, force=force)
     else:
@@ -199,7 +199,7 @@ def map_fit(
     given = about.given(out)
     options = method_options([method], kernel, earth).get(method, {})
     readings, found = read_sources(sources, columns, given, keep_latched, pose_topic, field_topic)
-    from magtwin.field.fit import fit, grid_report, raster
+    from magtwin.field.fit.fit import fit, grid_report, raster
 
     found = worth_a_map(readings, found, sources[0])
 
@@ -258,8 +258,8 @@ def map_check(
     json
         Print the summary as JSON.
     """
-    from magtwin.field.check import FILLED, check
-    from magtwin.field.fit import METHODS
+    from magtwin.field.fit.check import FILLED, check
+    from magtwin.field.fit.fit import METHODS
 
     methods = list(method or METHODS)
     options = {**FILLED, **method_options(methods, kernel, earth)}
@@ -332,17 +332,17 @@ def map_survey(
 
     import numpy as np
 
+    from magtwin.author.scene import read_scene
     from magtwin.files import check_free, sha256
     from magtwin.sim.room_survey import blocked_by
     from magtwin.sim.survey import survey, survey_readings
     from magtwin.usd.layers import layer_files
     from magtwin.usd.obstacles import read_obstacles
-    from magtwin.usd.scene import read_scene
 
     check_suffix(out, (".usdc", ".usd", ".parquet"), "a map layer, or a file of readings,")
     check_free(out, force=force)
     if seed < 0:
-        raise RefusedError(f"seed must be a whole number from 0 up, got {seed}")
+        raise InputError(f"seed must be a whole number from 0 up, got {seed}")
     step("Reading the scene")
     twin = read_scene(scene, check_network=False)
     day = twin.earth.date if twin.earth is not None else ""
@@ -366,7 +366,7 @@ def map_survey(
         else:
             field = survey(twin, **about, name=name or out.stem, progress=advance, blocked=blocked)
     if out.suffix == ".parquet":
-        from magtwin.io.readings import save_readings
+        from magtwin.io.surveys.readings import save_readings
 
         save_readings(replace(read, name=name or out.stem), out, force=force)
         print_report(read.report(), json)
@@ -408,8 +408,8 @@ def map_plot(
     force
         Replace the picture if it exists.
     """
+    from magtwin.figures.plots import plot_map
     from magtwin.files import check_free
-    from magtwin.io.plots import plot_map
 
     check_suffix(out, (".png", ".svg"), "a picture")
     check_free(out, force=force)
@@ -432,12 +432,12 @@ def map_info(file: Path, *, date: str | None = None, json: Json = False) -> None
     json
         Print it as JSON.
     """
-    from magtwin.field.card import map_card
+    from magtwin.field.maps.card import map_card
 
     if file.is_dir():
         card = map_card(_open_map(file, date))
     else:
-        from magtwin.field.epochs import at_date
+        from magtwin.field.maps.epochs import at_date
 
         epochs = _open_epochs(file)
         card = map_card(epochs[-1] if date is None else at_date(epochs, date), epochs)
@@ -463,7 +463,7 @@ def map_diff(
     json
         Print the summary as JSON.
     """
-    from magtwin.field.difference import difference
+    from magtwin.field.maps.difference import difference
     from magtwin.files import check_free
 
     if out is not None:
@@ -472,7 +472,7 @@ def map_diff(
     step("Comparing the maps")
     found = difference(_open_map(before), _open_map(after))
     if out is not None:
-        from magtwin.io.plots import plot_difference
+        from magtwin.figures.plots import plot_difference
 
         plot_difference(found, out, force=force)
     report = found.report()
@@ -504,8 +504,8 @@ def map_continue(
     json
         Print the summary as JSON.
     """
-    from magtwin.field.card import map_card
-    from magtwin.field.continuation import at_height
+    from magtwin.field.maps.card import map_card
+    from magtwin.field.maps.continuation import at_height
     from magtwin.files import check_free
     from magtwin.usd.maps import save_map
 
@@ -536,7 +536,7 @@ def map_export(file: Path, *, out: Path, date: str | None = None, force: Force =
     force
         Replace the folder if it exists.
     """
-    from magtwin.field.survey import write_survey
+    from magtwin.field.survey.gridded import write_survey
 
     for written in write_survey(_open_map(file, date), out, force=force):
         say(f"Wrote {written}")
@@ -557,7 +557,7 @@ def map_epochs(*files: Path, out: Path, force: Force = False, json: Json = False
     json
         Print the summary as JSON.
     """
-    from magtwin.field.epochs import drift, in_order
+    from magtwin.field.maps.epochs import drift, in_order
     from magtwin.files import check_free
     from magtwin.usd.maps import save_map_series
 
@@ -578,10 +578,10 @@ def _joined(report: Any, found: Any) -> Any:
 def _open_map(file: Path, date: str | None = None) -> Any:
     """The map of a layer or stage, of a day where one is given, or of a folder of survey CSVs."""
     if file.is_dir():
-        from magtwin.field.survey import import_survey
+        from magtwin.field.survey.gridded import import_survey
 
         if date is not None:
-            raise RefusedError(f"{file}: a folder of CSVs is one survey without a day; leave out --date")
+            raise InputError(f"{file}: a folder of CSVs is one survey without a day; leave out --date")
         return import_survey(file)
     from magtwin.usd.maps import load_map
 

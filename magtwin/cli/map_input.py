@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from magtwin.cli.terminal import step
-from magtwin.io.columns import Columns
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
+from magtwin.io.surveys.columns import Columns
 
 
 def is_survey_folder(source: Path, columns: Columns) -> bool:
     """Whether a source is a folder of one CSV a heading, whose columns need no names."""
-    from magtwin.io.readings import is_pattern
+    from magtwin.io.surveys.readings import is_pattern
 
     if (source / "metadata.yaml").is_file() or is_pattern(source) or any(source.glob("*.parquet")):
         return False
@@ -28,9 +28,9 @@ def read_sources(
     field_topic: str | None,
 ) -> Any:
     """The readings of the sources, and the report of what was found latched, stuck or outlying in them."""
-    from magtwin.field.latch import mask_latched
-    from magtwin.field.readings import TAKEN
-    from magtwin.io.readings import read_readings
+    from magtwin.field.survey.readings import TAKEN
+    from magtwin.field.survey.stuck import mask_latched
+    from magtwin.io.surveys.readings import read_readings
 
     step("Reading the survey")
     readings = read_readings(
@@ -41,7 +41,7 @@ def read_sources(
     if taken:
         found = replace(found, facts={**found.facts, "taken": [part.removeprefix(TAKEN) for part in taken]})
     if not (keep_latched or masked.good.any()):
-        raise RefusedError(
+        raise InputError(
             f"{sources[0]}: all {len(readings)} readings are those of a sensor that was stuck; "
             "survey again, or give --keep-latched to take them as they are"
         )
@@ -62,11 +62,11 @@ def worth_a_map(readings: Any, found: Any, source: Path) -> Any:
     """The report with what makes a map of these readings doubtful; refused where they are too few."""
     import numpy as np
 
-    from magtwin.field.problem import ONE_HEADING
+    from magtwin.field.fit.harmonic.problem import ONE_HEADING
 
     count, yaw, notes = int(readings.good.sum()), readings.yaw[readings.good], list[str]()
     if readings.grid is None and count < LEAST_READINGS:
-        raise RefusedError(
+        raise InputError(
             f"{source}: {count} of {len(readings)} readings are good; a map needs {LEAST_READINGS} at least, "
             "and some hundred to be of use"
         )
@@ -88,7 +88,7 @@ def method_options(methods: list[str], kernel: str | None, earth: str | None) ->
     options: dict[str, dict[str, Any]] = {}
     for flag, value, method in (("--kernel", kernel, "gp"), ("--earth", earth, "harmonic")):
         if value is not None and method not in methods:
-            raise RefusedError(f"{flag} is for --method {method} alone; leave it out of a {methods[0]} fit")
+            raise InputError(f"{flag} is for --method {method} alone; leave it out of a {methods[0]} fit")
     if kernel is not None:
         options["gp"] = {"kernel": kernel}
     if earth is not None:
@@ -101,30 +101,30 @@ def earth_nt(text: str) -> tuple[float, float, float]:
     words = [word.strip() for word in text.split(",")]
     forms = "a scene; latitude,longitude,height,date; or x,y,z in nT"
     if len(words) in (3, 4) and not Path(text).exists():
-        from magtwin.field.earth import earth_field_nt
-        from magtwin.field.readings import checked_earth_nt
+        from magtwin.field.sources.earth import earth_field_nt
+        from magtwin.field.survey.readings import checked_earth_nt
         from magtwin.field.units import GREATEST_MEAN_NT, LEAST_MEAN_NT
 
         try:
             x, y, z = (float(word) for word in words[:3])
         except ValueError as error:
-            raise RefusedError(f"--earth is {forms}; got {text!r}") from error
+            raise InputError(f"--earth is {forms}; got {text!r}") from error
         if len(words) == 4:
             return earth_field_nt(x, y, z, words[3])
         size = sum(c * c for c in checked_earth_nt((x, y, z))) ** 0.5
         if not LEAST_MEAN_NT <= size <= GREATEST_MEAN_NT:
-            raise RefusedError(
+            raise InputError(
                 f"--earth {text} is a field of {size:.6g} nT, and the Earth's is some 22,000 to 67,000; give "
                 "it in nT, or its place with the day, latitude,longitude,height,date"
             )
         return x, y, z
-    from magtwin.usd.scene import read_scene
+    from magtwin.author.scene import read_scene
 
     if not Path(text).is_file():
-        raise RefusedError(f"--earth is {forms}; there is no file {text!r}")
+        raise InputError(f"--earth is {forms}; there is no file {text!r}")
     known = read_scene(text, check_network=False).earth
     if known is None:
-        raise RefusedError(f"--earth {text}: this scene does not know the Earth's field; give it as {forms}")
+        raise InputError(f"--earth {text}: this scene does not know the Earth's field; give it as {forms}")
     return known.b_world_nt
 
 
@@ -137,5 +137,5 @@ def headings_rad(text: str) -> list[float]:
     except ValueError:
         degrees = []
     if not degrees or any(h != h for h in degrees):
-        raise RefusedError(f"headings are degrees with commas between, such as 0,90,180,270; got {text!r}")
+        raise InputError(f"headings are degrees with commas between, such as 0,90,180,270; got {text!r}")
     return [radians(h) for h in degrees]

@@ -26,7 +26,7 @@ def net_convert(pth: Path, *, out: Path, licence: str = "", force: Force = False
     force
         Replace the file if it exists.
     """
-    from magtwin.learn.model import convert
+    from magtwin.learn.models.network import convert
 
     check_suffix(out, (".safetensors",), "a network")
     step("Reading the checkpoint")
@@ -54,7 +54,7 @@ def net_export(weights: Path, *, onnx: Path, force: Force = False, json: Json = 
     json
         Print what it holds as JSON.
     """
-    from magtwin.learn.onnx import export_onnx
+    from magtwin.learn.models.onnx import export_onnx
 
     check_suffix(onnx, (".onnx",), "an ONNX file")
     step("Exporting the network")

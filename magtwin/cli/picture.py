@@ -8,10 +8,10 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, announcer, progress, say, step
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 
 if TYPE_CHECKING:
-    from magtwin.run import Run
+    from magtwin.run.run import Run
 
 STAGES = (".usd", ".usda", ".usdc", ".usdz")
 
@@ -51,29 +51,29 @@ def picture(
     force
         Replace what exists.
     """
+    from magtwin.figures.pictures import check_png
     from magtwin.files import check_free, existing
-    from magtwin.io.pictures import check_png
 
     existing(file, "run, stage or recording")
     check_free(check_png(out), force=force)
     pixels, steps = _size(size), announcer(quiet=False)
     if file.suffix == ".rrd" and camera is None and scene is None:
-        from magtwin.io.viewer import screenshot
+        from magtwin.io.rerun.viewer import screenshot
 
         steps("Drawing the recording in the Rerun viewer")
         for complaint in screenshot(file, out, time_s=at, size=pixels, force=force):
             print(f"  the viewer reports: {complaint}", file=sys.stderr)  # noqa: T201
     elif file.suffix in STAGES and at is None and scene is None:
-        from magtwin.io.pictures import picture_of_stage
-        from magtwin.io.scenery import View
+        from magtwin.figures.pictures import picture_of_stage
+        from magtwin.figures.scenery import View
 
         if camera == "chase":
-            raise RefusedError(f"{file}: a stage as it stands has nothing to follow; take another camera")
+            raise InputError(f"{file}: a stage as it stands has nothing to follow; take another camera")
         steps("Drawing the stage")
         seen = None if camera is None else View.of(camera).camera()
         picture_of_stage(file, out, size=pixels, camera=seen, force=force)
     else:
-        from magtwin.io.scenery import picture_of_run
+        from magtwin.figures.scenery import picture_of_run
 
         run, stage = _run_and_scene(file, scene)
         steps("Drawing the run")
@@ -117,15 +117,15 @@ def film(
     force
         Replace what exists.
     """
+    from magtwin.figures.films import film_of_run, film_of_stage
     from magtwin.files import check_free, existing
-    from magtwin.io.films import film_of_run, film_of_stage
 
     existing(file, "stage" if camera == "turntable" else "run")
     check_free(out, force=force)
     pixels = None if size is None else _size(size)
     turned = camera == "turntable"
     if turned and (speed is not None or scene is not None):
-        raise RefusedError("a turntable shows a stage as it stands: it takes no --speed and no --scene")
+        raise InputError("a turntable shows a stage as it stands: it takes no --speed and no --scene")
     run, stage = (None, file) if turned else _run_and_scene(file, scene)
     with progress("Filming", "frames") as advance:
 
@@ -167,5 +167,5 @@ def _size(text: str) -> tuple[int, int]:
     """Width and height from WxH."""
     width, _, height = text.partition("x")
     if not (width.isdecimal() and height.isdecimal() and len(text) < 20):
-        raise RefusedError(f"size is WIDTHxHEIGHT in pixels, such as 1280x720; got {text!r}")
+        raise InputError(f"size is WIDTHxHEIGHT in pixels, such as 1280x720; got {text!r}")
     return int(width), int(height)

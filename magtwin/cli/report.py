@@ -36,11 +36,11 @@ def report(
     force
         Replace what exists.
     """
+    from magtwin.errors import InputError
+    from magtwin.figures.pages import WRITERS, Told, page_of_runs, write_page
     from magtwin.files import check_free
     from magtwin.io.formats import read_run
-    from magtwin.io.pages import WRITERS, Told, page_of_runs, write_page
     from magtwin.io.provenance import map_of, planned_of
-    from magtwin.names import RefusedError
 
     check_suffix(out, tuple(WRITERS), "a report")
     check_free(out, force=force)
@@ -54,7 +54,7 @@ def report(
             note, field = "", None
             try:
                 field = map_of(run, scene, near=file)
-            except RefusedError as error:
+            except InputError as error:
                 note = f"Its map is not shown: {error}."
             name = file.name if names.count(file.name) == 1 else str(file)
             told.append(Told(name, run, field, planned_of(run, near=file), note))

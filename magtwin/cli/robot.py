@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say, step
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 
 
 @app.command
@@ -82,17 +82,17 @@ def robot(
     json
         Print the summary as JSON.
     """
+    from magtwin.author.from_urdf import DriveRule, from_urdf
     from magtwin.files import check_free, output
-    from magtwin.robot import DriveRule, from_urdf
 
     if (out is None) == (to_urdf is None):
-        raise RefusedError(
+        raise InputError(
             "robot makes a stage with --out DIR, or a URDF with --to-urdf FILE; give one of them"
         )
     given = (settings, package, arg, missing_meshes, collision, profile, drive, fix_base, merge_fixed)
     if to_urdf is not None:
         if any(option is not None for option in (*given, density, mass, single_file, strict, report)):
-            raise RefusedError(
+            raise InputError(
                 "--to-urdf takes a stage as it is, with --force and --json; leave the others out"
             )
         _to_urdf(urdf, to_urdf, force=force, json=json)
@@ -133,17 +133,17 @@ def robot(
 
 
 def _to_urdf(stage: Path, out: Path, *, force: bool, json: bool) -> None:
-    from magtwin.robot import write_urdf
+    from magtwin.author.from_urdf import write_urdf
 
     if stage.suffix in (".urdf", ".xacro"):
-        raise RefusedError(f"{stage}: --to-urdf takes a stage, .usd, .usda, .usdc or .usdz")
+        raise InputError(f"{stage}: --to-urdf takes a stage, .usd, .usda, .usdc or .usdz")
     print_report(write_urdf(stage, out, force=force), json)
     if not json:
         say(f"Wrote {out}")
 
 
 def _thumbnail(asset: Path, out: Path) -> None:
-    from magtwin.io.pictures import picture_of_stage
+    from magtwin.figures.pictures import picture_of_stage
 
     picture_of_stage(asset, out, size=(256, 256))
 
@@ -153,5 +153,5 @@ def _pairs(option: str, texts: list[str]) -> dict[str, str]:
     pairs = [text.partition("=") for text in texts]
     for text, (name, equals, _) in zip(texts, pairs, strict=True):
         if not (name and equals):
-            raise RefusedError(f"--{option} {text!r}: NAME=VALUE is wanted")
+            raise InputError(f"--{option} {text!r}: NAME=VALUE is wanted")
     return {name: value for name, _, value in pairs}

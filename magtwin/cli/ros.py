@@ -13,7 +13,7 @@ from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Seed, Session, Whole, announcer, progress, say, silence, step
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 
 if TYPE_CHECKING:
     from magtwin.ros.bus import Bus
@@ -46,10 +46,10 @@ class Node:
         """The node, until the end or Ctrl-C.
 
         Raises:
-            RefusedError: It cannot be there, or not for a `duration` [s].
+            InputError: It cannot be there, or not for a `duration` [s].
         """
         if duration is not None and not duration > 0:
-            raise RefusedError(f"duration must be above 0 s, got {duration!r}")
+            raise InputError(f"duration must be above 0 s, got {duration!r}")
         from magtwin.ros.bus import names_of, open_bus
 
         bus = open_bus(
@@ -255,10 +255,10 @@ def follow(
     stamped_commands
         Send cmd_vel as TwistStamped, and not as Twist.
     """
+    from magtwin.author.robot import read_robot
     from magtwin.files import shipped
     from magtwin.path import resolve_path
     from magtwin.ros.follow import Follower
-    from magtwin.usd.robot import read_robot
 
     tell = announcer(quiet=False)
     way = resolve_path(path)
@@ -328,13 +328,13 @@ def teleop(
     """
     from contextlib import ExitStack
 
+    from magtwin.author.robot import read_robot
     from magtwin.cli.drive import device
     from magtwin.files import existing, shipped
-    from magtwin.io.bag_raw import RawBagWriter
+    from magtwin.io.bags.raw import RawBagWriter
     from magtwin.ros.record import Recorder
     from magtwin.ros.teleop import Teleop
-    from magtwin.sim.manual import HELP, Gamepad, Hand, Keyboard
-    from magtwin.usd.robot import read_robot
+    from magtwin.sim.motion.manual import HELP, Gamepad, Hand, Keyboard
 
     if gamepad is not None:
         existing(gamepad, "gamepad")
@@ -385,7 +385,7 @@ def record(
     force
         Replace what exists.
     """
-    from magtwin.io.bag_raw import RawBagWriter
+    from magtwin.io.bags.raw import RawBagWriter
     from magtwin.ros.record import Recorder
 
     writer = RawBagWriter(out, force=force)
@@ -399,7 +399,7 @@ def record(
         counts = dict(writer.counts)
         writer.close()
     if not sum(counts.values()):
-        raise RefusedError("nothing was recorded: nobody offered a topic; look at --domain and --namespace")
+        raise InputError("nothing was recorded: nobody offered a topic; look at --domain and --namespace")
     for name, count in counts.items():
         say(f"{count:8d}  {name}")
     say(f"Wrote {out}; magtwin info {out}")
@@ -437,7 +437,7 @@ def replay(
     from magtwin.twin import open_twin
 
     if not speed > 0:
-        raise RefusedError(f"speed must be above 0, got {speed!r}")
+        raise InputError(f"speed must be above 0, got {speed!r}")
     whole = read_run(run)
     twin = None if scene is None else open_twin(scene, model_error=False)
     with where.bus("magtwin_replay") as bus:

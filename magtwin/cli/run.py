@@ -24,15 +24,15 @@ from magtwin.cli.terminal import (
     silence,
     step,
 )
-from magtwin.names import RefusedError, find
+from magtwin.errors import InputError, find
 
 if TYPE_CHECKING:
     from threading import Event
 
     from magtwin.io.recorder import Sink
     from magtwin.path import Path as Planned
-    from magtwin.run import Run
-    from magtwin.sim.lidar import Scans
+    from magtwin.run.run import Run
+    from magtwin.sim.sensors.lidar import Scans
     from magtwin.twin import Twin
 
 
@@ -62,10 +62,10 @@ def demo(
     json
         Print the summary as JSON.
     """
+    from magtwin.author.robot import build_robot
+    from magtwin.author.scene import author_scene
     from magtwin.files import output, shipped
     from magtwin.twin import scene_from_toml
-    from magtwin.usd.robot import build_robot
-    from magtwin.usd.scene import author_scene
 
     steps = announcer(quiet=json)
     with output(out, force=force) as folder:
@@ -221,8 +221,8 @@ def run(
     json
         Print the summary as JSON.
     """
+    from magtwin.author.scene import robots_in
     from magtwin.files import existing
-    from magtwin.usd.scene import robots_in
 
     existing(scene, "scene")
     given = {"rrd": rrd, "parquet": parquet, "bag": bag, "csv": csv, "usd": usd}
@@ -232,7 +232,7 @@ def run(
     beside = parquet.with_suffix(".scans.parquet") if scans and parquet is not None else None
     targets = [target for target in (out, *files.values(), beside) if target is not None]
     if len({target.resolve() for target in targets}) < len(targets):
-        raise RefusedError("two outputs have one name; give each its own")
+        raise InputError("two outputs have one name; give each its own")
     for kind, file in files.items():
         if kind != "bag" or file.suffix:
             check_suffix(file, _SUFFIXES[kind], f"what --{kind} writes")
@@ -242,24 +242,24 @@ def run(
         ("pace", pace, "a run that is shown live; give --live", live or viewer),
     ):
         if value is not None and not there:
-            raise RefusedError(f"--{option} is for {needs}, or drop it")
+            raise InputError(f"--{option} is for {needs}, or drop it")
     if live and viewer:
-        raise RefusedError("--live opens a viewer and --viewer names one that is there; give one of them")
+        raise InputError("--live opens a viewer and --viewer names one that is there; give one of them")
     if viewer:
-        from magtwin.io.live import check_listens
+        from magtwin.io.rerun.live import check_listens
 
         check_listens(viewer)
     if pace is not None and not pace > 0:
-        raise RefusedError(f"--pace must be above 0 simulated seconds a second, got {pace:g}")
+        raise InputError(f"--pace must be above 0 simulated seconds a second, got {pace:g}")
     way = _way(path, commands, engine, replay)
     if controller != "follower" and (commands or replay or path == "random"):
-        raise RefusedError(f"--controller {controller} follows a path, and {way} is none; drop one")
+        raise InputError(f"--controller {controller} follows a path, and {way} is none; drop one")
     if speed != 0.2 and (commands or replay):
-        raise RefusedError(f"--speed is for a path or a driver, and {way} has speeds of its own; drop one")
+        raise InputError(f"--speed is for a path or a driver, and {way} has speeds of its own; drop one")
     if fit and (commands or replay or path == "random"):
-        raise RefusedError(f"--fit is for a path, and {way} is none; drop it")
+        raise InputError(f"--fit is for a path, and {way} is none; drop it")
     if engine == "newton":
-        from magtwin.sim.newton import check_installed
+        from magtwin.sim.engines.newton import check_installed
 
         check_installed()
     options: dict[str, Any] = {
@@ -284,19 +284,17 @@ def run(
         find("robot", robot, robots)
     if len(robots) > 1:
         if live or viewer:
-            raise RefusedError(f"--live and --viewer show one robot, and {scene} has {', '.join(robots)}")
+            raise InputError(f"--live and --viewer show one robot, and {scene} has {', '.join(robots)}")
         if robot is None and (path or commands or replay):
-            raise RefusedError(f"which of {', '.join(robots)} is to drive {way}? say it with --robot NAME")
+            raise InputError(f"which of {', '.join(robots)} is to drive {way}? say it with --robot NAME")
         if fit and robot is None:
-            raise RefusedError(
-                f"whose path is to be fitted, of {', '.join(robots)}? say it with --robot NAME"
-            )
+            raise InputError(f"whose path is to be fitted, of {', '.join(robots)}? say it with --robot NAME")
         _run_together(
             scene, wanted, robot=robot, path=path, fit=fit, meet=meet, scans=scans, quiet=json, **options
         )
         return
     if meet is not None:
-        raise RefusedError(f"--meet is for several robots, and {scene} has one; drop it")
+        raise InputError(f"--meet is for several robots, and {scene} has one; drop it")
     if not (path or commands or replay):
         way = str(robots[next(iter(robots))] or way)
     shown = _Live(window=live, address=viewer, pace=pace or 1.0) if live or viewer else None
@@ -377,8 +375,8 @@ def _drive(
     `facts` say where files will lie as seen from the run's own, for those that move with it.
     """
     from magtwin.io.formats import read_run
-    from magtwin.sim.commands import read_commands
-    from magtwin.sim.way import way_of
+    from magtwin.sim.motion.commands import read_commands
+    from magtwin.sim.motion.way import way_of
     from magtwin.twin import in_session, open_twin, room_of, scan, simulate
 
     planned: Any = None
@@ -435,15 +433,13 @@ def _run_together(
     from magtwin.io.formats import read_run
     from magtwin.path import Path as Planned
     from magtwin.report import Report
-    from magtwin.sim.commands import read_commands
-    from magtwin.sim.way import way_of
+    from magtwin.sim.motion.commands import read_commands
+    from magtwin.sim.motion.way import way_of
     from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots
 
     steps = announcer(quiet=quiet)
     if options.pop("engine") == "newton":
-        raise RefusedError(
-            f"--engine newton drives one robot by itself, and {scene_file} has several; drop it"
-        )
+        raise InputError(f"--engine newton drives one robot by itself, and {scene_file} has several; drop it")
     commands, replay = options.pop("commands"), options.pop("replay")
     opening = {name: options.pop(name) for name in ("net", "magnetometer", "model_error")}
     twin = open_twin(scene_file, **opening)
@@ -525,11 +521,11 @@ class _Outputs:
                     files={kind: places[file] for kind, file in self.files.items()},
                     scans=None if self.scans is None else places[self.scans],
                 )
-            except RefusedError as error:
+            except InputError as error:
                 text = str(error)
                 for target, place in places.items():
                     text = text.replace(str(place), str(target))
-                raise RefusedError(text) from error
+                raise InputError(text) from error
 
     def begun(self) -> "_Outputs":
         """The same, in place: files grow there, under names that tell so."""
@@ -550,8 +546,8 @@ class _Outputs:
 
     def sinks(self, driven: _Driven) -> list["Sink"]:
         """What takes the run as it comes."""
-        from magtwin.io.live import RrdWriter
-        from magtwin.io.rosbag import BagWriter
+        from magtwin.io.bags.rosbag import BagWriter
+        from magtwin.io.rerun.live import RrdWriter
         from magtwin.io.tables import ParquetParts
 
         known: dict[str, Any] = {"expected": driven.run, "planned": driven.planned, "scans": driven.scans}
@@ -596,7 +592,7 @@ class _Outputs:
                         **options,
                     )
         if self.folder:
-            from magtwin.io.plotting import plot_run
+            from magtwin.figures.plotting import plot_run
 
             planned = driven.planned
             plot_run(
@@ -630,9 +626,9 @@ class _Live:
 
 def _show(driven: _Driven, live: _Live, outputs: _Outputs, *, quiet: bool) -> _Driven:
     """Let a run go on in step with the clock, seen and recorded; what came of it until its end, or Ctrl-C."""
-    from magtwin.io.live import LiveViewer
     from magtwin.io.recorder import Recorder, in_step
-    from magtwin.io.viewer import live_viewer
+    from magtwin.io.rerun.live import LiveViewer
+    from magtwin.io.rerun.viewer import live_viewer
 
     run, address = driven.run, live.address
     with ExitStack() as stack:
@@ -640,7 +636,7 @@ def _show(driven: _Driven, live: _Live, outputs: _Outputs, *, quiet: bool) -> _D
         if live.window:
             try:
                 address, _ = stack.enter_context(live_viewer())
-            except RefusedError as error:
+            except InputError as error:
                 print(f"  no view: {error}", file=sys.stderr)  # noqa: T201
         viewers = []
         if address is not None:
@@ -653,7 +649,7 @@ def _show(driven: _Driven, live: _Live, outputs: _Outputs, *, quiet: bool) -> _D
                 recorder.append(block)
                 advance(round(float(block["t"][-1])), round(float(run["t"][-1])), "Ctrl-C ends it")
         if not recorder.rows:
-            raise RefusedError("ended before the first reading; nothing is written")
+            raise InputError("ended before the first reading; nothing is written")
         if live.window and address is not None and sys.stdin.isatty():
             with silence():
                 _wait(address, stop)
@@ -668,14 +664,14 @@ def _show(driven: _Driven, live: _Live, outputs: _Outputs, *, quiet: bool) -> _D
 
 def _wait(address: str, stop: "Event") -> None:
     """Leave a viewer on the screen until it is closed, or Ctrl-C."""
-    from magtwin.io.live import check_listens
+    from magtwin.io.rerun.live import check_listens
 
     if not stop.is_set():
         print("  The run has ended; close the viewer, or press Ctrl-C", file=sys.stderr)  # noqa: T201
     while not stop.wait(0.5):
         try:
             check_listens(address)
-        except RefusedError:
+        except InputError:
             return
 
 
@@ -710,11 +706,11 @@ def _way(path: str | None, commands: Path | None, engine: str | None, replay: Pa
         if value is not None
     ]
     if len(named) > 1:
-        raise RefusedError(f"{' and '.join(named)} each say what to drive; give one of them")
+        raise InputError(f"{' and '.join(named)} each say what to drive; give one of them")
     if engine == "replay" and replay is None:
-        raise RefusedError("the engine replay needs the run that it drives once more: --replay RUN")
+        raise InputError("the engine replay needs the run that it drives once more: --replay RUN")
     if engine not in (None, "replay") and replay is not None:
-        raise RefusedError(
+        raise InputError(
             f"--replay drives a run as it was recorded, which --engine {engine} cannot; drop one"
         )
     return path or str(commands or replay or "figure8")
@@ -722,9 +718,9 @@ def _way(path: str | None, commands: Path | None, engine: str | None, replay: Pa
 
 def _picture(scene_file: Path, out: Path) -> None:
     """A picture of a stage; where no OpenGL is to be had, says so and goes on."""
-    from magtwin.io.pictures import picture_of_stage
+    from magtwin.figures.pictures import picture_of_stage
 
     try:
         picture_of_stage(scene_file, out)
-    except RefusedError as error:
+    except InputError as error:
         print(f"  no picture of the stage: {error}", file=sys.stderr)  # noqa: T201

@@ -94,21 +94,21 @@ def runs(
     """
     import numpy as np
 
+    from magtwin.errors import InputError
     from magtwin.files import existing, output
     from magtwin.io.tables import write_parquet
-    from magtwin.names import RefusedError
     from magtwin.report import Figure, Report
+    from magtwin.sim.motion.way import way_of
     from magtwin.sim.session import draw_speed
-    from magtwin.sim.way import way_of
     from magtwin.twin import in_session, open_twin, room_of, simulate_many
     from magtwin.verdict import HOLDS, HOLDS_ONE, Tally
 
     existing(scene, "scene")
     for name, value, least in (("count", count, 1), ("sessions", sessions, 1), ("seed", seed, 0)):
         if value is not None and value < least:
-            raise RefusedError(f"--{name} must be a whole number from {least} up, got {value}")
+            raise InputError(f"--{name} must be a whole number from {least} up, got {value}")
     if sessions is not None and session is not None:
-        raise RefusedError("--session survey is one session; drop --sessions")
+        raise InputError("--session survey is one session; drop --sessions")
     for name in path or MIXTURE:
         way_of(name)  # refuses a name or file that is none before the scene is opened
     steps = announcer(quiet=json)

@@ -39,15 +39,15 @@ def scene(
     json
         Print the summary as JSON.
     """
+    from magtwin.author.robot import notes_of
+    from magtwin.author.scene import author_scene
     from magtwin.files import check_free, shipped
     from magtwin.twin import scene_from_toml
     from magtwin.usd.info import info_of_stage
-    from magtwin.usd.robot import notes_of
-    from magtwin.usd.scene import author_scene
 
     file = Path(spec)
     if not file.suffix and not file.is_file():
-        from magtwin.names import find
+        from magtwin.errors import find
 
         file = find("scene", spec, {f.stem: f for f in sorted(shipped("scenes").glob("*.toml"))})
     check_free(out, force=force)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TextIO, cast
 from cyclopts import Parameter
 
 from magtwin.cli.progress import announcer, progress, silence, step
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 from magtwin.summary import printable
 
 __all__ = [
@@ -83,7 +83,7 @@ def stdout_console() -> Any:
 def check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:
     """Refuse a file to write whose name ends otherwise."""
     if path.suffix not in suffixes:
-        raise RefusedError(f"{path}: {what} ends in {' or '.join(suffixes)}")
+        raise InputError(f"{path}: {what} ends in {' or '.join(suffixes)}")
 
 
 def print_report(report: Any, as_json: bool) -> None:

@@ -7,11 +7,11 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, Whole, check_suffix, print_report, progress, say, step
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 
 if TYPE_CHECKING:
-    from magtwin.learn.config import TrainConfig
-    from magtwin.learn.descent import Epoch
+    from magtwin.learn.models.descent import Epoch
+    from magtwin.learn.training.config import TrainConfig
 
 Flag = Annotated[bool, Parameter(negative="")]
 Names = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]
@@ -120,16 +120,16 @@ def train(
     """
     import numpy as np
 
-    from magtwin.files import check_free, output, sha256
-    from magtwin.io.learning_curves import (
+    from magtwin.figures.learning_curves import (
         plot_learning_curve,
         record_learning_curve,
         write_learning_curve,
     )
-    from magtwin.learn.config import TrainConfig, read_config
-    from magtwin.learn.dataset import open_dataset
-    from magtwin.learn.split import split as split_of
-    from magtwin.learn.trained import fit
+    from magtwin.files import check_free, output, sha256
+    from magtwin.learn.data.dataset import open_dataset
+    from magtwin.learn.data.split import split as split_of
+    from magtwin.learn.training.config import TrainConfig, read_config
+    from magtwin.learn.training.result import fit
 
     check_suffix(out, (".safetensors",), "a network")
     card, picture, table, checkpoint = (
@@ -138,7 +138,7 @@ def train(
     for path in (out, card):
         check_free(path, force=force)
     if checkpoint.exists() and not (resume or force):
-        raise RefusedError(
+        raise InputError(
             f"{checkpoint}: an unfinished training; give --resume to go on with it, or --force to start anew"
         )
     given = {
@@ -168,7 +168,7 @@ def train(
     if rrd is not None:
         check_suffix(rrd, (".rrd",), "a Rerun recording")
         if not curves:
-            raise RefusedError("--rrd: a linear model is fitted at once and has no learning curve")
+            raise InputError("--rrd: a linear model is fitted at once and has no learning curve")
     for path in (*curves, *([rrd] if rrd else [])):
         check_free(path, force=force)
     step("Reading the data set")
@@ -225,12 +225,12 @@ def _widths(text: str) -> tuple[int, ...]:
     try:
         return tuple(int(word) for word in text.split(","))
     except ValueError:
-        raise RefusedError(f"--layers are whole numbers with commas between, got {text!r}") from None
+        raise InputError(f"--layers are whole numbers with commas between, got {text!r}") from None
 
 
 def _given(config: "TrainConfig", options: dict[str, Any]) -> "TrainConfig":
     """A configuration with the options that were given in place of its own."""
     found = {name: value for name, value in options.items() if value is not None}
     if {"model", "layers"} <= set(found) and found["model"] in ("paper", "released"):
-        raise RefusedError("--model and --layers both say the widths; give one of them")
+        raise InputError("--model and --layers both say the widths; give one of them")
     return config.with_options(**found)

@@ -8,10 +8,10 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, announcer, check_suffix, printable, say, stdout_console
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 
 if TYPE_CHECKING:
-    from magtwin.export.findings import Check, Findings, Severity
+    from magtwin.export.validation.findings import Check, Findings, Severity
 
 Validator = Literal["core", "nvidia", "simready", "isaac", "newton", "magtwin"]
 Asked = Literal["map-checksum", "map-file", "network-file"]
@@ -56,12 +56,12 @@ def validate(
     json
         Print it as JSON.
     """
-    from magtwin.export.validate import AGAINST, SAFE, validate
+    from magtwin.export.validation.validate import AGAINST, SAFE, validate
     from magtwin.files import check_free, output
-    from magtwin.learn.features import FEATURES
+    from magtwin.learn.data.features import FEATURES
 
     if not files:
-        raise RefusedError("validate needs a file; name a stage")
+        raise InputError("validate needs a file; name a stage")
     if out is not None:
         check_suffix(out, (".json",), "a report")
         check_free(out, force=force)

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd, UsdUtils, Vt
 
+from magtwin.errors import InputError
 from magtwin.export.contents import assets_of, kind_of
 from magtwin.files import sha256
-from magtwin.names import RefusedError
 from magtwin.usd.layers import open_stage, relative_asset
 from magtwin.usd.schema import place as said
 
@@ -37,7 +37,7 @@ def attach(root: Path, *more: Path) -> None:
         more: Files below that folder to attach though no property names them.
 
     Raises:
-        RefusedError: The stage has no default prim for them to stand below, or a prim called as their scope.
+        InputError: The stage has no default prim for them to stand below, or a prim called as their scope.
     """
     stage = open_stage(root)
     named = {file.resolve(): list[Sdf.Path]() for file in more}
@@ -50,10 +50,10 @@ def attach(root: Path, *more: Path) -> None:
         return
     default = stage.GetDefaultPrim()
     if not default:
-        raise RefusedError(f"{root}: has no default prim to attach files below; set one")
+        raise InputError(f"{root}: has no default prim to attach files below; set one")
     scope, meta = default.GetPath().AppendChild(SCOPE), stage.GetRootLayer()
     if stage.GetPrimAtPath(scope):
-        raise RefusedError(f"{root} <{scope}>: is where files are attached; rename that prim")
+        raise InputError(f"{root} <{scope}>: is where files are attached; rename that prim")
     layers = [layer for layer in stage.GetUsedLayers() if layer.realPath]
     for layer in layers:
         if any(kind_of(asset) in KINDS for _, asset in assets_of(layer)):
@@ -111,21 +111,21 @@ def detach(root: Path) -> tuple[Path, ...]:
         Those that nothing named.
 
     Raises:
-        RefusedError: A file is damaged, or its name or kind is none that magtwin attaches.
+        InputError: A file is damaged, or its name or kind is none that magtwin attaches.
     """
     stage = open_stage(root)
     found, unnamed = _found(stage), []
     for prim in found:
         name, data = str(prim.GetAttribute(NAME).Get() or ""), _bytes(prim)
         if Path(name).name != name or "\\" in name or kind_of(name) not in KINDS:
-            raise RefusedError(f"{said(prim)}: {NAME} {name!r} is no name of a file that is attached")
+            raise InputError(f"{said(prim)}: {NAME} {name!r} is no name of a file that is attached")
         if hashlib.sha256(data).hexdigest() != prim.GetAttribute(SHA256).Get():
-            raise RefusedError(
+            raise InputError(
                 f"{said(prim)}: the bytes of {name} are not those that its checksum was taken of"
             )
         file = root.parent / kind_of(name) / name
         if file.exists():
-            raise RefusedError(f"{said(prim)}: a second file {name}; rename one")
+            raise InputError(f"{said(prim)}: a second file {name}; rename one")
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(data)
         targets = prim.GetRelationship(OF).GetTargets()
@@ -134,7 +134,7 @@ def detach(root: Path) -> tuple[Path, ...]:
         for path in targets:
             attribute = stage.GetAttributeAtPath(path)
             if not attribute or attribute.GetTypeName() != Sdf.ValueTypeNames.Asset:
-                raise RefusedError(f"{said(prim)}: {OF} names {path}, which names no file")
+                raise InputError(f"{said(prim)}: {OF} names {path}, which names no file")
             layer = next((spec.layer for spec in attribute.GetPropertyStack()), stage.GetRootLayer())
             with Usd.EditContext(stage, layer):
                 attribute.Set(Sdf.AssetPath(relative_asset(layer, file)))

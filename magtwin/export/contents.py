@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 from pxr import Sdf, UsdUtils
 
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 from magtwin.usd.layers import SUFFIXES, open_stage
 
 KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -51,7 +51,7 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
         The root layer's copy.
 
     Raises:
-        RefusedError: A file that is named is not there, is of no kind that is carried or lies outside of
+        InputError: A file that is named is not there, is of no kind that is carried or lies outside of
             `within`; or the stage cannot be opened. Says the layer and the prim.
     """
     open_stage(root)  # refuses
@@ -61,7 +61,7 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
     others = [Path(asset).resolve() for asset in assets]
     for name in lost:
         if not _is_library(name):
-            raise RefusedError(
+            raise InputError(
                 f"{_namer(layers, name)}: names {name}, which is not there; put it there, or take the name "
                 "out"
             )
@@ -113,16 +113,16 @@ def _is_library(name: str) -> bool:
 def _check_carried(file: Path, layers: Iterable[Sdf.Layer], within: Path | None) -> None:
     """Refuse a file that must not be handed on."""
     if "[" in file.as_posix() or file.suffix == ".usdz":
-        raise RefusedError(
+        raise InputError(
             f"{_namer(layers, str(file))}: names {file}, a part of a package; unpack that with "
             "`magtwin export FILE.usdz --out DIR`, and name a layer in it"
         )
     if within is not None and not file.is_relative_to(within.resolve()):
-        raise RefusedError(
+        raise InputError(
             f"{_namer(layers, str(file))}: names {file}, outside of its package; it must bring all it names"
         )
     if file.suffix not in SUFFIXES and not kind_of(file):
-        raise RefusedError(
+        raise InputError(
             f"{_namer(layers, str(file))}: names {file}, which is no layer, texture, network or path, so it "
             "is not handed on; take the name out"
         )

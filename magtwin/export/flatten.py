@@ -19,7 +19,7 @@ def flatten(root: Path, out: Path) -> None:
         out: Layer to write, below the folder of `root`, so that what it names stays right.
 
     Raises:
-        RefusedError: The stage cannot be opened.
+        InputError: The stage cannot be opened.
     """
     stage = open_stage(root)
     with Usd.EditContext(stage, stage.GetSessionLayer()):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 from magtwin.usd.geometry import Shape, read_shapes
 from magtwin.usd.layers import open_stage
 from magtwin.usd.schema import NOUNS, attribute_name, prims_with
@@ -54,12 +54,12 @@ def write_glb(stage_file: Path, out: Path) -> None:
         out: The .glb file to make.
 
     Raises:
-        RefusedError: The stage cannot be opened, or shows nothing.
+        InputError: The stage cannot be opened, or shows nothing.
     """
     stage = open_stage(stage_file)
     shapes = [shape for shape in read_shapes(stage) if len(shape.faces)]
     if not shapes:
-        raise RefusedError(f"{stage_file}: shows no surface, so there is nothing to write")
+        raise InputError(f"{stage_file}: shows no surface, so there is nothing to write")
     scene = _Scene(stage)
     for home, own in _gathered(stage, shapes).items():
         scene.show(home, own)

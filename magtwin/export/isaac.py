@@ -1,7 +1,8 @@
 """Isaac Sim: what a scene needs there beside what every USD has, ROS 2 topics above all.
 
 An Action Graph a robot publishes clock, odometry, inertial unit, pose, battery, joints and scan, and drives
-the robot by the commands that come in, on the topics and in the frames of `magtwin.io.messages`. Isaac Sim
+the robot by the commands that come in, on the topics and in the frames of `magtwin.io.bags.messages`. Isaac
+Sim
 has no magnetometer: whoever reads these topics has what the network reads, and computes the field. None of
 this has been run in Isaac Sim; the graph is held against its nodes' definitions, see `magtwin.export.ogn`.
 """
@@ -12,11 +13,11 @@ from typing import Any
 
 from pxr import Sdf, Usd, UsdPhysics
 
+from magtwin.errors import InputError
 from magtwin.export.ogn import Graph
 from magtwin.frames import IDENTITY_XYZW
-from magtwin.names import RefusedError
-from magtwin.sim.battery import current_a, open_voltage
-from magtwin.spec import ZERO3, BatterySpec, MountSpec, RobotSpec, Scene
+from magtwin.sim.sensors.battery import current_a, open_voltage
+from magtwin.spec.scene import ZERO3, BatterySpec, MountSpec, RobotSpec, Scene
 from magtwin.usd.layers import WORLD
 from magtwin.usd.schema import only_prim_with, place, prims_with
 from magtwin.usd.sensors import BASE, IMU_TYPE, LIDAR_TYPE
@@ -67,14 +68,14 @@ def author_graph(stage: Usd.Stage, scene: Scene) -> list[Usd.Prim]:
         The graphs' prims.
 
     Raises:
-        RefusedError: A robot is not in the stage, is none to Isaac Sim, or lacks a sensor.
+        InputError: A robot is not in the stage, is none to Isaac Sim, or lacks a sensor.
     """
     robots = {prim.GetName(): prim for prim in prims_with(stage.GetPseudoRoot(), "robot")}
     alone, graphs = len(scene.robots) == 1, []
     for k, placed in enumerate(scene.robots):
         robot = placed.robot
         if robot.name not in robots:
-            raise RefusedError(f"the stage has no robot {robot.name!r}; it has {', '.join(robots) or 'none'}")
+            raise InputError(f"the stage has no robot {robot.name!r}; it has {', '.join(robots) or 'none'}")
         parts = _parts(robots[robot.name])
         if not stage.GetPrimAtPath(GRAPHS):
             stage.DefinePrim(GRAPHS, "Scope")
@@ -105,7 +106,7 @@ def _author(graph: Graph, robot: RobotSpec, parts: _Parts, namespace: str, *, cl
 
 
 def _qos(graph: Graph) -> None:
-    """As `magtwin.io.messages` offers its topics."""
+    """As `magtwin.io.bags.messages` offers its topics."""
     kind = f"{BRIDGE}ROS2QoSProfile"
     reliable, best = {"reliability": "reliable"}, {"reliability": "bestEffort"}
     graph.node(DEFAULT_QOS, kind, createProfile="Default for publishers/subscribers", depth=10, **reliable)
@@ -272,17 +273,17 @@ def frame_of(mount: MountSpec, name: str) -> str:
 def _parts(root: Usd.Prim) -> _Parts:
     """The prims that Isaac Sim needs of a robot; refused where one is missing."""
     if ROBOT_API not in root.GetMetadata("apiSchemas").GetAppliedItems():
-        raise RefusedError(
+        raise InputError(
             f"{place(root)}: has no {ROBOT_API}, so it is no robot to Isaac Sim; convert it from its URDF "
             "with `magtwin robot`"
         )
     links = root.GetRelationship(LINKS).GetForwardedTargets()
     joints = root.GetRelationship(JOINTS).GetForwardedTargets()
     if not links or not joints:
-        raise RefusedError(f"{place(root)}: {LINKS if not links else JOINTS} lists none; list them in order")
+        raise InputError(f"{place(root)}: {LINKS if not links else JOINTS} lists none; list them in order")
     base = root.GetStage().GetPrimAtPath(links[0])
     if not base or not base.HasAPI(UsdPhysics.RigidBodyAPI):
-        raise RefusedError(f"{place(root)}: {LINKS} begins with {links[0]}, which is no rigid body")
+        raise InputError(f"{place(root)}: {LINKS} begins with {links[0]}, which is no rigid body")
     return _Parts(
         root=root.GetPath(),
         base=links[0],
@@ -294,5 +295,5 @@ def _parts(root: Usd.Prim) -> _Parts:
 def _child(mount: Usd.Prim, kind: str) -> Usd.Prim:
     found = [prim for prim in mount.GetChildren() if prim.GetTypeName() == kind]
     if len(found) != 1:
-        raise RefusedError(f"{place(mount)}: has {len(found)} children of type {kind}; it needs one")
+        raise InputError(f"{place(mount)}: has {len(found)} children of type {kind}; it needs one")
     return found[0]

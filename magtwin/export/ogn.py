@@ -14,7 +14,7 @@ from typing import Any
 
 from pxr import Gf, Sdf, Usd
 
-from magtwin.names import RefusedError, hint
+from magtwin.errors import InputError, hint
 
 TABLE = Path(__file__).with_name("ogn.toml")
 
@@ -178,11 +178,11 @@ class Graph:
         """Define the graph's prim.
 
         Raises:
-            RefusedError: Something else is there already.
+            InputError: Something else is there already.
         """
         there = stage.GetPrimAtPath(path)
         if there and there.IsDefined() and there.GetTypeName() != "OmniGraph":
-            raise RefusedError(f"<{path}>: is taken by a {there.GetTypeName() or 'prim'}; rename that")
+            raise InputError(f"<{path}>: is taken by a {there.GetTypeName() or 'prim'}; rename that")
         self.stage, self.path = stage, path
         self._kinds: dict[str, Mapping[str, Kind]] = {}
         prim = stage.DefinePrim(path, "OmniGraph")
@@ -207,11 +207,11 @@ class Graph:
             **values: Of its inputs; of a target, the path or paths of prims.
 
         Raises:
-            RefusedError: There is no such type, it has no such input, or the input no such value.
+            InputError: There is no such type, it has no such input, or the input no such value.
         """
         types = node_types()
         if kind not in types:
-            raise RefusedError(f"no node type {kind!r}; {hint(kind, types)}")
+            raise InputError(f"no node type {kind!r}; {hint(kind, types)}")
         known = types[kind]
         prim = self.stage.DefinePrim(self.path.AppendChild(name), "OmniGraphNode")
         names = Sdf.ValueTypeNames
@@ -220,7 +220,7 @@ class Graph:
         inputs = dict(known.inputs)
         if message:
             if not message_fields(message):
-                raise RefusedError(f"no message {message!r}; {hint(message, _table()['messages'])}")
+                raise InputError(f"no message {message!r}; {hint(message, _table()['messages'])}")
             package, folder, short = message.split("/")
             values |= {"messagePackage": package, "messageSubfolder": folder, "messageName": short}
             inputs |= message_fields(message)
@@ -231,9 +231,9 @@ class Graph:
         }
         for key, value in values.items():
             if key not in inputs:
-                raise RefusedError(f"{kind} has no input {key!r}; {hint(key, inputs)}")
+                raise InputError(f"{kind} has no input {key!r}; {hint(key, inputs)}")
             if key in known.tokens and value not in known.tokens[key]:
-                raise RefusedError(f"{kind}: {key} {value!r} is none; {hint(str(value), known.tokens[key])}")
+                raise InputError(f"{kind}: {key} {value!r} is none; {hint(str(value), known.tokens[key])}")
             self._set(prim, key, inputs[key], value)
         return prim
 
@@ -241,11 +241,11 @@ class Graph:
         """Connect an output to an input, each as NODE.ATTRIBUTE with no namespace: tick.tick, clock.execIn.
 
         Raises:
-            RefusedError: One of them is not there, or their types do not go together.
+            InputError: One of them is not there, or their types do not go together.
         """
         output, input_ = self._end(given, "outputs"), self._end(taken, "inputs")
         if not fits(output[2], input_[2]):
-            raise RefusedError(f"{given} is {_words(output[2])}, {taken} takes {_words(input_[2])}")
+            raise InputError(f"{given} is {_words(output[2])}, {taken} takes {_words(input_[2])}")
         self._attribute(*output)
         attribute = self._attribute(*input_)
         attribute.AddConnection(output[0].GetPath().AppendProperty(output[1]))
@@ -254,10 +254,10 @@ class Graph:
         node, _, name = text.partition(".")
         kinds = self._kinds.get(node)
         if kinds is None:
-            raise RefusedError(f"{text}: no node {node!r}; {hint(node, self._kinds)}")
+            raise InputError(f"{text}: no node {node!r}; {hint(node, self._kinds)}")
         full = f"{namespace}:{name}"
         if full not in kinds:
-            raise RefusedError(f"{text}: no such attribute; {hint(full, kinds)}")
+            raise InputError(f"{text}: no such attribute; {hint(full, kinds)}")
         return self.stage.GetPrimAtPath(self.path.AppendChild(node)), full, kinds[full]
 
     @staticmethod
@@ -304,7 +304,7 @@ def _shape(kind: str) -> tuple[str, str, str]:
     """Base type, tuple and array of a kind, without its role."""
     found = _SHAPE.fullmatch(kind)
     if found is None:
-        raise RefusedError(f"{kind!r} is no type of OmniGraph")
+        raise InputError(f"{kind!r} is no type of OmniGraph")
     base, count, array = found["base"], found["tuple"] or "", found["array"] or ""
     role = next((r for r in ROLES if base.startswith(r)), "")
     if role:

@@ -13,28 +13,28 @@ from typing import Literal
 
 from pxr import Sdf, Usd, UsdGeom
 
+from magtwin.author.scene import read_scene
+from magtwin.errors import InputError, find
 from magtwin.export.attached import attach, detach
 from magtwin.export.contents import THUMBNAIL, bring_together
 from magtwin.export.flatten import flatten
 from magtwin.export.glb import write_glb
 from magtwin.export.howto import howto
-from magtwin.export.inspection import inspect
 from magtwin.export.isaac import GRAPHS, author_graph
 from magtwin.export.structure import structure
 from magtwin.export.units import to_metres_z_up
 from magtwin.export.usdz import pack, unpack
+from magtwin.export.validation.inspection import inspect
 from magtwin.files import check_free, existing, output, sha256
-from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
-from magtwin.run import Run
+from magtwin.run.run import Run
+from magtwin.urdf.simready import UNKNOWN
 from magtwin.usd.animation import write_animation
 from magtwin.usd.layers import open_stage, stage_sha256
 from magtwin.usd.maps import read_map
-from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import FOLDER as SCHEMA
 from magtwin.usd.schema import attribute_name, place, prims_with
 from magtwin.usd.sensors import MAP_CHECKSUM
-from magtwin.usd.urdf.simready import UNKNOWN
 from magtwin.version import __version__
 
 Profile = Literal["omniverse", "isaac", "newton", "viewer"]
@@ -126,7 +126,7 @@ def export_scene(
         progress: Called with what is done next.
 
     Raises:
-        RefusedError: The stage cannot be opened, names what is not there, is not what its checksums say, or
+        InputError: The stage cannot be opened, names what is not there, is not what its checksums say, or
             is not in metres with Z up and `convert_units` was not given; or `out` exists, or cannot hold what
             the stage has. Nothing is written.
     """
@@ -135,20 +135,18 @@ def export_scene(
     name: str = profile or ("omniverse" if kind in ("folder", "package") else "viewer")
     find("profile", name, PROFILES)
     if kind in ("layer", "web") and name != "viewer":
-        raise RefusedError(
-            f"{out}: {out.suffix} is for viewers; give a folder or a .usdz for --profile {name}"
-        )
+        raise InputError(f"{out}: {out.suffix} is for viewers; give a folder or a .usdz for --profile {name}")
     beside = out.with_name(f"{out.stem}_magtwin") if kind == "package" and name != "viewer" else None
     for target in filter(None, (out, beside)):
         check_free(target, force=force)
     if existing(scene_file, "stage").is_dir():
         own = scene_file / f"{scene_file.resolve().name}.usda"
-        raise RefusedError(
+        raise InputError(
             f"{scene_file}: a folder; give a USD file in it{f', such as {own}' if own.is_file() else ''}"
         )
     for target in filter(None, (out, beside)):
         if target.resolve() in (scene_file.resolve(), *scene_file.resolve().parents):
-            raise RefusedError(f"{target}: is or holds the stage that is exported; name another place")
+            raise InputError(f"{target}: is or holds the stage that is exported; name another place")
     with TemporaryDirectory() as scratch, _told_of(Path(scratch, "stage"), scene_file):
         work = _Work(Path(scratch, "stage"), scene_file, name, progress)
         work.gather(convert_units=convert_units, trusted=trusted)
@@ -178,7 +176,7 @@ def export_scene(
 
 
 def _no_kind(out: Path) -> str:
-    raise RefusedError(f"{out}: an export is a folder (no suffix), or ends in .usdz, .usd, .usdc or .glb")
+    raise InputError(f"{out}: an export is a folder (no suffix), or ends in .usdz, .usd, .usdc or .glb")
 
 
 @contextmanager
@@ -186,13 +184,13 @@ def _told_of(copy: Path, scene_file: Path) -> Iterator[None]:
     """Refusals of the copy that is worked on name the stage that was given."""
     try:
         yield
-    except RefusedError as error:
+    except InputError as error:
         there = scene_file if scene_file.suffix == ".usdz" else scene_file.parent
         text = str(error)
         for folder in (copy.with_name("package"), copy):
             for path in (folder.resolve(), folder):
                 text = text.replace(f"{path}{os.sep}", f"{there}{os.sep}")
-        raise RefusedError(text) from error
+        raise InputError(text) from error
 
 
 class _Work:
@@ -237,7 +235,7 @@ class _Work:
             return
         if not convert_units:
             said = stage.HasAuthoredMetadata("metersPerUnit") and stage.HasAuthoredMetadata("upAxis")
-            raise RefusedError(
+            raise InputError(
                 f"{self.source}: has {metres:g} m a unit and {up} up{'' if said else ', as it says none'}; "
                 "magtwin hands on metres with Z up: give --convert-units to convert its points and transforms"
             )
@@ -287,7 +285,7 @@ class _Work:
             file = Path(named.resolvedPath)
             checksum, seen = prim.GetAttribute(NETWORK_SHA256).Get(), sha256(file)
             if checksum and checksum.lower() != seen:
-                raise RefusedError(
+                raise InputError(
                     f"{place(prim)}: its network {named.path} has SHA-256 {seen}, the stage was made with "
                     f"{checksum}; put that network back, or make the scene anew"
                 )
@@ -314,13 +312,13 @@ class _Work:
                     self.progress(f"Writing {weights.stem} as ONNX")
                     write(weights, out)
                 self.onnx.append(out)
-            except RefusedError as error:
+            except InputError as error:
                 self.notes.append(f"{self._said(weights)} has no ONNX beside it: {error}")
 
     def for_isaac(self) -> None:
         """Give robots Isaac Sim's asset structure, and the scene its Action Graphs."""
         if self.scene is None:
-            raise RefusedError(
+            raise InputError(
                 f"{self.source}: is no scene of magtwin's, with lab, robot and magnetometer, which --profile "
                 "isaac is for; take --profile omniverse"
             )
@@ -372,7 +370,7 @@ class _Work:
         self.flat()
         for file in self.folder.rglob("*"):
             if file.is_file() and file != self.root:
-                raise RefusedError(
+                raise InputError(
                     f"{self.source}: {self._said(file)} cannot lie in a layer; give a folder or a .usdz"
                 )
         if out.suffix == ".usd":
@@ -404,7 +402,7 @@ class _Work:
             picture.unlink(missing_ok=True)  # of a folder that was exported before
             try:
                 thumbnail(out / self.root.name, picture)
-            except RefusedError as error:  # there is nothing to draw, or nothing to draw with
+            except InputError as error:  # there is nothing to draw, or nothing to draw with
                 self.notes.append(f"no thumbnail was drawn: {str(error).replace(f'{out}{os.sep}', '')}")
                 if not any(picture.parent.iterdir()):
                     shutil.rmtree(picture.parents[1])

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from pxr import Sdf, UsdUtils
 
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
+from magtwin.urdf.layout import GEOMETRIES, PAYLOADS, write_layers
 from magtwin.usd.layers import open_stage
-from magtwin.usd.urdf.layout import GEOMETRIES, PAYLOADS, write_layers
 
 
 def structure(asset: Path) -> None:
@@ -19,7 +19,7 @@ def structure(asset: Path) -> None:
         asset: Root layer of the robot, text, in a folder that may be changed.
 
     Raises:
-        RefusedError: The asset has no default prim, or names several layers.
+        InputError: The asset has no default prim, or names several layers.
     """
     folder = asset.parent / PAYLOADS
     layer = Sdf.Layer.FindOrOpen(str(asset))
@@ -27,7 +27,7 @@ def structure(asset: Path) -> None:
     if f"./{PAYLOADS}/base.usda" in named:
         return
     if not layer.defaultPrim or len(named) > 1 or folder.exists() or asset.suffix != ".usda":
-        raise RefusedError(
+        raise InputError(
             f"{asset}: is no robot in one text layer and one of meshes, which Isaac Sim's structure is made "
             "from; convert its URDF with `magtwin robot`"
         )

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
+from magtwin.errors import InputError
 from magtwin.export.contents import dependencies
-from magtwin.names import RefusedError
 from magtwin.usd.layers import open_stage
 
 LENGTHS: Mapping[str, float] = MappingProxyType(
@@ -80,12 +80,12 @@ def to_metres_z_up(root: Path) -> tuple[str, ...]:
         Notes on what may need a look, a line each.
 
     Raises:
-        RefusedError: The stage cannot be opened, or its unit is none.
+        InputError: The stage cannot be opened, or its unit is none.
     """
     stage = open_stage(root)
     metres, up = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)
     if not (math.isfinite(metres) and metres > 0):
-        raise RefusedError(f"{root}: metersPerUnit is {metres!r}; it must be a length above 0")
+        raise InputError(f"{root}: metersPerUnit is {metres!r}; it must be a length above 0")
     layers = dependencies(root)[0]
     foreign: set[str] = set()
     if metres != 1:

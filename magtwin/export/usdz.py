@@ -9,7 +9,7 @@ import struct
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 from magtwin.usd.layers import SUFFIXES
 
 ALLOWED = (*SUFFIXES, ".png", ".jpg", ".jpeg", ".exr", ".avif", ".m4a", ".mp3", ".wav")
@@ -37,18 +37,18 @@ def pack(root: Path, out: Path) -> None:
         out: The .usdz file to make.
 
     Raises:
-        RefusedError: A file is of no kind that a package may hold, or it would be too large.
+        InputError: A file is of no kind that a package may hold, or it would be too large.
     """
     folder = root.parent
     files = sorted(f for f in folder.rglob("*") if f.is_file() and not _is_hidden(f.relative_to(folder)))
     for file in files:
         if file.suffix.lower() not in ALLOWED:
-            raise RefusedError(
+            raise InputError(
                 f"{file.relative_to(folder)}: a .usdz may hold {', '.join(ALLOWED)}, and no other file; "
                 "export to a folder, or convert it"
             )
     if sum(file.stat().st_size + 1024 for file in files) > MOST_BYTES:
-        raise RefusedError(f"{out}: a .usdz holds at most 4 GiB; export to a folder")
+        raise InputError(f"{out}: a .usdz holds at most 4 GiB; export to a folder")
     with zipfile.ZipFile(out, "w", zipfile.ZIP_STORED, allowZip64=False) as archive:
         for file in (root, *(f for f in files if f != root)):
             entry = zipfile.ZipInfo(file.relative_to(folder).as_posix(), _DAY)
@@ -71,7 +71,7 @@ def unpack(package: Path, folder: Path) -> Path:
         The layer to open.
 
     Raises:
-        RefusedError: The file is no such package or is damaged, or an entry would lie outside of the folder
+        InputError: The file is no such package or is damaged, or an entry would lie outside of the folder
             or is of no kind that a package may hold.
     """
     try:
@@ -85,37 +85,37 @@ def unpack(package: Path, folder: Path) -> Path:
                     shutil.copyfileobj(source, file)  # refuses what is not as its checksum says
     except (zipfile.BadZipFile, EOFError, NotImplementedError, struct.error, OSError) as error:
         said = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise RefusedError(f"{package}: damaged, or no .usdz: {said}; copy or write it again") from error
+        raise InputError(f"{package}: damaged, or no .usdz: {said}; copy or write it again") from error
     return folder / entries[0].filename
 
 
 def _check(package: Path, entries: list[zipfile.ZipInfo]) -> None:
     """Refuse a package before anything of it is written."""
     if not entries or PurePosixPath(entries[0].filename).suffix.lower() not in SUFFIXES:
-        raise RefusedError(f"{package}: no .usdz: its first entry is no layer; write it again")
+        raise InputError(f"{package}: no .usdz: its first entry is no layer; write it again")
     seen: set[str] = set()
     for entry in entries:
         name = entry.filename
         path = PurePosixPath(name)
         climbs = path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name or "\0" in name
         if climbs or entry.orig_filename != name:
-            raise RefusedError(
+            raise InputError(
                 f"{package}: its entry {entry.orig_filename!r} would lie outside of it; do not open it, it "
                 "was made to write elsewhere"
             )
         if path.as_posix().lower() in seen:
-            raise RefusedError(f"{package}: holds {name!r} twice; write it again")
+            raise InputError(f"{package}: holds {name!r} twice; write it again")
         seen.add(path.as_posix().lower())
         if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
-            raise RefusedError(
+            raise InputError(
                 f"{package}: its entry {name!r} is compressed or encrypted, which a .usdz must not be; pack "
                 "it again with `magtwin export`"
             )
         if path.suffix.lower() not in ALLOWED:
-            raise RefusedError(f"{package}: holds {name!r}, which a .usdz must not; pack it again without")
+            raise InputError(f"{package}: holds {name!r}, which a .usdz must not; pack it again without")
     size = package.stat().st_size
     if sum(entry.file_size for entry in entries) > size:
-        raise RefusedError(f"{package}: its entries say that they are larger than it is; it is damaged")
+        raise InputError(f"{package}: its entries say that they are larger than it is; it is damaged")
 
 
 def _is_hidden(path: Path) -> bool:

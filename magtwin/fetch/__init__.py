@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from magtwin.errors import InputError, find
 from magtwin.files import output
-from magtwin.names import RefusedError, find
 
 _GITHUB = "https://raw.githubusercontent.com"
 
@@ -80,13 +80,13 @@ def fetch(
         The files written.
 
     Raises:
-        RefusedError: No such source, no connection, a file that is not there, or a wrong checksum.
+        InputError: No such source, no connection, a file that is not there, or a wrong checksum.
     """
     import pooch
 
     sources = find("source", name, SOURCES)
     if base_url is not None and urlsplit(base_url).scheme not in ("http", "https"):
-        raise RefusedError(f"--base-url {base_url!r}: must begin with http:// or https://")
+        raise InputError(f"--base-url {base_url!r}: must begin with http:// or https://")
     jobs = [
         (file, checksum, f"{(base_url or source.base_url).rstrip('/')}/{path}")
         for source in sources
@@ -103,9 +103,9 @@ def fetch(
                     url, f"sha256:{checksum}", fname=target.name, path=target.parent, downloader=downloader
                 )
             except ValueError as error:  # pooch: the checksum differs
-                raise RefusedError(f"{url}: its SHA-256 is not {checksum}; nothing was kept") from error
+                raise InputError(f"{url}: its SHA-256 is not {checksum}; nothing was kept") from error
             except OSError as error:  # requests' exceptions are OSErrors
                 reason = str(error).split("\n")[0]
-                raise RefusedError(f"{url}: could not be fetched ({reason}); nothing was kept") from error
+                raise InputError(f"{url}: could not be fetched ({reason}); nothing was kept") from error
         progress(len(jobs), len(jobs), "")
     return [dest / file for file, _, _ in jobs]

@@ -3,7 +3,7 @@
 import datetime
 from collections.abc import Sequence
 
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 
 ORIGIN = datetime.date(2000, 1, 1)
 """Day 0 of `day_number`."""
@@ -13,7 +13,7 @@ def parse_day(day: str | datetime.date, what: str = "date") -> datetime.date:
     """A day, from its name YYYY-MM-DD.
 
     Raises:
-        RefusedError: It is none; the text begins with `what`.
+        InputError: It is none; the text begins with `what`.
     """
     if isinstance(day, datetime.datetime):
         return day.date()
@@ -24,7 +24,7 @@ def parse_day(day: str | datetime.date, what: str = "date") -> datetime.date:
     except (TypeError, ValueError):
         parsed = None
     if parsed is None or parsed.isoformat() != day:  # 20260102 and 2026-W01-5 are ISO's too
-        raise RefusedError(f"{what} must be a day YYYY-MM-DD, got {day!r}")
+        raise InputError(f"{what} must be a day YYYY-MM-DD, got {day!r}")
     return parsed
 
 
@@ -32,7 +32,7 @@ def check_day(day: str, what: str) -> None:
     """Refuse the text of a day that is neither YYYY-MM-DD nor empty.
 
     Raises:
-        RefusedError: It is none; the text begins with `what`.
+        InputError: It is none; the text begins with `what`.
     """
     if day != "":
         parse_day(day, what)
@@ -42,13 +42,13 @@ def check_texts(survey: object, names: Sequence[str]) -> None:
     """Refuse what a survey or a map says of itself where it is no text, or its day none.
 
     Raises:
-        RefusedError: An attribute of `survey`, one of `names`, is no text, or `created` is no day.
+        InputError: An attribute of `survey`, one of `names`, is no text, or `created` is no day.
     """
     kind = type(survey).__name__
     for name in names:
         text = getattr(survey, name)
         if not isinstance(text, str):
-            raise RefusedError(f"{name} of {kind} must be a text, got {text!r}")
+            raise InputError(f"{name} of {kind} must be a text, got {text!r}")
     check_day(getattr(survey, "created", ""), f"created of {kind}")
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 from magtwin.summary import Summarized, Summary, listed, rectangle
 
 Array = NDArray[np.float64]
@@ -48,18 +48,18 @@ class Grid(Summarized):
             and headings[0] >= 0
             and headings[-1] < TURN
         ):
-            raise RefusedError(f"headings_rad of Grid must ascend in [0, 2 pi), got {self.headings_rad}")
+            raise InputError(f"headings_rad of Grid must ascend in [0, 2 pi), got {self.headings_rad}")
         for name in ("origin_m", "cell_m"):
             pair = tuple(float(v) for v in getattr(self, name))
             if len(pair) != 2 or not np.all(np.isfinite(pair)) or (name == "cell_m" and min(pair) <= 0):
                 above = " above 0" if name == "cell_m" else ""
-                raise RefusedError(f"{name} of Grid must be two lengths{above} [m], got {pair}")
+                raise InputError(f"{name} of Grid must be two lengths{above} [m], got {pair}")
             object.__setattr__(self, name, pair)
         object.__setattr__(self, "headings_rad", tuple(headings.tolist()))
         if self.rows < 2 or self.columns < 2:
-            raise RefusedError(f"a Grid needs 2 x 2 nodes at least, got {self.rows} x {self.columns}")
+            raise InputError(f"a Grid needs 2 x 2 nodes at least, got {self.rows} x {self.columns}")
         if np.prod(self.shape, dtype=float) > MOST_NODES:
-            raise RefusedError(
+            raise InputError(
                 f"a grid of {self.rows} x {self.columns} nodes in {len(headings)} headings is beyond "
                 f"{MOST_NODES:,} nodes; widen the spacing"
             )
@@ -74,14 +74,14 @@ class Grid(Summarized):
             headings_rad: Headings [rad], ascending in [0, 2 pi).
 
         Raises:
-            RefusedError: The spacing is not above 0, or leaves no cell.
+            InputError: The spacing is not above 0, or leaves no cell.
         """
         x0, x1, y0, y1 = (float(v) for v in np.asarray(extent, float))
         if not (np.isfinite(spacing_m) and spacing_m > 0):
-            raise RefusedError(f"spacing_m must be above 0 m, got {spacing_m!r}")
+            raise InputError(f"spacing_m must be above 0 m, got {spacing_m!r}")
         columns, rows = (int(np.floor(length / spacing_m + 1e-9)) + 1 for length in (x1 - x0, y1 - y0))
         if min(columns, rows) < 2:
-            raise RefusedError(f"spacing_m {spacing_m:g} leaves no cell on {x1 - x0:g} x {y1 - y0:g} m")
+            raise InputError(f"spacing_m {spacing_m:g} leaves no cell on {x1 - x0:g} x {y1 - y0:g} m")
         return cls(
             origin_m=(
                 (x0 + x1) / 2 - (columns - 1) * spacing_m / 2,

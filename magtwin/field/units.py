@@ -6,7 +6,7 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
 
 Array = NDArray[np.float64]
 Unit = Literal["nT", "uT", "T", "mG", "G"]
@@ -56,7 +56,7 @@ def check_unit(
         scale: Factor that took the file's values to nT, in place of a unit.
 
     Raises:
-        RefusedError: The mean lies outside 10,000..100,000 nT; the text names the unit that would fit. Or
+        InputError: The mean lies outside 10,000..100,000 nT; the text names the unit that would fit. Or
             more readings than outliers would be are another unit's factor off the others.
     """
     usual = float(np.sort(b_nt)[len(b_nt) // 2])
@@ -65,7 +65,7 @@ def check_unit(
         odd = np.flatnonzero((np.abs(np.log10(np.maximum(ratio, 1e-12))) < 0.3) & (other != unit))
         if LEAST_MEAN_NT <= usual <= GREATEST_MEAN_NT and len(odd) > max(1, MIXED * len(b_nt)):
             first = int(odd[0])
-            raise RefusedError(
+            raise InputError(
                 f"{row(first) if row else where}: {column} is {b_nt[first]:.6g} nT, where most readings are "
                 f"about {usual:,.0f} nT; it and {len(odd) - 1} more would fit in {other}: give all rows in "
                 "one unit"
@@ -74,7 +74,7 @@ def check_unit(
     if LEAST_MEAN_NT <= mean <= GREATEST_MEAN_NT:
         return
     if scale is not None:
-        raise RefusedError(
+        raise InputError(
             f"{where}: the mean of {column} is {mean:.6g} nT with scale {scale:g}, outside "
             f"{LEAST_MEAN_NT:,.0f}..{GREATEST_MEAN_NT:,.0f} nT; --scale {_four(scale * USUAL_NT / mean)} "
             f"would make it {USUAL_NT:,.0f} nT"
@@ -92,7 +92,7 @@ def check_unit(
             f"{advice or no_unit}; for a normalised sensor give --scale, the factor to nT "
             f"({_four(USUAL_NT / number)} would make it {USUAL_NT:,.0f} nT)"
         )
-    raise RefusedError(
+    raise InputError(
         f"{where}: the mean of {column} is {mean:.6g} nT, outside {LEAST_MEAN_NT:,.0f}.."
         f"{GREATEST_MEAN_NT:,.0f} nT; {advice}"
     )

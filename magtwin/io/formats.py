@@ -8,13 +8,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from magtwin.errors import InputError, hint
 from magtwin.files import existing
-from magtwin.names import RefusedError, hint
-from magtwin.run import Run, check_clock
+from magtwin.run.run import Run, check_clock
 
 if TYPE_CHECKING:
     from magtwin.path import Path as Planned
-    from magtwin.sim.lidar import Scans
+    from magtwin.sim.sensors.lidar import Scans
     from magtwin.twin import Twin
 
 
@@ -55,7 +55,7 @@ _NAMED = frozenset(("columns",))
 _PARQUET = Format("Parquet", _TABLES, "read_parquet", "write_parquet", reads=_NAMED)
 _BAG = Format(
     "rosbag2",
-    "magtwin.io.rosbag",
+    "magtwin.io.bags.rosbag",
     "read_bag",
     "write_bag",
     reads=frozenset(("topics", "unit")),
@@ -76,7 +76,7 @@ FORMATS: Mapping[str, Format] = MappingProxyType(
         ".npz": Format("npz", _TABLES, "read_npz", "write_npz"),
         ".rrd": Format(
             "Rerun",
-            "magtwin.io.rerun",
+            "magtwin.io.rerun.file",
             "read_run",
             "write_rrd",
             takes=frozenset(("twin", "planned", "scans")),
@@ -102,13 +102,13 @@ def read_run(path: str | os.PathLike[str], **options: Any) -> Run:
             another program wrote.
 
     Raises:
-        RefusedError: The file is missing, of no known kind, damaged, holds no run, or its format has no such
+        InputError: The file is missing, of no known kind, damaged, holds no run, or its format has no such
             option.
     """
     path = existing(path, "run")
     file, format_ = _found(path) if path.is_dir() else (path, format_of(path))
     if unknown := sorted(options.keys() - format_.reads):
-        raise RefusedError(f"{path}: {format_.name} is read without {unknown[0]}; drop it")
+        raise InputError(f"{path}: {format_.name} is read without {unknown[0]}; drop it")
     run = format_.reader()(file, **options)
     check_clock(run, str(path))
     return run
@@ -136,21 +136,21 @@ def write_run(
         options: Of single formats: `storage` and `units` of bags, `fps` of USD.
 
     Raises:
-        RefusedError: The name ends in no known way, the format has no such option, the run has no clock that
+        InputError: The name ends in no known way, the format has no such option, the run has no clock that
             ascends, the file exists and `force` was not given, or it cannot be written.
     """
     path = Path(path)
     format_ = format_of(path)
     if not format_.write:
         kinds = ", ".join(suffix for suffix, one in FORMATS.items() if one.write)
-        raise RefusedError(f"{path}: a recording of the {format_.name} is read, not written; write {kinds}")
+        raise InputError(f"{path}: a recording of the {format_.name} is read, not written; write {kinds}")
     if unknown := sorted(options.keys() - format_.takes):
-        raise RefusedError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
+        raise InputError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
     check_clock(run, "the run to write")
     if twin is not None and twin.stage is not None and "scene_file" in format_.takes:
-        raise RefusedError(
+        raise InputError(
             f"{path}: {format_.name} names the scene's file, and this scene has none; author it with "
-            "magtwin.usd.scene.author_scene and open that, or leave out twin"
+            "magtwin.author.scene.author_scene and open that, or leave out twin"
         )
     scene_file = None if twin is None else twin.scene_file
     known = {"twin": twin, "planned": planned, "scans": scans, "scene_file": scene_file}
@@ -162,12 +162,12 @@ def format_of(path: Path) -> Format:
     """The format that a file's name asks for; a bag's folder where it has no ending.
 
     Raises:
-        RefusedError: It ends in no known way.
+        InputError: It ends in no known way.
     """
     if not path.suffix:
         return _BAG
     if path.suffix not in FORMATS:
-        raise RefusedError(f"{path}: no known kind of run file; {hint(path.suffix, FORMATS)}")
+        raise InputError(f"{path}: no known kind of run file; {hint(path.suffix, FORMATS)}")
     return FORMATS[path.suffix]
 
 
@@ -179,7 +179,7 @@ def _found(folder: Path) -> tuple[Path, Format]:
         return folder / "run.parquet", _PARQUET
     if any(folder.glob("*.parquet")):
         return folder, _PARQUET
-    raise RefusedError(
+    raise InputError(
         f"{folder}: a folder without a run; name a file ({', '.join(FORMATS)}), or a folder with a bag, "
         "Parquet parts or run.parquet"
     )

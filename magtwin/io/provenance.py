@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.field.map import AnomalyMap
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
 from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
 from magtwin.report import Figure, Report
-from magtwin.run import COLUMNS, Run
+from magtwin.run.run import COLUMNS, Run
 from magtwin.twin import in_session_of, locate, path_facts, scene_of, simulate, simulate_robots, twin_of
 
 CAUSES: Mapping[str, str] = {
@@ -75,7 +75,7 @@ def repeat_of(file: str | FilePath, scene: str | FilePath | None = None) -> Repe
     """Make the run of a file once more, and compare it with what such a file would keep of it.
 
     Raises:
-        RefusedError: The file holds no run; or as for `repeat`.
+        InputError: The file holds no run; or as for `repeat`.
     """
     from magtwin.io.formats import read_run
 
@@ -96,7 +96,7 @@ def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePat
         near: The run's own file: files that its facts name are looked for in its folder too.
 
     Raises:
-        RefusedError: The facts do not say enough, a file is not there, or the run is of something that was
+        InputError: The facts do not say enough, a file is not there, or the run is of something that was
             made in Python and is no longer at hand.
     """
     return _compared(run, made_again(run, scene, near=near))
@@ -122,11 +122,11 @@ def made_again(
         progress: As for `magtwin.twin.engine_named`.
 
     Raises:
-        RefusedError: As for `repeat`; or the engine is not known or not installed.
+        InputError: As for `repeat`; or the engine is not known or not installed.
     """
     facts = run.facts
     if "seed" not in facts and seed is None:
-        raise RefusedError(
+        raise InputError(
             "the run does not say its seed, so it cannot be repeated; was it recorded elsewhere?"
         )
     twin = twin_of(run, scene, near=near, check=False)
@@ -137,7 +137,7 @@ def made_again(
         asked = float(facts["asked_duration_s"]) if "asked_duration_s" in facts else None
         speed = float(facts.get("speed_m_s", 0.2))
     except (KeyError, ValueError) as error:
-        raise RefusedError(f"the facts of the run do not say how it was made: {error}") from error
+        raise InputError(f"the facts of the run do not say how it was made: {error}") from error
     moved_by: Any = engine or facts.get("engine", "kinematic")
     options: dict[str, Any] = {
         "lidar": facts.get("lidar", "schedule"),
@@ -146,7 +146,7 @@ def made_again(
     if isinstance(what, Path):
         options["controller"] = facts.get("controller", "follower")
     if engine is None and moved_by not in ("kinematic", "newton", "replay"):
-        raise RefusedError(
+        raise InputError(
             f"the run was moved by an engine of its maker's own, {moved_by!r}, which is not here"
         )
     name = str(facts.get("robot", ""))
@@ -209,15 +209,15 @@ def map_of(
         near: The run's own file: files that its facts name are looked for in its folder too.
 
     Raises:
-        RefusedError: The scene is not there, or its map is another.
+        InputError: The scene is not there, or its map is another.
     """
+    from magtwin.author.scene import read_scene
     from magtwin.files import sha256
     from magtwin.usd.maps import load_map
-    from magtwin.usd.scene import read_scene
 
     layer = read_scene(scene_of(run, scene, near=near), check_network=False).map_layer
     if "map_sha256" in run.facts and run.facts["map_sha256"] != sha256(layer):
-        raise RefusedError(f"{layer}: is not the map that the run read")
+        raise InputError(f"{layer}: is not the map that the run read")
     return load_map(layer)
 
 
@@ -225,7 +225,7 @@ def planned_of(run: Run, *, near: str | FilePath | None = None) -> NDArray[np.fl
     """The path that a run was to drive [m], shape (M, 2); none where it is not at hand, or drove none."""
     try:
         path = _driven(run, near)
-    except RefusedError:
+    except InputError:
         return None
     if not isinstance(path, Path) or run.facts.get("path_sha256") != path_facts(path)["path_sha256"]:
         return None
@@ -262,7 +262,7 @@ def _same(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
 
 def _driven(run: Run, near: str | FilePath | None) -> Any:
     """What was driven: a path, commands, a run, or "random" where a driver went where they liked."""
-    from magtwin.sim.commands import read_commands
+    from magtwin.sim.motion.commands import read_commands
 
     facts = run.facts
     for kind, read in (("path", read_path_csv), ("commands", read_commands), ("replay", _read_run)):
@@ -270,17 +270,17 @@ def _driven(run: Run, near: str | FilePath | None) -> Any:
             file = str(facts[f"{kind}_file"])
             place = locate(file, near)
             if place is None:
-                raise RefusedError(f"{file}: the file that the run drove is not there; put it back")
+                raise InputError(f"{file}: the file that the run drove is not there; put it back")
             return _placed(read(place), run)
     name = str(facts.get("path", ""))
     if "replay_sha256" in facts or "commands_sha256" in facts:
-        raise RefusedError(
+        raise InputError(
             f"the run drove {name!r}, which came from no file; it cannot be repeated from its facts"
         )
     if name == "random":
         return name
     if name not in PATHS and name not in CASES:
-        raise RefusedError(f"the run drove the path {name!r}, which came from no file; it cannot be repeated")
+        raise InputError(f"the run drove the path {name!r}, which came from no file; it cannot be repeated")
     return _placed(path_named(name), run)
 
 
@@ -293,7 +293,7 @@ def _placed(driven: Any, run: Run) -> Any:
         numbers = tuple(map(float, placing.split()))
         return driven.placed(numbers)  # type: ignore[arg-type]
     except ValueError as error:
-        raise RefusedError(f"the run's fact path_placing is not four numbers: {placing!r}") from error
+        raise InputError(f"the run's fact path_placing is not four numbers: {placing!r}") from error
 
 
 def _read_run(file: FilePath) -> Run:

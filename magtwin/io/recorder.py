@@ -10,8 +10,8 @@ from typing import Protocol
 
 import numpy as np
 
-from magtwin.names import RefusedError
-from magtwin.run import Run
+from magtwin.errors import InputError
+from magtwin.run.run import Run
 
 PARTIAL = ".partial"
 """What stands before the ending of a file's name until the run in it has ended."""
@@ -65,7 +65,7 @@ class Recorder:
         """The next rows, a slice of the run: its columns and facts.
 
         Raises:
-            RefusedError: A sink cannot take them; the text says which and why.
+            InputError: A sink cannot take them; the text says which and why.
         """
         if not run.rows:
             return
@@ -80,7 +80,7 @@ class Recorder:
         """Give the files what they have not got yet.
 
         Raises:
-            RefusedError: As for `append`.
+            InputError: As for `append`.
         """
         self._flushed = time.monotonic()
         waiting, self._waiting = self._waiting, []
@@ -113,7 +113,7 @@ class Recorder:
     def _abort(self, sinks: Sequence[Sink]) -> None:
         """Let go of what cannot be completed any more."""
         for sink in sinks:
-            with suppress(RefusedError, OSError, RuntimeError):
+            with suppress(InputError, OSError, RuntimeError):
                 sink.abort()
 
 
@@ -126,10 +126,10 @@ def in_step(run: Run, pace: float = 1.0, *, stop: Event | None = None) -> Iterat
         stop: Ends it when set, at once.
 
     Raises:
-        RefusedError: The pace is not above 0.
+        InputError: The pace is not above 0.
     """
     if not pace > 0:
-        raise RefusedError(f"pace must be above 0 simulated seconds a second, got {pace:g}")
+        raise InputError(f"pace must be above 0 simulated seconds a second, got {pace:g}")
     stop = stop or Event()
     t, begun, sent = run["t"], time.monotonic(), 0
     while sent < run.rows and not stop.is_set():

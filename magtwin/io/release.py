@@ -30,10 +30,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.errors import InputError, hint
 from magtwin.files import existing, sha256
 from magtwin.frames import canonical, quat_from_yaw, wrap_angle
-from magtwin.names import RefusedError, hint
-from magtwin.run import COLUMNS, Run
+from magtwin.run.run import COLUMNS, Run
 
 CHUNK = 1 << 16
 """Characters that are read at a time."""
@@ -77,19 +77,19 @@ def read_release(path: str | os.PathLike[str]) -> Run:
         lidar_on. Its facts say how many frames there were, and whether the end was missing.
 
     Raises:
-        RefusedError: The file is missing or no such list, a frame is not as above (the text names it and
+        InputError: The file is missing or no such list, a frame is not as above (the text names it and
             its place), its clock goes back, or none carries a reading.
     """
     path = existing(path, "recording")
     if path.is_dir():
-        raise RefusedError(f"{path}: a folder; name the .json file in it")
+        raise InputError(f"{path}: a folder; name the .json file in it")
     table, frames, kept, last = array("d"), 0, 0, -math.inf
     reader = _Frames(path)
     for number, start, frame in reader:
         frames = number
         row = _numbers(frame, f"{path}, frame {number} (at character {start})")
         if row[0] < last:
-            raise RefusedError(
+            raise InputError(
                 f"{path}, frame {number} (at character {start}): its clock goes back from {last!r} to "
                 f"{row[0]!r} s; was it set while recording? cut the file in two there"
             )
@@ -101,7 +101,7 @@ def read_release(path: str | os.PathLike[str]) -> Run:
         table.extend(row)
         kept, last = kept + 1, row[0]
     if not kept:
-        raise RefusedError(
+        raise InputError(
             f"{path}: {frames} frames, and none carries a reading (nn_magnetic_magnitude is 0 in all); was "
             "the magnetometer's node running?"
         )
@@ -145,7 +145,7 @@ def _numbers(frame: dict[str, Any], where: str) -> list[float]:
     for key, shape in _SHAPES.items():
         if key not in frame:
             known = list(frame)[:20]
-            raise RefusedError(f"{where}: no {key!r} in it, as `save_json` writes; {hint(key, known)}")
+            raise InputError(f"{where}: no {key!r} in it, as `save_json` writes; {hint(key, known)}")
         value = frame[key]
         if not shape:
             row.append(_number(value, key, where))
@@ -154,14 +154,14 @@ def _numbers(frame: dict[str, Any], where: str) -> list[float]:
         elif value is None or value == []:
             row += [math.nan] * sum(shape)
         elif not isinstance(value, list) or len(value) != len(shape):
-            raise RefusedError(f"{where}: {key} must be {len(shape)} lists of numbers, got {_said(value)}")
+            raise InputError(f"{where}: {key} must be {len(shape)} lists of numbers, got {_said(value)}")
         else:
             for part, width in zip(value, shape, strict=True):
                 row += _some(part, width, key, where)
     if not math.isfinite(row[0]):
-        raise RefusedError(f"{where}: timestamp must be a time [s], got {_said(frame['timestamp'])}")
+        raise InputError(f"{where}: timestamp must be a time [s], got {_said(frame['timestamp'])}")
     if row[-1] not in (0.0, 1.0) and not math.isnan(row[-1]):
-        raise RefusedError(f"{where}: lidar must be 0 or 1, got {_said(frame['lidar'])}")
+        raise InputError(f"{where}: lidar must be 0 or 1, got {_said(frame['lidar'])}")
     return row
 
 
@@ -169,7 +169,7 @@ def _some(value: Any, count: int, key: str, where: str) -> list[float]:
     if value is None or value == []:
         return [math.nan] * count
     if not isinstance(value, list) or len(value) != count:
-        raise RefusedError(f"{where}: {key} must be {count} numbers here, got {_said(value)}")
+        raise InputError(f"{where}: {key} must be {count} numbers here, got {_said(value)}")
     return [_number(one, key, where) for one in value]
 
 
@@ -183,7 +183,7 @@ def _number(value: Any, key: str, where: str) -> float:
             number = math.inf
         if not math.isinf(number):
             return number
-    raise RefusedError(f"{where}: {key} must be a finite number, got {_said(value)}")
+    raise InputError(f"{where}: {key} must be a finite number, got {_said(value)}")
 
 
 def _said(value: Any) -> str:
@@ -210,9 +210,7 @@ class _Frames:
             begun = text.lstrip()
             if not begun.startswith("["):
                 seen = _said(begun[:20]) if begun else "nothing"
-                raise RefusedError(
-                    f"{self.path}: a recording of the release begins with '[', this with {seen}"
-                )
+                raise InputError(f"{self.path}: a recording of the release begins with '[', this with {seen}")
             at = text.index("[") + 1
             while True:
                 while True:  # to the next frame
@@ -227,7 +225,7 @@ class _Frames:
                 if text[at] == "]":
                     rest = (text[at + 1 :] + file.read(CHUNK)).strip()
                     if rest:
-                        raise RefusedError(
+                        raise InputError(
                             f"{self.path}: goes on after the end of its list, with {_said(rest[:20])}; are "
                             "these two recordings? cut them apart"
                         )
@@ -256,10 +254,10 @@ class _Frames:
         try:
             return file.read(CHUNK)
         except UnicodeDecodeError as error:
-            raise RefusedError(f"{self.path}: not a text file ({error}); a recording is JSON") from error
+            raise InputError(f"{self.path}: not a text file ({error}); a recording is JSON") from error
 
-    def _refused(self, number: int, place: int, text: str) -> RefusedError:
-        return RefusedError(f"{self.path}, frame {number} (at character {place}): {text}")
+    def _refused(self, number: int, place: int, text: str) -> InputError:
+        return InputError(f"{self.path}, frame {number} (at character {place}): {text}")
 
 
 def _is_cut(error: Exception, text: str) -> bool:

@@ -6,10 +6,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from magtwin.errors import InputError
 from magtwin.files import existing, output
 from magtwin.io.tables import check_parquet
-from magtwin.names import RefusedError
-from magtwin.sim.lidar import Scans
+from magtwin.sim.sensors.lidar import Scans
 
 _VECTORS = {"p_world_lidar": 3, "q_world_lidar_xyzw": 4}
 _DOCS = {
@@ -33,7 +33,7 @@ def write_scans(scans: Scans, path: str | os.PathLike[str], *, force: bool = Fal
         force: Whether one that exists is replaced.
 
     Raises:
-        RefusedError: The file exists and `force` was not given.
+        InputError: The file exists and `force` was not given.
     """
     columns, fields = [], []
     for name, (unit, doc) in _DOCS.items():
@@ -51,24 +51,22 @@ def read_scans(path: str | os.PathLike[str]) -> Scans:
     """The scans that `write_scans` wrote, to the last bit.
 
     Raises:
-        RefusedError: The file is missing, is not Parquet, was cut short, or holds no scans.
+        InputError: The file is missing, is not Parquet, was cut short, or holds no scans.
     """
     path = existing(path, "Parquet file of scans")
     check_parquet(path)
     try:
         table = pq.read_table(path)
     except (pa.ArrowException, OSError) as error:
-        raise RefusedError(
-            f"{path}: damaged Parquet ({str(error).splitlines()[0]}); write it again"
-        ) from error
+        raise InputError(f"{path}: damaged Parquet ({str(error).splitlines()[0]}); write it again") from error
     values = {}
     for name in _DOCS:
         if name not in table.column_names:
-            raise RefusedError(f"{path}: no scans: column {name!r} is missing; write them with --scans")
+            raise InputError(f"{path}: no scans: column {name!r} is missing; write them with --scans")
         column = table.column(name).combine_chunks()
         width = column.type.list_size if pa.types.is_fixed_size_list(column.type) else 0
         if name in _VECTORS and width != _VECTORS[name]:
-            raise RefusedError(f"{path}: column {name!r} must hold {_VECTORS[name]} numbers a row")
+            raise InputError(f"{path}: column {name!r} must hold {_VECTORS[name]} numbers a row")
         array = (column.flatten() if width else column).to_numpy(zero_copy_only=False)
         values[name] = array.reshape(-1, width) if width else array
     return Scans(**values)

@@ -21,7 +21,9 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from magtwin.arrow import (
+from magtwin.errors import InputError, find
+from magtwin.files import check_free, existing, output
+from magtwin.run.arrow import (
     FACTS,
     facts_from_json,
     facts_to_json,
@@ -30,9 +32,7 @@ from magtwin.arrow import (
     spec_said,
     table_of,
 )
-from magtwin.files import check_free, existing, output
-from magtwin.names import RefusedError, find
-from magtwin.run import COLUMNS, Run, check_clock
+from magtwin.run.run import COLUMNS, Run, check_clock
 
 _MAGIC = b"PAR1"
 _ABOUT = "magtwin"
@@ -51,7 +51,7 @@ def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool = False
         force: Whether one that exists is replaced.
 
     Raises:
-        RefusedError: The file exists and `force` was not given, or cannot be written, or a column cannot
+        InputError: The file exists and `force` was not given, or cannot be written, or a column cannot
             stand in a table.
     """
     table = table_of(run)
@@ -71,7 +71,7 @@ def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | N
         columns: What another program's file calls a Run's columns, as for `read_csv`.
 
     Raises:
-        RefusedError: The file is missing, is not Parquet, was cut short, lacks a column, or holds no run.
+        InputError: The file is missing, is not Parquet, was cut short, lacks a column, or holds no run.
     """
     path = existing(path, "Parquet file")
     try:
@@ -82,17 +82,17 @@ def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | N
             table = _on_the_floor(table.rename_columns(_renamed(table.column_names, columns, path)))
         return run_of(table, path)
     except UnicodeDecodeError as error:
-        raise RefusedError(f"{path}: damaged Parquet (a name is no text); write it again") from error
+        raise InputError(f"{path}: damaged Parquet (a name is no text); write it again") from error
 
 
 def _read_parts(path: Path) -> Run:
     parts = sorted(path.glob("part-*.parquet"))
     if not parts:
-        raise RefusedError(f"{path}: a folder without Parquet parts; name the file in it")
+        raise InputError(f"{path}: a folder without Parquet parts; name the file in it")
     tables = [_table(part) for part in parts]
     for part, table in zip(parts, tables, strict=True):
         if table.schema != tables[0].schema:
-            raise RefusedError(f"{part}: has other columns than {parts[0].name}; it is of another run")
+            raise InputError(f"{part}: has other columns than {parts[0].name}; it is of another run")
     metadata = tables[-1].schema.metadata  # what is known last
     return run_of(pa.concat_tables(tables).replace_schema_metadata(metadata), path)
 
@@ -100,15 +100,15 @@ def _read_parts(path: Path) -> Run:
 def check_parquet(path: Path) -> None:
     """Refuse what does not begin and end as Parquet files do."""
     if path.is_dir():
-        raise RefusedError(f"{path}: a folder, not a Parquet file; name the file in it")
+        raise InputError(f"{path}: a folder, not a Parquet file; name the file in it")
     with open(path, "rb") as file:
         head = file.read(4)
         file.seek(max(0, path.stat().st_size - 4))
         tail = file.read(4)
     if head != _MAGIC:
-        raise RefusedError(f"{path}: not a Parquet file: it begins with {head!r}, not {_MAGIC!r}")
+        raise InputError(f"{path}: not a Parquet file: it begins with {head!r}, not {_MAGIC!r}")
     if tail != _MAGIC:
-        raise RefusedError(f"{path}: Parquet cut short: its end is missing; write it again, or copy it again")
+        raise InputError(f"{path}: Parquet cut short: its end is missing; write it again, or copy it again")
 
 
 def _table(path: Path) -> pa.Table:
@@ -117,7 +117,7 @@ def _table(path: Path) -> pa.Table:
         return pq.read_table(path)
     except (pa.ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]
-        raise RefusedError(f"{path}: damaged Parquet ({reason}); write it again") from error
+        raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
 
 
 class ParquetParts:
@@ -136,13 +136,13 @@ class ParquetParts:
             force: Whether what exists of it is replaced, parts that another program left included.
 
         Raises:
-            RefusedError: It exists and `force` was not given, or its folder cannot be written.
+            InputError: It exists and `force` was not given, or its folder cannot be written.
         """
         self.path = check_free(path, force=force)
         self.folder = Path(f"{self.path}.parts")
         """Where the parts lie."""
         if self.folder.exists() and not force:
-            raise RefusedError(
+            raise InputError(
                 f"{self.folder}: parts of a run that did not end; magtwin convert reads them; then give "
                 "--force to replace them, or another name"
             )
@@ -151,19 +151,19 @@ class ParquetParts:
             shutil.rmtree(self.folder, ignore_errors=True)
             self.folder.mkdir(parents=True)
         except OSError as error:
-            raise RefusedError(f"{self.folder}: cannot be written ({error.strerror})") from error
+            raise InputError(f"{self.folder}: cannot be written ({error.strerror})") from error
 
     def append(self, run: Run) -> None:
         """Add the rows of a block; it is on the disk when this returns.
 
         Raises:
-            RefusedError: Its clock does not run on from the block before, or the disk is full.
+            InputError: Its clock does not run on from the block before, or the disk is full.
         """
         if not run.rows:
             return
         check_clock(run, "the block to append")
         if run["t"][0] <= self._last:
-            raise RefusedError(
+            raise InputError(
                 f"the block to append begins at {run['t'][0]:.9g} s, and the last ended at {self._last:.9g} s"
             )
         write_parquet(run, self.folder / f"part-{self._count:06d}.parquet")
@@ -205,7 +205,7 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
         force: Whether one that exists is replaced.
 
     Raises:
-        RefusedError: As for `write_parquet`.
+        InputError: As for `write_parquet`.
     """
     table = table_of(run)
     lines = [f"# {_ABOUT} run: facts, then columns by name with unit, frame and meaning, in JSON"]
@@ -216,7 +216,7 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
         lines.append(f"# column {field.name} {_line_safe(_json({'type': str(field.type), **said}))}")
     for name in table.column_names:
         if not name.isprintable() or set(name) & set('",# '):
-            raise RefusedError(f"column {name!r} cannot stand in a CSV file; use letters, digits and _")
+            raise InputError(f"column {name!r} cannot stand in a CSV file; use letters, digits and _")
     lines.append(",".join(table.column_names))
     with output(path, force=force) as aside, open(aside, "wb") as file:
         file.write(("\n".join(lines) + "\n").encode())
@@ -235,12 +235,12 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
             as `odom_p_x`. A p_world_base given without its z lies on the floor.
 
     Raises:
-        RefusedError: The file is missing, is no CSV of numbers, was cut short, lacks a column, or holds no
+        InputError: The file is missing, is no CSV of numbers, was cut short, lacks a column, or holds no
             run.
     """
     path = existing(path, "CSV file")
     if path.is_dir():
-        raise RefusedError(f"{path}: a folder, not a CSV file; name the file in it")
+        raise InputError(f"{path}: a folder, not a CSV file; name the file in it")
     with open(path, "rb") as file:
         about, names, skipped = _csv_head(file, path)
         file.seek(-1, os.SEEK_END)
@@ -253,11 +253,9 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
         try:
             types[name] = pa.type_for_alias(said[name].pop("type", str(types[name])))
         except ValueError as error:
-            raise RefusedError(f"{path}: column {name!r} has no such type: {error}") from error
+            raise InputError(f"{path}: column {name!r} has no such type: {error}") from error
     if cut and said:
-        raise RefusedError(
-            f"{path}: CSV cut short: its last line has no end; write it again, or copy it again"
-        )
+        raise InputError(f"{path}: CSV cut short: its last line has no end; write it again, or copy it again")
     try:
         table = pa.csv.read_csv(
             path,
@@ -272,9 +270,9 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
         )
     except (pa.ArrowException, OSError) as error:
         reason = " ".join(str(error).split())
-        raise RefusedError(f"{path}: not a CSV file of a run: {_short(reason)}") from error
+        raise InputError(f"{path}: not a CSV file of a run: {_short(reason)}") from error
     if rows not in ("", str(table.num_rows)):
-        raise RefusedError(
+        raise InputError(
             f"{path}: holds {table.num_rows} rows where its line '# rows' says {rows[:20]!r}: cut short, or "
             "edited; copy it again, or take that line out"
         )
@@ -289,8 +287,8 @@ def _renamed(names: Sequence[str], columns: Mapping[str, str], path: Path) -> li
     for name, theirs in columns.items():
         try:
             own[find("column", theirs, known)] = name
-        except RefusedError as error:
-            raise RefusedError(f"{path}: {error}") from error
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
     return [own.get(name, name) for name in names]
 
 
@@ -309,17 +307,17 @@ def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str]
         try:
             text = line.decode("utf-8-sig" if count == 1 else "utf-8").rstrip("\r\n")
         except UnicodeDecodeError as error:
-            raise RefusedError(f"{path}: line {count} is not text in UTF-8; it is no CSV file") from error
+            raise InputError(f"{path}: line {count} is not text in UTF-8; it is no CSV file") from error
         if len(line) == _CSV_LINE or "\0" in text:
-            raise RefusedError(f"{path}: line {count} is no line of a CSV file")
+            raise InputError(f"{path}: line {count} is no line of a CSV file")
         if text.startswith("#"):
             about.append(text)
         elif text.strip():
             other = next((sign for sign in (";", "\t") if sign in text and "," not in text), None)
             if other is not None:
-                raise RefusedError(f"{path}: its columns are separated by {other!r}; save it with commas")
+                raise InputError(f"{path}: its columns are separated by {other!r}; save it with commas")
             return about, [name.strip().strip('"') for name in text.split(",")], count
-    raise RefusedError(f"{path}: has no line of column names; it is empty, or cut short")
+    raise InputError(f"{path}: has no line of column names; it is empty, or cut short")
 
 
 def _csv_about(lines: list[str], path: Path) -> tuple[str, str, dict[str, dict[str, str]]]:
@@ -342,9 +340,9 @@ def _texts(text: str, where: str) -> dict[str, str]:
     try:
         said = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise RefusedError(f"{where}: what it says of a column is not JSON: {error}") from error
+        raise InputError(f"{where}: what it says of a column is not JSON: {error}") from error
     if not isinstance(said, dict) or not all(isinstance(value, str) for value in said.values()):
-        raise RefusedError(f"{where}: what it says of a column must be an object of texts, got {text[:40]!r}")
+        raise InputError(f"{where}: what it says of a column must be an object of texts, got {text[:40]!r}")
     return said
 
 
@@ -377,12 +375,12 @@ def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
         force: Whether one that exists is replaced.
 
     Raises:
-        RefusedError: As for `write_parquet`.
+        InputError: As for `write_parquet`.
     """
     check_clock(run, "the run to write")
     run.members()  # refuses what is no number
     if _ABOUT in run:
-        raise RefusedError(f"column {_ABOUT!r} has the name of what tells of the run; rename it")
+        raise InputError(f"column {_ABOUT!r} has the name of what tells of the run; rename it")
     columns = {
         name: {**said_of(run.spec(name), name), "parts": ",".join(run.spec(name).parts)} for name in run
     }
@@ -398,20 +396,20 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
         path: The file.
 
     Raises:
-        RefusedError: The file is missing, is no npz, is damaged or cut short, holds pickled objects, which
+        InputError: The file is missing, is no npz, is damaged or cut short, holds pickled objects, which
             could run anything and are not read, or holds no run.
     """
     path = existing(path, "npz file")
     if path.is_dir():
-        raise RefusedError(f"{path}: a folder, not an npz file; name the file in it")
+        raise InputError(f"{path}: a folder, not an npz file; name the file in it")
     try:
         with zipfile.ZipFile(path) as archive:
             names = [info.filename for info in archive.infolist()]
             if twice := sorted({name for name in names if names.count(name) > 1}):
-                raise RefusedError(f"{path}: two arrays are called {twice[0]!r}; write it again")
+                raise InputError(f"{path}: two arrays are called {twice[0]!r}; write it again")
             arrays = {name.removesuffix(".npy"): _array(archive, name, path) for name in names}
     except (zipfile.BadZipFile, EOFError, OSError, NotImplementedError, RuntimeError) as error:
-        raise RefusedError(f"{path}: not an npz file, damaged, or cut short ({error})") from error
+        raise InputError(f"{path}: not an npz file, damaged, or cut short ({error})") from error
     facts, said = _npz_about(arrays.pop(_ABOUT, np.array("{}")), path)
     specs = {
         name: spec_said(told, tuple(filter(None, told.get("parts", "").split(","))))
@@ -420,14 +418,14 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
     }
     for name, values in arrays.items():
         if values.dtype.kind not in "bfiu" or values.ndim not in (1, 2):
-            raise RefusedError(
+            raise InputError(
                 f"{path}: column {name!r} must hold numbers or flags in rows, got {values.dtype} "
                 f"of shape {values.shape}"
             )
     try:
         run = Run(arrays, facts, specs)
-    except (RefusedError, TypeError) as error:
-        raise RefusedError(f"{path}: {error}") from error
+    except (InputError, TypeError) as error:
+        raise InputError(f"{path}: {error}") from error
     check_clock(run, str(path))
     return run
 
@@ -442,12 +440,12 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path) -> NDArray[Any]:
         shape, fortran, dtype = header[version](file)
     except (ValueError, KeyError) as error:
         reason = " ".join(str(error).split())
-        raise RefusedError(f"{path}: {name} is not a numpy array ({_short(reason)})") from error
+        raise InputError(f"{path}: {name} is not a numpy array ({_short(reason)})") from error
     if dtype.hasobject:
-        raise RefusedError(f"{path}: {name} holds pickled objects, which are not read; save plain numbers")
+        raise InputError(f"{path}: {name} holds pickled objects, which are not read; save plain numbers")
     body = data[file.tell() :]
     if len(body) != dtype.itemsize * int(np.prod(shape, dtype=object)):
-        raise RefusedError(
+        raise InputError(
             f"{path}: {name} is cut short: {len(body)} bytes for {dtype} of shape {shape}; write it again"
         )
     return np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
@@ -460,5 +458,5 @@ def _npz_about(about: NDArray[Any], path: Path) -> tuple[Any, dict[str, dict[str
         facts, columns = told.get("facts", {}), told.get("columns", {})
         said = {str(name): _texts(json.dumps(text), str(path)) for name, text in columns.items()}
     except (ValueError, AttributeError, RecursionError) as error:
-        raise RefusedError(f"{path}: array {_ABOUT!r} tells nothing of a run ({error})") from error
+        raise InputError(f"{path}: array {_ABOUT!r} tells nothing of a run ({error})") from error
     return facts_from_json(json.dumps(facts), path), said

@@ -5,11 +5,11 @@ from typing import Any
 import torch
 from numpy.typing import ArrayLike
 
-from magtwin.field.harmonic import SHAPES, HarmonicField
-from magtwin.field.lookup import EDGE, TURN, Lookup, blend, sides_of
-from magtwin.field.map import AnomalyMap, Outside
-from magtwin.field.sources import MU_0_OVER_4_PI, NT_PER_T
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
+from magtwin.field.maps.lookup import EDGE, TURN, Lookup, blend, sides_of
+from magtwin.field.maps.map import AnomalyMap, Outside
+from magtwin.field.sources.harmonic import SHAPES, HarmonicField
+from magtwin.field.sources.point_dipoles import MU_0_OVER_4_PI, NT_PER_T
 
 
 class TorchMap(torch.nn.Module):
@@ -67,11 +67,11 @@ class TorchMap(torch.nn.Module):
             Field magnitude [nT], shape (...), of the type of `p_xy`.
 
         Raises:
-            RefusedError: A point lies off the grid and `outside` is "raise".
+            InputError: A point lies off the grid and `outside` is "raise".
         """
         p, yaw = _broadcast(p_xy, yaw, self.values)
         if outside not in ("nan", "clamp", "raise"):
-            raise RefusedError(f'outside must be "nan", "clamp" or "raise", got {outside!r}')
+            raise InputError(f'outside must be "nan", "clamp" or "raise", got {outside!r}')
         with torch.no_grad():
             u, angle = (p - self.origin) / self.cell, yaw - self._first
             edge = torch.clamp(4 * torch.finfo(u.dtype).eps * self.last, min=EDGE)
@@ -118,7 +118,7 @@ class TorchMap(torch.nn.Module):
         if off.any():
             x0, x1, y0, y1 = self._extent
             where = ", ".join(f"{c:.3f}" for c in p[off][0].tolist())
-            raise RefusedError(
+            raise InputError(
                 f"{int(off.sum())} of {off.numel()} points lie off the map {self._name!r} "
                 f"(x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m), the first at ({where}); "
                 'keep inside, or ask for outside="clamp" or "nan"'
@@ -208,9 +208,9 @@ def _broadcast(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Points and headings of one shape, in the precision that is computed in, on its device."""
     if p.ndim == 0 or p.shape[-1] != 2:
-        raise RefusedError(f"p_xy must have shape (..., 2), got {tuple(p.shape)}")
+        raise InputError(f"p_xy must have shape (..., 2), got {tuple(p.shape)}")
     if p.device != like.device:
-        raise RefusedError(f"p_xy is on {p.device}, the field on {like.device}; move one with .to()")
+        raise InputError(f"p_xy is on {p.device}, the field on {like.device}; move one with .to()")
     angle = torch.as_tensor(yaw, dtype=like.dtype, device=like.device)
     shape = torch.broadcast_shapes(p.shape[:-1], angle.shape)
     return p.to(like.dtype).expand(*shape, 2), angle.expand(shape)

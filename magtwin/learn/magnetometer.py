@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin import files
-from magtwin.learn.features import columns_of, features
-from magtwin.learn.predictor import Predictor, load_predictor
-from magtwin.learn.regressor import summary_of
-from magtwin.learn.weights import Fact
-from magtwin.names import RefusedError
-from magtwin.run import Run
-from magtwin.sim.model_error import ModelError
+from magtwin.errors import InputError
+from magtwin.learn.data.features import columns_of, features
+from magtwin.learn.models.predictor import Predictor, load_predictor
+from magtwin.learn.models.regressor import summary_of
+from magtwin.learn.models.weights import Fact
+from magtwin.run.run import Run
+from magtwin.sim.sensors.model_error import ModelError
 from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
@@ -60,12 +60,12 @@ class NeuralMagnetometer(Summarized):
             sha256: Checksum that the file must have, lower-case hex; "" takes any.
 
         Raises:
-            RefusedError: No such file, another checksum, or not a predictor.
+            InputError: No such file, another checksum, or not a predictor.
         """
         path = files.existing(path, "weights file")
         found = files.sha256(path)
         if sha256 and found != sha256.lower():
-            raise RefusedError(
+            raise InputError(
                 f"{path}: its sha256 is {found}, expected {sha256}; get the file again or change the checksum"
             )
         return cls(load_predictor(path), name=path.name, sha256=found)
@@ -89,14 +89,14 @@ class NeuralMagnetometer(Summarized):
         """Statistics of the error of its predictions; None where its file does not tell them.
 
         Raises:
-            RefusedError: Its file tells figures that cannot be.
+            InputError: Its file tells figures that cannot be.
         """
         told = [self.net.facts.get(name) for name in ("residual_offset_sd_nt", "residual_time_s")]
         if None in told or (self.net.kind == "mlp" and math.isnan(self.residual_sd_nt)):
             return None
         figures = [float(one) if isinstance(one, int | float) else math.nan for one in told]
         if not all(0 <= one < math.inf for one in figures):
-            raise RefusedError(
+            raise InputError(
                 f"{self.name}: residual_offset_sd_nt and residual_time_s of its facts must be finite and not "
                 f"below 0, got {told[0]!r} and {told[1]!r}"
             )
@@ -122,7 +122,7 @@ class NeuralMagnetometer(Summarized):
         """Disturbance at each reading of a run [nT], shape (N,).
 
         Raises:
-            RefusedError: The run lacks a column that the network reads.
+            InputError: The run lacks a column that the network reads.
         """
         return self.read([run], outside=False)[0].disturbance_nt
 
@@ -137,7 +137,7 @@ class NeuralMagnetometer(Summarized):
             outside: Whether `Read.outside` is wanted.
 
         Raises:
-            RefusedError: A run lacks a column that the network reads, or has its rows at another rate than
+            InputError: A run lacks a column that the network reads, or has its rows at another rate than
                 those that a network which looks back was trained on.
         """
         parts = [features(run, self.features) for run in runs]
@@ -159,7 +159,7 @@ class NeuralMagnetometer(Summarized):
         step = float(np.median(np.diff(run["t"]))) if run.rows > 1 else self.net.step_s
         every = round(self.net.step_s / step) if step > 0 else 0
         if every < 1 or abs(every * step / self.net.step_s - 1) > STEPS_ALIKE:
-            raise RefusedError(
+            raise InputError(
                 f"{self.name or 'the network'}: looks back over rows {self.net.step_s:g} s apart, the "
                 f"run has them {step:g} s apart; take a rate of {1 / self.net.step_s:g} Hz, or a whole "
                 "number of times that"
@@ -174,7 +174,7 @@ class NeuralMagnetometer(Summarized):
         return self.outside(features(run, self.features))
 
     def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
-        """As `outside_training`, from features (N, F); see `magtwin.learn.inputs.Inputs.outside`."""
+        """As `outside_training`, from features (N, F); see `magtwin.learn.data.inputs.Inputs.outside`."""
         return self.net.outside(x)
 
     def predict(self, x: ArrayLike) -> Array:

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from magtwin.field import lookup
-from magtwin.field.map import AnomalyMap
-from magtwin.learn.ensemble import Ensemble
-from magtwin.learn.features import (
+from magtwin.errors import InputError, hint
+from magtwin.field.maps import lookup
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.learn.data.features import (
     FEATURES,
     carried,
     circle,
@@ -28,15 +28,15 @@ from magtwin.learn.features import (
     turned_motion,
     turning_size,
 )
-from magtwin.learn.heads import LIMIT
-from magtwin.learn.hybrid import Hybrid
-from magtwin.learn.inputs import Inputs
-from magtwin.learn.linear import Linear
-from magtwin.learn.model import FieldNet
-from magtwin.learn.perceptron import Layer
-from magtwin.learn.predictor import Predictor
-from magtwin.names import RefusedError, hint
-from magtwin.run import COLUMNS
+from magtwin.learn.data.inputs import Inputs
+from magtwin.learn.models.ensemble import Ensemble
+from magtwin.learn.models.heads import LIMIT
+from magtwin.learn.models.hybrid import Hybrid
+from magtwin.learn.models.linear import Linear
+from magtwin.learn.models.network import FieldNet
+from magtwin.learn.models.perceptron import Layer
+from magtwin.learn.models.predictor import Predictor
+from magtwin.run.run import COLUMNS
 
 Array = NDArray[np.float64]
 Signals = Mapping[str, Any]
@@ -92,7 +92,7 @@ class Reader:
         self._say: Say | None = None
         try:
             lookup.warm_up()
-            from magtwin.learn import compiled
+            from magtwin.learn.models import compiled
 
             self._say = _compiled_way(predictor, compiled)
         except ImportError:  # the same numbers, in numpy and torch
@@ -116,7 +116,7 @@ class Reader:
                 column has parts, in their units and frames. Those of `Reader.signals`; others are not read.
 
         Raises:
-            RefusedError: A signal is missing, or has another number of parts.
+            InputError: A signal is missing, or has another number of parts.
         """
         x, y = p_xy
         sin, cos = math.sin(yaw), math.cos(yaw)
@@ -156,11 +156,11 @@ class Reader:
         """Say which signal is not as it should be."""
         for name in self.signals:
             if name not in signals:
-                raise RefusedError(f"no signal {name!r} to read a field by; {hint(name, signals)}")
+                raise InputError(f"no signal {name!r} to read a field by; {hint(name, signals)}")
             parts = COLUMNS[name].width
             shape = np.shape(signals[name])
             if shape != (() if parts == 1 else (parts,)):
-                raise RefusedError(f"signal {name!r} has {parts} numbers in a row, got shape {shape}")
+                raise InputError(f"signal {name!r} has {parts} numbers in a row, got shape {shape}")
 
 
 def _plan(names: Sequence[str]) -> tuple[list[Callable[..., Sequence[float]]], list[int] | None]:

@@ -11,12 +11,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.errors import InputError, find
 from magtwin.files import existing
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
-from magtwin.names import RefusedError, find
 from magtwin.report import Figure, Report
-from magtwin.run import Run
-from magtwin.sim.drive import wheel_rates
+from magtwin.run.run import Run
 from magtwin.sim.interference import (
     TORQUE_S,
     ambient_field_nt,
@@ -26,7 +25,8 @@ from magtwin.sim.interference import (
     turning_iron_nt,
     wheel_torques_nm,
 )
-from magtwin.spec import PlatformFieldSpec, RobotSpec, Scene
+from magtwin.sim.motion.drive import wheel_rates
+from magtwin.spec.scene import PlatformFieldSpec, RobotSpec, Scene
 from magtwin.verdict import verdict
 
 Array = NDArray[np.float64]
@@ -84,21 +84,21 @@ def design_matrix(
         and the bias, without unit for induced ones, in s for eddy ones.
 
     Raises:
-        RefusedError: A term is unknown or given twice, the field is not (N, 3), is nowhere or not
+        InputError: A term is unknown or given twice, the field is not (N, 3), is nowhere or not
             finite, or there are fewer than three readings.
     """
     b = np.asarray(b_vector_nt, float)
     if b.ndim != 2 or b.shape[1] != 3 or len(b) < 3:
-        raise RefusedError(f"b_vector_nt must have shape (N, 3) with N at least 3, got {b.shape}")
+        raise InputError(f"b_vector_nt must have shape (N, 3) with N at least 3, got {b.shape}")
     if not 0 < rate_hz < np.inf:
-        raise RefusedError(f"rate_hz must be above 0 Hz and finite, got {rate_hz!r}")
+        raise InputError(f"rate_hz must be above 0 Hz and finite, got {rate_hz!r}")
     size = np.linalg.norm(b, axis=1)
     if not np.all(size > 0):  # nan fails too
         row = int(np.flatnonzero(~(size > 0))[0])
-        raise RefusedError(f"b_vector_nt must be finite and not zero, got {b[row].tolist()} in row {row}")
+        raise InputError(f"b_vector_nt must be finite and not zero, got {b[row].tolist()} in row {row}")
     kinds = [name.rstrip("0123456789") for name in terms]
     if not terms or len(set(kinds)) < len(kinds):
-        raise RefusedError(
+        raise InputError(
             f"terms must name at least one kind, and each once, got {', '.join(terms) or 'none'}"
         )
     u = b / size[:, None]
@@ -174,7 +174,7 @@ class TollesLawson:
         """The model of a file that `save` wrote.
 
         Raises:
-            RefusedError: The file is missing, no JSON, or no such model.
+            InputError: The file is missing, no JSON, or no such model.
         """
         file = existing(path, "Tolles-Lawson model")
         try:
@@ -189,13 +189,13 @@ class TollesLawson:
             )
             find("vector of a Tolles-Lawson model", str(model.vector), VECTORS)
         except (ValueError, KeyError, TypeError, IndexError, OSError, RecursionError) as error:
-            raise RefusedError(
+            raise InputError(
                 f"{file}: not a Tolles-Lawson model as `magtwin compensate fit` writes it "
                 f"({type(error).__name__}: {error})"
             ) from error
         columns = sum(find("Tolles-Lawson term", term, TERMS) for term in model.terms)
         if len(model.coefficients) != columns or not np.all(np.isfinite(model.coefficients)):
-            raise RefusedError(
+            raise InputError(
                 f"{file}: {len(model.coefficients)} coefficients for {columns} columns of "
                 f"{', '.join(model.terms)}; each needs one, finite"
             )
@@ -242,22 +242,22 @@ def fit_tolles_lawson(
         The model.
 
     Raises:
-        RefusedError: Shapes do not fit, a value is not finite, the band does not fit the rate, a bias is
+        InputError: Shapes do not fit, a value is not finite, the band does not fit the rate, a bias is
             wanted in a band, or there are fewer readings than coefficients.
     """
     b = np.asarray(b_nt, float)
     matrix, names = design_matrix(b_vector_nt, rate_hz, terms)
     if b.shape != (len(matrix),):
-        raise RefusedError(f"b_nt must have shape ({len(matrix)},), as b_vector_nt has rows, got {b.shape}")
+        raise InputError(f"b_nt must have shape ({len(matrix)},), as b_vector_nt has rows, got {b.shape}")
     if not np.all(np.isfinite(b)):
         row = int(np.flatnonzero(~np.isfinite(b))[0])
-        raise RefusedError(f"b_nt must be finite, got {b[row]} in row {row}")
+        raise InputError(f"b_nt must be finite, got {b[row]} in row {row}")
     if len(b) <= len(names):
-        raise RefusedError(f"{len(b)} readings are too few for {len(names)} coefficients")
+        raise InputError(f"{len(b)} readings are too few for {len(names)} coefficients")
     if ridge is not None and not 0 <= ridge < np.inf:
-        raise RefusedError(f"ridge must not be below 0, and finite, got {ridge!r}")
+        raise InputError(f"ridge must not be below 0, and finite, got {ridge!r}")
     if band_hz is not None and "bias" in terms:
-        raise RefusedError(
+        raise InputError(
             "a bias is in no pass band, so a fit to one cannot tell it; leave the bias out, or fit all "
             "frequencies (band_hz=None, --no-band)"
         )
@@ -286,7 +286,7 @@ def fit_run(run: Run, *, vector: Vector = "measured", **options: Any) -> TollesL
         options: Those of `fit_tolles_lawson`.
 
     Raises:
-        RefusedError: The run has no such vectors, or nowhere enough of them.
+        InputError: The run has no such vectors, or nowhere enough of them.
     """
     b_vector, rows, rate = _unbroken(run, vector)
     b = run["b_measured_nt"][rows] - run["b_map_nt"][rows]
@@ -306,7 +306,7 @@ def compensate_run(run: Run, model: TollesLawson) -> tuple[Run, Report]:
     before = (run["b_measured_nt"] - run["b_map_nt"])[rows]
     after = before - interference[rows]
     if not before.std() > 0:
-        raise RefusedError("b_measured_nt less b_map_nt never changes, so there is nothing to take out of it")
+        raise InputError("b_measured_nt less b_map_nt never changes, so there is nothing to take out of it")
     removed = float(1 - after.var() / before.var())
     worse = (
         "below 0: they vary more than before, as the model was fitted to too few headings or another field"
@@ -365,12 +365,12 @@ def fit_platform(
         as h and S along an axis on which b never changes, the smallest that explain them.
 
     Raises:
-        RefusedError: Shapes do not fit, a value is not finite, or there are wheel angles and no robot.
+        InputError: Shapes do not fit, a value is not finite, or there are wheel angles and no robot.
     """
     ambient, measured = np.asarray(b_ambient_nt, float), np.asarray(b_measured_nt, float)
     n = len(ambient)
     if ambient.shape != (n, 3) or measured.shape != (n, 3) or n < 3:
-        raise RefusedError(
+        raise InputError(
             f"b_ambient_nt and b_measured_nt must have one shape (N, 3), N at least 3, got {ambient.shape} "
             f"and {measured.shape}"
         )
@@ -385,7 +385,7 @@ def fit_platform(
     for name, (values, width) in given.items():
         part[name] = np.zeros((n, width)) if values is None else np.asarray(values, float).reshape(-1, width)
         if len(part[name]) != n:
-            raise RefusedError(f"{name} must have {n} rows, got {len(part[name])}")
+            raise InputError(f"{name} must have {n} rows, got {len(part[name])}")
     on, angle = part["lidar_on"], part["lidar_angle"]
     turning = on * np.hstack([np.cos(angle), np.sin(angle)]) * (lidar_angle is not None)
     matrix = np.hstack(
@@ -401,7 +401,7 @@ def fit_platform(
     )
     iron = np.zeros((n, 3, 0)) if wheel_angle is None else _turning_iron(part["wheel_angle"], robot)
     if not all(np.all(np.isfinite(values)) for values in (matrix, iron, measured)):
-        raise RefusedError("every field and signal that a platform is fitted to must be finite")
+        raise InputError("every field and signal that a platform is fitted to must be finite")
     found, moments = _least_squares(matrix, iron, measured - ambient)
     row = lambda k: tuple(found[k].tolist())  # noqa: E731
     wheels: dict[str, Any] = {}
@@ -435,7 +435,7 @@ IRON = ("left_wheel", "right_wheel", "caster")
 def _turning_iron(wheel_angle: Array, robot: RobotSpec | None) -> Array:
     """Field of unit moments, up and forwards at the start, in each of `IRON` [nT], shape (N, 3, 6)."""
     if robot is None:
-        raise RefusedError("wheel_angle needs the robot, which says where its wheels are")
+        raise InputError("wheel_angle needs the robot, which says where its wheels are")
     unit = {f"{name}_{what}": 0.0 for name in IRON for what in ("moment", "phase")}
     fields = []
     for name in IRON:
@@ -487,7 +487,7 @@ def platform_of_run(run: Run, scene: Scene, *, vector: Vector = "exact") -> Plat
         The platform's figures.
 
     Raises:
-        RefusedError: The run has no vectors, its readings are not evenly spaced, or the scene has no
+        InputError: The run has no vectors, its readings are not evenly spaced, or the scene has no
             Earth's field.
     """
     b_vector, rows, rate = _unbroken(run, vector)
@@ -518,13 +518,13 @@ def _band_pass(values: Array, band_hz: tuple[float, float], rate_hz: float) -> A
 
     low, high = band_hz
     if not 0 < low < high < rate_hz / 2:
-        raise RefusedError(
+        raise InputError(
             f"band_hz must ascend between 0 and half the rate, {rate_hz / 2:g} Hz, got {low:g}, {high:g}"
         )
     stages = butter(4, band_hz, btype="bandpass", fs=rate_hz, output="sos")
     least = 3 * (2 * len(stages) + 1)
     if len(values) <= least:
-        raise RefusedError(f"{len(values)} readings are too few for the band-pass, {least + 1} are needed")
+        raise InputError(f"{len(values)} readings are too few for the band-pass, {least + 1} are needed")
     return np.asarray(sosfiltfilt(stages, values, axis=0))
 
 
@@ -566,7 +566,7 @@ def _unbroken(run: Run, vector: str) -> tuple[Array, slice, float]:
             if there
             else "record a vector magnetometer, or simulate a scene whose Earth field is known"
         )
-        raise RefusedError(f"the run has no field vectors in {name}, which direction cosines need; {do}")
+        raise InputError(f"the run has no field vectors in {name}, which direction cosines need; {do}")
     fine = np.isfinite(run["b_measured_nt"] - run["b_map_nt"]) & np.isfinite(b_vector).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], fine.astype(np.int8), [0]])))
     starts, stops = edges[::2], edges[1::2]
@@ -574,8 +574,8 @@ def _unbroken(run: Run, vector: str) -> tuple[Array, slice, float]:
     rows = slice(int(starts[k]), int(stops[k]))
     t = run["t"][rows]
     if len(t) < 3:
-        raise RefusedError(f"only {len(t)} readings in a row have a map and a vector; a fit needs more")
+        raise InputError(f"only {len(t)} readings in a row have a map and a vector; a fit needs more")
     step = float(np.median(np.diff(t)))
     if not step > 0 or np.abs(np.diff(t) - step).max() > 0.5 * step:
-        raise RefusedError("the run's readings are not evenly spaced in time; resample it first")
+        raise InputError("the run's readings are not evenly spaced in time; resample it first")
     return b_vector, rows, 1 / step

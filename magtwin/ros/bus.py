@@ -1,8 +1,8 @@
 """Bus: what a node needs of ROS 2, whoever carries it.
 
 Two carry it: rclpy, where it can be imported, and cyclonedds, which meets any ROS 2 on the network over DDS
-from any Python. Both are handed messages as bytes, which `magtwin.io.cdr` makes of fields by the one table
-of types, `magtwin.io.messages.TYPES`; so a node says and hears the same with either.
+from any Python. Both are handed messages as bytes, which `magtwin.io.bags.cdr` makes of fields by the one
+table of types, `magtwin.io.bags.messages.TYPES`; so a node says and hears the same with either.
 """
 
 import importlib
@@ -14,9 +14,9 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from magtwin.io.cdr import Messages, decode, encode, leaves
-from magtwin.io.messages import TYPES, Qos
-from magtwin.names import RefusedError, find
+from magtwin.errors import InputError, find
+from magtwin.io.bags.cdr import Messages, decode, encode, leaves
+from magtwin.io.bags.messages import TYPES, Qos
 from magtwin.ros.parameters import Parameter
 
 Backend = Literal["auto", "rclpy", "cyclonedds"]
@@ -48,7 +48,8 @@ def to_bytes(kind: str, fields: Mapping[str, Any]) -> bytes:
 
     Args:
         kind: Its type, such as `sensor_msgs/msg/Imu`.
-        fields: By the leaves' names, as `magtwin.io.cdr.encode` takes them; `form` in place of the table's
+        fields: By the leaves' names, as `magtwin.io.bags.cdr.encode` takes them; `form` in place of the
+        table's
             leaves, where parts are counted.
     """
     return encode(leaves(form_of(kind, fields)), fields, 1).tobytes()
@@ -76,7 +77,7 @@ class Message:
             form: Leaves in place of the table's, where parts are counted.
 
         Raises:
-            RefusedError: It is too short for its type, or not plain CDR.
+            InputError: It is too short for its type, or not plain CDR.
         """
         buffer = np.frombuffer(self.data, np.uint8)
         one = Messages(np.zeros(1, np.int64), buffer, np.zeros(1, np.int64), np.array([len(buffer)]))
@@ -191,7 +192,7 @@ class Names:
         """The name of a topic on the network, from the root.
 
         A relative name (`odom`) is in the namespace, `/clock` is global. `/robot/...` of
-        `magtwin.io.messages.TOPICS` counts as relative.
+        `magtwin.io.bags.messages.TOPICS` counts as relative.
         """
         relative = name.removeprefix("/robot/")
         whole = relative if relative.startswith("/") else f"{self._space}/{relative}"
@@ -211,16 +212,16 @@ def names_of(namespace: str = "robot", remaps: Iterable[str] = ()) -> Names:
     """Names from a command line: `remaps` of the form a:=b.
 
     Raises:
-        RefusedError: One is not of that form, or not a name of ROS.
+        InputError: One is not of that form, or not a name of ROS.
     """
     table = {}
     for remap in remaps:
         left, sign, right = remap.partition(":=")
         if not sign or not _is_name(left) or not _is_name(right):
-            raise RefusedError(f"a remap is a name:=another, such as odom:=/vicon/odom; got {remap!r}")
+            raise InputError(f"a remap is a name:=another, such as odom:=/vicon/odom; got {remap!r}")
         table[left] = right
     if namespace and not _is_name(namespace):
-        raise RefusedError(f"namespace {namespace!r} is none of ROS: letters, digits, _ and / are")
+        raise InputError(f"namespace {namespace!r} is none of ROS: letters, digits, _ and / are")
     return Names(namespace, table)
 
 
@@ -252,17 +253,17 @@ def open_bus(
         domain: The domain; None takes ROS_DOMAIN_ID, or 0.
 
     Raises:
-        RefusedError: The backend cannot be imported, or the domain is none.
+        InputError: The backend cannot be imported, or the domain is none.
     """
     if not name.isidentifier():
-        raise RefusedError(f"a node's name has letters, digits and _; got {name!r}")
+        raise InputError(f"a node's name has letters, digits and _; got {name!r}")
     if domain is None:
         told = os.environ.get("ROS_DOMAIN_ID", "0") or "0"
         if not told.isdigit():
-            raise RefusedError(f"ROS_DOMAIN_ID must be a whole number from 0 to 232, it is {told!r}")
+            raise InputError(f"ROS_DOMAIN_ID must be a whole number from 0 to 232, it is {told!r}")
         domain = int(told)
     if not 0 <= domain <= 232:
-        raise RefusedError(f"a domain of ROS must be from 0 to 232, got {domain}")
+        raise InputError(f"a domain of ROS must be from 0 to 232, got {domain}")
     opened = _backend(backend)
     bus: Bus = opened(name, names or Names(), sim_time=sim_time, domain=domain)
     return bus
@@ -273,7 +274,7 @@ def _backend(name: Backend) -> Any:
     there = available()
     if name != "auto" and name not in there:
         find("backend", name, BACKENDS)
-        raise RefusedError(MISSING if not there else f"{name} cannot be imported here; {there[0]} can")
+        raise InputError(MISSING if not there else f"{name} cannot be imported here; {there[0]} can")
     broken = []
     for one in there if name == "auto" else (name,):
         module, kind = BACKENDS[one]
@@ -281,7 +282,7 @@ def _backend(name: Backend) -> Any:
             return getattr(importlib.import_module(module), kind)
         except ImportError as error:
             broken.append(f"{one} is installed but cannot be imported: {str(error).splitlines()[0]}")
-    raise RefusedError("; ".join(broken) or MISSING)
+    raise InputError("; ".join(broken) or MISSING)
 
 
 def localhost_only() -> bool:

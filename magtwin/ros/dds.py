@@ -28,8 +28,8 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 
-from magtwin.io.messages import CLOCK, TYPES, Qos
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
+from magtwin.io.bags.messages import CLOCK, TYPES, Qos
 from magtwin.ros.bus import Heard, Message, Names, localhost_only
 from magtwin.ros.clock import Alarm, Clock
 from magtwin.ros.parameters import Parameter
@@ -110,7 +110,7 @@ class DdsBus:
                 _DOMAINS[domain] = Domain(domain, xml)
             self._participant = DomainParticipant(domain)
         except DDSException as error:
-            raise RefusedError(
+            raise InputError(
                 f"cyclonedds cannot join domain {domain} ({error}); is CYCLONEDDS_URI right, the network up, "
                 "and are there fewer than 32 nodes on this machine?"
             ) from error
@@ -221,7 +221,7 @@ class DdsBus:
             known = kind, DdsTopic(self._participant, f"rt{whole}", struct_of(kind))
             self._topics[whole] = known
         if known[0] != kind:
-            raise RefusedError(f"topic {whole} has messages of {known[0]} in this node, not also of {kind}")
+            raise InputError(f"topic {whole} has messages of {known[0]} in this node, not also of {kind}")
         return known[1]
 
     def _take(self) -> None:
@@ -242,7 +242,7 @@ class DdsBus:
             subscription.heard(Message(subscription.kind, data, sent_ns, now))
 
     def _told(self, message: Message) -> None:
-        with suppress(RefusedError):  # no clock is told by what is none
+        with suppress(InputError):  # no clock is told by what is none
             self.clock.tell(int(message.read(["clock"])["clock"]), message.sent_ns)
         self.clock.run_due()  # at each tick, with what was heard before it, even where several come at once
 

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from magtwin.io.messages import Qos, diagnostics
+from magtwin.io.bags.messages import Qos, diagnostics
 from magtwin.ros.bus import Bus, Message, to_bytes
 
 Level = Literal["ok", "warn", "error", "stale"]

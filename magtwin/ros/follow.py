@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from magtwin.errors import InputError, find
 from magtwin.frames import yaw_from_quat
-from magtwin.io.messages import COMMAND, ODOMETRY, POSE, Topic
-from magtwin.names import RefusedError, find
+from magtwin.io.bags.messages import COMMAND, ODOMETRY, POSE, Topic
 from magtwin.path import Path
 from magtwin.ros.bus import NS, Bus, to_bytes
 from magtwin.ros.diagnostics import Reporter, Status
 from magtwin.ros.inputs import Input
-from magtwin.sim.controllers import Guide, guide_along
-from magtwin.sim.follow import CONTROL_RATE_HZ
-from magtwin.sim.loop import RELEASE
-from magtwin.sim.plan import NODE_M
-from magtwin.spec import DriveSpec
+from magtwin.sim.motion.controllers import Guide, guide_along
+from magtwin.sim.motion.follow import CONTROL_RATE_HZ
+from magtwin.sim.motion.loop import RELEASE
+from magtwin.sim.motion.plan import NODE_M
+from magtwin.spec.scene import DriveSpec
 
 ESTIMATE = replace(POSE, name="/robot/estimate/pose")
 """Where a localizer thinks that the robot is."""
@@ -91,7 +91,8 @@ class Follower:
             drive: The robot's limits, and its motors' lag.
             bus: The node.
             speed: Wanted forward speed [m/s].
-            controller: A name of `magtwin.sim.controllers.CONTROLLERS`; "release" steers with the gain of the
+            controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`; "release" steers with the
+            gain of the
                 released package.
             source: A name of `SOURCES`.
             laps: How often to drive it; an open path is driven back and forth.
@@ -101,10 +102,10 @@ class Follower:
             say: Takes lines for people.
 
         Raises:
-            RefusedError: The path cannot be driven at that speed, or a name is unknown.
+            InputError: The path cannot be driven at that speed, or a name is unknown.
         """
         if laps < 1:
-            raise RefusedError(f"laps must be 1 or more, got {laps}")
+            raise InputError(f"laps must be 1 or more, got {laps}")
         if flip:
             path = Path(path.name, path.p_xy[::-1], path.closed)
         self.path, self._drive, self._bus, self._say = path, drive, bus, say

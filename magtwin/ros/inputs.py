@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.errors import InputError
 from magtwin.frames import quat_conjugate, rotate
-from magtwin.io.messages import SENSOR_DATA, TYPES, Topic
-from magtwin.names import RefusedError
+from magtwin.io.bags.messages import SENSOR_DATA, TYPES, Topic
 from magtwin.ros.bus import NS, Bus, Message, Subscription
 from magtwin.ros.diagnostics import Status
 
@@ -149,7 +149,7 @@ class Input:
         self.heard += 1
         try:
             stamp, columns = self._read(message)
-        except RefusedError:
+        except InputError:
             self.broken += 1
             return
         wanted = columns.keys() if self._wanted is None else self._wanted & columns.keys()
@@ -199,7 +199,7 @@ class Gravity:
         """The same columns with `imu_a` free of gravity.
 
         Raises:
-            RefusedError: It is not known yet whether it is.
+            InputError: It is not known yet whether it is.
         """
         if self.inside is None:
             self._sum += columns["imu_a"][0]
@@ -208,7 +208,7 @@ class Gravity:
             self.inside = abs(mean - GRAVITY) < GRAVITY / 10
             if self._count < SETTLE and not self.inside and mean > 1.0:
                 self.inside = None  # in motion; a mean of more tells
-                raise RefusedError("it is not known yet whether gravity is in its accelerations")
+                raise InputError("it is not known yet whether gravity is in its accelerations")
         if not self.inside:
             return columns
         up = (0.0, 0.0, GRAVITY)

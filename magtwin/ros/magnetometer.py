@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from magtwin.errors import InputError
 from magtwin.frames import canonical, into_base, yaw_from_quat
-from magtwin.io.messages import (
+from magtwin.io.bags.messages import (
     BATTERY,
     COMMAND,
     IMU,
@@ -27,13 +28,12 @@ from magtwin.io.messages import (
     Topic,
     sender_of,
 )
-from magtwin.names import RefusedError
 from magtwin.ros.bus import NS, Bus, Timer, to_bytes
 from magtwin.ros.diagnostics import Reporter, Status
 from magtwin.ros.inputs import Input, Scanning, newest_sent_ns
 from magtwin.ros.network import Following
 from magtwin.ros.parameters import Parameter
-from magtwin.run import Run
+from magtwin.run.run import Run
 from magtwin.twin import Twin
 
 if TYPE_CHECKING:
@@ -92,11 +92,11 @@ class Magnetometer:
             say: Takes lines for people.
 
         Raises:
-            RefusedError: The scene's magnetometer is physical, or its network reads what no input tells.
+            InputError: The scene's magnetometer is physical, or its network reads what no input tells.
         """
         spec = twin.scene.robot.magnetometer
         if twin.magnetometer is None and spec.kind != "map-only":
-            raise RefusedError(
+            raise InputError(
                 f"the magnetometer of scene {twin.scene.name!r} is {spec.kind}, which needs the lab itself; "
                 "robots' sensors tell it to a network: name weights, or a scene with a neural magnetometer"
             )
@@ -104,7 +104,7 @@ class Magnetometer:
         needed = (twin.magnetometer.columns if twin.magnetometer else frozenset()) - MADE
         told = {column for topic in INPUTS for column in _columns_of(topic)}
         if beyond := sorted(needed - told):
-            raise RefusedError(
+            raise InputError(
                 f"the network reads {', '.join(beyond)}, which no topic of this node tells; train it without"
             )
         chosen = [topic for topic in INPUTS if topic is POSE or needed & _columns_of(topic)]

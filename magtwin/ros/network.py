@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.run import Run
+from magtwin.run.run import Run
 
 if TYPE_CHECKING:
     from magtwin.learn.magnetometer import NeuralMagnetometer

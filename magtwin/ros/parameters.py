@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from magtwin.names import RefusedError, find
+from magtwin.errors import InputError, find
 
 
 @dataclass(frozen=True)
@@ -33,14 +33,14 @@ def settings(table: Mapping[str, Parameter], given: Iterable[str]) -> dict[str, 
         given: Those that are set, as `rate_hz:=50`.
 
     Raises:
-        RefusedError: One is not of that form or not a parameter's, or a value is of the wrong kind or out of
+        InputError: One is not of that form or not a parameter's, or a value is of the wrong kind or out of
             its range.
     """
     values = {name: parameter.default for name, parameter in table.items()}
     for text in given:
         name, sign, value = text.partition(":=")
         if not sign:
-            raise RefusedError(f"a parameter is set by name:=value, such as rate_hz:=50; got {text!r}")
+            raise InputError(f"a parameter is set by name:=value, such as rate_hz:=50; got {text!r}")
         values[name] = _value(name, find("parameter", name, table), value)
     return values
 
@@ -50,14 +50,14 @@ def _value(name: str, parameter: Parameter, text: str) -> Any:
     kind = type(parameter.default)
     if kind is bool:
         if text.lower() not in ("true", "false"):
-            raise RefusedError(f"parameter {name} is true or false, got {text!r}")
+            raise InputError(f"parameter {name} is true or false, got {text!r}")
         return text.lower() == "true"
     if kind is str:
         return checked(name, parameter, text)
     try:
         number = kind(text)
     except ValueError:
-        raise RefusedError(f"parameter {name} is a number, got {text!r}") from None
+        raise InputError(f"parameter {name} is a number, got {text!r}") from None
     return checked(name, parameter, number)
 
 
@@ -65,11 +65,11 @@ def checked(name: str, parameter: Parameter, value: Any) -> Any:
     """A value of a parameter's kind, if it is one that the parameter may have.
 
     Raises:
-        RefusedError: It is out of the range, or none of the words.
+        InputError: It is out of the range, or none of the words.
     """
     if parameter.words and value not in parameter.words:
-        raise RefusedError(f"parameter {name} is {' or '.join(parameter.words)}, got {value!r}")
+        raise InputError(f"parameter {name} is {' or '.join(parameter.words)}, got {value!r}")
     low, high = parameter.low, parameter.high
     if not ((low is None or value >= low) and (high is None or value <= high)):
-        raise RefusedError(f"parameter {name} must be from {low:g} to {high:g}, got {value:g}")
+        raise InputError(f"parameter {name} must be from {low:g} to {high:g}, got {value:g}")
     return value

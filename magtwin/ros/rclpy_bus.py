@@ -14,8 +14,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from magtwin.io.messages import Qos
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
+from magtwin.io.bags.messages import Qos
 from magtwin.ros.bus import Heard, Message, Names
 from magtwin.ros.parameters import Parameter, checked
 
@@ -37,13 +37,13 @@ def class_of(kind: str) -> Any:
     """Rclpy's class of a type of messages.
 
     Raises:
-        RefusedError: Its package is not installed.
+        InputError: Its package is not installed.
     """
     package, space, name = kind.split("/")
     try:
         return getattr(importlib.import_module(f"{package}.{space}"), name)
     except ImportError as error:
-        raise RefusedError(
+        raise InputError(
             f"the ROS package {package} is not installed, so there are no messages {kind}; install "
             f"ros-jazzy-{package.replace('_', '-')} or that of your distribution, or take cyclonedds"
         ) from error
@@ -147,7 +147,7 @@ class RclpyBus:
             try:
                 for one in known:
                     checked(one.name, own[one.name], one.value)
-            except RefusedError as error:
+            except InputError as error:
                 return SetParametersResult(successful=False, reason=str(error))
             for one in known:
                 changed(one.name, one.value)
@@ -162,7 +162,7 @@ class RclpyBus:
         """As for `Bus`: those whose package is installed."""
         try:
             return class_of(kind) is not None
-        except RefusedError:
+        except InputError:
             return False
 
     def resolve(self, topic: str) -> str:

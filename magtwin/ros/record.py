@@ -7,14 +7,14 @@ from functools import partial
 
 import numpy as np
 
-from magtwin.io.bag_raw import RawBagWriter
-from magtwin.io.bag_writer import Stream, sender_for
-from magtwin.io.cdr import encode, leaves
-from magtwin.io.messages import Qos, Unit
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
+from magtwin.io.bags.cdr import encode, leaves
+from magtwin.io.bags.messages import Qos, Unit
+from magtwin.io.bags.raw import RawBagWriter
+from magtwin.io.bags.writer import Stream, sender_for
 from magtwin.ros.bus import NS, Bus, Message, Publisher
 from magtwin.ros.topics import READ, RECORDED, SAMPLED
-from magtwin.run import Run
+from magtwin.run.run import Run
 from magtwin.twin import Twin
 
 FLUSH_S = 1.0
@@ -98,7 +98,7 @@ class Recorder:
     def _heard(self, name: str, message: Message) -> None:
         now = self._bus.now_ns()
         if self._sim_time and now < self._last_ns:
-            raise RefusedError(
+            raise InputError(
                 f"time jumped back from {self._last_ns / NS:.3f} to {now / NS:.3f} s, as after a reset: the "
                 "recording ends here; record anew"
             )
@@ -128,14 +128,14 @@ class Player:
             topics: Names of those to say; none says all.
 
         Raises:
-            RefusedError: The run has none of them.
+            InputError: The run has none of them.
         """
         self._run = run
         who = sender_for(twin, units, run.facts.get("rate_hz"))
         self._stream = Stream(run, who, None, topics=(*READ, *SAMPLED.values()), whole=True)
         said = [t for t in self._stream.topics if bus.knows(t.kind) and (not topics or t.name in topics)]
         if not said:
-            raise RefusedError(f"the run has no columns of {', '.join(topics) or 'any topic'}")
+            raise InputError(f"the run has no columns of {', '.join(topics) or 'any topic'}")
         self._publishers: dict[str, Publisher] = {t.name: bus.publisher(t.name, t.kind, t.qos) for t in said}
         self._bus, self._begun = bus, time.monotonic()
 

@@ -10,18 +10,29 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.io.bag_writer import Said, Stream, sender_for
-from magtwin.io.cdr import encode, leaves
-from magtwin.io.messages import COMMAND, IMU, MAGNITUDE, SCAN, TOTAL_FIELD, TYPES, VECTOR, Qos, Topic, Unit
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
+from magtwin.io.bags.cdr import encode, leaves
+from magtwin.io.bags.messages import (
+    COMMAND,
+    IMU,
+    MAGNITUDE,
+    SCAN,
+    TOTAL_FIELD,
+    TYPES,
+    VECTOR,
+    Qos,
+    Topic,
+    Unit,
+)
+from magtwin.io.bags.writer import Said, Stream, sender_for
 from magtwin.ros.bus import NS, Bus, Message, Publisher
 from magtwin.ros.diagnostics import Reporter, Status
 from magtwin.ros.network import Following
 from magtwin.ros.topics import READ, SAMPLED, TICKS
-from magtwin.run import Run
+from magtwin.run.run import Run
 from magtwin.sim.exact import check_field
-from magtwin.sim.online import Online
-from magtwin.sim.online_sensors import Samples
+from magtwin.sim.runs.online import Online
+from magtwin.sim.sensors.online_sensors import Samples
 from magtwin.twin import Session, Twin, in_session, model_error_of
 
 RESET = "/robot/reset"
@@ -105,12 +116,12 @@ class Simulator:
             say: Takes lines for people.
 
         Raises:
-            RefusedError: The robot would begin in an obstacle, or an option is out of range.
+            InputError: The robot would begin in an obstacle, or an option is out of range.
         """
         if not 0 < speed <= 100:
-            raise RefusedError(f"speed must be above 0 and at most 100 times real time, got {speed!r}")
+            raise InputError(f"speed must be above 0 and at most 100 times real time, got {speed!r}")
         if rate_hz is not None and rate_hz > MOST_HZ:
-            raise RefusedError(f"rate_hz must be at most {MOST_HZ:g} Hz live, got {rate_hz!r}")
+            raise InputError(f"rate_hz must be at most {MOST_HZ:g} Hz live, got {rate_hz!r}")
         twin = in_session(twin, session, seed=seed)
         self._twin, self._bus, self._seed, self._rate, self._lidar = twin, bus, seed, rate_hz, lidar
         self._speed, self._wall, self._say = speed, stamps == "wall", say
@@ -259,7 +270,7 @@ class Simulator:
         try:
             read = message.read([linear, angular])
             v, w = float(read[linear][0]), float(read[angular][2])
-        except RefusedError:
+        except InputError:
             v = w = math.nan
         if not (math.isfinite(v) and math.isfinite(w)):
             self._refused += 1

@@ -4,10 +4,10 @@ import os
 import select
 from collections.abc import Callable
 
-from magtwin.io.messages import COMMAND
+from magtwin.io.bags.messages import COMMAND
 from magtwin.ros.bus import Bus
 from magtwin.ros.follow import command_bytes
-from magtwin.sim.manual import Hand
+from magtwin.sim.motion.manual import Hand
 
 RATE_HZ = 20.0
 """Commands a second, far above what a robot's timeout asks for [Hz]."""

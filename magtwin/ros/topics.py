@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from magtwin.io.messages import (
+from magtwin.io.bags.messages import (
     BATTERY,
     CLOCK,
     COMMAND,

@@ -10,8 +10,8 @@ from typing import Any
 from cyclonedds.idl import IdlStruct, make_idl_struct
 from cyclonedds.idl import types as idl
 
-from magtwin.io.cdr import Leaf, leaves
-from magtwin.io.messages import TYPES
+from magtwin.io.bags.cdr import Leaf, leaves
+from magtwin.io.bags.messages import TYPES
 
 _NUMBERS = {
     "f8": idl.float64,

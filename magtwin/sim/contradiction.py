@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magtwin.field.map import AnomalyMap
-from magtwin.names import RefusedError
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
 from magtwin.sim.interference import ambient_gradient_nt_m
 from magtwin.sim.room_survey import in_steel
 from magtwin.sim.survey import field_at_rest_nt, sensor_height_m
-from magtwin.spec import Scene
+from magtwin.spec.scene import Scene
 
 LEAST_NT = 500.0
 """Difference (rms) up to which a map and sources always agree [nT]: a fit's error, a change of hard iron."""
@@ -71,7 +71,7 @@ def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
         The difference. `agrees` is true up to `LEAST_NT`, or `PART` of the map's standard deviation.
 
     Raises:
-        RefusedError: The scene has no Earth's field, or the map no valid node where a robot can stand.
+        InputError: The scene has no Earth's field, or the map no valid node where a robot can stand.
     """
     p_xy, yaw = anomaly_map.grid.poses()
     read = anomaly_map.recorded_yaw
@@ -79,7 +79,7 @@ def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
         yaw = np.where(np.isfinite(read), read, yaw)
     valid = np.flatnonzero(anomaly_map.valid)
     if not len(valid):
-        raise RefusedError(f"map {anomaly_map.name!r} has no valid node, so nothing to compare")
+        raise InputError(f"map {anomaly_map.name!r} has no valid node, so nothing to compare")
     valid = valid[:: -(-len(valid) // MOST_NODES)]
     p_xy, yaw, values = p_xy.reshape(-1, 2)[valid], yaw.ravel()[valid], anomaly_map.values_nt.ravel()[valid]
     height = sensor_height_m(scene) if anomaly_map.height_m is None else anomaly_map.height_m
@@ -89,7 +89,7 @@ def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
     kept = _in_lock(scene, p_xy, height, np.abs(off) > LEAST_NT)
     p_xy, yaw, values, off = p_xy[kept], yaw[kept], values[kept], off[kept]
     if not len(off):
-        raise RefusedError(
+        raise InputError(
             f"map {anomaly_map.name!r} has no node that is clear of what scene {scene.name!r} has there"
         )
     worst = int(np.argmax(np.abs(off)))
@@ -127,13 +127,13 @@ def check_agrees(scene: Scene, anomaly_map: AnomalyMap, where: str) -> Contradic
         The difference, if it is small enough; None if there is nothing to contradict.
 
     Raises:
-        RefusedError: They differ by more than `contradiction_nt` allows.
+        InputError: They differ by more than `contradiction_nt` allows.
     """
     if scene.earth is None or not scene.magnets:
         return None
     found = contradiction_nt(scene, anomaly_map)
     if not found.agrees:
-        raise RefusedError(
+        raise InputError(
             f"{where}: the map differs from the field of the scene's Earth, sources and furniture by {found} "
             f"({found.allowed_nt:,.0f} nT rms would do); if the map is right, remove the sources and the "
             "furniture (or their magnetization); if they are, survey them: magtwin map survey"

@@ -22,18 +22,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.field.map import CONSTANT_NT, AnomalyMap, Outside
-from magtwin.names import RefusedError
-from magtwin.run import Run
-from magtwin.sim.drive import Moment
+from magtwin.errors import InputError
+from magtwin.field.maps.map import CONSTANT_NT, AnomalyMap, Outside
+from magtwin.run.run import Run
 from magtwin.sim.interference import (
     field_at_sensor_nt,
     into_base_axes,
     own_field_nt,
     sensor_places,
 )
-from magtwin.sim.sensors import Moving
-from magtwin.spec import ZERO9, Scene
+from magtwin.sim.motion.drive import Moment
+from magtwin.sim.motion.sampling import Moving
+from magtwin.spec.scene import ZERO9, Scene
 
 Array = NDArray[np.float64]
 
@@ -190,7 +190,7 @@ class ExactField:
         if harmonic is None:
             way = self.scene.earth.b_world_nt if self.scene.earth else (0.0, np.cos(DIP), -np.sin(DIP))
             return np.broadcast_to(np.asarray(way, float), (len(cos), 3))
-        from magtwin.field.dipoles import dipole_field_nt  # compiled, as simulations are
+        from magtwin.field.sources.dipole_sums import dipole_field_nt  # compiled, as simulations are
 
         if self.holds_robot:
             x, y, z = harmonic.p_base_sensor
@@ -206,11 +206,11 @@ def check_truth(scene: Scene, anomaly_map: AnomalyMap) -> None:
     """Refuse a physical magnetometer where neither sources nor a map make a field.
 
     Raises:
-        RefusedError: The map is constant, and there is no Earth's field.
+        InputError: The map is constant, and there is no Earth's field.
     """
     physical = scene.robot.magnetometer.kind == "physical"
     if physical and ExactField(scene=scene, anomaly_map=anomaly_map).of == "none":
-        raise RefusedError(
+        raise InputError(
             f"scene {scene.name!r} has a constant map and no Earth field, so there is no field to read; name "
             "a map that was fitted to a survey, or give the scene an Earth field and sources"
         )
@@ -220,14 +220,14 @@ def check_field(scene: Scene, anomaly_map: AnomalyMap) -> None:
     """Refuse a scene whose field is constant: no magnetometer can tell one place from another.
 
     Raises:
-        RefusedError: The map is constant, and nothing on the stage is magnetised.
+        InputError: The map is constant, and nothing on the stage is magnetised.
     """
     made = scene.magnets or scene.others  # other robots have iron too
     if not anomaly_map.is_constant or (scene.earth is not None and made):
         return
     values = anomaly_map.values_nt[anomaly_map.valid]
     what = f"{values.mean():,.0f} nT at every node" if values.size else "without a valid node"
-    raise RefusedError(
+    raise InputError(
         f"scene {scene.name!r} has a constant field: its map {anomaly_map.name!r} is {what}, and nothing "
         "in it is magnetised; name a map that was fitted to a survey, or add [earth] with [[source]] or "
         "[[furniture]] tables (docs/sources.md)"
@@ -238,7 +238,7 @@ def check_read(run: Run, anomaly_map: AnomalyMap) -> None:
     """Refuse a run that read no field, or one field all along, because it was driven off the map.
 
     Raises:
-        RefusedError: Every reading is nan, or all are the nearest value of a map that the robot never met.
+        InputError: Every reading is nan, or all are the nearest value of a map that the robot never met.
     """
     if not {"p_world_base", "b_map_nt", "b_total_nt"} <= set(run) or not run.rows:
         return
@@ -254,14 +254,14 @@ def check_read(run: Run, anomaly_map: AnomalyMap) -> None:
             return
         what = f"all {run.rows:,} readings are {mapped[0]:,.0f} nT, the map's nearest value, as the robot"
     elif np.isfinite(mapped).any():
-        raise RefusedError(
+        raise InputError(
             f"all {run.rows:,} readings are nan though the robot drove on the map: the network gives nan, as "
             "one of its inputs is not known here; take a physical magnetometer, or another network"
         )
     else:
         what = f"all {run.rows:,} readings are nan, as the robot"
     low, high = p.min(axis=0), p.max(axis=0)
-    raise RefusedError(
+    raise InputError(
         f"{what} drove x {low[0]:.2f}..{high[0]:.2f}, y {low[1]:.2f}..{high[1]:.2f} m, where the map "
         f"{anomaly_map.name!r} (x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m) has no valid node; choose a path on it"
     )

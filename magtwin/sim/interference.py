@@ -8,14 +8,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.field.bodies import Bodies
-from magtwin.field.plane import Plane
-from magtwin.field.sources import dipole_field_nt
-from magtwin.names import RefusedError
-from magtwin.sim.battery import current_a
-from magtwin.sim.drive import Moment, wheel_rates
-from magtwin.sim.sensors import Moving, moment_at
-from magtwin.spec import (
+from magtwin.errors import InputError
+from magtwin.field.maps.plane import Plane
+from magtwin.field.sources.bodies import Bodies
+from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.sim.motion.drive import Moment, wheel_rates
+from magtwin.sim.motion.sampling import Moving, moment_at
+from magtwin.sim.sensors.battery import current_a
+from magtwin.spec.scene import (
     ZERO3,
     BatterySpec,
     DriveSpec,
@@ -70,7 +70,7 @@ def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
         Field in world axes [nT], shape (..., 3).
 
     Raises:
-        RefusedError: The scene has no Earth's field, so only its map is known; or a shape is not as above.
+        InputError: The scene has no Earth's field, so only its map is known; or a shape is not as above.
     """
     earth, bodies = _known(scene)
     p = np.asarray(p_world, float)
@@ -92,7 +92,7 @@ def level_field_nt(scene: Scene, p_xy: ArrayLike, height_m: float) -> tuple[Arra
         Field [nT], shape (N, 3), and dB/dx, dB/dy [nT/m], shape (N, 2, 3), in world axes.
 
     Raises:
-        RefusedError: As for `ambient_field_nt`.
+        InputError: As for `ambient_field_nt`.
     """
     earth = _known_earth(scene)
     plane = _plane(scene.magnets, earth, float(height_m))
@@ -115,7 +115,7 @@ def level_gradient_nt_m(scene: Scene, p_xy: ArrayLike, height_m: float) -> Array
         Gradient [nT/m], shape (N,).
 
     Raises:
-        RefusedError: As for `ambient_field_nt`.
+        InputError: As for `ambient_field_nt`.
     """
     total, slopes = level_field_nt(scene, p_xy, height_m)
     (xx, xy, xz), (yx, yy, yz) = np.moveaxis(slopes, 0, -1)
@@ -137,7 +137,7 @@ def ambient_gradient_nt_m(scene: Scene, p_world: ArrayLike) -> Array:
         Gradient [nT/m], shape (...).
 
     Raises:
-        RefusedError: As for `ambient_field_nt`.
+        InputError: As for `ambient_field_nt`.
     """
     earth, bodies = _known(scene)
     p = np.asarray(p_world, float)
@@ -158,7 +158,7 @@ def _known(scene: Scene) -> tuple[Array, Bodies]:
 def _known_earth(scene: Scene) -> EarthFieldSpec:
     """The Earth's field, where it is known."""
     if scene.earth is None:
-        raise RefusedError(
+        raise InputError(
             f"scene {scene.name!r} has no Earth's field, so its exact field is not known; "
             "give it an [earth] table, or read the field from its map"
         )
@@ -249,7 +249,7 @@ def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
         Field in base_link axes [nT], shape (N, 3).
 
     Raises:
-        RefusedError: The magnetometer is in the middle of one of them.
+        InputError: The magnetometer is in the middle of one of them.
     """
     platform, angle = robot.platform, np.asarray(wheel_angle, float)
     rolled = (angle[:, 0] + angle[:, 1]) * (robot.drive.wheel_radius_m / platform.caster_radius_m / 2)
@@ -274,7 +274,7 @@ def _unit_fields(robot: str, p_base_magnetometer: Vec3, p_base: Vec3) -> Array:
     """Field at the magnetometer of 1 A m2 at a place in base_link, up and forwards [nT], shape (2, 3)."""
     apart = np.subtract(p_base_magnetometer, p_base)
     if not np.linalg.norm(apart) > NEAREST_M:
-        raise RefusedError(
+        raise InputError(
             f"robot {robot!r}: its magnetometer, at {p_base_magnetometer} of base_link, is in the "
             "middle of a wheel or of the caster, whose iron is magnetised; move one of them"
         )
@@ -287,7 +287,8 @@ def wheel_torques_nm(
 ) -> Array:
     """Torque at each wheel: r (F / 2 sign w + m r / 2 dw/dt), half the robot's drag and inertia each.
 
-    That is what `magtwin.sim.battery` takes power for. The drag goes to nought in proportion below `CREEP`.
+    That is what `magtwin.sim.sensors.battery` takes power for. The drag goes to nought in proportion below
+    `CREEP`.
 
     Args:
         battery: Drag F [N] and mass m [kg].

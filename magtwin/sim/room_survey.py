@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from magtwin.field.holes import filled
-from magtwin.field.map import AnomalyMap
-from magtwin.obstacles import Obstacles
+from magtwin.field.maps.holes import filled
+from magtwin.field.maps.map import AnomalyMap
 from magtwin.sim.survey import sensor_height_m, survey
-from magtwin.spec import Scene, SurveySpec
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.scene import Scene, SurveySpec
 
 FLOOR_M = 0.01
 """What does not rise above this is driven over [m]."""
@@ -68,7 +68,7 @@ def survey_room(
         The map, and how many of its nodes were filled.
 
     Raises:
-        RefusedError: As for `survey`, or nothing could be measured in a heading.
+        InputError: As for `survey`, or nothing could be measured in a heading.
     """
     field = survey(
         scene,

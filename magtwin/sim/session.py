@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from magtwin.sim.drive import draw_wheel_errors
 from magtwin.sim.interference import draw_platform
-from magtwin.spec import DriveSpec, RobotSpec
+from magtwin.sim.motion.drive import draw_wheel_errors
+from magtwin.spec.scene import DriveSpec, RobotSpec
 
 YAW_ZERO = (np.pi, 0.3)
 """Mean and standard deviation of the heading at which the IMU is switched on [rad].

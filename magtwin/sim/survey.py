@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.errors import InputError
 from magtwin.field.grid import Grid
-from magtwin.field.map import AnomalyMap
-from magtwin.field.readings import Readings
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.survey.readings import Readings
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
-from magtwin.names import RefusedError
 from magtwin.sim.interference import ambient_field_nt, ambient_gradient_nt_m, platform_field_nt
-from magtwin.sim.magnetometer import latched_nt, lost_in, rounded
-from magtwin.spec import Scene
+from magtwin.sim.sensors.magnetometer import latched_nt, lost_in, rounded
+from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -108,7 +108,7 @@ def survey_readings(
         A row for each node, in the order of `Grid.poses`, with magnitudes; `good` where the robot can stand.
 
     Raises:
-        RefusedError: The Earth's field is unknown, the grid has no cell, or a figure is out of range.
+        InputError: The Earth's field is unknown, the grid has no cell, or a figure is out of range.
     """
     about: dict[str, Any] = {"source": source, "licence": licence, "created": created, "blocked": blocked}
     about |= {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
@@ -133,20 +133,20 @@ def _visit(
 ) -> tuple[Readings, NDArray[np.bool_]]:
     """The readings, and the nodes without one, shape (H, Y, X): lock was lost, or something stands there."""
     if readings < 1:
-        raise RefusedError(f"readings must be at least 1, got {readings!r}")
+        raise InputError(f"readings must be at least 1, got {readings!r}")
     for name, sd in {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}.items():
         if not 0 <= sd < np.inf:
-            raise RefusedError(f"{name} must not be below 0, got {sd!r}")
+            raise InputError(f"{name} must not be below 0, got {sd!r}")
     if position_error_m > spacing_m > 0:
-        raise RefusedError(
+        raise InputError(
             f"position_error_m {position_error_m!r} is beyond the spacing of {spacing_m!r} m; such a robot "
             "does not find its nodes"
         )
     if heading_error_rad > np.pi / 2:
-        raise RefusedError(f"heading_error_rad must not be above pi/2, got {heading_error_rad!r}")
+        raise InputError(f"heading_error_rad must not be above pi/2, got {heading_error_rad!r}")
     height = sensor_height_m(scene) if height_m is None else height_m
     if not 0 <= height < np.inf:
-        raise RefusedError(f"height_m is a height above the floor, 0 m or more, got {height!r}")
+        raise InputError(f"height_m is a height above the floor, 0 m or more, got {height!r}")
     x, y = scene.lab.floor_m
     grid = Grid.over((-x / 2, x / 2, -y / 2, y / 2), spacing_m, np.asarray(headings_rad, float))
     node, nominal = grid.poses()
@@ -223,7 +223,7 @@ def survey(
         The map, with its variance; nodes at which the sensor had lost lock or that are blocked are not valid.
 
     Raises:
-        RefusedError: As for `survey_readings`.
+        InputError: As for `survey_readings`.
     """
     errors: dict[str, Any] = {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
     read, lost = _visit(scene, rng, readings=readings, **errors, **options)

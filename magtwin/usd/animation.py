@@ -24,13 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
+from magtwin.errors import InputError, find
 from magtwin.files import existing, output
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
-from magtwin.names import RefusedError, find
-from magtwin.resample import grid
-from magtwin.run import COLUMNS, Column, Run, check_clock
-from magtwin.spec import Quat, Vec3
-from magtwin.usd.figures import read_pose, target
+from magtwin.run.resample import grid
+from magtwin.run.run import COLUMNS, Column, Run, check_clock
+from magtwin.spec.scene import Quat, Vec3
+from magtwin.usd.attributes import read_pose, target
 from magtwin.usd.geometry import BASE_LINK, read_links
 from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_stage
 from magtwin.usd.schema import attribute_name, only_prim_with, place, prims_with
@@ -144,18 +144,18 @@ def write_animation(
         force: Whether a file that exists is replaced.
 
     Raises:
-        RefusedError: The file exists and `force` was not given, cannot be written or is a part of the scene;
+        InputError: The file exists and `force` was not given, cannot be written or is a part of the scene;
             the run has no clock or no pose, or a column cannot stand in USD; or the scene has no robot.
     """
     path = Path(path)
     if path.suffix not in SUFFIXES:
-        raise RefusedError(f"{path}: a USD file ends in {', '.join(SUFFIXES)}")
+        raise InputError(f"{path}: a USD file ends in {', '.join(SUFFIXES)}")
     if fps is not None and not 0 < fps <= MOST_FPS:
-        raise RefusedError(f"fps must be above 0 and at most {MOST_FPS:g}, got {fps!r}")
+        raise InputError(f"fps must be above 0 and at most {MOST_FPS:g}, got {fps!r}")
     check_clock(run, "the run to write")
     t = run["t"]
     if not len(t):
-        raise RefusedError("the run has no rows, there is nothing to play")
+        raise InputError("the run has no rows, there is nothing to play")
     rate = fps or (round(1 / float(np.median(np.diff(t))), 6) if len(t) > 1 else 1.0)
     frames = run if fps is None else _frames(run, grid(t[0], t[-1], fps))
     codes = (frames["t"] - t[0]) * rate if fps is None else np.arange(frames.rows, dtype=float)
@@ -167,7 +167,7 @@ def write_animation(
     with output(path, force=force) as aside:
         layer = Sdf.Layer.CreateNew(str(aside))
         if layer is None:
-            raise RefusedError(f"{path}: cannot be made as a USD layer")
+            raise InputError(f"{path}: cannot be made as a USD layer")
         _describe(layer, run, stand, rate, (t[-1] - t[0]) * rate)
         if scene_file is not None:
             layer.subLayerPaths = [_relative(Path(scene_file), path)]
@@ -179,23 +179,23 @@ def write_animation(
         try:
             layer.Save()
         except Tf.ErrorException as error:
-            raise RefusedError(f"{path}: cannot be written; is the disk full?") from error
+            raise InputError(f"{path}: cannot be written; is the disk full?") from error
 
 
 def read_animation(path: str | os.PathLike[str]) -> Run:
     """The run that `write_animation` wrote, to the last bit; its scene need not be there.
 
     Raises:
-        RefusedError: The file is missing, is not USD, is cut short, or plays no run of magtwin's.
+        InputError: The file is missing, is not USD, is cut short, or plays no run of magtwin's.
     """
     _check_decodes(path)
     layer = _open_layer(path)
     try:
         run = _read(layer, path)
-    except RefusedError:
+    except InputError:
         raise
     except (Tf.ErrorException, ValueError, AttributeError, TypeError) as error:
-        raise RefusedError(f"{path}: holds a damaged run; write it again") from error
+        raise InputError(f"{path}: holds a damaged run; write it again") from error
     check_clock(run, str(path))
     return run
 
@@ -204,7 +204,7 @@ def is_animation(path: str | os.PathLike[str]) -> bool:
     """Whether a USD file plays a run of magtwin's.
 
     Raises:
-        RefusedError: The file is missing, or is not USD.
+        InputError: The file is missing, or is not USD.
     """
     layer = _open_layer(path)
     return bool(layer.GetAttributeAtPath(_run_path(layer).AppendProperty("magtwin:run:t")))
@@ -223,24 +223,22 @@ def _check_decodes(path: str | os.PathLike[str]) -> None:
     try:
         done = subprocess.run(command, capture_output=True, check=False, timeout=patience)
     except subprocess.TimeoutExpired as error:
-        raise RefusedError(f"{path}: damaged: USD does not come to its end; copy it again") from error
+        raise InputError(f"{path}: damaged: USD does not come to its end; copy it again") from error
     if done.returncode not in (0, 1):  # what Python itself refuses is said when it is read here
-        raise RefusedError(f"{path}: damaged: USD cannot decode it; copy it again, or write it again")
+        raise InputError(f"{path}: damaged: USD cannot decode it; copy it again, or write it again")
 
 
 def _open_layer(path: str | os.PathLike[str]) -> Sdf.Layer:
     """A layer as it is on disk now, and nothing that it names."""
     path = existing(path, "USD file")
     if path.is_dir():
-        raise RefusedError(f"{path}: a folder; give a USD file in it")
+        raise InputError(f"{path}: a folder; give a USD file in it")
     try:
         layer = Sdf.Layer.OpenAsAnonymous(str(path))
     except Tf.ErrorException as error:
-        raise RefusedError(
-            f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD"
-        ) from error
+        raise InputError(f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD") from error
     if layer is None:
-        raise RefusedError(f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD")
+        raise InputError(f"{path}: cannot be opened as USD; it is damaged, cut short, or not USD")
     return layer
 
 
@@ -248,7 +246,7 @@ def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
     """The run of a layer, with whatever faults its file has."""
     prim = layer.GetPrimAtPath(_run_path(layer))
     if not prim:
-        raise RefusedError(f"{path}: plays no run: it has no prim {_run_path(layer)} that holds one")
+        raise InputError(f"{path}: plays no run: it has no prim {_run_path(layer)} that holds one")
     columns, specs = {}, {}
     for attribute in sorted(prim.properties, key=_number):
         name = attribute.name.removeprefix("magtwin:run:")
@@ -260,8 +258,8 @@ def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
     facts = json.loads(layer.customLayerData.get(_FACTS, "{}"))
     try:
         return Run(columns, {key: value for key, value in facts.items() if _is_fact(value)}, specs)
-    except RefusedError as error:
-        raise RefusedError(f"{path}: holds a damaged run: {error}") from error
+    except InputError as error:
+        raise InputError(f"{path}: holds a damaged run: {error}") from error
 
 
 def _run_path(layer: Sdf.Layer) -> Sdf.Path:
@@ -285,7 +283,7 @@ def _pose_columns(run: Run) -> tuple[str, str]:
         if p in run and q in run and np.isfinite(run[p]).all(axis=1).any():
             return p, q
     known = "; ".join(" and ".join(pair) for pair in POSES)
-    raise RefusedError(f"the run says nowhere where the robot is; it needs {known}")
+    raise InputError(f"the run says nowhere where the robot is; it needs {known}")
 
 
 def _stand(stage: Usd.Stage, name: str) -> _Stand:
@@ -297,14 +295,12 @@ def _stand(stage: Usd.Stage, name: str) -> _Stand:
         prim = only_prim_with(root, "robot")  # refuses
     default = stage.GetDefaultPrim()
     if not default or prim.GetParent() != default:
-        raise RefusedError(
-            f"{place(prim)}: the robot must stand directly under the default prim of its scene"
-        )
+        raise InputError(f"{place(prim)}: the robot must stand directly under the default prim of its scene")
     if prim.IsInstance() or prim.IsInstanceProxy():
-        raise RefusedError(f"{place(prim)}: the robot is an instance, whose wheels cannot turn; make it none")
+        raise InputError(f"{place(prim)}: the robot is an instance, whose wheels cannot turn; make it none")
     cache = UsdGeom.XformCache()
     if cache.GetLocalToWorldTransform(default) != Gf.Matrix4d(1):
-        raise RefusedError(f"{place(default)}: is moved or scaled; magtwin plays runs in scenes that are not")
+        raise InputError(f"{place(default)}: is moved or scaled; magtwin plays runs in scenes that are not")
     to_root = cache.ComputeRelativeTransform(_base(prim), prim)[0].RemoveScaleShear()
     turn, offset = to_root.ExtractRotationQuat(), to_root.ExtractTranslation()
     sensors = {}
@@ -335,7 +331,7 @@ def _wheel(robot: Usd.Prim, joint_field: str, stage: Usd.Stage) -> tuple[Sdf.Pat
         (link.axis_link for link in read_links(stage).values() if link.joint == joint.GetName()), None
     )
     if axis is None:
-        raise RefusedError(f"{place(joint)}: is no revolute joint between two bodies; a wheel turns on one")
+        raise InputError(f"{place(joint)}: is no revolute joint between two bodies; a wheel turns on one")
     return body.GetPath(), *read_pose(body), axis
 
 
@@ -343,7 +339,7 @@ def _check_apart(path: Path, stage: Usd.Stage) -> None:
     """Refuse to replace a part of the scene by what plays in it."""
     for layer in stage.GetUsedLayers():
         if layer.realPath and Path(layer.realPath).resolve() == path.resolve():
-            raise RefusedError(f"{path}: is a part of the scene; give another name")
+            raise InputError(f"{path}: is a part of the scene; give another name")
 
 
 def _relative(scene_file: Path, path: Path) -> str:
@@ -438,7 +434,7 @@ def _store(layer: Sdf.Layer, path: Sdf.Path, run: Run) -> None:
     for number, (name, values) in enumerate(run.items()):
         kind = _KINDS.get(values.dtype.str[1:])
         if kind is None or values.ndim > 2 or not Sdf.Path.IsValidIdentifier(name):
-            raise RefusedError(
+            raise InputError(
                 f"column {name!r} cannot stand in USD: numbers or flags can, under a name of letters, digits "
                 f"and _, got {values.dtype} of shape {values.shape}"
             )
@@ -465,14 +461,12 @@ def _array(attribute: Sdf.AttributeSpec, path: str | os.PathLike[str]) -> NDArra
     """The values of a column."""
     dtype = next((dtype for dtype, kind in _KINDS.items() if kind == attribute.typeName), None)
     if dtype is None or attribute.default is None:
-        raise RefusedError(
-            f"{path}: <{attribute.path}> must be an array of numbers, got {attribute.typeName}"
-        )
+        raise InputError(f"{path}: <{attribute.path}> must be an array of numbers, got {attribute.typeName}")
     values = np.array(attribute.default, dtype)
     parts = str(attribute.customData.get("parts", ""))
     width = len(parts.split(","))
     if len(values) % width:
-        raise RefusedError(f"{path}: <{attribute.path}> has {len(values)} numbers in rows of {width}")
+        raise InputError(f"{path}: <{attribute.path}> has {len(values)} numbers in rows of {width}")
     return values.reshape(-1, width) if parts else values
 
 

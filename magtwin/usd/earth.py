@@ -4,10 +4,10 @@ import dataclasses
 
 from pxr import Sdf, Usd, UsdGeom
 
-from magtwin.field.earth import earth_field_nt
-from magtwin.names import RefusedError
-from magtwin.spec import ZERO3, EarthFieldSpec
-from magtwin.usd.figures import read_figures, write_figures
+from magtwin.errors import InputError
+from magtwin.field.sources.earth import earth_field_nt
+from magtwin.spec.scene import ZERO3, EarthFieldSpec
+from magtwin.usd.attributes import read_figures, write_figures
 from magtwin.usd.schema import apply_api, attribute_name, place
 
 DERIVED_FROM = attribute_name("earth", "derived_from")
@@ -29,22 +29,22 @@ def read_earth(prim: Usd.Prim) -> EarthFieldSpec:
     """The spec of an authored Earth's field, computed anew where the prim's place, day or north were changed.
 
     Raises:
-        RefusedError: It is none, or a figure is out of range.
+        InputError: It is none, or a figure is out of range.
     """
     spec = read_figures(EarthFieldSpec, prim, "earth")
     if spec.measured or prim.GetAttribute(DERIVED_FROM).Get() == _inputs(spec):
         return spec
     try:
         return derived(spec)
-    except RefusedError as error:
-        raise RefusedError(f"{place(prim)}: {error}") from error
+    except InputError as error:
+        raise InputError(f"{place(prim)}: {error}") from error
 
 
 def derived(spec: EarthFieldSpec) -> EarthFieldSpec:
     """The spec with the IGRF's field of its place, day and north, to 0.1 nT.
 
     Raises:
-        RefusedError: The model does not reach there.
+        InputError: The model does not reach there.
     """
     x, y, z = earth_field_nt(
         spec.latitude_deg, spec.longitude_deg, spec.height_m, spec.date, north_deg=spec.north_deg
@@ -57,7 +57,7 @@ def checked(spec: EarthFieldSpec) -> EarthFieldSpec:
     """The spec with its field derived where it gives none, and held against the model's where it does.
 
     Raises:
-        RefusedError: The field that it gives is not the model's, and is not said to be measured.
+        InputError: The field that it gives is not the model's, and is not said to be measured.
     """
     if spec.measured:
         return spec
@@ -65,7 +65,7 @@ def checked(spec: EarthFieldSpec) -> EarthFieldSpec:
     if spec.b_world_nt == ZERO3:
         return model
     if max(abs(a - b) for a, b in zip(spec.b_world_nt, model.b_world_nt, strict=True)) > AGREES_NT:
-        raise RefusedError(
+        raise InputError(
             f"b_world_nt {list(spec.b_world_nt)} is not the IGRF-14's field of that place, day and north, "
             f"{list(model.b_world_nt)}; leave it out, or say measured = true"
         )

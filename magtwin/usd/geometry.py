@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
+from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW, canonical
-from magtwin.names import RefusedError
-from magtwin.spec import ZERO3, Quat, Vec3
+from magtwin.spec.scene import ZERO3, Quat, Vec3
 from magtwin.usd.layers import open_stage
 
 SEGMENTS = 32
@@ -110,7 +110,7 @@ def read_shapes(stage: Usd.Stage | str | os.PathLike[str], *, purposes: Sequence
         purposes: USD's purposes of what is wanted.
 
     Raises:
-        RefusedError: The file is missing or is not USD, or a mesh contradicts itself; the text names
+        InputError: The file is missing or is not USD, or a mesh contradicts itself; the text names
             the prim.
     """
     stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
@@ -168,7 +168,7 @@ def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
         stage: A stage, or the path of a USD file.
 
     Raises:
-        RefusedError: The file is missing or is not USD, or joints go round in a circle.
+        InputError: The file is missing or is not USD, or joints go round in a circle.
     """
     stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
     cache, bodies = UsdGeom.XformCache(), _bodies(stage)
@@ -267,7 +267,7 @@ def _root(path, above: dict):  # type: ignore[no-untyped-def]
     while path in above:
         path = above[path][1]
         if path in seen:
-            raise RefusedError(f"{path}: its joints go round in a circle: {' -> '.join(map(str, seen))}")
+            raise InputError(f"{path}: its joints go round in a circle: {' -> '.join(map(str, seen))}")
         seen.append(path)
     return path
 
@@ -347,7 +347,7 @@ def _mesh(mesh: UsdGeom.Mesh) -> _Solid:
     if counts.sum() != len(corners) or (
         len(corners) and not 0 <= corners.min() <= corners.max() < len(points)
     ):
-        raise RefusedError(
+        raise InputError(
             f"{mesh.GetPath()}: its {counts.sum()} corners, {len(corners)} indices and {len(points)} points "
             "contradict each other; export the mesh again"
         )
@@ -488,7 +488,7 @@ def _display_colours(gprim: UsdGeom.Gprim, solid: _Solid, mask: NDArray) -> NDAr
         return values[solid.triangles[mask]].reshape(-1, 3)
     if kind == UsdGeom.Tokens.uniform and len(values) > solid.origin.max():
         return np.repeat(values[solid.origin[mask]], 3, axis=0)
-    raise RefusedError(
+    raise InputError(
         f"{gprim.GetPath()}: {len(values)} displayColor values of interpolation {kind!r} do not fit its "
         f"{len(solid.points)} points; author one for each"
     )

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
+from magtwin.errors import InputError
 from magtwin.files import existing, output, sha256
-from magtwin.names import RefusedError
 
 WORLD = Sdf.Path("/World")
 """Default prim of maps and scenes."""
@@ -30,11 +30,11 @@ def new_stage(
         force: Whether one that exists is replaced.
 
     Raises:
-        RefusedError: The suffix is not USD's, or the file exists and `force` was not given.
+        InputError: The suffix is not USD's, or the file exists and `force` was not given.
     """
     path = Path(path)
     if path.suffix not in SUFFIXES:
-        raise RefusedError(f"{path}: a USD file ends in {', '.join(SUFFIXES)}")
+        raise InputError(f"{path}: a USD file ends in {', '.join(SUFFIXES)}")
     with output(path, force=force) as aside:
         stage = Usd.Stage.CreateNew(str(aside))
         describe_stage(stage, documentation)
@@ -57,12 +57,12 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
     """The stage of a USD file, as it is on disk now, with every layer that it names.
 
     Raises:
-        RefusedError: No such file, or not USD, or one of its sublayers or references is missing; the
+        InputError: No such file, or not USD, or one of its sublayers or references is missing; the
             text says what USD said of it.
     """
     path = existing(path, "USD file")
     if path.is_dir():
-        raise RefusedError(f"{path}: a folder; give a USD file in it")
+        raise InputError(f"{path}: a folder; give a USD file in it")
     heard = (
         UsdUtils.CoalescingDiagnosticDelegate()
     )  # keeps USD's warnings off the terminal: they are refusals
@@ -71,11 +71,11 @@ def open_stage(path: str | os.PathLike[str]) -> Usd.Stage:
         stage.Reload()  # a layer that someone still holds would be shown as it was
         errors = stage.GetCompositionErrors()
     except Tf.ErrorException as error:
-        raise RefusedError(f"{path}: cannot be opened as USD: {_reason(error)}") from error
+        raise InputError(f"{path}: cannot be opened as USD: {_reason(error)}") from error
     finally:
         heard.TakeUncoalescedDiagnostics()
     if errors:
-        raise RefusedError(f"{path}: {_one_line(_text(errors[0]))}")
+        raise InputError(f"{path}: {_one_line(_text(errors[0]))}")
     return stage
 
 
@@ -83,7 +83,7 @@ def layer_files(path: str | os.PathLike[str]) -> list[Path]:
     """The files of a stage's root layer and its sublayers, strongest first; references are not among them.
 
     Raises:
-        RefusedError: As for `open_stage`.
+        InputError: As for `open_stage`.
     """
     stage = open_stage(path)  # held in a name: its layers go with it
     layers = stage.GetLayerStack(includeSessionLayers=False)
@@ -98,7 +98,7 @@ def stage_sha256(path: str | os.PathLike[str]) -> str:
     where they lie.
 
     Raises:
-        RefusedError: No such file, or it or a layer that it names is not USD.
+        InputError: No such file, or it or a layer that it names is not USD.
     """
     return _content_sha256(existing(path, "USD file").resolve(), ())
 
@@ -114,7 +114,7 @@ def _content_sha256(file: Path, above: tuple[Path, ...]) -> str:
             return sha256(file)
         layer = Sdf.Layer.OpenAsAnonymous(str(file))
     except Tf.ErrorException as error:
-        raise RefusedError(f"{file}: cannot be opened as USD: {_reason(error)}") from error
+        raise InputError(f"{file}: cannot be opened as USD: {_reason(error)}") from error
 
     def checksum(asset: str) -> str:
         named = file.parent / asset

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
-from magtwin.names import find
+from magtwin.errors import find
 
 
 @dataclass(frozen=True)

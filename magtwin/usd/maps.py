@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from magtwin.field.colours import COLOUR_MAP, colour_limits
+from magtwin.errors import InputError
 from magtwin.field.days import ORIGIN, day_number
-from magtwin.field.epochs import at_date, day_of, in_order
-from magtwin.field.harmonic import SHAPES as HARMONIC
-from magtwin.field.harmonic import HarmonicField
-from magtwin.field.map import AnomalyMap
-from magtwin.names import RefusedError
+from magtwin.field.maps.colours import COLOUR_MAP, colour_limits
+from magtwin.field.maps.epochs import at_date, day_of, in_order
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.sources.harmonic import SHAPES as HARMONIC
+from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.geometry import linear_from_srgb
 from magtwin.usd.layers import WORLD, new_stage, open_stage
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, only_prim_with, place, prims_with
@@ -64,7 +64,7 @@ def save_map(field: AnomalyMap, path: str | os.PathLike[str], *, force: bool = F
         force: Whether one that exists is replaced.
 
     Raises:
-        RefusedError: The file exists and `force` was not given, or has another suffix; or a figure of
+        InputError: The file exists and `force` was not given, or has another suffix; or a figure of
             the map is none that JSON can hold.
     """
     _save((field,), path, force)
@@ -82,7 +82,7 @@ def save_map_series(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], *,
         force: Whether one that exists is replaced.
 
     Raises:
-        RefusedError: As for `save_map`, and for maps that are no epochs of one (`magtwin.field.epochs`).
+        InputError: As for `save_map`, and for maps that are no epochs of one (`magtwin.field.maps.epochs`).
     """
     _save(in_order(maps), path, force)
 
@@ -96,13 +96,13 @@ def load_map(path: str | os.PathLike[str], date: str | datetime.date | None = No
             around it; the latest unless given.
 
     Raises:
-        RefusedError: The file is missing, is not USD, holds no map or several, its arrays do not fit
+        InputError: The file is missing, is not USD, holds no map or several, its arrays do not fit
             together, or they are not what the checksum was taken of; or the day is none, or before the
             first or after the last epoch.
     """
     if Path(path).suffix in (".csv", ".txt", ".parquet", ".pq", ".mcap", ".db3"):
         fitted = Path(path).with_suffix(".usdc").name
-        raise RefusedError(
+        raise InputError(
             f"{path}: a table of readings or a recording, not a map; fit a map to it first: "
             f"magtwin map fit {Path(path).name} --out {fitted}"
         )
@@ -116,7 +116,7 @@ def load_epochs(path: str | os.PathLike[str]) -> tuple[AnomalyMap, ...]:
     """Every epoch of a layer's or stage's map, the earliest first; one where it has a single one.
 
     Raises:
-        RefusedError: As for `load_map`, for any of the epochs.
+        InputError: As for `load_map`, for any of the epochs.
     """
     stage = open_stage(path)
     prim = only_prim_with(stage.GetPseudoRoot(), "anomalyMap")
@@ -126,10 +126,10 @@ def load_epochs(path: str | os.PathLike[str]) -> tuple[AnomalyMap, ...]:
     for sample, epoch in zip(_samples(prim), epochs, strict=True):
         try:
             day = day_of(epoch)
-        except RefusedError as error:
-            raise RefusedError(f"{place(prim)}: at time {sample.time:g}, {error}") from error
+        except InputError as error:
+            raise InputError(f"{place(prim)}: at time {sample.time:g}, {error}") from error
         if sample.time != day_number(day):
-            raise RefusedError(
+            raise InputError(
                 f"{place(prim)}: its epoch at time {sample.time:g} must be of the day that many days after "
                 f"{ORIGIN}, got {attribute_name('anomalyMap', 'created')} {day}; make the map anew"
             )
@@ -140,7 +140,7 @@ def is_map_layer(path: str | os.PathLike[str]) -> bool:
     """Whether a USD file holds an anomaly map and no robot, so that it is a map and no scene.
 
     Raises:
-        RefusedError: The file is missing or no stage.
+        InputError: The file is missing or no stage.
     """
     stage = open_stage(path)
     root = stage.GetPseudoRoot()
@@ -156,7 +156,7 @@ def checksums(prim: Usd.Prim) -> list[tuple[str, str]]:
     """What a map's checksum says and what its arrays give, of the default and then of each epoch.
 
     Raises:
-        RefusedError: An array is missing or of another type; names the prim.
+        InputError: An array is missing or of another type; names the prim.
     """
     pairs = []
     for sample in (None, *_samples(prim)):
@@ -191,29 +191,29 @@ def _samples(prim: Usd.Prim) -> list[_Sample]:
 def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
     """The map of a prim at a time, or its default."""
     if (unit := _get(prim, "unit")) != UNIT:
-        raise RefusedError(f"{place(prim)}: the map is in {unit!r}, magtwin reads {UNIT}; make the map anew")
+        raise InputError(f"{place(prim)}: the map is in {unit!r}, magtwin reads {UNIT}; make the map anew")
     checksum = _get(prim, "checksum", sample)
     if not re.fullmatch("[0-9a-f]{64}", checksum):
-        raise RefusedError(
+        raise InputError(
             f"{place(prim)}: {attribute_name('anomalyMap', 'checksum')} must be a SHA-256, 64 digits 0-9a-f, "
             f"got {checksum[:SAID]!r}; make the map anew"
         )
     values, valid, variance = (np.array(_get(prim, name, sample)) for name in ("values", "valid", "variance"))
     harmonic = _read_harmonic(prim, sample)
     if checksum != _checksum(values, valid, variance, harmonic):
-        raise RefusedError(
+        raise InputError(
             f"{place(prim)}: the map's values are not those that its checksum was taken of; make the map anew"
         )
     shape = tuple(_get(prim, "shape"))
     if len(shape) != 3 or min(shape) < 1 or not values.size == valid.size == math.prod(shape):
-        raise RefusedError(
+        raise InputError(
             f"{place(prim)}: shape {list(shape)} does not fit {values.size} values and {valid.size} flags"
         )
     if variance.size not in (0, values.size):
-        raise RefusedError(f"{place(prim)}: {values.size} values have {variance.size} variances")
+        raise InputError(f"{place(prim)}: {values.size} values have {variance.size} variances")
     headings = np.array(_get(prim, "headings"), float)
     if not (headings.size and np.all(np.diff(headings) > 0) and headings[0] >= 0 and headings[-1] < 360):
-        raise RefusedError(
+        raise InputError(
             f"{place(prim)}: {attribute_name('anomalyMap', 'headings')} must ascend in [0, 360) deg, got "
             f"{str(headings.tolist())[:SAID]}; make the map anew"
         )
@@ -232,8 +232,8 @@ def _read(prim: Usd.Prim, sample: _Sample | None) -> AnomalyMap:
             **{name: _get(prim, name) for name in PLACES},
             **{name: _get(prim, name, sample) for name in TEXTS},
         )
-    except RefusedError as error:
-        raise RefusedError(f"{place(prim)}: {error}") from error
+    except InputError as error:
+        raise InputError(f"{place(prim)}: {error}") from error
 
 
 def _read_recorded(
@@ -246,7 +246,7 @@ def _read_recorded(
         return None
     recorded = np.array(_check_type(attribute, value), float)
     if recorded.size != math.prod(shape):
-        raise RefusedError(
+        raise InputError(
             f"{place(prim)}: {attribute.GetName()} has {recorded.size} numbers for {math.prod(shape)} values"
         )
     return recorded.reshape(shape)
@@ -257,7 +257,7 @@ def _exact(prim: Usd.Prim, values: NDArray, recorded: NDArray | None) -> NDArray
     if recorded is None:
         return values.astype(float)
     if not np.array_equal(recorded.astype(np.float32), values, equal_nan=True):
-        raise RefusedError(
+        raise InputError(
             f"{place(prim)}: the map's values are not those that were recorded, in single precision; make "
             "the map anew"
         )
@@ -270,7 +270,7 @@ def _read_height(prim: Usd.Prim) -> float | None:
     if height is None:
         return None
     if not isinstance(height, float) or not math.isfinite(height):
-        raise RefusedError(
+        raise InputError(
             f"{attribute.GetName()} must be a length [m], got {height!r}; clear it where unknown"
         )
     return height
@@ -285,9 +285,9 @@ def _read_parameters(prim: Usd.Prim, text: str) -> dict[str, Any]:
         figures = json.loads(text, parse_constant=_no_number)
         json.dumps(figures, allow_nan=False)  # 1e999 is a number to JSON, and infinite
     except (ValueError, RecursionError) as error:
-        raise RefusedError(f"{name} is not JSON ({error}), got {text[:SAID]!r}; make the map anew") from error
+        raise InputError(f"{name} is not JSON ({error}), got {text[:SAID]!r}; make the map anew") from error
     if not isinstance(figures, dict):
-        raise RefusedError(f"{name} must be a JSON object, got {text[:SAID]!r}; make the map anew")
+        raise InputError(f"{name} must be a JSON object, got {text[:SAID]!r}; make the map anew")
     return figures
 
 
@@ -312,14 +312,14 @@ def _read_harmonic(prim: Usd.Prim, sample: _Sample | None) -> dict[str, NDArray]
         arrays[name] = np.array(value, float).reshape([-1 if n < 0 else n for n in shape])
     if arrays and len(arrays) < len(HARMONIC):
         lost = ", ".join(attribute_name("harmonic", name) for name in HARMONIC.keys() - arrays.keys())
-        raise RefusedError(f"{place(prim)}: its harmonic field has no {lost}; make the map anew")
+        raise InputError(f"{place(prim)}: its harmonic field has no {lost}; make the map anew")
     return arrays or None
 
 
 def _save(maps: Sequence[AnomalyMap], path: str | os.PathLike[str], force: bool) -> None:
     """Write maps of one grid, the earliest first: the last as the default, all of several as time samples."""
     if Path(path).suffix not in (".usdc", ".usd"):
-        raise RefusedError(f"{path}: a map layer ends in .usdc or .usd")
+        raise InputError(f"{path}: a map layer ends in .usdc or .usd")
     latest = maps[-1]
     times = [float(day_number(day_of(m))) for m in maps] if len(maps) > 1 else []
     samples = [_of_a_day(m) for m in maps]
@@ -408,7 +408,7 @@ def _written_parameters(field: AnomalyMap) -> str:
     try:
         return json.dumps(dict(field.parameters), allow_nan=False, ensure_ascii=False)
     except (TypeError, ValueError) as error:
-        raise RefusedError(
+        raise InputError(
             f"parameters of map {field.name!r} must be finite numbers, texts and lists of them ({error})"
         ) from error
 
@@ -423,7 +423,7 @@ def _get(prim: Usd.Prim, name: str, sample: _Sample | None = None) -> Any:
 def _check_type(attribute: Usd.Attribute, value: Any) -> Any:
     kind = attribute.GetTypeName()
     if not isinstance(value, type(kind.defaultValue)):
-        raise RefusedError(f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}")
+        raise InputError(f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}")
     return value
 
 

@@ -6,7 +6,7 @@ import os
 import numpy as np
 from pxr import Usd, UsdGeom, UsdPhysics
 
-from magtwin.obstacles import Obstacles
+from magtwin.spec.obstacles import Obstacles
 from magtwin.usd.geometry import SHOWN, read_triangles
 from magtwin.usd.layers import open_stage
 from magtwin.usd.schema import prims_with
@@ -42,7 +42,7 @@ def read_obstacles(stage: Usd.Stage | str | os.PathLike[str], *, height_m: float
             `ROBOT_HEIGHT_M`.
 
     Raises:
-        RefusedError: The file is missing or is not USD, or a mesh contradicts itself; the text names
+        InputError: The file is missing or is not USD, or a mesh contradicts itself; the text names
             the prim.
     """
     stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)

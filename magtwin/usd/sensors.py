@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
+from magtwin.errors import InputError, hint
 from magtwin.frames import IDENTITY_XYZW, canonical, xyzw_from_wxyz
-from magtwin.names import RefusedError, hint
-from magtwin.spec import (
+from magtwin.spec.scene import (
     BatterySpec,
     DriveSpec,
     ImuSpec,
@@ -27,7 +27,7 @@ from magtwin.spec import (
     RobotSpec,
     Vec3,
 )
-from magtwin.usd.figures import read_figures, read_pose, target, write_figures, write_pose
+from magtwin.usd.attributes import read_figures, read_pose, target, write_figures, write_pose
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, only_prim_with, place, require_api
 
 S = TypeVar("S")
@@ -80,7 +80,7 @@ def define_magnetometer(stage: Usd.Stage, path: str | Sdf.Path, spec: Magnetomet
         spec: What to author; `network` becomes a path relative to the edited layer.
 
     Raises:
-        RefusedError: The parent prim is not the link, or a prim of another type is there.
+        InputError: The parent prim is not the link, or a prim of another type is there.
     """
     prim = _define_mounted(stage, path, spec)
     write_figures(apply_api(prim, "magnetometer"), "magnetometer", spec, skip=POSE_FIELDS)
@@ -91,7 +91,7 @@ def read_magnetometer(prim: Usd.Prim) -> MagnetometerSpec:
     """The spec of an authored magnetometer; whether its network is there is for its user to see.
 
     Raises:
-        RefusedError: It is none, or a figure is out of range.
+        InputError: It is none, or a figure is out of range.
     """
     return _read_mounted(MagnetometerSpec, prim, "magnetometer")
 
@@ -222,7 +222,7 @@ def define_drive(prim: Usd.Prim, spec: DriveSpec) -> Usd.Prim:
     """Apply a differential drive to a robot's root prim; its wheel joints must be authored below.
 
     Raises:
-        RefusedError: No joint has the name that the spec gives.
+        InputError: No joint has the name that the spec gives.
     """
     write_figures(apply_api(prim, "drive"), "drive", spec, skip=JOINT_FIELDS)
     found = [p for p in Usd.PrimRange(prim) if p.IsA(UsdPhysics.Joint)]
@@ -230,7 +230,7 @@ def define_drive(prim: Usd.Prim, spec: DriveSpec) -> Usd.Prim:
     for field in JOINT_FIELDS:
         name = getattr(spec, field)
         if name not in joints:
-            raise RefusedError(f"{place(prim)}: no joint {name!r} for {field}; {hint(name, joints)}")
+            raise InputError(f"{place(prim)}: no joint {name!r} for {field}; {hint(name, joints)}")
         relationship = prim.GetRelationship(attribute_name("drive", field))
         if relationship.GetTargets() != [joints[name].GetPath()]:
             relationship.SetTargets([joints[name].GetPath()])
@@ -241,7 +241,7 @@ def read_drive(prim: Usd.Prim) -> DriveSpec:
     """The spec of an authored drive.
 
     Raises:
-        RefusedError: It is none, a figure is out of range, or a wheel's joint is missing.
+        InputError: It is none, a figure is out of range, or a wheel's joint is missing.
     """
     require_api(prim, "drive")
     joints = {f: target(prim, attribute_name("drive", f)).GetName() for f in JOINT_FIELDS}
@@ -278,7 +278,7 @@ def read_robot_prim(prim: Usd.Prim, asset: Path) -> RobotSpec:
         asset: USD file that the robot comes from.
 
     Raises:
-        RefusedError: A part is missing or there twice, or a figure is out of range; names the prim.
+        InputError: A part is missing or there twice, or a figure is out of range; names the prim.
     """
     magnetometer, imu, lidar = (only_prim_with(prim, noun) for noun in ("magnetometer", "imu", "lidar"))
     parts: dict[str, Any] = {
@@ -303,8 +303,8 @@ def read_robot_prim(prim: Usd.Prim, asset: Path) -> RobotSpec:
             q_base_lidar_link_xyzw=_q_base(prim, lidar.GetParent()),
             **parts,
         )
-    except RefusedError as error:
-        raise RefusedError(f"{place(prim)}: {error}") from error
+    except InputError as error:
+        raise InputError(f"{place(prim)}: {error}") from error
 
 
 def _base(root: Usd.Prim) -> Usd.Prim:
@@ -347,7 +347,7 @@ def _define_xform(stage: Usd.Stage, path: str | Sdf.Path) -> Usd.Prim:
 def _define_mounted(stage: Usd.Stage, path: str | Sdf.Path, spec: MountSpec) -> Usd.Prim:
     path = Sdf.Path(str(path))
     if path.GetParentPath().name != spec.link:
-        raise RefusedError(f"<{path}>: this sensor sits on {spec.link!r}, so its prim must be a child of it")
+        raise InputError(f"<{path}>: this sensor sits on {spec.link!r}, so its prim must be a child of it")
     prim = _define_xform(stage, path)
     write_pose(prim, spec.p_link_sensor, spec.q_link_sensor_xyzw)
     return prim

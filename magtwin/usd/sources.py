@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from magtwin.field.bodies import mesh_moments
+from magtwin.errors import InputError
+from magtwin.field.sources.bodies import mesh_moments
 from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multiply, rotate, xyzw_from_wxyz
-from magtwin.names import RefusedError
-from magtwin.spec import ZERO3, Quat, SourceSpec, Vec3
-from magtwin.usd.figures import check_prim_name, plain_value, write_pose
+from magtwin.spec.scene import ZERO3, Quat, SourceSpec, Vec3
+from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
 from magtwin.usd.layers import WORLD
 from magtwin.usd.looks import define_looks, wear
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
@@ -50,7 +50,7 @@ def define_source(
         look: Which of those materials it wears.
 
     Raises:
-        RefusedError: Its name cannot name a prim.
+        InputError: Its name cannot name a prim.
     """
     path = Sdf.Path(str(parent)).AppendChild(check_prim_name(spec.name, "source"))
     prim = stage.DefinePrim(path, TYPES[spec.shape])
@@ -123,18 +123,18 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
         local: Whether its pose is wanted in its parent's axes in place of world's.
 
     Raises:
-        RefusedError: It is no source, is of a type that none can be, is sheared or mirrored, its mesh is
+        InputError: It is no source, is of a type that none can be, is sheared or mirrored, its mesh is
             open, or a figure is out of range.
     """
     require_api(prim, "source")
     shape = SHAPES.get(prim.GetTypeName())
     if shape is None:
-        raise RefusedError(
+        raise InputError(
             f"{place(prim)}: a {prim.GetTypeName() or 'prim without type'} cannot be a magnetic source; "
             f"put MagtwinMagneticSourceAPI on {', '.join(SHAPES)}"
         )
     if any(above.IsA(UsdGeom.PointInstancer) for above in _above(prim)):
-        raise RefusedError(
+        raise InputError(
             f"{place(prim)}: a magnetic source below a PointInstancer stands in no one place; reference it "
             "where it stands, as an instance if need be"
         )
@@ -152,13 +152,13 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
         spec |= geometry | {"q_world_xyzw": q if turn == IDENTITY_XYZW else _product(q, turn)}
         if own["moment"] != ZERO3:
             if own["magnetization"] != ZERO3:
-                raise RefusedError("has both a moment and a magnetization; give one of them")
+                raise InputError("has both a moment and a magnetization; give one of them")
             own["magnetization"] = _over(own["moment"], SourceSpec(**spec).body().volume_m3)
         return SourceSpec(
             **spec, magnetization=own["magnetization"], susceptibility=figures["susceptibility"]
         )
-    except RefusedError as error:
-        raise RefusedError(f"{place(prim)}: {error}") from error
+    except InputError as error:
+        raise InputError(f"{place(prim)}: {error}") from error
 
 
 def _point(
@@ -166,7 +166,7 @@ def _point(
 ) -> SourceSpec:
     """An Xform's dipole, its moment turned into world axes."""
     if magnetization != ZERO3 or susceptibility:
-        raise RefusedError(
+        raise InputError(
             "an Xform has no volume to be magnetised; give it a moment, or put the schema on its Cube, "
             "Cylinder, Sphere or Mesh"
         )
@@ -207,7 +207,7 @@ def _triangles(mesh: UsdGeom.Mesh, scale: Vec3) -> tuple[Any, Any]:
     if counts.sum() != len(corners) or (
         len(corners) and not 0 <= corners.min() <= corners.max() < len(points)
     ):
-        raise RefusedError(
+        raise InputError(
             f"its {counts.sum()} corners, {len(corners)} indices and {len(points)} points do not fit together"
         )
     first = np.cumsum(counts) - counts
@@ -231,9 +231,7 @@ def _triangles(mesh: UsdGeom.Mesh, scale: Vec3) -> tuple[Any, Any]:
 def _check_round(scales: Any, what: str) -> None:
     if max(scales) - min(scales) > SQUARE * max(scales):
         seen = ", ".join(f"{s:g}" for s in scales)
-        raise RefusedError(
-            f"{what} must be the same each way, got {seen}; use a Mesh for an ellipsoid or oval"
-        )
+        raise InputError(f"{what} must be the same each way, got {seen}; use a Mesh for an ellipsoid or oval")
 
 
 def placement(prim: Usd.Prim, *, local: bool = False) -> Placement:
@@ -242,7 +240,7 @@ def placement(prim: Usd.Prim, *, local: bool = False) -> Placement:
     What magtwin wrote at the origin comes back to the bit, any other transform as it composes.
 
     Raises:
-        RefusedError: It is mirrored, sheared, flattened or not finite.
+        InputError: It is mirrored, sheared, flattened or not finite.
     """
     xformable = UsdGeom.Xformable(prim)
     ops = xformable.GetOrderedXformOps()
@@ -259,17 +257,17 @@ def placement(prim: Usd.Prim, *, local: bool = False) -> Placement:
     rows = np.array(matrix)[:3, :3]
     lengths = np.sqrt(np.square(rows).sum(axis=1))
     if not (np.isfinite(np.array(matrix)).all() and lengths.min() > 0):
-        raise RefusedError(
+        raise InputError(
             f"{place(prim)}: its transform flattens it or is not finite; a source needs its size"
         )
     rows = rows / lengths[:, None]
     if np.abs(rows @ rows.T - np.eye(3)).max() > SQUARE:
-        raise RefusedError(
+        raise InputError(
             f"{place(prim)}: it is sheared, by a scale above a turn; scale it along its own axes, or bake "
             "the transform into a mesh"
         )
     if np.linalg.det(rows) < 0:
-        raise RefusedError(
+        raise InputError(
             f"{place(prim)}: it is mirrored by a negative scale, and a magnetization in mirrored axes has no "
             "one meaning; turn it instead"
         )

@@ -17,18 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.field.fit import fit, raster
-from magtwin.field.map import AnomalyMap
-from magtwin.field.readings import Readings
+from magtwin.author.robot import read_robot
+from magtwin.field.fit.fit import fit, raster
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.survey.readings import Readings
 from magtwin.files import output, shipped
 from magtwin.frames import quat_from_rpy
-from magtwin.furniture import parts_of
 from magtwin.report import Report
 from magtwin.sim.survey import survey_readings
-from magtwin.spec import ZERO3, EarthFieldSpec, FurnitureSpec, LabSpec, RobotSpec, Scene, SourceSpec
+from magtwin.spec.furniture import parts_of
+from magtwin.spec.scene import ZERO3, EarthFieldSpec, FurnitureSpec, LabSpec, RobotSpec, Scene, SourceSpec
 from magtwin.usd.earth import derived
 from magtwin.usd.maps import save_map
-from magtwin.usd.robot import read_robot
 
 HERE = Path(__file__).resolve().parent
 SEED = 398

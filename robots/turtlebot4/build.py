@@ -532,8 +532,8 @@ def write(folder):
 
 
 if __name__ == "__main__":
-    from magtwin.io.pictures import picture_of_stage
-    from magtwin.usd.robot import build_robot
+    from magtwin.author.robot import build_robot
+    from magtwin.figures.pictures import picture_of_stage
 
     report = build_robot(
         write(HERE),

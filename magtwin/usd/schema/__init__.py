@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pxr import Plug, Usd
 
-from magtwin.names import RefusedError, find
+from magtwin.errors import InputError, find
 
 FOLDER = Path(__file__).resolve().parent
 
@@ -36,13 +36,13 @@ def register() -> None:
     """Make the schemas known to USD; once more does nothing.
 
     Raises:
-        RefusedError: USD's schema registry was in use before, and will not take them any more.
+        InputError: USD's schema registry was in use before, and will not take them any more.
     """
     Plug.Registry().RegisterPlugins(str(FOLDER))
     registry = Usd.SchemaRegistry()
     unknown = [api for api in NOUNS.values() if not registry.FindAppliedAPIPrimDefinition(api)]
     if unknown:
-        raise RefusedError(
+        raise InputError(
             f"the USD schemas {', '.join(unknown)} came too late: USD reads schemas once, at the first use "
             "of a stage; import magtwin.usd before opening one, or add "
             f"{FOLDER} to PXR_PLUGINPATH_NAME"
@@ -67,14 +67,14 @@ def apply_api(prim: Usd.Prim, noun: str) -> Usd.Prim:
     """Apply the schema of `noun` to `prim`, in the stage's edit target, unless it has it already.
 
     Raises:
-        RefusedError: It may not be applied to a prim of that type.
+        InputError: It may not be applied to a prim of that type.
     """
     api = find("schema", noun, NOUNS)
     if prim.HasAPI(api):
         return prim
     allowed = prim.CanApplyAPI(api)
     if not allowed:
-        raise RefusedError(
+        raise InputError(
             f"{place(prim)}: {api} goes on {_kinds(api)} only, not on a {prim.GetTypeName() or 'def'}"
         )
     prim.ApplyAPI(api)
@@ -91,11 +91,11 @@ def require_api(prim: Usd.Prim, noun: str) -> Usd.Prim:
     """`prim`, if it has the schema of `noun`.
 
     Raises:
-        RefusedError: It has not.
+        InputError: It has not.
     """
     api = find("schema", noun, NOUNS)
     if not prim.HasAPI(api):
-        raise RefusedError(f"{place(prim)}: has no {api}; it is not a {noun} that magtwin authored")
+        raise InputError(f"{place(prim)}: has no {api}; it is not a {noun} that magtwin authored")
     return prim
 
 
@@ -109,10 +109,10 @@ def only_prim_with(root: Usd.Prim, noun: str) -> Usd.Prim:
     """The one prim at or below `root` that has the schema of `noun`.
 
     Raises:
-        RefusedError: There is none, or there are several.
+        InputError: There is none, or there are several.
     """
     prims = prims_with(root, noun)
     if len(prims) != 1:
         seen = ", ".join(str(prim.GetPath()) for prim in prims) or "none"
-        raise RefusedError(f"{place(root)}: needs one prim with {NOUNS[noun]} below it, found {seen}")
+        raise InputError(f"{place(root)}: needs one prim with {NOUNS[noun]} below it, found {seen}")
     return prims[0]

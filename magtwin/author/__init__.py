@@ -1,0 +1,1 @@
+"""Authoring: a scene from TOML or Python, a robot with its sensors."""

@@ -1,0 +1,285 @@
+"""Robot: an asset with drive, battery and sensors, from a URDF and what a URDF cannot say."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from pxr import Sdf, Usd, UsdPhysics
+
+from magtwin.author.shape import drive_of, footprint_of, stand_on_floor
+from magtwin.errors import InputError, hint
+from magtwin.files import existing, from_table, read_toml, sha256
+from magtwin.spec.scene import (
+    BatterySpec,
+    DriveSpec,
+    ImuSpec,
+    LidarSpec,
+    MagnetometerSpec,
+    MocapSpec,
+    MountSpec,
+    PlatformFieldSpec,
+    RobotSpec,
+    Spec,
+)
+from magtwin.urdf.convert import convert_with_report
+from magtwin.urdf.options import DEFAULTS, Options
+from magtwin.urdf.report import ConversionReport
+from magtwin.urdf.reroot import reroot
+from magtwin.usd.geometry import BASE_LINK
+from magtwin.usd.layers import open_stage
+from magtwin.usd.schema import NOUNS, prims_with
+from magtwin.usd.sensors import (
+    define_battery,
+    define_drive,
+    define_footprint,
+    define_imu,
+    define_lidar,
+    define_magnetometer,
+    define_mocap,
+    define_platform,
+    read_drive,
+    read_robot_prim,
+)
+
+_DEFAULTS = RobotSpec(name="", asset=Path())
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotSettings(Spec):
+    """What a URDF cannot say of a robot; a robot.toml, or [robot] of a scene's TOML, holds its fields.
+
+    What is None is taken from the URDF's own tags where it has them, else it is the default of its
+    spec, on the base where the URDF has no link of the default's name.
+    """
+
+    name: str = ""
+    """Name that the URDF must give the robot; "" takes any."""
+
+    footprint_radius_m: float | None = None
+    """Radius of the circle that must stay clear of walls [m]; that of the robot's shape unless given."""
+
+    drive: DriveSpec | None = None
+    battery: BatterySpec = field(default_factory=BatterySpec)
+    platform: PlatformFieldSpec = field(default_factory=PlatformFieldSpec)
+    magnetometer: MagnetometerSpec | None = None
+    imu: ImuSpec | None = None
+    lidar: LidarSpec | None = None
+    mocap: MocapSpec = field(default_factory=MocapSpec)
+
+    conversion: Options = DEFAULTS
+    """How the URDF is converted."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.footprint_radius_m is not None:
+            self._above_zero("footprint_radius_m")
+
+
+def build_robot(
+    urdf: str | os.PathLike[str],
+    settings: str | os.PathLike[str] | RobotSettings,
+    out: str | os.PathLike[str],
+    *,
+    options: Options | None = None,
+    force: bool = False,
+    thumbnail: Callable[[Path, Path], object] | None = None,
+) -> ConversionReport:
+    """Convert a URDF and author its drive, battery, own magnetic field and sensors.
+
+    Args:
+        urdf: The description, see `convert_urdf`.
+        settings: RobotSettings, or a TOML with their fields; sensors name their links.
+        out: Root layer to write, `.usda`; `read_robot` gives its spec.
+        options: How the URDF is converted, in place of what the settings say.
+        force: Whether files that are there are replaced.
+        thumbnail: Draws the asset, see `convert_with_report`.
+
+    Returns:
+        What became of the URDF.
+
+    Raises:
+        InputError: The URDF or the settings cannot be used (file, line and key are given), or a file
+            is there already; nothing is written.
+    """
+    where = "" if isinstance(settings, RobotSettings) else f"{settings}: "
+    given = settings if isinstance(settings, RobotSettings) else read_settings(settings)
+
+    def finish(robot: Usd.Prim) -> list[str]:
+        if given.name and robot.GetName() != given.name:
+            raise InputError(f"{where}name is {given.name!r}, but the URDF's robot is {robot.GetName()!r}")
+        try:
+            return _equip(robot, given)
+        except InputError as error:
+            raise InputError(f"{where}{error}") from error
+
+    return convert_with_report(
+        urdf,
+        out,
+        options=options or given.conversion,
+        force=force,
+        finish=finish,
+        thumbnail=thumbnail,
+    )
+
+
+def read_settings(settings: str | os.PathLike[str]) -> RobotSettings:
+    """The settings of a TOML.
+
+    Raises:
+        InputError: The file is missing or not TOML, or a key or value is wrong; the line is given.
+    """
+    return from_table(RobotSettings, read_toml(settings), settings)
+
+
+def read_robot(asset: str | os.PathLike[str]) -> RobotSpec:
+    """The spec of a robot's asset.
+
+    Raises:
+        InputError: The file is missing, is not USD, or is not an asset that `build_robot` made. Whether
+            a network that it names is there is for its user to see.
+    """
+    path = existing(asset, "robot asset").resolve()
+    stage = open_stage(path)
+    if not stage.GetDefaultPrim():
+        raise InputError(f"{path}: has no default prim, so no robot; make the asset with `magtwin robot`")
+    return read_robot_prim(stage.GetDefaultPrim(), path)
+
+
+def read_description(asset: str | os.PathLike[str]) -> str:
+    """The URDF that an asset was converted from, its root base_link, if `description_of` finds it; else "".
+
+    Raises:
+        InputError: It is none that can be read.
+    """
+    source = description_of(asset)
+    if source is None:
+        return ""
+    try:
+        text = source.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{source}: is not UTF-8, which ROS says descriptions in; save it as that"
+        ) from error
+    return reroot(text, BASE_LINK, source)
+
+
+def notes_of(asset: str | os.PathLike[str]) -> list[str]:
+    """What was repaired, guessed or left out when an asset was converted."""
+    stage = open_stage(existing(asset, "robot asset"))
+    return [str(note) for note in stage.GetRootLayer().customLayerData.get("magtwin", {}).get("notes", [])]
+
+
+def description_of(asset: str | os.PathLike[str]) -> Path | None:
+    """The URDF that an asset was converted from, if it still lies beside it, unchanged."""
+    stage = open_stage(
+        existing(asset, "robot asset")
+    )  # held in a name: a layer does not keep its stage alive
+    said = stage.GetRootLayer().customLayerData.get("magtwin", {})
+    source = Path(asset).parent / Path(str(said.get("source", ""))).name
+    if source.suffix != ".urdf" or not source.is_file() or sha256(source) != said.get("sourceSha256"):
+        return None
+    return source
+
+
+def robot_of(prim: Usd.Prim) -> RobotSpec:
+    """The spec of the robot at `prim` in a composed scene, its asset the file that the prim refers to.
+
+    Raises:
+        InputError: It is not the prim of a robot that `build_robot` made; the text names it.
+    """
+    arcs = Usd.PrimCompositionQuery.GetDirectReferences(prim).GetCompositionArcs()
+    layer = arcs[0].GetTargetLayer() if arcs else prim.GetStage().GetRootLayer()
+    return read_robot_prim(prim, Path(layer.realPath).resolve())
+
+
+def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
+    """Author what settings say at a converted robot's prim and on its links; notes of what was guessed."""
+    stage, links, notes = robot.GetStage(), _links(robot), list[str]()
+    robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set("Wheeled")
+    radius = settings.footprint_radius_m
+    if radius is None:
+        radius = footprint_of(robot) or _DEFAULTS.footprint_radius_m
+        notes.append(f"footprint_radius_m not given: {radius:g} m, from the robot's shape")
+    define_footprint(robot, radius)
+    if settings.drive is not None or not prims_with(robot, "drive"):
+        drive, found = drive_of(robot, settings.drive or DriveSpec())
+        define_drive(robot, drive)
+        notes += found
+    notes += stand_on_floor(robot, read_drive(robot))
+    define_platform(robot, settings.platform)
+    define_mocap(robot, settings.mocap)
+    define_battery(stage, _free(links, _base(robot), "battery"), settings.battery)
+    told: tuple[tuple[str, Any, Any, Any], ...] = (
+        ("imu", settings.imu, ImuSpec(), define_imu),
+        ("lidar", settings.lidar, LidarSpec(), define_lidar),
+    )
+    for name, given, spec, define in told:
+        if given is None and prims_with(robot, name):
+            continue
+        if given is None and spec.link not in links:
+            base = _base(robot)
+            notes.append(f"no {name} given: placed at the origin of {base.name}")
+            define(stage, _free(links, base, name), replace(spec, link=base.name))
+        else:
+            path = _mount(links, name, given or spec)
+            notes += _make_way(robot, name, path)
+            define(stage, path, replace(given or spec, link=path.GetParentPath().name))
+    if settings.magnetometer is not None or not prims_with(robot, "magnetometer"):
+        magnetometer = settings.magnetometer or MagnetometerSpec()
+        path = _mount(links, "magnetometer", magnetometer)
+        notes += _make_way(robot, "magnetometer", path)
+        define_magnetometer(stage, path, replace(magnetometer, link=path.GetParentPath().name))
+    return notes
+
+
+def _make_way(robot: Usd.Prim, noun: str, path: Sdf.Path) -> list[str]:
+    """Let the settings' sensor at `path` be the robot's only one of its kind; notes of what gave way.
+
+    One of the URDF's tags on the same link is the same device and goes; one on another link stays for
+    other simulators.
+    """
+    stage, notes = robot.GetStage(), []
+    for prim in prims_with(robot, noun):
+        if prim.GetPath() == path:
+            continue
+        where = f"{noun} {prim.GetName()!r} of link {prim.GetParent().GetName()!r}"
+        if prim.GetParent().GetPath() == path.GetParentPath():
+            notes.append(f"{where}: the settings say what it is, not the URDF's tags")
+            stage.RemovePrim(prim.GetPath())
+            continue
+        notes.append(f"{where} is not simulated here: the settings name another")
+        prim.RemoveAPI(NOUNS[noun])
+        for attribute in prim.GetAuthoredPropertiesInNamespace(f"magtwin:{noun}"):
+            prim.RemoveProperty(attribute.GetName())
+    return notes
+
+
+def _links(robot: Usd.Prim) -> dict[str, Sdf.Path]:
+    """Paths of a robot's links by name, the URDF's and USD's, those that only name a place included."""
+    named = ("IsaacLinkAPI", "IsaacSiteAPI")
+    return {
+        name: prim.GetPath()
+        for prim in Usd.PrimRange(robot)
+        if any(api in named for api in prim.GetPrimTypeInfo().GetAppliedAPISchemas())
+        for name in {prim.GetName(), prim.GetDisplayName() or prim.GetName()}
+    }
+
+
+def _base(robot: Usd.Prim) -> Sdf.Path:
+    """Path of the robot's first body, which the converter makes its base."""
+    return next(p.GetPath() for p in robot.GetChildren() if p.HasAPI(UsdPhysics.RigidBodyAPI))
+
+
+def _mount(links: dict[str, Sdf.Path], name: str, spec: MountSpec) -> Sdf.Path:
+    """Path of a sensor on its link."""
+    if spec.link not in links:
+        raise InputError(f"[{name}] link: the URDF has no link {spec.link!r}; {hint(spec.link, links)}")
+    return _free(links, links[spec.link], name)
+
+
+def _free(links: dict[str, Sdf.Path], link: Sdf.Path, name: str) -> Sdf.Path:
+    """Path of a sensor on a link, called `name` unless a frame on that link is, which must not move."""
+    names = (name, *(f"{name}_{i}" for i in range(2, len(links) + 3)))
+    return next(path for n in names if (path := link.AppendChild(n)) not in links.values())

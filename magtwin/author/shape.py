@@ -1,0 +1,136 @@
+"""What a robot's shape tells that nobody has said: its footprint, its wheels, and where the floor is."""
+
+import math
+from dataclasses import dataclass, replace
+
+from pxr import Gf, Usd, UsdGeom, UsdPhysics
+
+from magtwin.spec.scene import DriveSpec
+from magtwin.usd.attributes import read_pose, write_pose
+
+ALIKE_M = 0.01
+"""How far two wheels of an axle may be from mirror images of each other [m]."""
+
+OFF = 0.02
+"""Part by which a figure must differ from the robot's shape for that to be taken in its place."""
+
+SUNK_M = 1e-3
+"""Distance between wheels and floor up to which a robot stands on it [m]."""
+
+_DEFAULTS = DriveSpec()
+
+
+@dataclass(frozen=True)
+class Wheel:
+    """A body on a joint that turns without end."""
+
+    joint: str
+    x: float
+    y: float
+    z: float
+    """Its middle in the robot's axes [m]."""
+    radius_m: float
+
+    @property
+    def lowest_m(self) -> float:
+        """Height of its lowest point [m]."""
+        return self.z - self.radius_m
+
+
+def drive_of(robot: Usd.Prim, given: DriveSpec) -> tuple[DriveSpec, list[str]]:
+    """A drive with what the robot's shape tells in place of defaults; and notes of that.
+
+    Wheels that no setting names are the only two that mirror each other. Their distance and radius are taken
+    from the shape where the settings leave them at the default, which is a TurtleBot 4's.
+
+    Args:
+        robot: The robot's prim, converted.
+        given: What the settings say.
+    """
+    wheels = {wheel.joint: wheel for wheel in wheels_of(robot)}
+    names = given.left_wheel_joint, given.right_wheel_joint
+    notes = list[str]()
+    if names == (_DEFAULTS.left_wheel_joint, _DEFAULTS.right_wheel_joint) and not set(names) <= set(wheels):
+        axles = _axles(list(wheels.values()))
+        if len(axles) == 1:
+            names = axles[0][0].joint, axles[0][1].joint
+            notes.append(f"wheel joints not given: {names[0]!r} is the left one, {names[1]!r} the right one")
+    drive = replace(given, left_wheel_joint=names[0], right_wheel_joint=names[1])
+    if not set(names) <= set(wheels):
+        return drive, notes
+    left, right = wheels[names[0]], wheels[names[1]]
+    seen = {"wheel_separation_m": left.y - right.y, "wheel_radius_m": (left.radius_m + right.radius_m) / 2}
+    for name, value in seen.items():
+        default = getattr(_DEFAULTS, name)
+        if value > 0 and getattr(given, name) == default and abs(value / default - 1) > OFF:
+            drive = replace(drive, **{name: round(value, 5)})  # type: ignore[arg-type]
+            notes.append(f"{name} not given: {value:.5g} m, from the robot's shape")
+    return drive, notes
+
+
+def stand_on_floor(robot: Usd.Prim, drive: DriveSpec) -> list[str]:
+    """Raise or lower a robot's bodies so that its wheels touch the floor, z = 0 of its prim; a note of that.
+
+    A URDF whose root is not at the floor, such as a base_link between the wheels, would stand in it.
+    """
+    wheels = {wheel.joint: wheel for wheel in wheels_of(robot)}
+    lowest = [wheels[n].lowest_m for n in (drive.left_wheel_joint, drive.right_wheel_joint) if n in wheels]
+    if len(lowest) < 2 or abs(min(lowest)) < SUNK_M:
+        return []
+    up = round(-min(lowest), 6)
+    for body in robot.GetChildren():
+        if body.HasAPI(UsdPhysics.RigidBodyAPI):
+            (x, y, z), q = read_pose(body)
+            write_pose(body, (x, y, z + up), q)
+    way = "raised" if up > 0 else "lowered"
+    return [f"the robot is {way} by {abs(up):g} m, so that its wheels stand on the floor"]
+
+
+def wheels_of(robot: Usd.Prim) -> list[Wheel]:
+    """The bodies of a robot that turn without end."""
+    found = []
+    for prim in Usd.PrimRange(robot):
+        joint = UsdPhysics.RevoluteJoint(prim)
+        if not joint or math.isfinite(joint.GetLowerLimitAttr().Get() or 0.0):
+            continue
+        bodies = joint.GetBody1Rel().GetTargets()
+        box = _box(robot, prim.GetStage().GetPrimAtPath(bodies[0])) if bodies else None
+        if box is None or box.IsEmpty():
+            continue
+        (x, y, z), size = box.GetMidpoint(), box.GetSize()
+        name = prim.GetDisplayName() or prim.GetName()
+        found.append(Wheel(name, x, y, z, max(size[0], size[2]) / 2))
+    return found
+
+
+def footprint_of(robot: Usd.Prim) -> float | None:
+    """Radius of the circle about the robot's origin that holds its shape seen from above [m], to the mm.
+
+    None of a robot without shapes.
+    """
+    box = _box(robot, robot)
+    if box.IsEmpty():
+        return None
+    low, high = box.GetMin(), box.GetMax()
+    far = math.hypot(max(-low[0], high[0]), max(-low[1], high[1]))
+    return math.ceil(far * 1e3 - 1e-6) / 1e3
+
+
+def _axles(wheels: list[Wheel]) -> list[tuple[Wheel, Wheel]]:
+    """Wheels that mirror each other, left and right."""
+    return [
+        (left, right)
+        for left in wheels
+        for right in wheels
+        if left.y > ALIKE_M
+        and max(abs(left.x - right.x), abs(left.y + right.y), abs(left.z - right.z)) < ALIKE_M
+    ]
+
+
+def _box(robot: Usd.Prim, prim: Usd.Prim) -> Gf.Range3d:
+    """The box about what is below a prim, along the robot's axes."""
+    purposes = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.guide]
+    boxes, places = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes), UsdGeom.XformCache()
+    bound = boxes.ComputeWorldBound(prim)
+    bound.Transform(places.GetLocalToWorldTransform(robot).GetInverse())
+    return bound.ComputeAlignedRange()

@@ -1,0 +1,207 @@
+"""Inspection: a stage looked at in a process of its own, since a damaged layer can end its reader.
+
+    python -m magtwin.export.validation.inspection JOB.json
+
+`inspect` starts it. The job says what to look at, and the answer is written where the job says.
+"""
+
+import importlib
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Collection
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from magtwin.errors import InputError
+from magtwin.export.validation.findings import Check, Finding, check_from
+
+PATIENCE_S = 120.0
+"""How long a stage may take, and a second more a megabyte [s]."""
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was seen of a stage."""
+
+    checks: tuple[Check, ...]
+
+    robots: dict[str, Path | None] = field(default_factory=dict)
+    """File of the asset of each robot, by its prim; None where it is no asset of its own."""
+
+    bodies: int = 0
+    """Rigid bodies of the stage."""
+
+    mended: tuple[str, ...] = ()
+
+
+def inspect(
+    file: Path,
+    against: Collection[str],
+    *,
+    root: Path | None = None,
+    home: Path | None = None,
+    inputs: Collection[str] | None = None,
+    fix: Collection[str] = (),
+) -> Inspection:
+    """Mend a stage and hold it to what this process cannot risk to read.
+
+    Args:
+        file: What the user named.
+        against: Of "core", "isaac" and "magtwin".
+        root: Root layer of a .usdz that was unpacked; the file itself unless given.
+        home: Folder that it was unpacked to.
+        inputs: Names of the inputs that a network may have.
+        fix: Names of what to mend first.
+
+    Raises:
+        InputError: The file ends its reader, or is no stage, or cannot be mended.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        answer = Path(folder, "answer.json")
+        job = {
+            "file": str(file),
+            "root": str(root or file),
+            "home": None if home is None else str(home),
+            "against": sorted(against),
+            "inputs": None if inputs is None else sorted(inputs),
+            "fix": list(fix),
+            "answer": str(answer),
+        }
+        job_file = Path(folder, "job.json")
+        job_file.write_text(json.dumps(job), encoding="utf-8")
+        command = [sys.executable, "-P", "-m", "magtwin.export.validation.inspection", str(job_file)]
+        try:
+            done = subprocess.run(
+                command,
+                capture_output=True,
+                check=False,
+                timeout=PATIENCE_S + file.stat().st_size / 1e6,
+                text=True,
+                errors="replace",
+            )
+        except subprocess.TimeoutExpired as error:
+            raise InputError(f"{file}: damaged: USD does not come to its end; copy it again") from error
+        if not answer.is_file():
+            if done.returncode < 0:
+                raise InputError(f"{file}: damaged: USD ends when it reads it; copy it, or write it again")
+            last = (done.stderr.strip().splitlines() or ["nothing was said"])[-1]
+            raise RuntimeError(f"the inspection of {file} ended with {done.returncode}: {last}")
+        said = json.loads(answer.read_text(encoding="utf-8"))
+    if said.get("refused"):
+        raise InputError(_as_named(said["refused"], home, file))
+    for check in said["checks"]:
+        for finding in check["findings"]:
+            finding |= {name: _as_named(finding[name], home, file) for name in ("text", "where")}
+    return Inspection(
+        tuple(check_from(check) for check in said["checks"]),
+        {prim: None if asset is None else Path(asset) for prim, asset in said["robots"].items()},
+        said["bodies"],
+        tuple(said["mended"]),
+    )
+
+
+def _as_named(text: str, home: Path | None, file: Path) -> str:
+    """What was said of the folder that a package was unpacked to, said of the package."""
+    for folder in () if home is None else (home.resolve(), home):
+        text = text.replace(folder.as_posix(), file.as_posix())
+    return text
+
+
+def _look(job: dict[str, Any]) -> dict[str, Any]:
+    """Do a job."""
+    importlib.import_module("magtwin.usd")  # registers the schemas before USD is first used
+    from pxr import Tf, Usd, UsdPhysics, UsdUtils
+
+    from magtwin.export.attached import detach
+    from magtwin.export.validation.fix import mend
+    from magtwin.export.validation.isaac_rules import ISAAC_RULES
+    from magtwin.export.validation.rule import Subject
+    from magtwin.export.validation.rules import RULES, robot_assets
+
+    file, root = Path(job["file"]), Path(job["root"])
+    packed = None if job["home"] is None else Path(job["home"])
+    heard = UsdUtils.CoalescingDiagnosticDelegate()  # keeps what USD says off the terminal
+    checks: list[Check] = []
+    try:
+        lost: list[Finding] = []
+        if packed is not None:
+            try:
+                detach(root)
+            except InputError as error:
+                lost.append(Finding("attached", str(error), advice="export the package anew"))
+        mended = mend(root, job["fix"]) if job["fix"] else []
+        stage = Usd.Stage.Open(str(root))
+        if stage is None:
+            raise InputError(f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD")
+        for layer in stage.GetUsedLayers():
+            _take_out(layer)
+        if "core" in job["against"]:
+            checks.append(_core(stage if packed is None else Usd.Stage.Open(str(file))))
+        inputs = None if job["inputs"] is None else frozenset(job["inputs"])
+        subject = Subject(stage, root, inputs, packed)
+        for name, rules in (("isaac", ISAAC_RULES), ("magtwin", RULES)):
+            if name in job["against"]:
+                found = [finding for rule in rules.values() for finding in rule.findings(subject)]
+                found += lost if name == "magtwin" else []
+                checks.append(Check(name, tuple(found), scope=f"{len(rules)} rules"))
+        assets = robot_assets(subject)
+        bodies = sum(prim.HasAPI(UsdPhysics.RigidBodyAPI) for prim in subject.prims)
+    except (Tf.ErrorException, UnicodeError, MemoryError) as error:
+        raise InputError(f"{file}: cannot be opened as USD; it is damaged, cut short, or not USD") from error
+    finally:
+        heard.TakeUncoalescedDiagnostics()
+    return {
+        "checks": [asdict(check) for check in checks],
+        "robots": {prim: None if asset is None else str(asset) for prim, asset in assets.items()},
+        "bodies": bodies,
+        "mended": mended,
+    }
+
+
+def _take_out(layer: Any) -> None:
+    """Read every value of a layer, so that one which cannot be decoded ends this process and no other."""
+
+    def visit(path: Any) -> None:
+        if path.IsPropertyPath():
+            layer.GetObjectAtPath(path).GetInfo("default")
+            for time in layer.ListTimeSamplesForPath(path):
+                layer.QueryTimeSample(path, time)
+
+    layer.Traverse("/", visit)
+
+
+def _core(stage: Any) -> Check:
+    """What OpenUSD's own validators say of a stage."""
+    from pxr import Usd, UsdValidation
+
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    findings = []
+    for error in UsdValidation.ValidationContext(validators).Validate(stage):
+        kind = error.GetType()
+        severity: Any = {
+            UsdValidation.ValidationErrorType.Error: "error",
+            UsdValidation.ValidationErrorType.Warn: "warning",
+        }.get(kind, "note")
+        places = [site.GetPrim().GetPath() for site in error.GetSites() if site.GetPrim()]
+        text = " ".join(error.GetMessage().split())
+        findings.append(Finding(error.GetName(), text, str(places[0]) if places else "", "", severity))
+    findings.sort(key=lambda finding: (finding.rule, finding.where, finding.text))
+    version = ".".join(map(str, Usd.GetVersion()[1:]))
+    return Check("core", tuple(findings), scope=f"{len(validators)} validators of OpenUSD {version}")
+
+
+def main(job_file: str) -> None:
+    """Do the job of a file, and write its answer."""
+    job = json.loads(Path(job_file).read_text(encoding="utf-8"))
+    try:
+        answer = _look(job)
+    except InputError as error:
+        answer = {"refused": str(error)}
+    Path(job["answer"]).write_text(json.dumps(answer), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

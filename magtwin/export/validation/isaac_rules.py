@@ -1,0 +1,242 @@
+"""Isaac Sim's rules for robots, sensors and graphs, by its "Asset Structure" and "Robot Schema" pages.
+
+What SimReady's profiles ask of a robot's own asset is theirs to say; these hold of a whole stage, composed.
+"""
+
+import math
+from collections.abc import Iterator
+
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
+
+from magtwin.export.validation.rule import Rule, Subject, Wrong, rule_into
+from magtwin.usd.sensors import IMU_TYPE, LIDAR_API, LIDAR_TYPE
+
+ISAAC_RULES: dict[str, Rule] = {}
+"""By name."""
+
+ROBOT_API, LINK_API, JOINT_API = "IsaacRobotAPI", "IsaacLinkAPI", "IsaacJointAPI"
+LINKS, JOINTS = "isaac:physics:robotLinks", "isaac:physics:robotJoints"
+MIMIC_APIS = ("NewtonMimicAPI", "PhysxMimicJointAPI")
+
+GRAPH, NODE = "OmniGraph", "OmniGraphNode"
+"""Types of the prims of an Action Graph."""
+
+LEAST_SCAN_HZ = 0.466
+"""Least turns a second whose period a 32-bit number of nanoseconds holds (SimReady LI.003)."""
+
+CORE = "omni:sensor:Core:"
+EMITTER_STATE, ROI = f"{CORE}emitterState:", "isRoiState"
+
+MOVING = ("PhysicsRevoluteJoint", "PhysicsPrismaticJoint")
+
+
+def applied(prim: Usd.Prim) -> list[str]:
+    """Names of the schemas applied to a prim, those that are not known here too."""
+    return list(prim.GetPrimTypeInfo().GetAppliedAPISchemas())
+
+
+def robots(subject: Subject) -> list[Usd.Prim]:
+    """Prims that Isaac Sim takes for robots."""
+    return [prim for prim in subject.prims if ROBOT_API in applied(prim)]
+
+
+def below(prim: Usd.Prim) -> list[Usd.Prim]:
+    """A prim and all below it."""
+    return list(Usd.PrimRange(prim))
+
+
+@rule_into(ISAAC_RULES, "magtwin robot makes an articulation that says it")
+def robot_schema(subject: Subject) -> Iterator[Wrong]:
+    """Every articulation is a robot to Isaac Sim, one articulation each, and says of what type it is."""
+    found = robots(subject)
+    for prim in subject.prims:
+        if prim.HasAPI(UsdPhysics.ArticulationRootAPI) and not any(
+            prim.GetPath().HasPrefix(robot.GetPath()) for robot in found
+        ):
+            yield Wrong(f"is an articulation without {ROBOT_API}", str(prim.GetPath()))
+    for robot in found:
+        where = str(robot.GetPath())
+        roots = [prim for prim in below(robot) if prim.HasAPI(UsdPhysics.ArticulationRootAPI)]
+        if len(roots) != 1:
+            yield Wrong(f"has {len(roots)} articulation roots, Isaac Sim wants one", where)
+        if not robot.GetAttribute("isaac:robotType").Get():
+            yield Wrong("does not say isaac:robotType", where, severity="warning")
+
+
+@rule_into(ISAAC_RULES, "list them with magtwin robot, or in Isaac Sim's robot schema panel")
+def robot_lists(subject: Subject) -> Iterator[Wrong]:
+    """Every robot lists all its bodies, then all its joints, each once, and nothing that is not there."""
+    for robot in robots(subject):
+        prims, where = below(robot), str(robot.GetPath())
+        bodies = {prim.GetPath() for prim in prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)}
+        joints = {prim.GetPath() for prim in prims if prim.IsA(UsdPhysics.Joint)}
+        for name, wanted, api in ((LINKS, bodies, LINK_API), (JOINTS, joints, JOINT_API)):
+            relationship = robot.GetRelationship(name)
+            listed = list(relationship.GetTargets()) if relationship else []
+            lost, odd = sorted(wanted - set(listed)), [path for path in listed if path not in wanted]
+            if lost:
+                yield Wrong(f"{name} lacks {_few(lost)}", where)
+            if odd:
+                yield Wrong(f"{name} lists {_few(odd)}, which is no such thing of its own", where)
+            if len(set(listed)) < len(listed):
+                yield Wrong(f"{name} lists something twice", where)
+            bare = sorted(p for p in wanted if api not in applied(subject.stage.GetPrimAtPath(p)))
+            if bare:
+                yield Wrong(f"{_few(bare)} lack {api}", where)
+
+
+@rule_into(ISAAC_RULES, "point body0 and body1 to rigid bodies, or body0 to the robot for the world")
+def joint_bodies(subject: Subject) -> Iterator[Wrong]:
+    """Every joint holds a rigid body to another, or to the world."""
+    for prim in subject.prims:
+        if not prim.IsA(UsdPhysics.Joint):
+            continue
+        joint, where = UsdPhysics.Joint(prim), str(prim.GetPath())
+        held = 0
+        for name, relationship in (("body0", joint.GetBody0Rel()), ("body1", joint.GetBody1Rel())):
+            for path in relationship.GetTargets():
+                end = subject.stage.GetPrimAtPath(path)
+                if end and end.HasAPI(UsdPhysics.RigidBodyAPI):
+                    held += 1
+                elif end and name == "body1":
+                    yield Wrong(f"{name} <{path}> is no rigid body", where)
+        if not held:
+            yield Wrong("holds no rigid body", where)
+
+
+@rule_into(ISAAC_RULES, "give it a drive of finite force; one of no gains leaves it free")
+def joint_drives(subject: Subject) -> Iterator[Wrong]:
+    """Every joint that moves and follows no other has a drive whose greatest force is finite and above 0."""
+    for prim in subject.prims:
+        apis = applied(prim)
+        if prim.GetTypeName() not in MOVING or any(api.startswith(MIMIC_APIS) for api in apis):
+            continue
+        axis = "linear" if prim.GetTypeName() == "PhysicsPrismaticJoint" else "angular"
+        force = UsdPhysics.DriveAPI(prim, axis).GetMaxForceAttr().Get() if _driven(apis, axis) else None
+        if force is None:
+            yield Wrong(f"has no {axis} drive", str(prim.GetPath()))
+        elif not 0 < force < math.inf:
+            yield Wrong(f"has a drive of force {force:g}", str(prim.GetPath()))
+
+
+@rule_into(
+    ISAAC_RULES, "say convexHull or convexDecomposition: a body that moves cannot collide as triangles"
+)
+def collider_shapes(subject: Subject) -> Iterator[Wrong]:
+    """No rigid body collides as bare triangles."""
+    for body in subject.prims:
+        if not body.HasAPI(UsdPhysics.RigidBodyAPI):
+            continue
+        for prim in Usd.PrimRange(body, Usd.TraverseInstanceProxies()):
+            if not prim.HasAPI(UsdPhysics.CollisionAPI) or not prim.IsA(UsdGeom.Mesh):
+                continue
+            mesh = UsdPhysics.MeshCollisionAPI(prim)
+            kind = mesh.GetApproximationAttr().Get() if prim.HasAPI(UsdPhysics.MeshCollisionAPI) else "none"
+            if kind == UsdPhysics.Tokens.none:
+                yield Wrong("is a triangle mesh that moves", str(prim.GetPath()))
+
+
+@rule_into(ISAAC_RULES, "take the scale into the shapes below")
+def rigid_scale(subject: Subject) -> Iterator[Wrong]:
+    """No rigid body is scaled, and none lies in another."""
+    cache = UsdGeom.XformCache()
+    bodies = {prim.GetPath() for prim in subject.prims if prim.HasAPI(UsdPhysics.RigidBodyAPI)}
+    for path in sorted(bodies):
+        prim = subject.stage.GetPrimAtPath(path)
+        scale = Gf.Transform(cache.GetLocalToWorldTransform(prim)).GetScale()
+        if not Gf.IsClose(scale, Gf.Vec3d(1), 1e-6):
+            yield Wrong(f"is scaled by {scale[0]:g}, {scale[1]:g}, {scale[2]:g}", str(path))
+        above = next((p for p in path.GetAncestorsRange() if p != path and p in bodies), None)
+        if above and not UsdGeom.Xformable(prim).GetResetXformStack():
+            yield Wrong(f"lies in the rigid body <{above}>", str(path), "let bodies lie side by side")
+
+
+@rule_into(ISAAC_RULES, "magtwin robot and magtwin export author it so")
+def sensor_mounts(subject: Subject) -> Iterator[Wrong]:
+    """Every sensor of Isaac Sim's rides on a rigid body and has the figures that it runs by."""
+    for prim in subject.prims:
+        kind, where = prim.GetTypeName(), str(prim.GetPath())
+        if kind not in (IMU_TYPE, LIDAR_TYPE):
+            continue
+        if not any(_rigid(subject.stage.GetPrimAtPath(path)) for path in prim.GetPath().GetAncestorsRange()):
+            yield Wrong("rides on no rigid body", where)
+        if kind == IMU_TYPE:
+            period = prim.GetAttribute("sensorPeriod").Get()
+            if period is None or period < 0:
+                yield Wrong(f"has a sensorPeriod of {period}", where)
+            continue
+        if LIDAR_API not in applied(prim):
+            yield Wrong(f"has not {LIDAR_API}", where)
+            continue
+        turns = prim.GetAttribute(f"{CORE}scanRateBaseHz").Get()
+        near, far = (prim.GetAttribute(f"{CORE}{end}RangeM").Get() for end in ("near", "far"))
+        if turns is None or turns < LEAST_SCAN_HZ:
+            yield Wrong(f"turns at {turns} Hz", where)
+        if near is None or far is None or not 0 <= near < far:
+            yield Wrong(f"ranges from {near} to {far} m", where)
+        emitters = prim.GetAttribute(f"{CORE}numberOfEmitters").Get()
+        if emitters is None:
+            yield Wrong("does not say its numberOfEmitters (SimReady LI.002)", where)
+            continue
+        for attribute in prim.GetAttributes():
+            name = attribute.GetName()
+            if name.startswith(EMITTER_STATE) and not name.endswith(ROI):
+                values = attribute.Get()
+                if values is not None and len(values) not in (0, emitters):
+                    yield Wrong(f"has {emitters} emitters and {len(values)} of {name}", where)
+
+
+@rule_into(ISAAC_RULES, "add a PhysicsScene: magtwin scene authors one with the lab")
+def physics_scene(subject: Subject) -> Iterator[Wrong]:
+    """A stage with robots in a lab has one physics scene, whose gravity pulls down."""
+    if not (subject.having("lab") and robots(subject)):
+        return
+    scenes = [prim for prim in subject.prims if prim.IsA(UsdPhysics.Scene)]
+    if len(scenes) != 1:
+        yield Wrong(f"has {len(scenes)} physics scenes")
+    for prim in scenes:
+        direction = Gf.Vec3d(UsdPhysics.Scene(prim).GetGravityDirectionAttr().Get() or (0, 0, 0))
+        if direction.GetLength() and not Gf.IsClose(direction.GetNormalized(), Gf.Vec3d(0, 0, -1), 1e-6):
+            yield Wrong(f"pulls along {tuple(direction)}", str(prim.GetPath()))
+
+
+@rule_into(ISAAC_RULES, "bind a material to it, or to a prim above it")
+def materials(subject: Subject) -> Iterator[Wrong]:
+    """Everything that is shown wears a material."""
+    for prim in subject.stage.Traverse(Usd.TraverseInstanceProxies()):
+        if not prim.IsA(UsdGeom.Gprim) or UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.guide:
+            continue
+        subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
+        bound, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+        if not bound and not subsets:
+            yield Wrong("wears no material", str(prim.GetPath()), severity="warning")
+
+
+@rule_into(ISAAC_RULES, "author it with magtwin export --profile isaac")
+def action_graph(subject: Subject) -> Iterator[Wrong]:
+    """Every node of an Action Graph has what its definition has, and takes what it can from outputs."""
+    from magtwin.export.ogn import faults, ports
+
+    for prim in subject.prims:
+        if prim.GetTypeName() != NODE:
+            continue
+        where, kind = str(prim.GetPath()), prim.GetAttribute("node:type").Get()
+        if prim.GetParent().GetTypeName() != GRAPH:
+            yield Wrong(f"is in no {GRAPH}", where)
+        if ports(prim) is None:
+            yield Wrong(f"is of the type {kind!r}, of which nothing is known here", where, severity="warning")
+        for text in faults(prim):
+            yield Wrong(text, where)
+
+
+def _driven(apis: list[str], axis: str) -> bool:
+    return f"PhysicsDriveAPI:{axis}" in apis
+
+
+def _rigid(prim: Usd.Prim) -> bool:
+    return bool(prim) and prim.HasAPI(UsdPhysics.RigidBodyAPI)
+
+
+def _few(paths: list[Sdf.Path]) -> str:
+    names = [f"<{path}>" for path in paths[:3]]
+    return ", ".join(names) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")

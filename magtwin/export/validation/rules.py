@@ -1,0 +1,471 @@
+"""Rules of magtwin's own: what a lab, its map and its robots must hold to, so that others find them.
+
+The checksum in a map's layer covers its arrays, not the grid that they lie on. That its shape, origin, cell
+and headings are right too is seen from the coloured floor, which was made from them (`map_grid`), and from
+the checksum of the whole file, which the magnetometer keeps (`map_file`).
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
+
+from magtwin.author.furniture import read_magnets
+from magtwin.author.lab import read_lab
+from magtwin.author.robot import robot_of
+from magtwin.errors import InputError
+from magtwin.export.attached import attached_sha256
+from magtwin.export.validation.findings import Severity
+from magtwin.export.validation.rule import (
+    Rule,
+    Subject,
+    Wrong,
+    climbs,
+    is_absolute,
+    named_files,
+    rule_into,
+    wrong_of,
+)
+from magtwin.files import sha256
+from magtwin.usd.attributes import plain_value, target
+from magtwin.usd.earth import read_earth
+from magtwin.usd.maps import HEAT_MAP, checksums, heading_variants, read_map
+from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.schema import NOUNS, attribute_name
+from magtwin.usd.sensors import (
+    IMU_TYPE,
+    LIDAR_TYPE,
+    MAP_CHECKSUM,
+    MAP_RELATIONSHIP,
+    read_footprint,
+    read_imu,
+    read_lidar,
+    read_magnetometer,
+)
+
+RULES: dict[str, Rule] = {}
+"""By name."""
+
+NETWORK = attribute_name("magnetometer", "network")
+NETWORK_SHA256 = attribute_name("magnetometer", "network_sha256")
+INPUTS = attribute_name("magnetometer", "inputs")
+
+NEEDED = ("values", "valid", "shape", "origin", "cell_size", "headings", "unit", "checksum")
+"""Attributes that a map's layer must author: a fallback would be a grid that is not its own."""
+
+SAME_M = 1e-6
+"""Single precision at 10 m [m]: what two places that ought to be one may be apart."""
+
+UPRIGHT = 1 - 1e-9
+"""Cosine of the tilt of a robot that stands."""
+
+MOST_HEADER = 1 << 24
+"""Bytes of a network's header that are read."""
+
+
+@rule_into(RULES, "put the file where it is named, or export the scene anew")
+def references(subject: Subject) -> Iterator[Wrong]:
+    """Every layer, texture and other file that is named is there."""
+    networks = {_path(prim, NETWORK) for prim in subject.having("magnetometer")}
+    _, _, unresolved = UsdUtils.ComputeAllDependencies(str(subject.file))
+    told = [" ".join(str(error).split()) for error in subject.stage.GetCompositionErrors()]
+    for text in told:
+        yield Wrong(text)
+    for path in unresolved:
+        if path not in networks and not any(path in text for text in told):
+            yield Wrong(f"names {path}, which is not there")
+
+
+@rule_into(RULES, "name it relative to the layer: --fix does that for what is there")
+def absolute_paths(subject: Subject) -> Iterator[Wrong]:
+    """No layer names a file by a path that holds on one machine alone."""
+    for layer in subject.layers:
+        for named in named_files(layer):
+            if is_absolute(named.path):
+                yield Wrong(f"{subject.name_of(layer)} names {named.path}", named.where)
+
+
+@rule_into(RULES, "magtwin export makes a folder that can be moved alone")
+def climbing_paths(subject: Subject) -> Iterator[Wrong]:
+    """Nothing leads out of the stage's folder: a warning, but an error in a .usdz."""
+    for layer in subject.layers:
+        if not Path(layer.realPath).resolve().is_relative_to(subject.folder):
+            continue  # told where it was named
+        for named in named_files(layer):
+            if named.path and not is_absolute(named.path) and climbs(named.path, layer, subject.folder):
+                severity: Severity = "error" if subject.packed else "warning"
+                yield Wrong(
+                    f"{subject.name_of(layer)} names {named.path}, outside the stage's folder",
+                    named.where,
+                    severity=severity,
+                )
+
+
+@rule_into(RULES, "magtwin export --convert-units turns such a stage into metres with Z up")
+def units(subject: Subject) -> Iterator[Wrong]:
+    """The stage says that it is in metres and kilograms with Z up, and no layer below says otherwise."""
+    root = subject.stage.GetRootLayer()
+    stage, advice = subject.stage, "--fix says so where magtwin made the stage"
+    if not stage.HasAuthoredMetadata("metersPerUnit"):
+        yield Wrong("does not say metersPerUnit, and counts as centimetres", advice=advice)
+    if not stage.HasAuthoredMetadata("upAxis"):
+        yield Wrong("does not say upAxis, and counts as Y up", advice=advice)
+    for layer in subject.layers:
+        said = layer.pseudoRoot
+        name = "" if layer == root else f"{subject.name_of(layer)} "
+        metres = said.GetInfo("metersPerUnit") if said.HasInfo("metersPerUnit") else 1.0
+        up = said.GetInfo("upAxis") if said.HasInfo("upAxis") else "Z"
+        kilograms = said.GetInfo("kilogramsPerUnit") if said.HasInfo("kilogramsPerUnit") else 1.0
+        if not UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters):
+            yield Wrong(f"{name}is in units of {metres:g} m; USD does not convert them")
+        if up != UsdGeom.Tokens.z:
+            yield Wrong(f"{name}has {up} up; USD does not turn it")
+        if not math.isclose(kilograms, UsdPhysics.MassUnits.kilograms, rel_tol=1e-6):
+            yield Wrong(f"{name}is in units of {kilograms:g} kg; USD does not convert them")
+
+
+@rule_into(RULES, "set it to the prim that holds all others: --fix does where there is one")
+def default_prim(subject: Subject) -> Iterator[Wrong]:
+    """The stage has a default prim, so that others can refer to it."""
+    if not subject.stage.GetDefaultPrim():
+        name = subject.stage.GetRootLayer().defaultPrim
+        yield Wrong(f"its default prim {name!r} is not there" if name else "has no default prim")
+
+
+@rule_into(RULES, "take the name that is meant from docs/schema.md")
+def schema_names(subject: Subject) -> Iterator[Wrong]:
+    """Every schema and attribute in magtwin's name is one that it has, on a prim with its schema."""
+    for prim in subject.prims:
+        for api in prim.GetPrimTypeInfo().GetAppliedAPISchemas():
+            if api.startswith("Magtwin") and api not in NOUNS.values():
+                yield Wrong(f"has the schema {api}, which there is not", str(prim.GetPath()))
+        for prop in prim.GetAuthoredPropertiesInNamespace("magtwin"):
+            name = prop.GetName()
+            if prop.IsCustom() or prim.GetPrimDefinition().GetPropertyDefinition(name):
+                continue  # what is custom is nobody's schema, such as the readings of a run
+            noun = NOUNS.get(name.split(":")[1], "")
+            why = f"which {noun} has not" if noun and prim.HasAPI(noun) else "and has no schema of it"
+            yield Wrong(f"has {name}, {why}", str(prim.GetPath()))
+
+
+@rule_into(RULES, "point it to the prim that is meant")
+def targets(subject: Subject) -> Iterator[Wrong]:
+    """Every relationship and every connection points to something that is there."""
+    for prim in subject.prims:
+        for prop in prim.GetAuthoredProperties():
+            if isinstance(prop, Usd.Relationship):
+                ends = prop.GetTargets()
+            else:
+                ends = prop.GetConnections() if prop.HasAuthoredConnections() else []
+            for end in ends:
+                if not subject.stage.GetObjectAtPath(end):
+                    yield Wrong(
+                        f"{prop.GetName()} points to <{end}>, which is not there", str(prim.GetPath())
+                    )
+
+
+@rule_into(RULES, "make the map anew with magtwin map")
+def map_complete(subject: Subject) -> Iterator[Wrong]:
+    """Every map has its arrays, its grid and its unit, authored, and they fit together."""
+    for prim in subject.having("anomalyMap"):
+        where = str(prim.GetPath())
+        lost = [
+            name
+            for name in (attribute_name("anomalyMap", field) for field in NEEDED)
+            if not prim.GetAttribute(name).HasAuthoredValue()
+        ]
+        if lost:
+            yield Wrong(f"does not say {', '.join(lost)}", where)
+        elif all(said == taken for said, taken in checksums(prim)):  # what else is wrong with it
+            read_map(prim)
+
+
+@rule_into(RULES, "put the map's own arrays back, or, where they are meant, --fix-also map-checksum")
+def map_checksum(subject: Subject) -> Iterator[Wrong]:
+    """The arrays of every map, of each of its days, are those that its checksum was taken of."""
+    for prim in subject.having("anomalyMap"):
+        for said, taken in checksums(prim):
+            if said != taken:
+                yield Wrong(
+                    f"its arrays have SHA-256 {taken[:12]}..., its checksum says {said[:12] or 'nothing'}...",
+                    str(prim.GetPath()),
+                )
+
+
+@rule_into(RULES, "the checksum does not cover the grid: make the map anew with magtwin map")
+def map_grid(subject: Subject) -> Iterator[Wrong]:
+    """The coloured floor of every map lies where its grid does, with a variant for each of its headings."""
+    for prim in subject.having("anomalyMap"):
+        floor = prim.GetChild(HEAT_MAP.name)
+        if not floor or not floor.IsA(UsdGeom.Mesh):
+            yield Wrong("has no coloured floor to show it", str(prim.GetPath()), severity="warning")
+            continue
+        names = ("shape", "origin", "cell_size", "headings")
+        got = [prim.GetAttribute(attribute_name("anomalyMap", name)).Get() for name in names]
+        shape, origin, cell, headings = (np.array(value, float).ravel() for value in got)
+        if (shape.size, origin.size, cell.size) != (3, 2, 2):
+            continue  # map-complete tells
+        points = np.array(UsdGeom.Mesh(floor).GetPointsAttr().Get() or [(np.nan,) * 3], float)[:, :2]
+        least, most = origin, origin + cell * (shape[[2, 1]] - 1)
+        seen = points.min(axis=0), points.max(axis=0)
+        if not np.allclose([least, most], seen, rtol=0, atol=max(SAME_M, 1e-6 * float(np.abs(most).max()))):
+            yield Wrong(
+                f"its grid spans {_span(least, most)}, its coloured floor {_span(*seen)}",
+                str(floor.GetPath()),
+            )
+        variants = floor.GetVariantSets().GetVariantSet("heading").GetVariantNames()
+        if variants and sorted(variants) != sorted(heading_variants(np.deg2rad(headings))):
+            degrees = ", ".join(f"{heading:g}" for heading in headings)
+            yield Wrong(
+                f"its headings are {degrees} deg, its coloured floor has {', '.join(variants)}",
+                str(floor.GetPath()),
+            )
+
+
+@rule_into(
+    RULES, "put the map back that the scene was made with, or, where this one is meant, --fix-also map-file"
+)
+def map_file(subject: Subject) -> Iterator[Wrong]:
+    """The file of the map's layer is the one that the magnetometer keeps the checksum of."""
+    for prim in subject.having("magnetometer"):
+        file = map_file_of(subject, prim)
+        said = str(plain_value(prim.GetAttribute(MAP_CHECKSUM)) or "").lower()
+        if file is not None and said and (seen := sha256(file)) != said:
+            yield Wrong(
+                f"{file.name} has SHA-256 {seen[:12]}..., it names {said[:12]}...", str(prim.GetPath())
+            )
+
+
+def map_file_of(subject: Subject, magnetometer: Usd.Prim) -> Path | None:
+    """The file that holds a magnetometer's map; None where that is the stage's own, or there is no map."""
+    ends = magnetometer.GetRelationship(MAP_RELATIONSHIP).GetTargets()
+    prim = subject.stage.GetPrimAtPath(ends[0]) if len(ends) == 1 else None
+    if not prim or not prim.HasAPI(NOUNS["anomalyMap"]):
+        return None
+    stack = prim.GetAttribute(attribute_name("anomalyMap", "values")).GetPropertyStack()
+    layer = stack[0].layer if stack else None
+    if layer is None or layer == subject.stage.GetRootLayer() or not layer.realPath:
+        return None  # a flattened stage is its own map
+    return Path(layer.realPath)
+
+
+@rule_into(RULES, "point magtwin:magnetometer:map to the map's prim")
+def magnetometer_map(subject: Subject) -> Iterator[Wrong]:
+    """Every magnetometer in a lab reads a map that is on the stage, all of them one."""
+    first = None
+    for prim in subject.having("magnetometer") if subject.having("lab") else ():
+        end = target(prim, MAP_RELATIONSHIP)
+        if not end.HasAPI(NOUNS["anomalyMap"]):
+            yield Wrong(f"reads <{end.GetPath()}>, which is no map", str(prim.GetPath()))
+        first = first or end
+        if end != first:
+            yield Wrong(f"reads <{end.GetPath()}>, another than <{first.GetPath()}>", str(prim.GetPath()))
+
+
+@rule_into(RULES, "put the weights back, or, where these are meant, --fix-also network-file")
+def network_file(subject: Subject) -> Iterator[Wrong]:
+    """The weights that a magnetometer names are there, and are those that it keeps the checksum of."""
+    for prim in subject.having("magnetometer"):
+        spec, where = read_magnetometer(prim), str(prim.GetPath())
+        if spec.kind != "neural":
+            continue
+        file = network_of(prim)
+        attached = attached_sha256(prim.GetAttribute(NETWORK))
+        if spec.network is None and attached:  # in a layer that brings its network as bytes
+            if attached != spec.network_sha256.lower():
+                yield Wrong(
+                    f"its attached network has SHA-256 {attached[:12]}..., it names "
+                    f"{spec.network_sha256[:12]}...",
+                    where,
+                    "export the layer anew",
+                )
+        elif spec.network is None and spec.network_sha256:
+            yield Wrong(
+                f"keeps the checksum {spec.network_sha256[:12]}... of a network that it does not name",
+                where,
+                "name it again to read this magnetometer",
+                severity="warning",
+            )
+        elif spec.network is None:
+            yield Wrong("is neural and names no network", where)
+        elif file is None:
+            yield Wrong(f"names the network {spec.network.name}, which is not there", where)
+        elif spec.network_sha256 and (seen := sha256(file)) != spec.network_sha256.lower():
+            yield Wrong(
+                f"{file.name} has SHA-256 {seen[:12]}..., it names {spec.network_sha256[:12]}...", where
+            )
+
+
+def network_of(magnetometer: Usd.Prim) -> Path | None:
+    """The file of a magnetometer's weights; None where it is not there."""
+    network = read_magnetometer(magnetometer).network
+    return network if network is not None and network.is_file() else None
+
+
+@rule_into(RULES, "train it on inputs that magtwin knows (magtwin train --help lists them)")
+def network_inputs(subject: Subject) -> Iterator[Wrong]:
+    """The inputs of every network are known, none is there twice, and the file of weights has the same."""
+    for prim in subject.having("magnetometer"):
+        spec, where = read_magnetometer(prim), str(prim.GetPath())
+        if spec.kind != "neural":
+            continue
+        unknown = [] if subject.inputs is None else sorted(set(spec.inputs) - subject.inputs)
+        if unknown:
+            yield Wrong(f"has the inputs {', '.join(unknown)}, which are not known", where)
+        if len(set(spec.inputs)) < len(spec.inputs):
+            yield Wrong("has an input twice", where)
+        file = network_of(prim)
+        own = _inputs_of(file) if file is not None and file.suffix == ".safetensors" else None
+        if own is not None and spec.inputs and own != spec.inputs:
+            yield Wrong("names other inputs than its file of weights, or in another order", where)
+
+
+def _inputs_of(weights: Path) -> tuple[str, ...] | None:
+    """The names of the inputs in the header of a safetensors file; None where it says none."""
+    with weights.open("rb") as file:
+        size = int.from_bytes(file.read(8), "little")
+        try:
+            header = json.loads(file.read(min(size, MOST_HEADER)))
+            names = json.loads(header["__metadata__"]["features"])
+        except (ValueError, KeyError, TypeError):
+            return None
+    return tuple(map(str, names)) if isinstance(names, list) else None
+
+
+@rule_into(RULES, "move the map or the lab to the origin of the world, in its axes")
+def frames(subject: Subject) -> Iterator[Wrong]:
+    """Lab and map stand in the world's own axes, and the map lies within the floor."""
+    cache, labs = UsdGeom.XformCache(), subject.having("lab")
+    for prim in (*labs, *subject.having("anomalyMap")):
+        if cache.GetLocalToWorldTransform(prim) != Gf.Matrix4d(1):
+            yield Wrong("is moved, turned or scaled, and its figures are in world", str(prim.GetPath()))
+    if len(labs) != 1:
+        return
+    half = np.array(read_lab(labs[0]).floor_m) / 2
+    for prim in subject.having("anomalyMap"):
+        x0, x1, y0, y1 = (field := read_map(prim)).extent
+        beyond = max(float(np.max(np.abs([[x0, y0], [x1, y1]]) - half)), 0.0)
+        if beyond > max(field.cell_m) / 2 + SAME_M:
+            yield Wrong(
+                f"reaches {beyond:.3g} m beyond the floor of {2 * half[0]:g} x {2 * half[1]:g} m",
+                str(prim.GetPath()),
+                "say the lab's size and the map's origin in one frame",
+            )
+
+
+@rule_into(RULES, "start it on the floor, upright, clear of the walls")
+def robot_inside(subject: Subject) -> Iterator[Wrong]:
+    """Every robot stands upright on the floor, its footprint within it."""
+    labs = subject.having("lab")
+    if len(labs) != 1:
+        return
+    half = np.array(read_lab(labs[0]).floor_m) / 2
+    cache = UsdGeom.XformCache()
+    for prim in subject.having("robot"):
+        at = cache.GetLocalToWorldTransform(prim)
+        x, y, z = at.ExtractTranslation()
+        where, radius = str(prim.GetPath()), read_footprint(prim)
+        if np.any(np.abs([x, y]) + radius > half + SAME_M):
+            yield Wrong(
+                f"stands at ({x:g}, {y:g}) m and needs {radius:g} m about it: it is off the floor", where
+            )
+        if abs(z) > SAME_M:
+            yield Wrong(f"stands {z:g} m above the floor", where)
+        if at.TransformDir(Gf.Vec3d(0, 0, 1)).GetNormalized()[2] < UPRIGHT:
+            yield Wrong("does not stand upright", where)
+
+
+@rule_into(RULES, "start it elsewhere: a run that begins in something is refused")
+def robot_clear(subject: Subject) -> Iterator[Wrong]:
+    """Every robot stands clear of what it collides with, and of the other robots."""
+    robots = subject.having("robot")
+    if not (robots and subject.having("lab")):
+        return
+    obstacles, cache = read_obstacles(subject.stage), UsdGeom.XformCache()
+    places = [np.array(cache.GetLocalToWorldTransform(prim).ExtractTranslation())[:2] for prim in robots]
+    radii = [read_footprint(prim) for prim in robots]
+    for i, prim in enumerate(robots):
+        distance, which = obstacles.clearance(places[i][None], reach_m=radii[i] + 1.0)
+        if distance[0] < radii[i] - SAME_M:
+            what = obstacles.names[int(which[0])]
+            yield Wrong(
+                f"is {distance[0]:.3g} m from {what}, and needs {radii[i]:g} m about it", str(prim.GetPath())
+            )
+        for j in range(i):
+            apart = float(np.linalg.norm(places[i] - places[j]))
+            if apart < radii[i] + radii[j] - SAME_M:
+                yield Wrong(f"stands {apart:.3g} m from <{robots[j].GetPath()}>", str(prim.GetPath()))
+
+
+@rule_into(RULES, "set the figure within the range that docs/schema.md gives")
+def figures(subject: Subject) -> Iterator[Wrong]:
+    """Lab, Earth's field, sources and robots have all their parts, and no figure is out of its range."""
+    looks: list[tuple[Callable[[], object], Usd.Prim]] = []
+    for noun, read in (("lab", read_lab), ("earth", read_earth), ("robot", robot_of)):
+        looks += [(partial(read, prim), prim) for prim in subject.having(noun)]
+    if subject.having("source"):
+        looks.append((partial(read_magnets, subject.stage), subject.stage.GetPseudoRoot()))
+    for look, prim in looks:
+        try:
+            look()
+        except InputError as error:
+            wrong = wrong_of(error)
+            yield wrong if wrong.where else Wrong(wrong.text, str(prim.GetPath()))
+    for noun in ("lab", "earth"):
+        for prim in subject.having(noun)[1:]:
+            yield Wrong(f"is a second {NOUNS[noun]}", str(prim.GetPath()), "keep one of them")
+
+
+@rule_into(RULES, "author the sensor anew with magtwin robot or magtwin scene")
+def sensor_types(subject: Subject) -> Iterator[Wrong]:
+    """The sensors that Isaac Sim runs have the rates and ranges of magtwin's, whose children they are."""
+    single = {"rel_tol": 1e-6, "abs_tol": 1e-9}
+    for prim in subject.having("imu"):
+        sensor = next((p for p in prim.GetChildren() if p.GetTypeName() == IMU_TYPE), None)
+        period = sensor.GetAttribute("sensorPeriod").Get() if sensor else None
+        rate = read_imu(prim).rate_hz
+        if period is None or not math.isclose(period, 1 / rate, **single):
+            yield Wrong(f"reads {rate:g} Hz, its {IMU_TYPE} has a period of {period} s", str(prim.GetPath()))
+    for prim in subject.having("lidar"):
+        spec = read_lidar(prim)
+        sensor = next((p for p in prim.GetChildren() if p.GetTypeName() == LIDAR_TYPE), None)
+        for name, wanted in (("nearRangeM", spec.range_min_m), ("farRangeM", spec.range_max_m)):
+            seen = sensor.GetAttribute(f"omni:sensor:Core:{name}").Get() if sensor else None
+            if seen is None or not math.isclose(seen, wanted, **single):
+                yield Wrong(
+                    f"ranges to {wanted:g} m, its {LIDAR_TYPE} has {name} {seen}", str(prim.GetPath())
+                )
+
+
+def robot_assets(subject: Subject) -> dict[str, Path | None]:
+    """File of the asset of each robot by its prim's path; None where it is part of the stage's own layer."""
+    found: dict[str, Path | None] = {}
+    for prim in subject.having("robot") or _articulations(subject):
+        arcs = Usd.PrimCompositionQuery.GetDirectReferences(prim).GetCompositionArcs()
+        file = Path(arcs[0].GetTargetLayer().realPath) if arcs else None
+        whole = prim == subject.stage.GetDefaultPrim()
+        found[str(prim.GetPath())] = subject.file if whole else file
+    return found
+
+
+def _articulations(subject: Subject) -> list[Usd.Prim]:
+    """Robots of a stage that magtwin knows nothing of."""
+    default = subject.stage.GetDefaultPrim()
+    return [default] if default and "IsaacRobotAPI" in _applied(default) else []
+
+
+def _applied(prim: Usd.Prim) -> list[str]:
+    return list(prim.GetPrimTypeInfo().GetAppliedAPISchemas())
+
+
+def _path(prim: Usd.Prim, name: str) -> str:
+    value = prim.GetAttribute(name).Get()
+    return (value.resolvedPath or value.path) if isinstance(value, Sdf.AssetPath) else ""
+
+
+def _span(least: np.ndarray, most: np.ndarray) -> str:
+    return f"x {least[0]:g} to {most[0]:g} m, y {least[1]:g} to {most[1]:g} m"

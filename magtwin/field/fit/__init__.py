@@ -1,0 +1,1 @@
+"""Maps from readings: interpolation, Gaussian process, and the checks of a fit."""

@@ -1,0 +1,231 @@
+"""Check: how well methods tell readings that they were not shown."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError, find
+from magtwin.field.fit.fit import METHODS, fit
+from magtwin.field.fit.interpolation import check_readings
+from magtwin.field.survey.bins import spacing_m
+from magtwin.field.survey.readings import Readings
+from magtwin.report import Figure, Report
+from magtwin.verdict import Z_90
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+Progress = Callable[[int, int, str], Any]
+
+FILLED: Mapping[str, Mapping[str, Any]] = {"trilinear": {"fill": True}, "cubic": {"fill": True}}
+"""Options of methods in a check: nodes that were left out are bridged, or every cell would be unknown."""
+
+BLOCK_SPACINGS = 3
+"""Side of a block that is left out, in spacings of the readings."""
+
+BLOCKS = 5
+"""Parts of a floor in blocks: block (i, j) is in part (i + 2 j) mod 5, apart from all eight around it."""
+
+
+def check(
+    readings: Readings,
+    methods: Sequence[str] = tuple(METHODS),
+    *,
+    split: str | Sequence[tuple[Rows, Rows]] | None = None,
+    within_m: float | None = None,
+    options: Mapping[str, Mapping[str, Any]] = FILLED,
+    progress: Progress | None = None,
+) -> Report:
+    """Fit every method to a part of a survey, and hold what it says of the rest against the readings.
+
+    Readings that are not good count on neither side. Every method is fitted anew to each part, with its
+    figures: nothing of the readings left out reaches it.
+
+    Args:
+        readings: A survey.
+        methods: Names of `METHODS`.
+        split: "checkerboard": every other node of a gridded survey is left out, at all its headings,
+            then the others. "heading": one nominal heading of a gridded survey at a time. "run": one run at
+            a time. "block": every fifth block of three spacings, in five
+            turns. Or the rows to fit and the rows to predict of each turn. Unless given, the first
+            that the survey allows of checkerboard, run and block.
+        within_m: Only readings this near to one that was fitted are predicted [m].
+        options: Options of the methods, by name of the method.
+        progress: Called as progress(done, total, what).
+
+    Returns:
+        Of each method, and of the mean of the readings that it was shown as "naive": root of the mean squared
+        error, mean and median absolute error [nT] over the readings that it predicts; the share of
+        readings that it does predict; the share that lies in its 90 % interval; the mean logarithm of its
+        predictive density at the reading [log 1/nT], higher is better, both for normal
+        errors of the variance it states and its noise. For gridded surveys, errors and coverage by heading.
+
+    Raises:
+        InputError: No such method or split, the split does not fit, or nothing is left to predict.
+    """
+    for name in methods:
+        find("method", name, METHODS)
+    if not methods or len(set(methods)) < len(methods):
+        raise InputError(f"methods of a check must be one or more, each once, got {list(methods)}")
+    check_readings(readings)
+    named, turns = _turns(readings, split)
+    turns = [(train, _near(readings, train, test, within_m)) for train, test in turns]
+    tested = np.concatenate([test for _, test in turns])
+    if not len(tested):
+        near = "" if within_m is None else f" within {within_m:g} m of those that are fitted"
+        raise InputError(f"no good reading of {readings.name!r} is left to predict{near}; widen it")
+    figures = [
+        Figure("readings predicted", len(tested), note=f"of {int(readings.good.sum())} good ones"),
+        Figure("turns", len(turns), note=f"{min(len(a) for a, _ in turns)} readings fitted at least"),
+    ]
+    heading = None if readings.node is None else readings.node[tested, 0]
+    step, steps = 0, len(methods) * len(turns)
+    for method in ("naive", *methods):
+        mean, variance = [], []
+        for train, test in turns:
+            if method == "naive":
+                shown = readings.b_nt[train]
+                m, v = np.full(len(test), shown.mean()), np.full(len(test), shown.var())
+            else:
+                if progress is not None:
+                    progress(step, steps, method)
+                step += 1
+                m, v = _predict(_shown(readings, train), readings.take(test), method, options.get(method, {}))
+            mean.append(m)
+            variance.append(v)
+        figures += _figures(method, readings, tested, np.concatenate(mean), np.concatenate(variance), heading)
+    if progress is not None:
+        progress(steps, steps, "done")
+    facts: dict[str, Any] = {"split": named}
+    if within_m is not None:
+        facts["within"] = f"{within_m:g} m of a reading that was fitted"
+    return Report(f"check of {readings.name or 'survey'}", tuple(figures), facts)
+
+
+def _shown(readings: Readings, rows: Rows) -> Readings:
+    """Some readings, on a grid of the headings that they have."""
+    shown = readings.take(rows)
+    if shown.grid is None or shown.node is None:
+        return shown
+    left, heading = np.unique(shown.node[:, 0], return_inverse=True)
+    if len(left) == len(shown.grid.headings_rad):
+        return shown
+    grid = replace(shown.grid, headings_rad=tuple(shown.grid.headings_rad[h] for h in left))
+    return shown.with_(grid=grid, node=np.column_stack([heading.ravel(), shown.node[:, 1:]]))
+
+
+def _predict(train: Readings, test: Readings, method: str, options: Mapping[str, Any]) -> tuple[Array, Array]:
+    """What a method fitted to some readings says of others: mean [nT], variance with noise [nT^2].
+
+    Maps that know nominal headings only are asked for these.
+    """
+    model = fit(train, method, **options)
+    yaw = test.yaw
+    if test.grid is not None and test.node is not None and method in FILLED:
+        yaw = np.asarray(test.grid.headings_rad)[test.node[:, 0]]
+    mean, variance = model.predict(test.p_xy, yaw)
+    return mean, variance + model.noise_nt2
+
+
+def _turns(
+    readings: Readings, split: str | Sequence[tuple[Rows, Rows]] | None
+) -> tuple[str, list[tuple[Rows, Rows]]]:
+    """Name of a split, and the rows to fit and to predict of each turn."""
+    good = np.flatnonzero(readings.good)
+    if split is not None and not isinstance(split, str):
+        return "given rows", [(np.intersect1d(a, good), np.intersect1d(b, good)) for a, b in split]
+    if split is None:
+        runs = len(np.unique(readings.run[good])) > 1
+        split = "checkerboard" if readings.grid is not None else "run" if runs else "block"
+    part, said = find("split", split, SPLITS)(readings)
+    parts = np.unique(part[good])
+    if len(parts) < 2:
+        raise InputError(
+            f"split {split!r} leaves nothing out of {readings.name!r}: all readings are in one part"
+        )
+    return said, [(good[part[good] != k], good[part[good] == k]) for k in parts]
+
+
+def _checkerboard(readings: Readings) -> tuple[Rows, str]:
+    return _nodes(readings, "checkerboard")[:, 1:].sum(
+        axis=1
+    ) % 2, "every other node at all its headings, then the others"
+
+
+def _heading(readings: Readings) -> tuple[Rows, str]:
+    return _nodes(readings, "heading")[:, 0], "one heading at a time"
+
+
+def _nodes(readings: Readings, split: str) -> Rows:
+    if readings.node is None:
+        raise InputError(
+            f"split {split!r} needs the nodes of a gridded survey, {readings.name!r} has none; "
+            "take 'run' or 'block'"
+        )
+    return readings.node
+
+
+def _run(readings: Readings) -> tuple[Rows, str]:
+    return readings.run, "one run at a time"
+
+
+def _block(readings: Readings) -> tuple[Rows, str]:
+    side = BLOCK_SPACINGS * spacing_m(readings)
+    corner = readings.p_xy[readings.good].min(axis=0)
+    i, j = np.floor((readings.p_xy - corner) / side + 1e-9).astype(np.intp).T
+    return (i + 2 * j) % BLOCKS, f"every fifth block of {side:.3g} x {side:.3g} m, in turn"
+
+
+SPLITS: dict[str, Callable[[Readings], tuple[Rows, str]]] = {
+    "checkerboard": _checkerboard,
+    "heading": _heading,
+    "run": _run,
+    "block": _block,
+}
+"""What gives each reading the part that it is left out with, by name."""
+
+
+def _near(readings: Readings, train: Rows, test: Rows, within_m: float | None) -> Rows:
+    if within_m is None or not len(test) or not len(train):
+        return test
+    from scipy.spatial import cKDTree
+
+    return test[cKDTree(readings.p_xy[train]).query(readings.p_xy[test])[0] <= within_m]
+
+
+def _figures(
+    method: str, readings: Readings, rows: Rows, mean: Array, variance: Array, heading: Rows | None
+) -> Iterator[Figure]:
+    error = mean - readings.b_nt[rows]
+    known = np.isfinite(error) & np.isfinite(variance)
+    if not known.any():
+        yield Figure(f"{method} predicted", 0.0, "%")
+        return
+    e, v = error[known], np.maximum(variance[known], np.finfo(float).tiny)
+    inside = np.abs(e) <= Z_90 * np.sqrt(v)
+    score = -0.5 * (np.log(2 * np.pi * v) + e**2 / v)
+    yield Figure(f"{method} RMSE", _nt(np.sqrt(np.mean(e**2))), "nT")
+    yield Figure(f"{method} MAE", _nt(np.mean(np.abs(e))), "nT")
+    yield Figure(f"{method} median error", _nt(np.median(np.abs(e))), "nT", note="of the absolute ones")
+    yield Figure(f"{method} coverage", _percent(inside), "%", note="of readings in the 90 % interval")
+    yield Figure(f"{method} log score", round(float(score.mean()), 3), note="mean log density [1/nT]")
+    yield Figure(f"{method} predicted", _percent(known), "%", note="of readings")
+    if heading is None or readings.grid is None:
+        return
+    for h, angle in enumerate(np.degrees(readings.grid.headings_rad)):
+        own = heading[known] == h
+        if own.any():
+            note = f"coverage {_percent(inside[own]):g} %"
+            yield Figure(
+                f"{method} RMSE at {angle:g} deg", _nt(np.sqrt(np.mean(e[own] ** 2))), "nT", note=note
+            )
+
+
+def _nt(value: Any) -> float:
+    return round(float(value), 1)
+
+
+def _percent(flags: NDArray[np.bool_]) -> float:
+    return round(100 * float(flags.mean()), 1)

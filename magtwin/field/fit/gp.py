@@ -1,0 +1,335 @@
+"""Gaussian process: the field as a survey makes it likely, place and heading together."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.fit.covariance import Covariance, Kernel
+from magtwin.field.fit.interpolation import check_readings, flat_poses
+from magtwin.field.fit.model import FittedModel
+from magtwin.field.survey.bins import GRAIN_M, Bins, bin_readings, spacing_m
+from magtwin.field.survey.readings import Readings
+from magtwin.field.survey.roughness import local_mean, tail
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int, str], Any]
+
+MOST = 4000
+"""Readings, or means of some that lie together, that the field is conditioned on: 128 MB of covariance."""
+
+MOST_LEARNT = 800
+"""Of these, those that the figures are learnt from."""
+
+MOST_TRIED = 240
+"""Of these, those that the starts are tried on."""
+
+STARTS = (1.0, 0.4, 2.5)
+"""Reaches that learning starts from, in first guesses."""
+
+STEPS = 60
+"""Steps of L-BFGS, once the best start is known."""
+
+PATCHES = 8
+"""Patches along the longer side of the floor at most, each with its own strength of field."""
+
+PATCH_SPACINGS = 3.0
+"""Least distance between patches in spacings of the readings: fewer tell no strength from noise."""
+
+WIDEST = 6.0
+"""How far a figure may go from its first guess: a logarithm by a factor of 400, the arm by 0.2 m."""
+
+SECTORS = 24
+"""Sectors of heading in which readings that lie together are averaged apart."""
+
+FINEST = 8
+"""Cells along a spacing in which the readings of a drive are averaged at least."""
+
+BLOCK = 1024
+"""Poses predicted at a time."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class GpModel(FittedModel):
+    """A Gaussian process conditioned on readings."""
+
+    parameters: Mapping[str, Any]
+    """Figures of the covariance and of the data, by name with unit."""
+
+    noise_nt2: float
+    """Variance of a reading about the field [nT^2]: of the sensor, of headings and places, and of runs."""
+
+    covariance: Covariance
+    """Its form."""
+
+    figures: Array
+    """Its figures, shape (covariance.size,)."""
+
+    mean_nt: float
+    """Mean of the readings [nT]."""
+
+    poses: tuple[Array, Array]
+    """Places [m], shape (N, 2), and headings [rad], shape (N,), of what it is conditioned on."""
+
+    lower: Array
+    """Cholesky factor of the covariance of what was read, shape (N, N)."""
+
+    alpha: Array
+    """That covariance's inverse times the readings less their mean, shape (N,)."""
+
+    missed: tuple[Any, Array]
+    """Places left out in turn, a cKDTree, and the mean squared miss over the variance at each."""
+
+    method: str = "gp"
+    """Name of the method."""
+
+    def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
+        """Field [nT] and its variance [nT^2] at poses; nan where a pose is nan.
+
+        The variance is the process's own (Rasmussen & Williams 2006, eq. 2.26), scaled by how far places
+        around that were left out were missed, for real fields are rougher here than there, and so that
+        nine in ten of all readings left out lie in their 90 % intervals. See `FieldModel.predict`.
+        """
+        from scipy.linalg import solve_triangular
+
+        p, angle, shape = flat_poses(p_xy, yaw)
+        mean, variance = np.full(len(p), np.nan), np.full(len(p), np.nan)
+        finite = np.flatnonzero(np.isfinite(p).all(axis=1) & np.isfinite(angle))
+        for start in range(0, len(finite), BLOCK):
+            rows = finite[start : start + BLOCK]
+            across = self.covariance.between(self.figures, self.poses, (p[rows], angle[rows]))
+            mean[rows] = self.mean_nt + across.T @ self.alpha
+            half = solve_triangular(self.lower, across, lower=True, overwrite_b=True, check_finite=False)
+            prior = self.covariance.variance_nt2(self.figures, p[rows])
+            own = np.maximum(prior - np.einsum("ij,ij->j", half, half), 0.0)
+            variance[rows] = own * self._scale(p[rows])
+        return mean.reshape(shape), variance.reshape(shape)
+
+    def _scale(self, p_xy: Array) -> Array:
+        tree, squares = self.missed
+        return local_mean(tree, squares, p_xy)
+
+
+def fit_gp(readings: Readings, *, kernel: Kernel = "poisson", progress: Progress | None = None) -> GpModel:
+    """Condition a Gaussian process on the good readings, its figures the likeliest.
+
+    Recorded headings count. Where there are more than `MOST` readings, or a drive's crowd, those of one
+    run, cell and sector of heading are averaged; their scatter joins the noise. The figures, among them
+    how strong the field is in each part of the floor, maximise the marginal likelihood by L-BFGS with its
+    gradient, from several starts.
+
+    Args:
+        readings: A survey.
+        kernel: Function of distance (`Covariance`).
+        progress: Called as progress(done, total, what).
+
+    Returns:
+        The model.
+
+    Raises:
+        InputError: There are fewer than four good readings, they lie on one line or are all the same;
+            or the kernel is unknown.
+    """
+    if kernel not in ("matern", "poisson"):
+        raise InputError(f'kernel must be "matern" or "poisson", got {kernel!r}')
+    check_readings(readings)
+    say = progress or (lambda done, total, what: None)
+    total = len(STARTS) + 3
+    say(0, total, "averaging")
+    bins, within = _data(readings)
+    mean = float(bins.b_nt.mean())
+    poses, b = (bins.p_xy, bins.yaw), bins.b_nt - mean
+    several = readings.grid is None and len(np.unique(bins.run)) > 1
+    turned = np.ptp(np.abs(np.angle(np.exp(1j * (bins.yaw - bins.yaw[0]))))) > 1e-6
+    spacing = spacing_m(readings)
+    covariance = Covariance(kernel, 3 if turned else 1, several, *_patches(bins.p_xy, spacing))
+    order = np.random.default_rng(0).permutation(len(b))  # a fixed draw: which rows are learnt from
+    figures = _learn(covariance, bins, b, order, spacing, lambda done, what: say(done, total, what))
+    say(total - 2, total, "conditioning")
+    lower = _factor(covariance, figures, bins)
+    from scipy.linalg import cho_solve
+
+    alpha = cho_solve((lower, True), b)
+    say(total - 1, total, "leaving out")
+    missed = _missed(covariance, figures, bins, b, order, lower, spacing)
+    noise = covariance.noise_nt2(figures) + covariance.run_nt2(figures) + within
+    say(total, total, "done")
+    return GpModel(
+        parameters=_parameters(covariance, figures, readings, len(b), noise),
+        noise_nt2=noise,
+        covariance=covariance,
+        figures=figures,
+        mean_nt=mean,
+        poses=poses,
+        lower=lower,
+        alpha=alpha,
+        missed=missed,
+    )
+
+
+def _data(readings: Readings) -> tuple[Bins, float]:
+    """What the process is conditioned on, and the variance of a reading within it [nT^2]."""
+    good = readings.good
+    cell = GRAIN_M if readings.grid is not None else spacing_m(readings) / FINEST
+    while True:
+        bins, index = bin_readings(readings, cell, sectors=SECTORS, by_run=True)
+        if len(bins.b_nt) <= MOST:
+            break
+        cell = max(1.2 * cell, GRAIN_M)
+    freedom = len(index) - len(bins.b_nt)
+    away = readings.b_nt[good] - bins.b_nt[index]
+    return bins, float(away @ away / freedom) if freedom else 0.0
+
+
+def _patches(p_xy: Array, spacing: float) -> tuple[Array, float]:
+    """Middles of even patches over the readings, and how far they are apart [m]."""
+    low, high = p_xy.min(axis=0), p_xy.max(axis=0)
+    apart = max(float((high - low).max()) / PATCHES, PATCH_SPACINGS * spacing)
+    axes = [np.linspace(a, b, round((b - a) / apart) + 1) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2), apart
+
+
+def _learn(
+    covariance: Covariance,
+    bins: Bins,
+    b: Array,
+    order: NDArray[np.intp],
+    least_m: float,
+    say: Callable[[int, str], Any],
+) -> Array:
+    """The likeliest figures: the best of several starts on few readings, then on more.
+
+    The starts have one strength everywhere. No reach is shorter than
+    the readings' spacing: such a part could not be told from noise.
+    """
+    from scipy.optimize import minimize
+
+    guess, h = _guess(covariance, bins, b), covariance.harmonics
+    least = guess - WIDEST
+    reaches = [*range(h, 2 * h), *([3 * h + 2] * covariance.runs)]
+    least[reaches] = np.minimum(np.log(least_m), guess[reaches])
+    bounds = list(zip(least, guess + WIDEST, strict=True))
+
+    even = bounds.copy()
+    even[covariance.of_patches] = [(0.0, 0.0)] * len(covariance.patches)
+
+    def descend(start: Array, rows: NDArray[np.intp], steps: int, bounds: Any) -> tuple[float, Array]:
+        data = (bins.p_xy[rows], bins.yaw[rows], bins.run[rows], b[rows])
+        found = minimize(
+            covariance.loss,
+            np.maximum(start, least),
+            (guess, *data),
+            "L-BFGS-B",
+            jac=True,
+            bounds=bounds,
+            options={"maxiter": steps},
+        )
+        return float(found.fun), np.asarray(found.x)
+
+    tried = np.sort(order[:MOST_TRIED])
+    starts = []
+    for k, factor in enumerate(STARTS):
+        say(k, "starts")
+        start = guess.copy()
+        start[h : 2 * h] += np.log(factor)
+        starts.append(descend(start, tried, STEPS // 2, even))
+    best = min(starts, key=lambda found: found[0])[1]
+    say(len(STARTS), "figures")
+    return descend(best, np.sort(order[:MOST_LEARNT]), STEPS, bounds)[1]
+
+
+def _guess(covariance: Covariance, bins: Bins, b: Array) -> Array:
+    """Where learning starts: the readings' spread and an eighth of the floor."""
+    h, spread = covariance.harmonics, float(b.std())
+    extent = float(np.ptp(bins.p_xy, axis=0).max())
+    waves = [np.log(spread)] + [np.log(spread / 20)] * (h - 1)
+    even = [np.log(spread)] + [np.log(spread / 10)] * (h - 1)
+    guess = [*waves, *[np.log(extent / 8)] * h, *even, np.log(spread / 50)]
+    guess += [np.log(spread / 20), np.log(extent / 16)] * covariance.runs
+    guess += [0.0] * (len(covariance.patches) + 2 * (h > 1))
+    return np.array(guess)
+
+
+def _matrix(covariance: Covariance, figures: Array, bins: Bins, rows: Any = slice(None)) -> Array:
+    """Covariance of what was read, noise and runs included."""
+    poses, run = (bins.p_xy[rows], bins.yaw[rows]), bins.run[rows]
+    matrix = covariance.between(figures, poses, poses)
+    if covariance.runs:
+        matrix += covariance.within_runs(figures, covariance.places(figures, *poses), run)
+    matrix[np.diag_indices_from(matrix)] += covariance.noise_nt2(figures)
+    return matrix
+
+
+def _factor(covariance: Covariance, figures: Array, bins: Bins, rows: Any = slice(None)) -> Array:
+    from scipy.linalg import cholesky
+
+    return np.asarray(
+        cholesky(_matrix(covariance, figures, bins, rows), lower=True, overwrite_a=True, check_finite=False)
+    )
+
+
+def _missed(
+    covariance: Covariance,
+    figures: Array,
+    bins: Bins,
+    b: Array,
+    order: NDArray[np.intp],
+    lower: Array,
+    side_m: float,
+) -> tuple[Any, Array]:
+    """Leave out each cell of the floor in turn: its middle, and its mean squared miss over the variance.
+
+    With P the inverse of the covariance, what the others say misses the readings of a block by
+    P_bb^-1 (P b)_b, with covariance P_bb^-1 (Rasmussen & Williams 2006, eq. 5.12, for blocks).
+    """
+    from scipy.linalg.lapack import dpotri
+    from scipy.spatial import cKDTree
+
+    rows = np.arange(len(b))
+    if len(b) > 2 * MOST_LEARNT:
+        rows = np.sort(order[: 2 * MOST_LEARNT])
+        lower = _factor(covariance, figures, bins, rows)
+    inverse = np.tril(dpotri(lower, lower=1)[0])
+    inverse += np.tril(inverse, -1).T
+    pull = inverse @ b[rows]
+    cell = np.floor((bins.p_xy[rows] - bins.p_xy.min(axis=0)) / side_m + 0.5).astype(np.int64)
+    _, block = np.unique(cell, axis=0, return_inverse=True)
+    block = block.ravel()
+    places: list[Array] = []
+    squares, each, place = [], [], []
+    for members in np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1]):
+        own = inverse[np.ix_(members, members)]
+        spread = np.linalg.inv(own)
+        miss = spread @ pull[members]
+        squares.append(float(miss @ pull[members]) / len(members))
+        each.append(miss**2 / np.diag(spread))
+        place.append(np.full(len(members), len(places)))
+        places.append(bins.p_xy[rows][members].mean(axis=0))
+    tree, squared = cKDTree(np.array(places)), np.array(squares)
+    return tree, squared * tail(tree, squared, np.concatenate(each), np.concatenate(place))
+
+
+def _parameters(
+    covariance: Covariance, figures: Array, readings: Readings, count: int, noise: float
+) -> dict[str, Any]:
+    h = covariance.harmonics
+    size, uneven = np.exp(figures[: 3 * h]), np.exp(figures[covariance.of_patches])
+    told: dict[str, Any] = {
+        "kernel": covariance.kernel,
+        "readings": int(readings.good.sum()),
+        "conditioned_on": count,
+        "sd_nt": [round(float(v), 3) for v in size[:h]],
+        "reach_m": [round(float(v), 5) for v in size[h : 2 * h]],
+        "uniform_sd_nt": [round(float(v), 3) for v in size[2 * h :]],
+        "strength_of_patches": [round(float(uneven.min()), 3), round(float(uneven.max()), 3)],
+        "noise_nt": round(float(np.sqrt(noise)), 3),
+    }
+    if covariance.runs:
+        told["run_sd_nt"] = round(float(np.sqrt(covariance.run_nt2(figures))), 3)
+        told["run_reach_m"] = round(float(np.exp(figures[3 * h + 2])), 5)
+    if h > 1:
+        told["p_base_sensor_m"] = [round(float(v), 5) for v in covariance.arm_m(figures)]
+    return told

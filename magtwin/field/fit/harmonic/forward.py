@@ -1,0 +1,144 @@
+"""Forward: what a robot reads over layers of dipoles, and how that changes with every unknown."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.field.sources.dipole_sums import dipole_field_and_gradient_nt, moment_rows
+from magtwin.field.sources.harmonic import HarmonicField
+
+Array = NDArray[np.float64]
+
+SOFT = np.zeros((8, 3, 3))
+"""Soft iron's parts, orthonormal: the six off the diagonal, and two on it. The trace is none of them: how
+much a platform strengthens every field alike cannot be told from how strong the field is, and if it were
+free, the prior of the moments would make it grow."""
+SOFT[np.arange(6), [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = 1.0
+SOFT[6] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2)
+SOFT[7] = np.diag([1.0, 1.0, -2.0]) / np.sqrt(6)
+SOFT.flags.writeable = False
+
+PLATFORM = 13
+"""Unknowns of the platform: hard iron (3), soft iron (8, see `SOFT`), lever arm (2)."""
+
+SPIN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+"""dR/dyaw = R SPIN for turns about z."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """Readings that a set of unknowns predicts, C parts each: 1 for magnitudes, 3 for vectors."""
+
+    values_nt: Array
+    """What is read, shape (N, C)."""
+
+    jacobian: Array
+    """Its derivatives by the unknowns, shape (N, C, P)."""
+
+    by_place: Array
+    """Its derivatives by x and y of the robot [nT/m], shape (N, C, 2)."""
+
+    by_yaw: Array
+    """Its derivative by the heading [nT/rad], shape (N, C)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Forward:
+    """Dipoles, a uniform field and a platform; the sensor moves in the plane at `height_m`.
+
+    The unknowns are, in order, the moments, dipole by dipole (3 D), the uniform field B_0 (3) and the
+    platform's h, S and l (`PLATFORM`).
+    """
+
+    p_world_dipole: Array
+    """Places of the dipoles [m], shape (D, 3)."""
+
+    height_m: float
+    """Height of the sensor [m]."""
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return 3 * len(self.p_world_dipole) + 3 + PLATFORM
+
+    def field(self, unknowns: Array) -> HarmonicField:
+        """The unknowns as a field with its platform."""
+        m, uniform, hard, soft, lever = self._parts(unknowns)
+        return HarmonicField(
+            p_world_dipole=self.p_world_dipole,
+            m_world=m,
+            b_uniform_nt=uniform,
+            hard_iron_nt=hard,
+            soft_iron=soft,
+            p_base_sensor=np.array([*lever, self.height_m]),
+        )
+
+    def vectors(self, p_world: Array) -> Array:
+        """Derivatives of the field at points by the unknowns, in world axes, shape (N, 3, P).
+
+        Args:
+            p_world: Points [m], shape (N, 3).
+        """
+        p, count = np.ascontiguousarray(p_world, float), 3 * len(self.p_world_dipole)
+        jacobian = np.zeros((len(p), 3, self.size))
+        moment_rows(p, self.p_world_dipole, np.tile(np.eye(3), (len(p), 1, 1)), jacobian)
+        jacobian[:, :, count : count + 3] = np.eye(3)
+        return jacobian
+
+    def read(self, unknowns: Array, p_xy: Array, yaw: Array, *, vectors: bool) -> Reading:
+        """What the robot reads at poses, with all derivatives.
+
+        Args:
+            unknowns: Moments [A m^2], uniform field [nT] and platform, shape (P,).
+            p_xy: Where base_link is [m], shape (N, 2).
+            yaw: Headings [rad], shape (N,).
+            vectors: Whether the field's parts in base_link are read, or its magnitude.
+        """
+        m, uniform, hard, soft, lever = self._parts(unknowns)
+        turn, swing = _turns(yaw)
+        at = np.column_stack([p_xy + turn[:, :2, :2] @ lever, np.full(len(p_xy), self.height_m)])
+        b, slope = dipole_field_and_gradient_nt(at, self.p_world_dipole, m)
+        b += uniform
+        whole = np.eye(3) + soft
+        base = np.einsum("nji,nj->ni", turn, b)
+        inner = base @ whole.T + hard
+        out = np.broadcast_to(np.eye(3), (len(b), 3, 3))
+        if not vectors:
+            size = np.linalg.norm(inner, axis=1)
+            out = (inner / size[:, None])[:, None, :]
+        rows = out @ whole  # what a change of the field in base_link axes adds to what is read
+        world = rows @ turn.transpose(0, 2, 1)
+        by_place = world @ slope
+        turned = np.einsum("nji,nj->ni", swing, b)
+        carried = np.einsum("nji,njk,nk->ni", turn, slope[:, :, :2], swing[:, :2, :2] @ lever)
+        count, parts = m.size, out.shape[1]
+        jacobian = np.empty((len(b), parts, self.size))
+        moment_rows(at, self.p_world_dipole, world, jacobian)
+        jacobian[:, :, count : count + 3] = world
+        jacobian[:, :, count + 3 : count + 6] = out
+        jacobian[:, :, count + 6 : count + 14] = np.einsum("nci,kij,nj->nck", out, SOFT, base, optimize=True)
+        jacobian[:, :, count + 14 :] = by_place[:, :, :2] @ turn[:, :2, :2]
+        values = inner if vectors else size[:, None]
+        by_yaw = np.einsum("nci,ni->nc", rows, turned + carried)
+        return Reading(values, jacobian, by_place[:, :, :2], by_yaw)
+
+    def _parts(self, unknowns: Array) -> tuple[Array, Array, Array, Array, Array]:
+        count = 3 * len(self.p_world_dipole)
+        rest = unknowns[count:]
+        return (
+            unknowns[:count].reshape(-1, 3),
+            rest[:3],
+            rest[3:6],
+            np.tensordot(rest[6:14], SOFT, 1),
+            rest[14:],
+        )
+
+
+def _turns(yaw: ArrayLike) -> tuple[Array, Array]:
+    """Rotation matrices from base_link to world and their derivatives by the heading, (N, 3, 3) each."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.zeros((len(c), 3, 3))
+    turn[:, 0, 0] = turn[:, 1, 1] = c
+    turn[:, 1, 0], turn[:, 0, 1], turn[:, 2, 2] = s, -s, 1.0
+    return turn, turn @ SPIN

@@ -1,0 +1,137 @@
+"""Layers: where the equivalent dipoles of a harmonic fit lie."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.survey.bins import spacing_m as survey_spacing_m
+from magtwin.field.survey.means import means
+from magtwin.field.survey.readings import Readings
+
+Array = NDArray[np.float64]
+
+LADDERS = ((1.0, 2.0, 4.0), (1.0, 2.0, 4.0, -2.0))
+"""Depths of the layers below the sensor, in that of the first: each stands for sources twice as large. The
+last of the second set is above the sensor, for what stands beside it. The fit takes the set with the greater
+evidence."""
+
+DEPTH_SPACINGS = 1.8
+"""Depth of the first layer in spacings of the survey: a layer nearer than about one stands for
+waves that the readings do not resolve (Dampney 1969)."""
+
+DRIVE_SPACINGS = 0.9
+"""The same for a drive, whose readings are dense along it."""
+
+LEAST_DEPTH_M = 0.3
+"""Least depth of the first layer below the sensor [m]; a robot's sensor is not nearer to the floor's iron."""
+
+SHEET = 0.6
+"""Distance of the dipoles of a layer in its depth: e^(-2 pi / 0.6) of their field is ripple, 3e-5."""
+
+MARGIN = 1.2
+"""Width by which a layer goes beyond the readings, in its depth."""
+
+REACH = 0.6
+"""Distance over which dipoles share one strength, in their layer's depth."""
+
+MOST_DIPOLES = 1500
+"""Dipoles at most; layers with more are thinned."""
+
+FEW_ROWS = 2700
+"""Readings, each part of a vector counted, up to which their matrix is factored; beyond, the unknowns' is."""
+
+DIPOLES_OF_MANY = 800
+"""Dipoles at most where there are more rows than `FEW_ROWS`."""
+
+DIPOLES_OF_DRIVE = 500
+"""Dipoles at most for the magnitudes of a drive: more took 15 times as long and predicted no better."""
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """Places of the dipoles."""
+
+    p_world_dipole: Array
+    """Places [m], shape (D, 3)."""
+
+    area_m2: Array
+    """Area of its layer that each stands for [m^2], shape (D,)."""
+
+    layer: NDArray[np.intp]
+    """Layer of each, shape (D,)."""
+
+    depths: tuple[float, ...]
+    """Depth of each layer below the sensor, negative above it [m]."""
+
+    def shares(self) -> list[Array]:
+        """Weights with which dipoles of a layer share their strengths, one matrix for each layer."""
+        shares = []
+        for k, depth in enumerate(self.depths):
+            p = self.p_world_dipole[self.layer == k, :2]
+            apart = np.sum((p[:, None] - p[None]) ** 2, axis=-1)
+            shares.append(np.exp(-apart / (2 * (REACH * depth) ** 2)))
+        return shares
+
+
+def ladders(
+    depth_m: float | Sequence[float] | None, good: Readings, height_m: float
+) -> list[tuple[float, ...]]:
+    """The sets of depths to try [m]: those given, else what `LADDERS` makes of the survey's spacing.
+
+    Raises:
+        InputError: A depth is 0 or not finite.
+    """
+    if depth_m is None:
+        spacings = DRIVE_SPACINGS if good.grid is None else DEPTH_SPACINGS
+        first = max(spacings * survey_spacing_m(good), LEAST_DEPTH_M, height_m)
+        return [tuple(first * step for step in ladder) for ladder in LADDERS]
+    depths = tuple(float(d) for d in np.atleast_1d(np.asarray(depth_m, float)))
+    if not depths or not all(np.isfinite(d) and d != 0 for d in depths):
+        raise InputError(f"depth_m must be depths below the sensor [m], other than 0, got {depth_m!r}")
+    return [depths]
+
+
+def layers_below(
+    good: Readings, depths: tuple[float, ...], spacing_m: float | None, height_m: float
+) -> Layers:
+    """Layers below (and above) the bounding box of the readings; thinned if there are too many dipoles.
+
+    Args:
+        good: Good readings of a survey.
+        depths: Depth of each layer below the sensor [m].
+        spacing_m: Distance between the dipoles of the first layer [m]; `SHEET` of its depth if None.
+        height_m: Height of the sensor [m].
+
+    Raises:
+        InputError: The spacing given makes too many dipoles.
+    """
+    low, high = good.p_xy.min(axis=0), good.p_xy.max(axis=0)
+    part = SHEET if spacing_m is None else spacing_m / abs(depths[0])
+    most = _most(good, min(map(abs, depths)))
+    while True:
+        places, areas, layer = [], [], []
+        for k, depth in enumerate(depths):
+            margin, step = MARGIN * abs(depth), part * abs(depth)
+            counts = np.ceil((high - low + 2 * margin) / step).astype(int) + 1
+            x, y = (np.linspace(a - margin, b + margin, n) for a, b, n in zip(low, high, counts, strict=True))
+            grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+            places.append(np.column_stack([grid, np.full(len(grid), height_m - depth)]))
+            areas.append(np.full(len(grid), (x[1] - x[0]) * (y[1] - y[0])))
+            layer.append(np.full(len(grid), k))
+        count = sum(map(len, places))
+        if count <= most:
+            return Layers(np.concatenate(places), np.concatenate(areas), np.concatenate(layer), depths)
+        if spacing_m is not None:
+            raise InputError(f"spacing_m {spacing_m:g} makes {count:,} dipoles, more than {most:,}; widen it")
+        part *= max(np.sqrt(count / most), 1.02)
+
+
+def _most(good: Readings, depth_m: float) -> int:
+    """Dipoles at most for a survey."""
+    if good.node is None and good.b_body_nt is None:
+        return DIPOLES_OF_DRIVE
+    rows = (1 if good.b_body_nt is None else 3) * (1 + int(means(good, depth_m)[0].max()))
+    return MOST_DIPOLES if rows <= FEW_ROWS else DIPOLES_OF_MANY

@@ -1,0 +1,140 @@
+"""Problem: which readings a harmonic fit explains, and the priors that it does not learn."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.field.fit.harmonic.forward import Forward, Reading
+from magtwin.field.fit.harmonic.hyperparameters import Figures
+from magtwin.field.fit.harmonic.layers import DEPTH_SPACINGS, Layers
+from magtwin.field.survey.means import means
+from magtwin.field.survey.readings import Readings
+
+Array = NDArray[np.float64]
+
+WEAK = 0.1
+"""Strength of layers above in those of layers below, to begin with: what both can explain is below."""
+
+BEGINNINGS, BEGUN_DIP = 4, np.radians(60.0)
+"""Directions of the compass, and dip, that a fit begins with beside straight down if the Earth's field is
+unknown: several fields explain magnitudes, and steps find the nearest one."""
+
+HARD_IRON_SD_NT, SOFT_IRON_SD, LEVER_SD_M = 3000.0, 0.03, 0.05
+"""Standard deviations of the priors of the platform's parts, about 0."""
+
+STRETCH = 24.0
+"""Way of a drive that is left out together, in the first layer's depth: at 0.2 m/s over half a minute."""
+
+ONE_HEADING = 0.99
+"""Length of the headings' mean vector from which they are one: they spread by 8 deg at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is read where, and the priors that are no figures."""
+
+    forward: Forward
+    layers: Layers
+    p_xy: Array
+    yaw: Array
+    read_nt: Array  # (N, C)
+    cell: NDArray[np.intp]  # of each good reading
+    follow: bool  # whether rows follow each other as a drive's do
+    mean: Array  # of the unknowns' priors
+    rest_sd: Array  # standard deviations of the priors of all unknowns but the moments
+    begins: list[Array]  # uniform fields to begin with
+
+    @classmethod
+    def of(
+        cls,
+        good: Readings,
+        layers: Layers,
+        height: float,
+        earth_nt: Sequence[float] | None,
+        earth_sd_nt: float,
+    ) -> "Problem":
+        """The problem of good readings over layers of dipoles, as `fit_harmonic` describes its arguments."""
+        read = good.b_nt[:, None] if good.b_body_nt is None else good.b_body_nt
+        cell, follow = means(good, min(map(abs, layers.depths)))
+        size = np.bincount(cell)
+
+        def mean(values: Array) -> Array:
+            return np.asarray(np.bincount(cell, values) / size)
+
+        read = np.column_stack([mean(part) for part in read.T])
+        p = np.column_stack([mean(good.p_xy[:, 0]), mean(good.p_xy[:, 1])])
+        yaw = np.arctan2(mean(np.sin(good.yaw)), mean(np.cos(good.yaw)))
+        typical = float(np.median(good.b_nt))
+        uniform, sd = np.array([0.0, 0.0, -typical]), typical / 2
+        begins = [uniform, *_tilted(typical)]
+        if earth_nt is not None:
+            uniform, sd = np.asarray(earth_nt, float), earth_sd_nt
+            begins = [uniform]
+        elif good.b_body_nt is not None:
+            c, s = np.cos(yaw), np.sin(yaw)
+            turned = [c * read[:, 0] - s * read[:, 1], s * read[:, 0] + c * read[:, 1], read[:, 2]]
+            uniform = np.array([part.mean() for part in turned])
+            begins = [uniform]
+        forward = Forward(layers.p_world_dipole, height)
+        prior = np.zeros(forward.size)
+        count = 3 * len(layers.p_world_dipole)
+        prior[count : count + 3] = uniform
+        rest = np.repeat([sd, HARD_IRON_SD_NT, SOFT_IRON_SD, LEVER_SD_M], [3, 3, 8, 2])
+        if abs(np.mean(np.exp(1j * yaw))) > ONE_HEADING:
+            rest[3:] = 0.0  # a platform that never turned cannot be told from the field
+        return cls(forward, layers, p, yaw, read, cell, follow, prior, rest, begins)
+
+    @property
+    def vectors(self) -> bool:
+        """Whether vectors are read, not magnitudes."""
+        return self.read_nt.shape[1] == 3
+
+    def places(self) -> list[NDArray[np.intp]]:
+        """Rows of the parts of readings that lie together: at one node, or within a spacing."""
+        side = abs(self.layers.depths[0]) / DEPTH_SPACINGS
+        square = np.floor(self.p_xy / side + 0.5).astype(np.int64)
+        _, place = np.unique(square, axis=0, return_inverse=True)
+        return self._grouped(place.ravel())
+
+    def stretches(self) -> list[NDArray[np.intp]]:
+        """Rows of the parts of readings of each stretch of a drive's way; none of other surveys."""
+        if not self.follow:
+            return []
+        step = np.linalg.norm(np.diff(self.p_xy, axis=0), axis=1)
+        way = np.concatenate([[0.0], np.cumsum(step)])
+        return self._grouped(np.floor(way / (STRETCH * abs(self.layers.depths[0]))).astype(np.intp))
+
+    def _grouped(self, group: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+        """Rows of the parts of readings, by the groups that their readings (N,) are in."""
+        rows = np.arange(self.read_nt.size).reshape(self.read_nt.shape)
+        order = np.argsort(group, kind="stable")
+        ends = np.flatnonzero(np.diff(group[order])) + 1
+        return [rows[part].ravel() for part in np.split(order, ends)]
+
+    def at(self, unknowns: Array) -> Reading:
+        """What unknowns predict for every row, with derivatives."""
+        return self.forward.read(unknowns, self.p_xy, self.yaw, vectors=self.vectors)
+
+    def first(self) -> Figures:
+        """Figures to begin with: strengths that make the field's spread, noises of a small part of it."""
+        spread = float(self.read_nt.std(axis=0).max())
+        depth = np.array(self.layers.depths)[self.layers.layer]
+        above = depth < 0
+        # a white layer of density s per metre makes a field of variance 3 (1e2 s)^2 pi / (8 d^4) or so
+        density = max(spread, 1.0) * depth**2 / 100
+        return Figures(
+            noise_nt=max(spread / 50, 1e-3),
+            position_m=0.01,
+            heading_rad=0.02 if np.any(self.rest_sd[3:]) else 0.0,
+            freedom=8.0,
+            strength=density * np.sqrt(self.layers.area_m2) * np.where(above, WEAK, 1.0),
+        )
+
+
+def _tilted(magnitude_nt: float) -> list[Array]:
+    """Fields that dip by `BEGUN_DIP` towards each of some directions of the compass."""
+    level, down = magnitude_nt * np.cos(BEGUN_DIP), magnitude_nt * np.sin(BEGUN_DIP)
+    angles = 2 * np.pi * np.arange(BEGINNINGS) / BEGINNINGS
+    return [np.array([level * np.cos(a), level * np.sin(a), -down]) for a in angles]

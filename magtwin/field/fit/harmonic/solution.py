@@ -1,0 +1,305 @@
+"""Solution: unknowns of a harmonic fit, Gauss-Newton steps to likelier ones, and learning of figures."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.field.fit.harmonic.forward import SOFT, Reading
+from magtwin.field.fit.harmonic.hyperparameters import Figures
+from magtwin.field.fit.harmonic.model import HarmonicModel, widened
+from magtwin.field.fit.harmonic.posterior import Posterior
+from magtwin.field.fit.harmonic.problem import Problem
+from magtwin.field.survey.headings import between, surveyed
+from magtwin.field.survey.readings import Readings
+from magtwin.verdict import Z_90
+
+Array = NDArray[np.float64]
+
+DRAWN = 0.005
+"""Weight of the layer's strength beside that of the dipoles around, as a part of theirs."""
+
+TAILS = np.geomspace(4.0, 48.0, 13)
+"""Degrees of freedom of Student's t that are tried."""
+
+SETTLED = 0.2
+"""Change of the logarithm of the posterior below which Gauss-Newton has arrived."""
+
+STEPS = 30
+
+FIRST_STEPS = 4
+"""Gauss-Newton steps under the first figures, before learning begins."""
+
+WIDTHS = np.linspace(-np.log(16), np.log(16), 161)
+"""Logarithms of the widths of intervals that are tried, as factors of the posterior's variances."""
+
+NOISES = np.geomspace(1.0, 16.0, 25)
+"""Factors of the noise's variance that are tried for a drive."""
+
+WIDTH_SD = np.log(2)
+"""How far the width is thought to lie from 1, as a logarithm, before places are left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Unknowns, what they predict, and the figures that they were found under."""
+
+    problem: Problem
+    figures: Figures
+    unknowns: Array
+    reading: Reading
+
+    @classmethod
+    def start(cls, problem: Problem, figures: Figures, uniform: Array) -> "Solution":
+        """Steps from a uniform field, in the first of which all readings are trusted alike and little."""
+        unknowns = problem.mean.copy()
+        count = 3 * len(figures.strength)
+        unknowns[count : count + 3] = uniform
+        state = cls(problem, figures, unknowns, problem.at(unknowns))
+        off = problem.read_nt - state.reading.values_nt
+        coarse = np.full(off.shape, max(float(np.mean(off**2)) / 100, figures.noise_nt**2))
+        state = state._moved(state._towards(1 / coarse), 1.0)
+        for _ in range(FIRST_STEPS):
+            state = state.step()
+        return state
+
+    @property
+    def uniform(self) -> Array:
+        """The uniform part of the field [nT]."""
+        count = 3 * len(self.figures.strength)
+        return self.unknowns[count : count + 3]
+
+    @property
+    def prior_sd(self) -> Array:
+        """Standard deviations of the unknowns' priors, shape (P,)."""
+        return np.concatenate([np.repeat(self.figures.strength, 3), self.problem.rest_sd])
+
+    @property
+    def off(self) -> Array:
+        """What is read minus what is predicted (N, C)."""
+        return self.problem.read_nt - self.reading.values_nt
+
+    def weights(self, variance: Array) -> Array:
+        """Expected precision of a reading's own scale under Student's t, (N,)."""
+        freedom, parts = self.figures.freedom, variance.shape[1]
+        return np.asarray((freedom + parts) / (freedom + np.sum(self.off**2 / variance, axis=1)))
+
+    def objective(self, variance: Array) -> float:
+        """Minus the logarithm of the posterior, but for a constant, for scales that are held."""
+        freedom, parts = self.figures.freedom, variance.shape[1]
+        surprise = np.log1p(np.sum(self.off**2 / variance, axis=1) / freedom)
+        moved = self._scaled()
+        return float((freedom + parts) / 2 * surprise.sum() + moved @ moved / 2)
+
+    def posterior(self, precision: Array) -> Posterior:
+        """What the readings, of these precisions (N, C), tell of the unknowns in units of their priors."""
+        return Posterior.of(self._rows() * np.sqrt(precision).reshape(-1, 1))
+
+    def _rows(self) -> Array:
+        return self.reading.jacobian.reshape(-1, self.reading.jacobian.shape[-1]) * self.prior_sd
+
+    def _scaled(self) -> Array:
+        """The unknowns from their priors' means, in units of their standard deviations; 0 where held."""
+        sd = self.prior_sd
+        return np.divide(self.unknowns - self.problem.mean, sd, out=np.zeros_like(sd), where=sd > 0)
+
+    def _towards(self, precision: Array) -> Array:
+        """The unknowns that solve the problem made linear here."""
+        posterior, root = self.posterior(precision), np.sqrt(precision).ravel()
+        best = posterior.mean(root * self.off.ravel() + posterior.rows @ self._scaled())
+        return np.asarray(self.problem.mean + self.prior_sd * best)
+
+    def _moved(self, towards: Array, part: float) -> "Solution":
+        unknowns = self.unknowns + part * (towards - self.unknowns)
+        return Solution(self.problem, self.figures, unknowns, self.problem.at(unknowns))
+
+    def _stepped(self) -> tuple["Solution", float]:
+        variance = self.figures.variance(self.reading)
+        towards = self._towards(self.weights(variance)[:, None] / variance)
+        before, part = self.objective(variance), 1.0
+        while part > 0.05:
+            after = self._moved(towards, part)
+            gain = before - after.objective(variance)
+            if gain >= 0:
+                return after, gain
+            part /= 2
+        return self, 0.0
+
+    def step(self) -> "Solution":
+        """One Gauss-Newton step, halved until the posterior grows."""
+        return self._stepped()[0]
+
+    def settle(self) -> "Solution":
+        """Steps until nothing is gained."""
+        state = self
+        for _ in range(STEPS):
+            state, gain = state._stepped()
+            if gain < SETTLED:
+                break
+        return state
+
+    def learnt(self, shares: list[Array] | None) -> "Solution":
+        """The same with figures that these unknowns make likely."""
+        from scipy.special import gammaln, psi
+
+        figures, layers = self.figures, self.problem.layers
+        variance = figures.variance(self.reading)
+        weights = self.weights(variance)
+        precision = weights[:, None] / variance
+        posterior = self.posterior(precision)
+        count = len(figures.strength)
+        known = posterior.known()[: 3 * count].reshape(count, 3).mean(axis=1)
+        known = np.clip(known, 1e-9, 1)
+        square = np.mean(self.unknowns[: 3 * count].reshape(count, 3) ** 2, axis=1) / layers.area_m2
+        density = figures.strength**2 / layers.area_m2
+        new = np.empty(count)
+        for k in range(len(layers.depths)):
+            own = layers.layer == k
+            whole = square[own].sum() / known[own].sum()
+            new[own] = whole
+            if shares is not None:
+                drawn = DRAWN * shares[k].sum(axis=1).mean() * known[own].mean()
+                new[own] = (shares[k] @ square[own] + drawn * whole) / (shares[k] @ known[own] + drawn)
+        new = np.clip(new, 0.3 * density, 3 * density)
+        left = posterior.fitted().reshape(variance.shape) / precision
+        size = (self.off**2 + left) * weights[:, None] / variance
+        share = figures.terms(self.reading) / variance[..., None]
+        whole_share = np.maximum(np.sum(share, axis=(0, 1)), np.finfo(float).tiny)  # 0 for what is held at 0
+        scale = np.sqrt(np.sum(share * size[..., None], axis=(0, 1)) / whole_share)
+        parts = variance.shape[1]
+        old = (figures.freedom + parts) / 2
+        tail = np.mean(np.log(weights) - weights) + psi(old) - np.log(old)
+        half = TAILS / 2
+        freedom = float(TAILS[np.argmax(half * np.log(half) - gammaln(half) + half * tail)])
+        learnt = Figures(
+            noise_nt=float(figures.noise_nt * scale[0]),
+            position_m=float(figures.position_m * scale[1]),
+            heading_rad=float(figures.heading_rad * scale[2]),
+            freedom=freedom,
+            strength=np.sqrt(new * layers.area_m2),
+        )
+        return Solution(self.problem, learnt, self.unknowns, self.reading)
+
+    def evidence(self) -> float:
+        """Logarithm of the evidence by Laplace's approximation (Rasmussen & Williams 2006, eq. 3.32)."""
+        from scipy.special import gammaln
+
+        variance = self.figures.variance(self.reading)
+        freedom, parts = self.figures.freedom, variance.shape[1]
+        constant = gammaln((freedom + parts) / 2) - gammaln(freedom / 2) - parts / 2 * np.log(freedom * np.pi)
+        fit = len(variance) * constant - np.log(variance).sum() / 2 - self.objective(variance)
+        precision = self.weights(variance)[:, None] / variance
+        return float(fit - self.posterior(precision).half_log_det())
+
+    def model(self, good: Readings) -> HarmonicModel:
+        """The fitted model."""
+        figures, problem = self.figures, self.problem
+        variance = figures.variance(self.reading)
+        precision = self.weights(variance)[:, None] / variance
+        posterior = self.posterior(precision)
+        learnt, (louder, width) = posterior.directions(), self._calibrated(posterior, precision)
+        headings, turned = self._turned(posterior, precision)
+        field = problem.forward.field(self.unknowns)
+        slopes = problem.forward.read(self.unknowns, problem.p_xy, problem.yaw, vectors=False)
+        wide = figures.freedom / (figures.freedom - 2)
+        noise = louder * wide * float(np.mean(figures.variance(slopes)))
+        off = good.b_nt - field.magnitude_nt(good.p_xy, good.yaw)
+        within = off - (np.bincount(problem.cell, off) / np.bincount(problem.cell))[problem.cell]
+        noise += float(np.mean(within**2))
+        return HarmonicModel(
+            field=field,
+            parameters=self._parameters(learnt, width, len(good))
+            | {"added between headings [nT/rad^2]": round(float(np.sqrt(turned)), 2)}
+            | (
+                {} if louder == 1 else {"factor of the noise along a drive": round(float(np.sqrt(louder)), 3)}
+            ),
+            noise_nt2=noise,
+            figures=figures,
+            forward=problem.forward,
+            unknowns=self.unknowns,
+            prior_sd=self.prior_sd,
+            learnt=learnt,
+            width=width,
+            headings_rad=headings,
+            turned=turned,
+        )
+
+    def _calibrated(self, posterior: Posterior, precision: Array) -> tuple[float, float]:
+        """Factors of the noise's and of the field's variance that readings left out in turn show.
+
+        The likeliest under Student's t, a place counting once; where readings tell nothing of it, near 1.
+        Readings that follow each other on a drive share what motors, battery and LiDAR add, so that whole
+        stretches of a drive are left out, and the noise grows by what they share.
+        """
+        root, problem = np.sqrt(precision).ravel(), self.problem
+        places, stretches = problem.places(), problem.stretches()
+        target = root * self.off.ravel() + posterior.rows @ self._scaled()
+        off, field = posterior.left_out(target, stretches or places)
+        share = np.empty(len(root))
+        for rows in places:
+            share[rows] = 1 / len(rows)
+        noise, freedom = self.figures.variance(self.reading).ravel(), self.figures.freedom
+        square, field = (off / root) ** 2, field / root**2
+        best = np.inf, 1.0, 1.0
+        for factor in NOISES if stretches else NOISES[:1]:
+            scale = widened(field, factor * noise, np.exp(WIDTHS)[:, None]) + factor * noise
+            surprise = (freedom + 1) / 2 * np.log1p(square / (freedom * scale)) + np.log(scale) / 2
+            loss = surprise @ share + (WIDTHS / WIDTH_SD) ** 2 / 2
+            k = int(np.argmin(loss))
+            best = min(best, (float(loss[k]), float(factor), float(np.exp(WIDTHS[k]))))
+        return best[1], best[2]
+
+    def _turned(self, posterior: Posterior, precision: Array) -> tuple[Array, float]:
+        """See `HarmonicModel.headings_rad` and `HarmonicModel.turned`."""
+        from scipy.special import stdtrit
+
+        heading, group = surveyed(self.problem.yaw)
+        if not len(heading) or not np.any(self.problem.rest_sd[3:]):
+            return np.empty(0), 0.0
+        root = np.sqrt(precision).ravel()
+        target = root * self.off.ravel() + posterior.rows @ self._scaled()
+        rows = np.arange(len(root)).reshape(precision.shape)
+        groups = [rows[group == h].ravel() for h in range(len(heading))]
+        off, field = posterior.left_out(target, groups)
+        beyond, away = 0.0, 0.0
+        for h, part in enumerate(groups):
+            beyond += float(np.sum((off[part] ** 2 - field[part] - 1) / root[part] ** 2))
+            away += len(part) * float(between(np.delete(heading, h), heading[h : h + 1])[0])
+        few = float(stdtrit(len(heading), 0.95)) / Z_90  # so many headings tell it: Student's t
+        return heading, max(beyond / away, 0.0) * few**2
+
+    def _parameters(self, learnt: Array, width: float, count: int) -> dict[str, Any]:
+        figures, problem = self.figures, self.problem
+        last = learnt[-len(problem.rest_sd) :]
+        sd = problem.rest_sd * np.sqrt(np.maximum(1 - np.sum(last**2, axis=1), 0))
+        uniform, hard, soft, lever = np.split(self.unknowns[-len(problem.rest_sd) :], [3, 6, 14])
+        layers = problem.layers
+        density = [
+            float(
+                np.sqrt(np.mean(figures.strength[layers.layer == k] ** 2 / layers.area_m2[layers.layer == k]))
+            )
+            for k in range(len(layers.depths))
+        ]
+        return {
+            "readings": count,
+            "means of readings": len(problem.p_xy),
+            "parts of a reading": "vector" if problem.vectors else "magnitude",
+            "dipoles": len(figures.strength),
+            "depths below the sensor [m]": [round(d, 4) for d in layers.depths],
+            "strengths of the layers [A m^2/m]": [round(d, 4) for d in density],
+            "noise [nT]": round(figures.noise_nt, 3),
+            "error of places [m]": round(figures.position_m, 5),
+            "error of headings [rad]": round(figures.heading_rad, 5),
+            "degrees of freedom": round(figures.freedom, 2),
+            "uniform field [nT]": np.round(uniform, 1).tolist(),
+            "uniform field, sd [nT]": np.round(sd[:3], 1).tolist(),
+            "hard iron [nT]": np.round(hard, 1).tolist(),
+            "hard iron, sd [nT]": np.round(sd[3:6], 1).tolist(),
+            "soft iron": np.round(np.tensordot(soft, SOFT, 1).ravel(), 5).tolist(),
+            "soft iron, sd": np.round(np.sqrt(np.tensordot(sd[6:14] ** 2, SOFT**2, 1)).ravel(), 5).tolist(),
+            "lever arm [m]": np.round(lever, 5).tolist(),
+            "lever arm, sd [m]": np.round(sd[14:], 5).tolist(),
+            "width of variances": round(width, 4),
+            "log evidence": round(self.evidence(), 2),
+        }

@@ -1,0 +1,217 @@
+"""The field at other heights from the map of one."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.sources.harmonic import HarmonicField
+
+Array = NDArray[np.float64]
+
+LARGEST_STEP_DOWN = 0.25
+"""Greatest step down of a grid, in cells: its shortest waves then grow threefold, and soon without bound."""
+
+GRAIN_M = 1e-6
+"""Heights closer than this are one."""
+
+
+def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
+    """The map of the same nodes at another height of the sensor.
+
+    **From a harmonic field** the values are exact: the field of its dipoles at that height, as the survey's
+    robot would read it there.
+
+    **From the grid alone** each heading's layer goes up by its waves (Blakely, Potential Theory in Gravity
+    and Magnetic Applications, 1995, eq. 12.8):
+
+        F[B(z + dz)] = F[B(z)] exp(-dz |k|),  k = (k_x, k_y)
+
+    after its mean is taken out, the layer is mirrored at its border and tapered to nothing a layer's
+    width away. The filter is exact for harmonic functions. A magnitude is none, yet |B| = F + b . F / F +
+    |b_perp|^2 / 2F + ... of an anomaly b on a uniform field F is harmonic to first order, so the result
+    holds where b is small beside F: parts of size (sd of the map)^2 / 2F are continued wrongly, which
+    `parameters` tell as `second_order_nt`. It errs near the border too, for what lies beyond is a guess,
+    and so are masked nodes, which are filled with their nearest neighbours.
+
+    **Variance.** The filter's kernel K weighs nodes, so a value's variance is at most (sum |K| sd)^2
+    however their errors go together; that bound is what the result carries. A filled node or one beyond
+    the border counts with what the guess may miss: the root mean square slope of the layer over twice the
+    distance to the nearest node that is known, at most the spread of the layer times the root of 2.
+
+    Args:
+        field: The map; its height must be known: the dipoles of a survey whose height was not lie below its
+            sensor, nobody knows how far above the floor.
+        height_m: Height of the sensor above the floor [m]. A grid goes down by a quarter of a cell at
+            most, for its noise grows as exp(dz |k|); a harmonic field down to the floor, and not nearer to a
+            layer of dipoles, below the sensor or above it, than these are to each other.
+
+    Returns:
+        The map there, with `method` and `parameters` that say how; valid where the map is. Its variance
+        is unknown where the map's is, and farther below it than a grid goes down.
+
+    Raises:
+        InputError: The map's height is unknown, or `height_m` is none that the map can be taken to.
+    """
+    if not np.isfinite(height_m):
+        raise InputError(f"height_m must be a length [m], got {height_m!r}")
+    if height_m < 0:
+        raise InputError(f"height_m is a height above the floor, 0 m or more, got {height_m!r}")
+    height_m = float(height_m)
+    if field.height_m is None:
+        raise InputError(
+            f"the height of map {field.name!r} is unknown, so it cannot be taken to another; say it when the "
+            "survey is read (--height)"
+        )
+    start = field.harmonic.height_m if field.harmonic is not None else field.height_m
+    if abs(height_m - start) < GRAIN_M:
+        return field
+    if field.harmonic is not None:
+        return _of_the_dipoles(field, start, height_m)
+    return _of_the_grid(field, start, height_m)
+
+
+def _of_the_dipoles(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap:
+    harmonic = field.harmonic
+    assert harmonic is not None
+    lowest, highest = _reach_m(harmonic, start)
+    if height_m < min(lowest, start):
+        raise InputError(
+            f"height_m {height_m:g} lies too low for map {field.name!r}: below {lowest:.4g} m is the floor, "
+            "or its dipoles are so near that each shows by itself"
+        )
+    if height_m > max(highest, start):
+        raise InputError(
+            f"height_m {height_m:g} lies too high for map {field.name!r}: above {highest:.4g} m are dipoles, "
+            "which stand for iron above the robot, so near that each shows by itself"
+        )
+    variance = None
+    if field.variance_nt2 is not None and height_m - start >= -LARGEST_STEP_DOWN * min(field.cell_m):
+        variance = _variance(field, height_m - start)
+    return replace(
+        field,
+        values_nt=harmonic.magnitude_nt(*field.grid.poses(), height_m=height_m),
+        variance_nt2=variance,
+        recorded_yaw=None,
+        height_m=height_m,
+        method=_said(field, start, height_m, "by its harmonic field"),
+        parameters={**field.parameters, "continued_from_m": start},
+        harmonic=replace(harmonic, p_base_sensor=np.append(harmonic.p_base_sensor[:2], height_m)),
+    )
+
+
+def _reach_m(harmonic: HarmonicField, start: float) -> tuple[float, float]:
+    """Heights that a harmonic field holds from and up to [m]: the floor, or dipoles' own spacing off them.
+
+    A layer of equivalent dipoles s apart is a smooth field but for ripples of about exp(-2 pi d / s) at a
+    distance d, two parts in a thousand at d = s. Dipoles at heights of their own have no such spacing.
+    """
+    places = harmonic.p_world_dipole
+    below, above = places[places[:, 2] <= start], places[places[:, 2] > start]
+    lowest, highest = 0.0, np.inf
+    if len(below):
+        top = float(below[:, 2].max())
+        lowest = max(0.0, top + _apart_m(below[below[:, 2] > top - GRAIN_M]))
+    if len(above):
+        bottom = float(above[:, 2].min())
+        highest = bottom - _apart_m(above[above[:, 2] < bottom + GRAIN_M])
+    return lowest, highest
+
+
+def _apart_m(layer: Array) -> float:
+    """Median distance of dipoles of one height to the next of them [m]."""
+    from scipy.spatial import cKDTree
+
+    return float(np.median(cKDTree(layer).query(layer, 2)[0][:, 1])) if len(layer) > 1 else GRAIN_M
+
+
+def _of_the_grid(field: AnomalyMap, start: float, height_m: float) -> AnomalyMap:
+    step = height_m - start
+    cell = min(field.cell_m)
+    if step < -LARGEST_STEP_DOWN * cell:
+        raise InputError(
+            f"height_m {height_m:g} lies {-step:g} m below the map {field.name!r}; a grid of {cell:g} m goes "
+            f"down by {LARGEST_STEP_DOWN * cell:g} m at most, below that its noise would be field; fit the "
+            "readings with --method harmonic, which knows the field down to the floor"
+        )
+    x0, x1, y0, y1 = field.extent
+    if step > max(x1 - x0, y1 - y0):
+        raise InputError(
+            f"height_m {height_m:g} lies {step:g} m above the map {field.name!r} of {x1 - x0:g} x "
+            f"{y1 - y0:g} m; farther above than it is long, what lies beside it makes the field"
+        )
+    if not field.valid.any(axis=(1, 2)).all():
+        raise InputError(f"map {field.name!r} has a heading without a valid node; nothing can be continued")
+    known = field.values_nt[field.valid]
+    layers = [_Layer(*pair, field.cell_m) for pair in zip(field.values_nt, field.valid, strict=True)]
+    return replace(
+        field,
+        values_nt=np.stack([layer.continued(step) for layer in layers]),
+        variance_nt2=None if field.variance_nt2 is None else _variance(field, step),
+        recorded_yaw=None,
+        height_m=height_m,
+        method=_said(field, start, height_m, "by the waves of its grid (Blakely 1995, eq. 12.8)"),
+        parameters={
+            **field.parameters,
+            "continued_from_m": start,
+            "second_order_nt": round(float(known.var() / (2 * known.mean())), 3),
+        },
+    )
+
+
+def _said(field: AnomalyMap, start: float, height_m: float, how: str) -> str:
+    text = f"continued from {start:g} to {height_m:g} m {how}"
+    return f"{field.method}; {text}" if field.method else text
+
+
+def _variance(field: AnomalyMap, step: float) -> Array:
+    """Greatest variance that the values can have at `step` above the map [nT^2]."""
+    assert field.variance_nt2 is not None
+    layers = zip(field.values_nt, field.valid, np.sqrt(field.variance_nt2), strict=True)
+    return np.stack([_Layer(v, valid, field.cell_m).deviation(sd, step) ** 2 for v, valid, sd in layers])
+
+
+class _Layer:
+    """One heading's field, filled where masked, mirrored at its border, and tapered beyond."""
+
+    def __init__(self, values: Array, valid: NDArray[np.bool_], cell_m: tuple[float, float]) -> None:
+        from scipy.ndimage import distance_transform_edt
+
+        self.values, self.valid = values, valid
+        self.cell_m = (cell_m[1], cell_m[0])  # along rows, along columns
+        self.mean = float(values[valid].mean())
+        rows, columns = valid.shape
+        self.pads = ((rows, rows), (columns, columns))
+        self.inside = (slice(rows, 2 * rows), slice(columns, 2 * columns))
+        around = np.pad(valid, self.pads)
+        self.distance, nearest = distance_transform_edt(~around, sampling=self.cell_m, return_indices=True)
+        inner = nearest[:, self.inside[0], self.inside[1]] - np.array([rows, columns])[:, None, None]
+        self.filled = values[tuple(inner)]  # a masked node as its nearest neighbour that is known
+        taper = [np.pad(np.ones(n), (n, n), mode="linear_ramp") for n in valid.shape]
+        self.taper = np.outer(*(np.sin(np.pi / 2 * t) ** 2 for t in taper))
+
+    def continued(self, step: float) -> Array:
+        """The field at `step` above [nT], shape (Y, X)."""
+        anomaly = self.taper * np.pad(self.filled - self.mean, self.pads, mode="symmetric")
+        return self.mean + self._filtered(anomaly, self._response(step, anomaly.shape))
+
+    def deviation(self, sd: Array, step: float) -> Array:
+        """Greatest standard deviation that its values can have, from that of the nodes [nT], shape (Y, X)."""
+        along = np.gradient(self.filled, *self.cell_m)
+        slope = float(np.sqrt(np.mean(np.square(along).sum(axis=0))))
+        spread = np.sqrt(2) * float(self.values[self.valid].std())
+        guess = np.minimum(2 * slope * self.distance, spread)
+        guess[self.inside][self.valid] = sd[self.valid]
+        kernel = np.abs(np.fft.irfft2(self._response(step, guess.shape), guess.shape))
+        return self._filtered(guess, np.fft.rfft2(kernel))
+
+    def _response(self, step: float, shape: tuple[int, ...]) -> Array:
+        ky = 2 * np.pi * np.fft.fftfreq(shape[0], self.cell_m[0])
+        kx = 2 * np.pi * np.fft.rfftfreq(shape[1], self.cell_m[1])
+        return np.exp(-step * np.hypot(ky[:, None], kx))
+
+    def _filtered(self, padded: Array, response: NDArray[Any]) -> Array:
+        return np.fft.irfft2(np.fft.rfft2(padded) * response, padded.shape)[self.inside]

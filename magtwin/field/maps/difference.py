@@ -1,0 +1,343 @@
+"""MapDifference: two surveys of one floor against each other, what changed and where."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.grid import Grid
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+FALSE_SHARE = 0.05
+"""Share of the nodes called changed that may have kept their field, in the mean: the false-discovery rate."""
+
+SD_PER_MAD = 1.4826
+"""Standard deviation of a normal distribution, for each median absolute deviation."""
+
+GRAIN_M = 1e-3
+"""Heights that differ by less are one: 5 nT in a steep field."""
+
+TOLD = 20
+"""Regions that a report tells of, those of the greatest z first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Region:
+    """Nodes side by side, or corner to corner, whose field changed in some heading."""
+
+    centre_m: tuple[float, float]
+    """World x and y of its middle, each node weighed by its greatest change [m]."""
+
+    extent_m: tuple[float, float, float, float]
+    """Least x, greatest x, least y, greatest y of its nodes [m]."""
+
+    nodes: int
+    """Number of nodes."""
+
+    peak_nt: float
+    """Local change where z is greatest [nT]."""
+
+    peak_sd_nt: float
+    """Standard deviation of that change where the field kept still [nT]."""
+
+    peak_z: float
+    """z there: that change in standard deviations."""
+
+    peak_m: tuple[float, float]
+    """World x and y of that node [m]."""
+
+    peak_heading_rad: float
+    """Heading there [rad]."""
+
+    def said(self) -> str:
+        """Where it is and how sure, in words."""
+        (x, y), (x0, x1, y0, y1) = self.centre_m, self.extent_m
+        return (
+            f"z {self.peak_z:.3g}, about ({x:.2f}, {y:.2f}) m, x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m, "
+            f"{self.nodes} node{'s' * (self.nodes > 1)}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class MapDifference(Summarized):
+    """Field of a later survey minus that of an earlier one, on the nodes that both know.
+
+    Arrays are nan where one of the surveys knows nothing.
+    """
+
+    names: tuple[str, str]
+    """What the surveys are called, the earlier first."""
+
+    days: tuple[str, str]
+    """Their days, "" where unknown."""
+
+    grid: Grid
+    """Nodes of the comparison."""
+
+    change_nt: Array
+    """The later field minus the earlier [nT], shape (H, Y, X)."""
+
+    bias_nt: Array
+    """What every node of a heading has in common, the median of its changes [nT], shape (H,)."""
+
+    sd_nt: Array
+    """Standard deviation of a change where the field kept still [nT], shape (H, Y, X)."""
+
+    from_variance: bool
+    """Whether `sd_nt` comes from the surveys' variances; else from the spread of the changes."""
+
+    z: Array
+    """Local change in standard deviations, shape (H, Y, X)."""
+
+    threshold_z: float
+    """Least |z| that is called a change."""
+
+    regions: tuple[Region, ...]
+    """Where the field changed, the greatest |z| first."""
+
+    cautions: tuple[str, ...] = ()
+    """What the two surveys say of themselves that may make them incomparable."""
+
+    @property
+    def local_nt(self) -> Array:
+        """Change less the bias of its heading [nT], shape (H, Y, X)."""
+        return self.change_nt - self.bias_nt[:, None, None]
+
+    @property
+    def changed(self) -> Flags:
+        """Nodes whose field changed, shape (H, Y, X)."""
+        return np.abs(self.z) >= self.threshold_z  # false for nan
+
+    def report(self) -> Report:
+        """What changed, where, and how much against the standard deviation."""
+        known = np.isfinite(self.z)
+        local = self.local_nt[known]
+        count, changed = int(known.sum()), int(self.changed.sum())
+        source = (
+            "from both maps' variances" if self.from_variance else "a map has none: from the robust spread"
+        )
+        h, j, i = np.unravel_index(np.nanargmax(np.abs(self.z)), self.z.shape)
+        figures = [
+            Figure("compared nodes", count, note="over all headings"),
+            Figure(
+                "common bias",
+                float(self.bias_nt.mean()),
+                "nT",
+                float(self.bias_nt.std()),
+                "mean and spread over headings",
+            ),
+            Figure("spread of local changes", _robust_sd(local), "nT", note="robust"),
+            Figure("expected spread", float(np.sqrt(np.mean(self.sd_nt[known] ** 2))), "nT", note=source),
+        ]
+        if self.from_variance:
+            note = "robust; 1 where the variances are right and little changed"
+            figures.append(Figure("spread of z", _robust_sd(self.z[known]), note=note))
+        figures += [
+            Figure(
+                "surest local change",
+                float(self.local_nt[h, j, i]),
+                "nT",
+                float(self.sd_nt[h, j, i]),
+                f"z {self.z[h, j, i]:.3g}, {self._where(h, j, i)}",
+            ),
+            Figure(
+                "threshold", self.threshold_z, note=f"|z|, for a false-discovery rate of {FALSE_SHARE:.0%}"
+            ),
+            Figure("changed nodes", changed, note=f"{changed / count:.1%} of those compared"),
+            Figure("regions", len(self.regions)),
+        ]
+        for number, region in enumerate(self.regions[:TOLD], 1):
+            figures.append(Figure(f"region {number}", region.peak_nt, "nT", region.peak_sd_nt, region.said()))
+        facts: dict[str, Any] = {}
+        for label, name, day in zip(("from", "to"), self.names, self.days, strict=True):
+            facts[label] = " ".join(text for text in (name, day) if text)
+        if self.cautions:
+            facts["caution"] = list(self.cautions)
+        return Report(f"difference {self.names[0]} to {self.names[1]}", tuple(figures), facts)
+
+    def _where(self, h: Any, j: Any, i: Any) -> str:
+        x, y = self.grid.x_m[i], self.grid.y_m[j]
+        return f"at ({x:g}, {y:g}) m, heading {np.degrees(self.grid.headings_rad[h]):g} deg"
+
+    def _summary(self) -> Summary:
+        """What is compared; how much changed, and where most."""
+        before, after = (" ".join(t for t in pair if t) for pair in zip(self.names, self.days, strict=True))
+        known, changed = (int(a.any(axis=0).sum()) for a in (np.isfinite(self.z), self.changed))
+        return Summary(
+            f"MapDifference: {before} to {after}",
+            (
+                (
+                    "nodes",
+                    f"{changed:,} of {known:,} changed (|z| >= {self.threshold_z:.2f})",
+                ),
+                ("bias", f"{self.bias_nt.mean():+.3g} nT, mean over {len(self.bias_nt)} headings"),
+                ("regions", f"{len(self.regions)}" + (f"; first: {self.regions[0]}" if self.regions else "")),
+                ("caution", "; ".join(self.cautions)),
+            ),
+        )
+
+
+def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
+    """What changed from one survey to another.
+
+    They are compared at the nodes of the coarser grid, in the headings of the map that has fewer, wherever
+    both know the field; the other is looked up there. Its interpolation errs as any does, and that is in
+    no variance: surveys to be compared closely are best fitted on one grid.
+
+    The change of a node is b - a. Its heading's median is the bias that all nodes have in common, such as
+    the day's field of the Earth and the sensor's own offset; what is left is local. With the variances
+    of both maps its standard deviation is sqrt(V_a + V_b), of a node looked up at most that between
+    its neighbours'. Without, it is taken to be one for all nodes, 1.4826 times their median absolute
+    deviation, which changes of less than half of the floor hardly move. Neither is below a step of
+    single precision, as layers keep it.
+
+    A node is called changed where |z| reaches the threshold of Benjamini and Hochberg (J. R. Statist.
+    Soc. B 57, 289, 1995): with two-sided normal p-values in ascending order, the last p_k <= k q / m.
+    Of the nodes called so a share of q = 5 % in the mean kept their field, for errors that are
+    independent or go together.
+
+    Args:
+        a: The earlier survey.
+        b: The later one.
+
+    Returns:
+        Changes, bias, z and the regions of changed nodes, neighbours at sides and corners.
+
+    Raises:
+        InputError: The maps have no node in common, or differ in frame, datum or height; where one is
+            unknown, the report says so.
+    """
+    cautions = _compared(a, b)
+    grid = _common(a, b)
+    p, yaw = grid.poses()
+    change = b.lookup(p, yaw) - a.lookup(p, yaw)
+    known = np.isfinite(change)
+    if not known.any():
+        raise InputError(f"maps {a.name!r} and {b.name!r} have no valid node in common")
+    seen = known.any(axis=(1, 2))
+    bias = np.zeros(len(change))
+    bias[seen] = np.nanmedian(change[seen], axis=(1, 2))
+    local = change - bias[:, None, None]
+    floor = float(np.spacing(np.float32(np.abs(b.values_nt[b.valid]).max())))
+    from_variance = a.variance_nt2 is not None and b.variance_nt2 is not None
+    if from_variance:
+        sd = np.sqrt(_variance(a, p, yaw) + _variance(b, p, yaw))
+    else:
+        sd = np.where(known, _robust_sd(local[known]), np.nan)
+    sd = np.maximum(sd, floor)
+    z = local / sd
+    threshold = _threshold(np.abs(z[known]))
+    return MapDifference(
+        names=(a.name, b.name),
+        days=(a.created, b.created),
+        grid=grid,
+        change_nt=change,
+        bias_nt=bias,
+        sd_nt=sd,
+        from_variance=from_variance,
+        z=z,
+        threshold_z=threshold,
+        regions=_regions(grid, local, z, threshold),
+        cautions=cautions,
+    )
+
+
+def _compared(a: AnomalyMap, b: AnomalyMap) -> tuple[str, ...]:
+    """What is doubtful about comparing two maps; refused where nodes of one name are other places."""
+    for name in ("frame", "datum"):
+        first, second = getattr(a, name), getattr(b, name)
+        if first != second and first and second:
+            raise InputError(
+                f"map {a.name!r} has the {name} {first!r} and {b.name!r} {second!r}, so that one x and y are "
+                "two places; bring the readings of one into the other's before its map is made, or, where "
+                f"both mean the same, make both with one --{name}"
+            )
+    if a.height_m is not None and b.height_m is not None and abs(a.height_m - b.height_m) > GRAIN_M:
+        raise InputError(
+            f"map {a.name!r} is of {a.height_m:g} m above the floor and {b.name!r} of {b.height_m:g} m; take "
+            "one to the other's height first (magtwin map continue)"
+        )
+    cautions = []
+    unknown = {
+        name: (getattr(a, attribute) in ("", None)) + (getattr(b, attribute) in ("", None))
+        for name, attribute in {"frame": "frame", "datum": "datum", "height": "height_m"}.items()
+    }
+    for count, which in ((1, "one map"), (2, "both maps")):
+        if names := [name for name, maps in unknown.items() if maps == count]:
+            cautions.append(f"{', '.join(names)} unknown in {which}, taken for one")
+    return tuple(cautions)
+
+
+def _common(a: AnomalyMap, b: AnomalyMap) -> Grid:
+    """Nodes to compare at."""
+    coarse = b if np.prod(b.cell_m) > np.prod(a.cell_m) * (1 + 1e-9) else a
+    few = b if len(b.headings_rad) < len(a.headings_rad) else a
+    rows, columns = coarse.values_nt.shape[1:]
+    return Grid(
+        origin_m=coarse.origin_m,
+        cell_m=coarse.cell_m,
+        headings_rad=few.grid.headings_rad,
+        rows=rows,
+        columns=columns,
+    )
+
+
+def _variance(field: AnomalyMap, p_xy: Array, yaw: Array) -> Array:
+    """Variance of a map's values at poses, as between its nodes' [nT^2]."""
+    assert field.variance_nt2 is not None
+    return replace(field, values_nt=field.variance_nt2, variance_nt2=None, harmonic=None).lookup(p_xy, yaw)
+
+
+def _robust_sd(values: Array) -> float:
+    return SD_PER_MAD * float(np.median(np.abs(values - np.median(values))))
+
+
+def _threshold(size: Array) -> float:
+    """|z| whose two-sided p-value is q k / m, k as many as Benjamini and Hochberg call, or 1."""
+    from scipy.special import erfc, erfcinv
+
+    p = np.sort(erfc(size / np.sqrt(2)))
+    called = np.flatnonzero(p <= FALSE_SHARE * np.arange(1, len(p) + 1) / len(p))
+    count = called[-1] + 1 if len(called) else 1
+    return float(np.sqrt(2) * erfcinv(FALSE_SHARE * count / len(p)))
+
+
+def _regions(grid: Grid, local: Array, z: Array, threshold: float) -> tuple[Region, ...]:
+    """Connected nodes of the floor that changed in some heading."""
+    from scipy.ndimage import find_objects, label
+
+    size = np.nan_to_num(np.abs(z))
+    labels, _ = label((size >= threshold).any(axis=0), structure=np.ones((3, 3)))
+    most = np.nan_to_num(np.abs(local)).max(axis=0)
+    regions = []
+    for number, box in enumerate(find_objects(labels), 1):
+        rows, columns = box
+        j, i = np.nonzero(labels[box] == number)
+        j, i = j + rows.start, i + columns.start
+        x, y, weight = grid.x_m[i], grid.y_m[j], most[j, i]
+        h, k = np.unravel_index(np.argmax(size[:, j, i]), (len(z), len(j)))
+        regions.append(
+            Region(
+                centre_m=(float(np.average(x, weights=weight)), float(np.average(y, weights=weight))),
+                extent_m=(
+                    float(grid.x_m[columns.start]),
+                    float(grid.x_m[columns.stop - 1]),
+                    float(grid.y_m[rows.start]),
+                    float(grid.y_m[rows.stop - 1]),
+                ),
+                nodes=len(j),
+                peak_nt=float(local[h, j[k], i[k]]),
+                peak_sd_nt=float(local[h, j[k], i[k]] / z[h, j[k], i[k]]),
+                peak_z=float(z[h, j[k], i[k]]),
+                peak_m=(float(x[k]), float(y[k])),
+                peak_heading_rad=float(grid.headings_rad[h]),
+            )
+        )
+    return tuple(sorted(regions, key=lambda r: -abs(r.peak_z)))

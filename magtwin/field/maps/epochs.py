@@ -1,0 +1,168 @@
+"""Epochs: one map surveyed on several days, the field between them, and how it drifts."""
+
+import datetime
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from magtwin.errors import InputError
+from magtwin.field.days import day_number, parse_day
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.report import Figure, Report
+
+COMMON = ("headings_rad", "origin_m", "cell_m", "frame", "datum", "height_m")
+"""What the epochs of a map must have in common, beside the number of nodes."""
+
+GRAIN = 1e-9
+"""Lengths [m] and angles [rad] closer than this are one."""
+
+
+def day_of(field: AnomalyMap) -> datetime.date:
+    """The day of a map.
+
+    Raises:
+        InputError: It has none.
+    """
+    if field.created == "":
+        raise InputError(
+            f"map {field.name!r} does not say its day; say it when the map is made (--created YYYY-MM-DD)"
+        )
+    return parse_day(field.created, f"created of map {field.name!r}")
+
+
+def in_order(maps: Sequence[AnomalyMap]) -> tuple[AnomalyMap, ...]:
+    """Maps of one floor, the earliest first.
+
+    Args:
+        maps: Two or more, each with its day in `created`, in any order.
+
+    Raises:
+        InputError: There are fewer than two, one has no day, two have one, or the nodes, the frame,
+            the datum or the height of one are not those of the others.
+    """
+    if len(maps) < 2:
+        raise InputError(f"epochs of a map are two at least, got {len(maps)}; save_map keeps a single one")
+    days = [day_of(m) for m in maps]
+    order = sorted(range(len(maps)), key=lambda k: days[k])
+    for early, late in itertools.pairwise(order):
+        if days[early] == days[late]:
+            raise InputError(
+                f"maps {maps[early].name!r} and {maps[late].name!r} are both of {days[late]}; an epoch is a "
+                "day, so keep one of the two"
+            )
+    first = maps[order[0]]
+    for other in (maps[k] for k in order[1:]):
+        for name in COMMON:
+            mine, theirs = getattr(first, name), getattr(other, name)
+            if not _same(mine, theirs):
+                raise InputError(
+                    f"epochs lie on one grid, but {name} is {_said(mine)} on {first.created} and "
+                    f"{_said(theirs)} on {other.created}; fit or survey both on one grid"
+                )
+        if first.values_nt.shape != other.values_nt.shape:
+            raise InputError(
+                f"epochs lie on one grid, but there are {first.values_nt.shape} nodes on {first.created} "
+                f"and {other.values_nt.shape} on {other.created}; fit or survey both on one grid"
+            )
+    return tuple(maps[k] for k in order)
+
+
+def at_date(maps: Sequence[AnomalyMap], date: str | datetime.date) -> AnomalyMap:
+    """The map of a day: an epoch's own, or linear in time between the two around it.
+
+    B = (1 - w) B_0 + w B_1, w the share of the time that has passed. Two surveys err independently, so
+    the variance is (1 - w)^2 V_0 + w^2 V_1: below that of either amid them, which holds where the field
+    did drift evenly. A node is valid where it is on both days. What lies between has no harmonic field:
+    magnitudes are interpolated, not vectors.
+
+    Args:
+        maps: One map, or epochs as from `in_order`.
+        date: The day, or its name YYYY-MM-DD.
+
+    Raises:
+        InputError: It is no day, or not from the first epoch to the last.
+    """
+    day = parse_day(date)
+    days = [day_of(m) for m in maps]
+    if not days[0] <= day <= days[-1]:
+        span = f"is of {days[0]} only" if len(days) == 1 else f"reaches from {days[0]} to {days[-1]}"
+        raise InputError(f"date {day} lies beyond the map {maps[-1].name!r}, which {span}")
+    k = int(np.searchsorted([d.toordinal() for d in days], day.toordinal()))
+    if days[k] == day:
+        return maps[k]
+    before, after = maps[k - 1], maps[k]
+    w = (day - days[k - 1]) / (days[k] - days[k - 1])
+    variance = None
+    if before.variance_nt2 is not None and after.variance_nt2 is not None:
+        variance = (1 - w) ** 2 * before.variance_nt2 + w**2 * after.variance_nt2
+    between = f"linear in time between {before.created} and {after.created}"
+    return replace(
+        after,
+        values_nt=(1 - w) * before.values_nt + w * after.values_nt,
+        variance_nt2=variance,
+        valid=before.valid & after.valid,
+        method=f"{_joined(before.method, after.method)}; {between}",
+        source=_joined(before.source, after.source),
+        licence=_joined(before.licence, after.licence),
+        created=day.isoformat(),
+        parameters={} if before.parameters != after.parameters else before.parameters,
+        harmonic=None,
+        recorded_yaw=None,
+    )
+
+
+def drift(maps: Sequence[AnomalyMap]) -> Report:
+    """How fast the field changed at the nodes that are valid on every day.
+
+    The drift of a node is the slope of the line through its values by least squares. Its standard
+    deviation follows from the variances where every epoch has them.
+
+    Args:
+        maps: Epochs as from `in_order`.
+
+    Returns:
+        Days, mean drift with the spread over the nodes, and the greatest with its place and its own
+        standard deviation; [nT/day].
+    """
+    days = np.array([day_number(day_of(m)) for m in maps], float)
+    figures = [
+        Figure("epochs", len(maps), note=", ".join(m.created for m in maps)),
+        Figure("span", int(days[-1] - days[0]), "days"),
+    ]
+    valid = np.logical_and.reduce([m.valid for m in maps])
+    if valid.any():
+        weight = (days - days.mean()) / np.sum((days - days.mean()) ** 2)
+        slope = sum(w * np.where(valid, m.values_nt, 0.0) for w, m in zip(weight, maps, strict=True))
+        known = slope[valid]
+        figures.append(
+            Figure(
+                "drift", float(known.mean()), "nT/day", float(known.std()), "mean and spread over the nodes"
+            )
+        )
+        h, j, i = np.unravel_index(np.argmax(np.where(valid, np.abs(slope), -1.0)), slope.shape)
+        sd = None
+        variances = [m.variance_nt2 for m in maps]
+        if all(v is not None for v in variances):
+            sd = float(np.sqrt(sum(w**2 * v[h, j, i] for w, v in zip(weight, variances, strict=True))))  # type: ignore[index]
+        m = maps[0]
+        where = f"at ({m.x_m[i]:g}, {m.y_m[j]:g}) m, heading {np.degrees(m.headings_rad[h]):g} deg"
+        figures.append(Figure("greatest drift", float(slope[h, j, i]), "nT/day", sd, where))
+    return Report(f"drift of map {maps[-1].name}", tuple(figures))
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether texts are equal, and lengths and angles but for rounding."""
+    if isinstance(a, str) or a is None or b is None:
+        return a == b
+    return np.shape(a) == np.shape(b) and bool(np.allclose(a, b, rtol=0, atol=GRAIN))
+
+
+def _joined(first: str, second: str) -> str:
+    return first if first == second else "; ".join(text for text in (first, second) if text)
+
+
+def _said(value: object) -> str:
+    return str(value.tolist()) if isinstance(value, np.ndarray) else repr(value)

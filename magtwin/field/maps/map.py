@@ -1,0 +1,400 @@
+"""AnomalyMap: the magnitude of the magnetic field over a floor, by position and heading."""
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.days import check_texts
+from magtwin.field.grid import Grid
+from magtwin.field.maps.lookup import EDGE, Lookup
+from magtwin.field.sources.harmonic import HarmonicField
+from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary, listed, rectangle, span
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Picture
+
+Array = NDArray[np.float64]
+
+TURN = 2 * np.pi
+TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")
+"""What a map says of itself in words."""
+
+CONSTANT_NT = 1e-3
+"""Range of a map's values up to which it is constant [nT]."""
+
+Outside = Literal["nan", "clamp", "raise"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class AnomalyMap(Summarized):
+    """Total field on a grid over x, y and heading, as a robot reads it that stands at each node.
+
+    Node (h, j, i) lies at x = origin_m[0] + i cell_m[0], y = origin_m[1] + j cell_m[1] in world, with
+    the robot's heading at headings_rad[h]. Arrays are copied at birth and cannot be written to; two
+    maps are equal when every field is.
+    """
+
+    values_nt: Array
+    """Field magnitude at the nodes [nT], shape (H, Y, X); anything, even nan, where not `valid`."""
+
+    origin_m: tuple[float, float]
+    """World x and y of node [0, 0] [m]."""
+
+    cell_m: tuple[float, float]
+    """Distance between nodes along x and y [m]."""
+
+    headings_rad: Array
+    """Headings of the layers [rad], ascending in [0, 2 pi), shape (H,)."""
+
+    valid: NDArray[np.bool_] = None  # type: ignore[assignment]
+    """Nodes whose value is field, shape (H, Y, X); all of them unless given."""
+
+    variance_nt2: Array | None = None
+    """Variance of each value [nT^2], shape (H, Y, X); none where unknown."""
+
+    name: str = ""
+    """What the map is called, and its layer."""
+
+    method: str = ""
+    """How the values came about."""
+
+    source: str = ""
+    """What they were made from: files with checksums, or a script with its seed."""
+
+    licence: str = ""
+    """SPDX name of the licence that they are under."""
+
+    created: str = ""
+    """Day on which they were made, YYYY-MM-DD; "" where unknown."""
+
+    frame: str = ""
+    """Axes that x, y and heading are in, such as "world: x east, y north, z up"."""
+
+    datum: str = ""
+    """Where that frame lies: its origin in the room or on Earth, and what heights are above."""
+
+    height_m: float | None = None
+    """Height of the sensor above the floor at which the values hold [m]; none where unknown."""
+
+    recorded_yaw: Array | None = None
+    """Yaw of the robot when each value was read [rad], shape (H, Y, X); none where values are no readings."""
+
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    """Figures of the method, by name: plain numbers, texts, and lists of them, as JSON can hold."""
+
+    harmonic: HarmonicField | None = None
+    """The vector field that the values were computed from; none where there is no such thing."""
+
+    def __post_init__(self) -> None:
+        values = _frozen(self.values_nt, float)
+        if values.ndim != 3 or not (values.shape[0] >= 1 and min(values.shape[1:]) >= 2):
+            raise InputError(
+                f"values_nt of AnomalyMap must have shape (H, Y, X) with at least one heading and "
+                f"2 x 2 nodes, got {values.shape}"
+            )
+        valid = np.ones(values.shape, bool) if self.valid is None else self.valid
+        arrays: dict[str, Any] = {"values_nt": values, "valid": _frozen(valid, bool)}
+        arrays["headings_rad"] = headings = _frozen(self.headings_rad, float)
+        if self.variance_nt2 is not None:
+            arrays["variance_nt2"] = _frozen(self.variance_nt2, float)
+        if self.recorded_yaw is not None:
+            arrays["recorded_yaw"] = _frozen(self.recorded_yaw, float)
+        for name, array in arrays.items():
+            shape = values.shape[:1] if name == "headings_rad" else values.shape
+            if array.shape != shape:
+                raise InputError(f"{name} of AnomalyMap must have shape {shape}, got {array.shape}")
+            object.__setattr__(self, name, array)
+        if not (np.all(np.diff(headings) > 0) and headings[0] >= 0 and headings[-1] < TURN):
+            raise InputError(f"headings_rad of AnomalyMap must ascend in [0, 2 pi), got {headings.tolist()}")
+        for name in ("origin_m", "cell_m"):
+            pair = tuple(float(v) for v in getattr(self, name))
+            if len(pair) != 2 or not np.all(np.isfinite(pair)) or (name == "cell_m" and min(pair) <= 0):
+                above = " above 0" if name == "cell_m" else ""
+                raise InputError(f"{name} of AnomalyMap must be two lengths{above} [m], got {pair}")
+            object.__setattr__(self, name, pair)
+        self._check_values()
+
+    def _check_values(self) -> None:
+        check_texts(self, TEXTS)
+        if not isinstance(self.parameters, Mapping):
+            raise InputError(f"parameters of AnomalyMap must be figures by name, got {self.parameters!r}")
+        if self.height_m is not None and not 0 <= self.height_m < np.inf:
+            raise InputError(
+                f"height_m of AnomalyMap is a height above the floor, 0 m or more, got {self.height_m!r}"
+            )
+        bad = self.valid & ~np.isfinite(self.values_nt)
+        if bad.any():
+            h, j, i = np.argwhere(bad)[0]
+            raise InputError(
+                f"values_nt of AnomalyMap must be finite at valid nodes, got {self.values_nt[h, j, i]} at "
+                f"heading {h}, row {j}, column {i}; mask the node in `valid`"
+            )
+        if self.variance_nt2 is not None and not np.all(self.variance_nt2[self.valid] >= 0):
+            raise InputError("variance_nt2 of AnomalyMap must not be below 0, nor nan, at valid nodes")
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, AnomalyMap):
+            return NotImplemented
+        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+
+    @property
+    def grid(self) -> Grid:
+        """The nodes."""
+        _, rows, columns = self.values_nt.shape
+        headings = tuple(self.headings_rad.tolist())
+        return Grid(
+            origin_m=self.origin_m, cell_m=self.cell_m, headings_rad=headings, rows=rows, columns=columns
+        )
+
+    @property
+    def x_m(self) -> Array:
+        """World x of the columns [m], shape (X,)."""
+        return np.asarray(self.origin_m[0] + self.cell_m[0] * np.arange(self.values_nt.shape[2]))
+
+    @property
+    def y_m(self) -> Array:
+        """World y of the rows [m], shape (Y,)."""
+        return np.asarray(self.origin_m[1] + self.cell_m[1] * np.arange(self.values_nt.shape[1]))
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Least x, greatest x, least y, greatest y of the nodes, in world [m]."""
+        _, rows, columns = self.values_nt.shape
+        (x, y), (dx, dy) = self.origin_m, self.cell_m
+        return x, x + dx * (columns - 1), y, y + dy * (rows - 1)
+
+    def contains(self, p_xy: ArrayLike) -> NDArray[np.bool_]:
+        """Whether points lie on the grid, its border included, masked nodes or not.
+
+        Args:
+            p_xy: Points in world [m], shape (..., 2).
+
+        Returns:
+            Flags, shape (...); false for nan.
+        """
+        u = (np.asarray(p_xy, float) - self.origin_m) / self.cell_m
+        _, rows, columns = self.values_nt.shape
+        return np.all((u >= -EDGE) & (u <= np.array([columns - 1, rows - 1]) + EDGE), axis=-1)
+
+    def lookup(self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan") -> Array:
+        """Field at poses, linear in heading, y and x between the nodes around each.
+
+        B = sum over the 8 nodes of w_h w_y w_x B_hyx. Heading lies on a circle: between the last
+        layer and 2 pi above the first one it is interpolated as between any two. With one layer only
+        the heading does not matter. A pose gives the same bytes alone and among others.
+
+        Args:
+            p_xy: Points in world [m], shape (..., 2).
+            yaw: Headings [rad], any real number, shape (...); the two shapes are broadcast.
+            outside: What a point off the grid gives: nan, the nearest point's field, or a refusal.
+
+        Returns:
+            Field magnitude [nT], shape (...); nan where an input is nan, and where a masked node has
+            weight.
+
+        Raises:
+            InputError: A point lies off the grid and `outside` is "raise".
+        """
+        return self._look(p_xy, yaw, outside, gradient=False)[0]
+
+    def gradient(self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan") -> Array:
+        """What `lookup` changes by, per metre and per radian: its exact derivatives within a cell.
+
+        At a border between cells they are those of the cell with the greater x, y or heading.
+
+        Args:
+            p_xy: Points in world [m], shape (..., 2).
+            yaw: Headings [rad], shape (...); the two shapes are broadcast.
+            outside: What a point off the grid gives: nan, the nearest point's, without a change
+                across the border, or a refusal.
+
+        Returns:
+            dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad], shape (..., 3); nan where `lookup` is, and where
+            a masked node would have a part.
+
+        Raises:
+            InputError: A point lies off the grid and `outside` is "raise".
+        """
+        return self._look(p_xy, yaw, outside, gradient=True)[1]
+
+    def lookup_with_gradient(
+        self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
+    ) -> tuple[Array, Array]:
+        """What `lookup` and `gradient` give, shapes (...) and (..., 3), for the price of the latter."""
+        return self._look(p_xy, yaw, outside, gradient=True)
+
+    def at(self, x: float, y: float, yaw: float, *, outside: Outside = "nan") -> float:
+        """Field at one pose [nT]: what `lookup` gives, in about a microsecond.
+
+        Args:
+            x: World x [m].
+            y: World y [m].
+            yaw: Heading [rad].
+            outside: As for `lookup`.
+
+        Raises:
+            InputError: The point lies off the grid and `outside` is "raise".
+        """
+        if outside == "nan":
+            return self._lookup.at(x, y, yaw)
+        self._check_outside(np.array([[x, y]]), outside)
+        return self._lookup.at(x, y, yaw, clamp=outside == "clamp")
+
+    def at_with_gradient(
+        self, x: float, y: float, yaw: float, *, outside: Outside = "nan"
+    ) -> tuple[float, float, float, float]:
+        """Field at one pose [nT], dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad]; all else as for `at`."""
+        if outside != "nan":
+            self._check_outside(np.array([[x, y]]), outside)
+        return self._lookup.at_with_gradient(x, y, yaw, clamp=outside == "clamp")
+
+    def plot(self, quantity: str = "field", headings: Sequence[float] | None = None) -> "Picture":
+        """Draw the map as filled contours, a panel per heading; see `magtwin.plot`.
+
+        Args:
+            quantity: "field", "gradient", "variance", "mask" or "headings".
+            headings: Headings to show [rad]. None shows the map's own, of more than eight four.
+
+        Returns:
+            A matplotlib figure. A notebook shows it; `figure.savefig("map.png")` writes it.
+
+        Raises:
+            InputError: No heading is to be shown, or nothing is known of the quantity.
+        """
+        return importlib.import_module("magtwin").plot(self, quantity=quantity, headings=headings)  # loads io
+
+    def report(self) -> Report:
+        """The figures that tell one map from another, over its valid nodes.
+
+        The gradient is that of the magnitude along the floor, by central differences, one-sided at the
+        border. The heading amplitude is that of a + c cos(heading) + s sin(heading), fitted by least
+        squares to the means of the layers over the nodes valid in all of them; it needs three layers.
+        """
+        values = np.where(self.valid, self.values_nt, np.nan)
+        along_y, along_x = np.gradient(values, self.cell_m[1], self.cell_m[0], axis=(1, 2))
+        slope = np.hypot(along_x, along_y)
+        slope = slope[np.isfinite(slope)] / 1000
+        known = values[self.valid]
+        figures = [
+            Figure("headings", len(self.headings_rad)),
+            Figure("nodes", int(self.values_nt[0].size), note="a heading"),
+            Figure("masked nodes", int(np.count_nonzero(~self.valid)), note="over all headings"),
+        ]
+        if known.size:
+            figures += [
+                Figure("mean", round(float(known.mean()), 1), "nT", spread=round(float(known.std()), 1)),
+                Figure("least", round(float(known.min()), 1), "nT"),
+                Figure("greatest", round(float(known.max()), 1), "nT"),
+            ]
+        if slope.size:
+            figures += [
+                Figure("median gradient", round(float(np.median(slope)), 3), "uT/m"),
+                Figure("mean gradient", round(float(slope.mean()), 3), "uT/m"),
+                Figure("greatest gradient", round(float(slope.max()), 3), "uT/m"),
+            ]
+        everywhere = self.valid.all(axis=0)
+        if len(self.headings_rad) >= 3 and everywhere.any():
+            means = self.values_nt[:, everywhere].mean(axis=1)
+            h = self.headings_rad
+            waves = np.column_stack([np.ones_like(h), np.cos(h), np.sin(h)])
+            _, c, s = np.linalg.lstsq(waves, means, rcond=None)[0]
+            figures.append(Figure("heading amplitude", round(float(np.hypot(c, s)), 1), "nT"))
+        return Report(f"map {self.name}", tuple(figures), {"method": self.method, "licence": self.licence})
+
+    @cached_property
+    def is_constant(self) -> bool:
+        """Whether all valid nodes have the same value, within 1 pT, or no node is valid."""
+        values = self.values_nt[self.valid]
+        return not values.size or float(np.ptp(values)) <= CONSTANT_NT
+
+    @cached_property
+    def _lookup(self) -> Lookup:
+        return Lookup(self.values_nt, self.valid, self.origin_m, self.cell_m, self.headings_rad)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields: what lookup keeps is made anew from them."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def _look(
+        self, p_xy: ArrayLike, yaw: ArrayLike, outside: Outside, *, gradient: bool
+    ) -> tuple[Array, Array]:
+        p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
+        if p.ndim == 0 or p.shape[-1] != 2:
+            raise InputError(f"p_xy must have shape (..., 2), got {p.shape}")
+        shape = yaw.shape
+        if p.shape[:-1] != shape:
+            shape = np.broadcast_shapes(p.shape[:-1], shape)
+            p, yaw = np.broadcast_to(p, (*shape, 2)), np.broadcast_to(yaw, shape)
+        p, yaw = p.reshape(-1, 2), yaw.reshape(-1)
+        if outside != "nan":
+            self._check_outside(p, outside)
+        b, slopes = self._lookup.lookup(p, yaw, clamp=outside == "clamp", gradient=gradient)
+        return b.reshape(shape), slopes.reshape(*shape, 3) if gradient else slopes
+
+    def _check_outside(self, p: Array, outside: Outside) -> None:
+        if outside not in ("nan", "clamp", "raise"):
+            raise InputError(f'outside must be "nan", "clamp" or "raise", got {outside!r}')
+        if outside != "raise":
+            return
+        off = ~(self.contains(p) | np.isnan(p).any(axis=-1))
+        if off.any():
+            x0, x1, y0, y1 = self.extent
+            where = ", ".join(f"{c:.3f}" for c in p[off][0])
+            raise InputError(
+                f"{np.count_nonzero(off)} of {len(p)} points lie off the map {self.name!r} "
+                f"(x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m), the first at ({where}); "
+                'keep inside, or ask for outside="clamp" or "nan"'
+            )
+
+    def _summary(self) -> Summary:
+        """Name and range; nodes and extent; headings; how well it is known; method."""
+        known, (x0, x1, y0, y1) = self.values_nt[self.valid], self.extent
+        title = f"AnomalyMap {self.name or 'without a name'}: "
+        if known.size:
+            title += f"{span(known.min(), known.max(), 'nT')}, mean {known.mean():,.0f} nT"
+        else:
+            title += "no valid node"
+        headings, rows, columns = self.values_nt.shape
+        masked = int(np.count_nonzero(~self.valid))
+        degrees = listed([f"{d:.4g}" for d in np.degrees(self.headings_rad)], 40)
+        about = [self.created or "day unknown"]
+        about.append("height unknown" if self.height_m is None else f"sensor at {self.height_m:.3g} m")
+        if self.variance_nt2 is not None and known.size:
+            about.append(f"sd {np.sqrt(np.median(self.variance_nt2[self.valid])):.3g} nT (median)")
+        about += [self.licence] if self.licence else []
+        return Summary(
+            title,
+            (
+                (
+                    "nodes",
+                    f"{columns} x {rows}, {self.cell_m[0]:.3g} x {self.cell_m[1]:.3g} m apart, "
+                    f"{rectangle(x0, x1, y0, y1)}",
+                ),
+                ("headings", f"{headings}: {degrees} deg" + (f"; {masked:,} nodes masked" if masked else "")),
+                ("known", ", ".join(about)),
+                ("method", self.method or "unknown"),
+                ("source", self.source),
+                ("frame", self.frame),
+                ("datum", self.datum),
+            ),
+        )
+
+
+def _frozen(values: ArrayLike, kind: type) -> NDArray[Any]:
+    """A copy that cannot be written to."""
+    array: NDArray[Any] = np.array(values, kind)
+    array.flags.writeable = False
+    return array
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return np.array_equal(a, b, equal_nan=a.dtype != bool)
+    return bool(a is b or (not isinstance(a, np.ndarray) and not isinstance(b, np.ndarray) and a == b))

@@ -1,0 +1,213 @@
+"""Plane: the field at one height, where robots drive, computed once a place and looked up from then on."""
+
+from contextlib import suppress
+from functools import cache
+from threading import Lock
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.maps.lookup import Lookup, warm_up
+from magtwin.field.sources.bodies import CELL_M, FARTHEST_CELL, Bodies
+from magtwin.field.sources.point_dipoles import dipole_block, in_blocks, in_two_threads
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+HALF_M = CELL_M / 2
+"""Half the side of a square [m]; squares are the level cuts of the cells of `Bodies`."""
+
+NODES = 10
+"""Chebyshev nodes along each side of a square."""
+
+CLEAR_M = 0.35
+"""Distance from a square beyond which what is there is interpolated [m]; what is nearer is added up point by
+point."""
+
+MOST_SQUARES = 40_000
+"""Squares that are kept: 2,500 m2, 0.1 GB. When there are more, all are forgotten."""
+
+BLOCK = 32_768
+"""Points worked on at a time; they lie in fewer squares than are kept."""
+
+PAYS, PER_SQUARE = 800_000, 100
+"""Points in numpy that take as long as opening the compiled code, and how many of them as long as a square
+does beside its points."""
+
+ERROR, SLOPE_ERROR = 2e-7, 2e-5
+"""What interpolation errs by at most, over the greatest field and slope that a source makes at the distance
+`CLEAR_M`, where it errs most: 0.01 nT where that is as strong as the Earth's. A test holds it to them."""
+
+
+class Plane:
+    """The field of magnetised bodies on a level plane, as polynomials over squares of it.
+
+    In a square, what lies farther off than `CLEAR_M` is computed at Chebyshev nodes, as `Bodies` has it
+    there, when a point is first asked for. The error of the polynomial through them falls as rho^-n, with
+    rho = d / a + sqrt((d / a)^2 - 1), a half the square's side and d the distance of what is nearest from its
+    middle (Trefethen 2013, Approximation Theory and Practice, theorem 8.2): 8.3^-10. What a point is told
+    depends on its place alone, to the last bit but for what is nearer than `CLEAR_M`.
+    """
+
+    def __init__(self, bodies: Bodies, height_m: float) -> None:
+        """Take in what is magnetised, and the height of the plane above the floor [m]."""
+        self.bodies, self.height_m = bodies, float(height_m)
+        self._lock = Lock()
+        self._points = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._slots: dict[int, int] = {}
+        self._table = np.empty((64, NODES, 3 * NODES))
+        self._close: dict[int, Bodies] = {}
+
+    def field_and_slopes_nt(self, p_xy: ArrayLike) -> tuple[Array, Array]:
+        """The field, and how it changes along x and y.
+
+        Args:
+            p_xy: Points of the plane [m], shape (N, 2).
+
+        Returns:
+            Field in world axes [nT], shape (N, 3), and its derivatives dB/dx, dB/dy [nT/m], shape (N, 2, 3).
+            nan where a point is not finite or 130 km from the origin.
+        """
+        p = np.asarray(p_xy, float)
+        if p.ndim != 2 or p.shape[1] != 2:
+            raise InputError(f"p_xy must have shape (N, 2), got {p.shape}")
+        out = np.empty((len(p), 3, 3))
+        known = np.all(np.abs(p) < CELL_M * FARTHEST_CELL, axis=1)
+        if known.all():
+            for start in range(0, len(p), BLOCK):
+                self._evaluate(p[start : start + BLOCK], out[start : start + BLOCK])
+        else:
+            field, slopes = self.field_and_slopes_nt(p[known])
+            out[~known] = np.nan
+            out[known, 0], out[known, 1:] = field, slopes
+        return out[:, 0], out[:, 1:]
+
+    def _evaluate(self, p: Array, out: Array) -> None:
+        """Field and slopes of points, into an array of shape (N, 3, 3)."""
+        cell = np.floor(p / CELL_M)
+        local = 2 * (p / CELL_M - cell) - 1  # exact, as CELL_M is a power of 2
+        number = cell.astype(np.int64)
+        # Points come along a track: sought is one square for all that follow one another in it.
+        key = (number[:, 0] << 32) + number[:, 1]
+        first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+        keys, passed = np.unique(key[first], return_inverse=True)
+        which = np.repeat(passed, np.diff(first, append=len(key)))
+        with self._lock:
+            slots = self._slots_of(keys)
+            table, close = self._table, self._close
+        compiled = self._opened(len(p) + PER_SQUARE * len(keys))
+        if compiled:
+            u, w = np.ascontiguousarray(local.T)
+            compiled.polynomials(table, slots[which], u, w, 1 / HALF_M, out)
+        else:
+            order = np.argsort(which, kind="stable")
+            for slot, rows in zip(
+                slots.tolist(), np.split(order, np.cumsum(np.bincount(which))[:-1]), strict=True
+            ):
+                out[rows] = _by_numpy(table[slot], *local[rows].T)
+        for k in np.flatnonzero(np.isin(slots, list(close))) if close else ():
+            rows = np.flatnonzero(which == k)
+            at = np.column_stack([p[rows], np.full(len(rows), self.height_m)])
+            for axis in (0, 1):
+                along = np.zeros(at.shape)
+                along[:, axis] = 1.0
+                field, out_of_near = close[int(slots[k])].field_and_rate_nt(at, along)
+                out[rows, 1 + axis] += out_of_near
+            out[rows, 0] += field
+
+    def _slots_of(self, keys: Numbers) -> Numbers:
+        """Where squares are in the table; those that are not there yet are computed."""
+        new = [key for key in keys.tolist() if key not in self._slots]
+        if len(self._slots) + len(new) > MOST_SQUARES and self._slots:
+            self._forget()
+            new = keys.tolist()
+        if new:
+            first = len(self._slots)
+            room = first + len(new)
+            if room > len(self._table):
+                table = np.empty((max(room, 2 * len(self._table)), NODES, 3 * NODES))
+                table[:first] = self._table[:first]
+                self._table = table
+            self._make(new, first)
+            self._slots |= {key: first + k for k, key in enumerate(new)}
+        return np.array([self._slots[key] for key in keys.tolist()], np.int64)
+
+    def _make(self, keys: list[int], first: int) -> None:
+        """Polynomials of squares, into the table from a slot on."""
+        node, powers = _nodes()
+        reach = CLEAR_M + np.sqrt(2) * HALF_M
+        layer = np.clip(np.floor(self.height_m / CELL_M), -FARTHEST_CELL, FARTHEST_CELL - 1)
+        works = []
+        for slot, key in enumerate(keys, first):
+            x, y = (key + (1 << 31)) >> 32, ((key + (1 << 31)) & 0xFFFF_FFFF) - (1 << 31)
+            centre = CELL_M * (np.array([x, y, layer]) + 0.5)
+            middle = np.append(centre[:2], self.height_m)
+            places, moments, near = self.bodies.seen_from(centre)
+            clear = np.sqrt(np.square(places - middle).sum(axis=1)) >= reach
+            apart = [body.clearance(middle[None])[0] >= reach for body in near]
+            some = [body for body, far in zip(near, apart, strict=True) if not far]
+            if some or not clear.all():
+                self._close[slot] = Bodies(some, places[~clear], moments[~clear])
+            whole = [body for body, far in zip(near, apart, strict=True) if far]
+            works.append((slot, middle, places[clear], moments[clear], whole))
+
+        def fit(work: tuple[int, Array, Array, Array, list]) -> None:
+            slot, middle, places, moments, whole = work
+            u, w = np.meshgrid(node, node, indexing="ij")
+            square = middle + HALF_M * np.stack([u, w, np.zeros_like(u)], axis=-1).reshape(-1, 3)
+            b = np.concatenate(
+                [
+                    dipole_block(square[rows], None, places, moments)[0]
+                    for rows in in_blocks(len(square), len(places))
+                ]
+            )
+            for body in whole:
+                b += body.exact_field_nt(square)
+            sums = np.einsum("ik,jl,klc->ijc", powers, powers, b.reshape(NODES, NODES, 3))
+            self._table[slot] = sums.reshape(NODES, -1)
+
+        in_two_threads(fit, works, pairs=sum(NODES**2 * len(work[2]) for work in works))
+
+    def _opened(self, points: int) -> ModuleType | None:
+        """The compiled code where it is open, or where it pays to open it."""
+        if Lookup.compiled is None and self._points < PAYS:
+            self._points += points
+            if self._points >= PAYS:
+                with suppress(ImportError):
+                    warm_up()
+        return Lookup.compiled
+
+
+@cache
+def _nodes() -> tuple[Array, Array]:
+    """Chebyshev nodes in -1..1, and the matrix from values there to coefficients of powers."""
+    node = np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
+    return node, np.linalg.inv(np.vander(node, increasing=True))
+
+
+def _by_numpy(table: Array, u: Array, w: Array) -> Array:
+    """A square's polynomial and its slopes at points in -1..1, as `compiled.polynomials` has them."""
+    a = np.repeat(table[-1][:, None], len(u), axis=1)
+    slope = np.zeros(a.shape)
+    for row in table[-2::-1]:
+        slope *= u
+        slope += a
+        a *= u
+        a += row[:, None]
+    rows, slopes = a.reshape(NODES, 3, -1), slope.reshape(NODES, 3, -1)
+    f, along_u, along_w = rows[-1].copy(), slopes[-1].copy(), np.zeros(rows[-1].shape)
+    for k in range(NODES - 2, -1, -1):
+        along_w *= w
+        along_w += f
+        f *= w
+        f += rows[k]
+        along_u *= w
+        along_u += slopes[k]
+    along_u *= 1 / HALF_M
+    along_w *= 1 / HALF_M
+    return np.stack([f, along_u, along_w]).transpose(2, 0, 1)

@@ -1,0 +1,1 @@
+"""Sources of a field: the Earth, magnetised bodies and point dipoles."""

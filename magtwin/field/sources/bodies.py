@@ -1,0 +1,540 @@
+"""Magnetised bodies: boxes, cylinders, spheres, closed meshes; near by, far away, in the Earth's field."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from itertools import compress
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.sources.point_dipoles import (
+    MU_0_OVER_4_PI,
+    NT_PER_T,
+    dipole_block,
+    in_blocks,
+    in_two_threads,
+)
+from magtwin.frames import matrix_from_quat
+
+Array = NDArray[np.float64]
+Triangles = NDArray[np.intp]
+Rows = NDArray[np.intp]
+
+MU_0 = 4 * math.pi * MU_0_OVER_4_PI
+"""Magnetic constant [T m/A]."""
+
+TOLERANCE = 1e-4
+"""Error that dipoles which stand for a box or a cylinder are chosen for, over the greatest field that it
+makes at that distance from its box. One in a hundred of random ones exceeds it, none reaches twice that."""
+
+MESH_SIZES = 3.0
+"""Longest sides of its box within which a mesh's field is exact; beyond, four dipoles stand for it, within
+0.2 % for meshes that are not far from convex."""
+
+MOST_DIPOLES = 512
+"""Dipoles that a box or a cylinder is cut into at most; nearer than they hold, its field is exact."""
+
+LADDER, RUNGS = 1.25, 48
+"""Ratio of the distances at which a body is cut anew, and how often it is: to 45,000 times as far."""
+
+CELL_M = 0.25
+"""Side of the cells of space in which one set of dipoles is used [m]."""
+
+FARTHEST_CELL = 1 << 19
+"""Cells beyond this one, 130 km from the origin, count as it does."""
+
+STEP_M = 1e-5
+"""Step of the differences that give the rate of change near a body [m]; along an edge of a box 1 cm away they
+err by (1e-5 / 1e-2)^2 / 6, 2e-7 of it."""
+
+SHAPES = ("cuboid", "cylinder", "sphere", "mesh")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Body:
+    """A uniformly magnetised body in world."""
+
+    shape: str
+    """One of `SHAPES`."""
+
+    size_m: Array
+    """Sides of its box along its own axes [m], shape (3,); a cylinder's axis is its own z."""
+
+    p_world: Array
+    """Where its own origin is [m], shape (3,): the middle of all but a mesh."""
+
+    q_world_xyzw: Array
+    """Its axes in world, shape (4,)."""
+
+    magnetization: Array
+    """Magnetization in its own axes [A/m], shape (3,)."""
+
+    vertices: Array | None = None
+    """Vertices of a mesh in its own axes [m], shape (V, 3)."""
+
+    faces: Triangles | None = None
+    """Corners of its triangles, counter-clockwise seen from outside, shape (F, 3)."""
+
+    @property
+    def volume_m3(self) -> float:
+        """Volume [m3]."""
+        if self.vertices is not None and self.faces is not None:
+            return mesh_moments(self.vertices, self.faces)[0]
+        return (
+            float(np.prod(self.size_m))
+            * {"cuboid": 1, "cylinder": np.pi / 4, "sphere": np.pi / 6}[self.shape]
+        )
+
+    @cached_property
+    def rotation(self) -> Array:
+        """Matrix from its own axes to world's, shape (3, 3)."""
+        return matrix_from_quat(self.q_world_xyzw)
+
+    @cached_property
+    def middle(self) -> Array:
+        """Middle of its box in its own axes [m], shape (3,)."""
+        if self.vertices is None:
+            return np.zeros(3)
+        return np.asarray((self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2)
+
+    def exact_field_nt(self, p_world: ArrayLike) -> Array:
+        """Its field everywhere, inside too, by magpylib (Ortner and Coliado Bandeira 2020).
+
+        Args:
+            p_world: Points [m], shape (N, 3).
+
+        Returns:
+            Field in world axes [nT], shape (N, 3).
+        """
+        p = (np.asarray(p_world, float) - self.p_world) @ self.rotation
+        field = _magnet(self).getB(p).reshape(p.shape)
+        return np.asarray(NT_PER_T * field @ self.rotation.T)
+
+    def clearance(self, p_world: Array) -> Array:
+        """Distance of points from its box [m], 0 inside, shape (N, 3) -> (N,)."""
+        beyond = np.abs((p_world - self.p_world) @ self.rotation - self.middle) - self.size_m / 2
+        return np.asarray(np.sqrt(np.square(np.maximum(beyond, 0)).sum(axis=1)))
+
+
+def _magnet(body: Body) -> Any:
+    """The body in its own frame, as magpylib has it."""
+    import magpylib  # its scipy takes 0.3 s
+
+    polarization = MU_0 * body.magnetization
+    if body.shape == "cuboid":
+        return magpylib.magnet.Cuboid(dimension=body.size_m, polarization=polarization)
+    if body.shape == "cylinder":
+        return magpylib.magnet.Cylinder(dimension=body.size_m[[0, 2]], polarization=polarization)
+    if body.shape == "sphere":
+        return magpylib.magnet.Sphere(diameter=body.size_m[0], polarization=polarization)
+    return magpylib.magnet.TriangularMesh(
+        vertices=body.vertices,
+        faces=body.faces,
+        polarization=polarization,
+        check_open="ignore",  # check_mesh did
+        check_disconnected="ignore",
+        check_selfintersecting="skip",
+        reorient_faces="skip",
+    )
+
+
+def check_mesh(vertices: Array, faces: Triangles, what: str) -> None:
+    """Refuse a mesh that encloses no volume: open, of several minds about its sides, inside out or flat.
+
+    Raises:
+        InputError: It is one; the text begins with `what`.
+    """
+    if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
+        raise InputError(
+            f"{what} needs vertices (V, 3) and triangles (F, 3), got {vertices.shape} and {faces.shape}"
+        )
+    if not np.isfinite(vertices).all():
+        raise InputError(
+            f"{what} must have finite vertices, got {vertices[~np.isfinite(vertices).all(axis=1)][0]}"
+        )
+    if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(
+            f"{what} has {len(faces)} triangles that name corners beyond its {len(vertices)} vertices"
+        )
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    there, seen = np.unique(edges @ [len(vertices), 1], return_counts=True)
+    back = np.unique(edges[:, ::-1] @ [len(vertices), 1])
+    lone = np.setxor1d(there, back)
+    if len(lone) or seen.max() > 1:
+        edge = int(lone[0]) if len(lone) else int(there[seen.argmax()])
+        a, b = (np.round(vertices[k], 6).tolist() for k in divmod(edge, len(vertices)))
+        raise InputError(
+            f"{what} is not a closed mesh: the edge from {a} to {b} has not one triangle on either side; "
+            "close its holes, merge its doubled vertices and make its faces look outwards"
+        )
+    volume, extent = mesh_moments(vertices, faces)[0], np.ptp(vertices, axis=0)
+    if not volume > 1e-9 * max(extent.max() ** 3, np.finfo(float).tiny):
+        raise InputError(f"{what} encloses no volume: {volume:g} m3; its faces must look outwards")
+
+
+def mesh_moments(vertices: Array, faces: Triangles) -> tuple[float, Array, Array]:
+    """Volume [m3], centroid [m] (3,) and second moments about it by volume [m2] (3, 3) of a closed mesh.
+
+    Sums over the tetrahedra between a middle point and each triangle (Tonon 2004, for the covariance).
+    """
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    corner = (vertices - middle)[faces]
+    volume = np.einsum("fi,fi->f", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6
+    total = volume.sum()
+    if not abs(total) > 0:
+        return 0.0, middle, np.zeros((3, 3))
+    whole = corner.sum(axis=1)
+    centroid = volume @ whole / 4 / total
+    second = np.einsum("f,fi,fj->ij", volume, whole, whole) + np.einsum(
+        "f,fki,fkj->ij", volume, corner, corner
+    )
+    return float(total), middle + centroid, second / 20 / total - np.outer(centroid, centroid)
+
+
+# Bodies in the Earth's field
+
+
+def induced_magnetization(body: Body, susceptibility: float, b_world_nt: ArrayLike) -> Array:
+    """What the Earth's field magnetises a body to.
+
+    M = chi (1 + chi N)^-1 H, H = B / mu_0, N the demagnetising tensor of the shape. That is exact for a
+    sphere, which is magnetised uniformly. For a box N is the mean over its volume (Aharoni 1998, J. Appl.
+    Phys. 83, 3432), for a cylinder Sato and Ishii's fit of that (1989, J. Appl. Phys. 66, 983), for a mesh
+    that of the box with its second moments. What other bodies add to the Earth's field there is left out.
+
+    Args:
+        body: Its shape and turn; its magnetization is not read.
+        susceptibility: chi [1].
+        b_world_nt: The Earth's field in world axes [nT], shape (3,).
+
+    Returns:
+        Magnetization in the body's own axes [A/m], shape (3,).
+    """
+    h = np.asarray(b_world_nt, float) @ body.rotation / (NT_PER_T * MU_0)
+    return np.asarray(susceptibility * np.linalg.solve(np.eye(3) + susceptibility * demagnetising(body), h))
+
+
+def demagnetising(body: Body) -> Array:
+    """Demagnetising tensor of a body in its own axes [1], of trace 1, shape (3, 3)."""
+    if body.shape == "sphere":
+        return np.eye(3) / 3
+    if body.shape == "cylinder":
+        slender = body.size_m[2] / body.size_m[0]
+        along = 1 / (4 * slender / math.sqrt(math.pi) + 1)
+        return np.diag([(1 - along) / 2, (1 - along) / 2, along])
+    if body.vertices is None or body.faces is None:
+        return np.diag(_of_a_box(body.size_m))
+    second, axes = np.linalg.eigh(mesh_moments(body.vertices, body.faces)[2])
+    return np.asarray(axes @ np.diag(_of_a_box(np.sqrt(12 * second))) @ axes.T)
+
+
+def _of_a_box(size: Array) -> Array:
+    """Demagnetising factors of a box by its sides (Aharoni 1998, eq. 1), shape (3,) -> (3,)."""
+    along = np.array([_along_c(*np.roll(size, -k - 1)) for k in range(3)])
+    return along / along.sum()  # the factors sum to 1 but for rounding, which thin plates magnify
+
+
+def _along_c(a: float, b: float, c: float) -> float:
+    """The factor along the side c of a box with sides a, b, c."""
+    a, b, c = (float(side) / max(a, b, c) for side in (a, b, c))
+    ab, bc, ca, abc = math.hypot(a, b), math.hypot(b, c), math.hypot(a, c), math.hypot(a, b, c)
+    total = (b * b - c * c) / (2 * b * c) * math.log((abc - a) / (abc + a))
+    total += (a * a - c * c) / (2 * a * c) * math.log((abc - b) / (abc + b))
+    total += b / (2 * c) * math.log((ab + a) / (ab - a)) + a / (2 * c) * math.log((ab + b) / (ab - b))
+    total += c / (2 * a) * math.log((bc - b) / (bc + b)) + c / (2 * b) * math.log((ca - a) / (ca + a))
+    total += 2 * math.atan2(a * b, c * abc) + (a**3 + b**3 - 2 * c**3) / (3 * a * b * c)
+    total += (a * a + b * b - 2 * c * c) / (3 * a * b * c) * abc
+    total += c / (a * b) * (ca + bc) - (ab**3 + bc**3 + ca**3) / (3 * a * b * c)
+    return total / math.pi
+
+
+# Bodies seen as dipoles
+
+
+@cache
+def _gauss(count: int) -> tuple[Array, Array, Array]:
+    """Nodes in -1..1 and weights, of sum 1, of the Gauss-Legendre rule; and weights for (f'(1) - f'(-1)) / 2.
+
+    The latter are the slopes of the polynomial through the nodes, sum_k (2k + 1) / 2 <f, P_k> P_k.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    even = np.arange(0, count, 2)
+    rises = np.zeros(count)
+    rises[even] = (2 * even + 1) / 2 * even * (even + 1) / 2  # P_k'(1) = k (k + 1) / 2
+    return nodes, weights / 2, weights * np.polynomial.legendre.legval(nodes, rises)
+
+
+def _count(half: float, distance: float) -> int:
+    """Nodes that a rule over -half..half needs for the field of what lies `distance` aside.
+
+    One does where the second moment that it leaves out is small. The error of n nodes falls as rho^-2n, with
+    rho = d / a + sqrt(1 + (d / a)^2) the Bernstein ellipse through the nearest singularity (Trefethen 2013,
+    Approximation Theory and Practice, theorem 19.3), and grows as n^3/2 as that of a dipole is steep.
+    """
+    if SECOND * (half / distance) ** 2 <= TOLERANCE:
+        return 1
+    count, rate = 2, 2 * math.asinh(distance / half)
+    while AMPLIFIED * (2 * count) ** 1.5 * math.exp(-rate * count) > TOLERANCE:
+        count += 1
+    return count
+
+
+SECOND, AMPLIFIED, FOURTH = 4.0, 60.0, 80.0
+"""Errors over (a / d)^2, (2 n)^3/2 rho^-2n and (b / d)^4, above those measured; a test holds them to it."""
+
+
+def _line(half: float, thin: float, distance: float) -> tuple[Array, Array]:
+    """Nodes and weights for the mean of f - thin^2 / 6 f'' over -half..half."""
+    count = _count(math.sqrt(max(half**2 - thin**2, 0.0)), distance)
+    nodes, weights, slopes = _gauss(count)
+    if count == 2:
+        return math.sqrt((half**2 - thin**2) / 3) * np.array([-1.0, 1.0]), weights
+    return half * nodes, weights - thin**2 / (6 * half**2) * slopes
+
+
+def _dipoles_of(body: Body, distance: float) -> tuple[Array, Array]:
+    """Places in the body's axes (K, 3) and shares (K,) of dipoles that stand for it from `distance` on.
+
+    The field's Laplacian is nought, so the second derivative across the thinnest side, c, whose mean over it
+    is c^2 / 6 of that, is less the sum of those along the others: these take it over, and one node does
+    across. A cube is one dipole, a rod a row of them, a plate a sheet, all right to the fourth order in c.
+    """
+    half = body.size_m / 2
+    if body.shape == "sphere":  # exactly a dipole
+        return np.zeros((1, 3)), np.ones(1)
+    if body.shape == "cylinder":
+        return _of_a_cylinder(half[0], half[2], distance)
+    if body.vertices is not None and body.faces is not None:
+        return _of_a_mesh(body.vertices, body.faces)
+    thin = float(half.min()) if _is_thin(half.min(), distance) else 0.0
+    rules = [_line(h, thin, distance) for h in half]
+    nodes = np.stack(np.meshgrid(*[x for x, _ in rules], indexing="ij"), -1)
+    shares = np.einsum("i,j,k->ijk", *[w for _, w in rules])
+    return nodes.reshape(-1, 3), shares.ravel()
+
+
+def _how_many(body: Body, distance: float) -> int:
+    """How many dipoles `_dipoles_of` gives a box or a cylinder, or some more."""
+    sides = body.size_m / 2
+    counts = [_count(half, distance) for half in sides]
+    if body.shape == "cylinder":
+        rings = 1 if _is_thin(sides[0], distance) else counts[0]
+        return counts[2] * (1 if rings == 1 else rings * (2 * rings + 2))
+    if _is_thin(sides.min(), distance):
+        counts[int(sides.argmin())] = 1
+    return math.prod(counts)
+
+
+def _is_thin(half: float, distance: float) -> bool:
+    """Whether one node does across a side, its second moment taken over by the others."""
+    return FOURTH * (half / distance) ** 4 <= TOLERANCE
+
+
+def _of_a_cylinder(radius: float, half: float, distance: float) -> tuple[Array, Array]:
+    """A rule along the axis, times one in the square of the radius with evenly spaced angles."""
+    disc, part = np.zeros((1, 2)), np.ones(1)
+    if _is_thin(radius, distance) and half > radius:  # second moments are half^2 / 3 and radius^2 / 4
+        along, share = _line(half, math.sqrt(0.75) * radius, distance)
+    else:
+        along, share = _line(half, 0.0, distance)
+        if (rings := _count(radius, distance)) > 1:
+            square, weight, _ = _gauss(rings)
+            spokes = 2 * rings + 2
+            angle = 2 * np.pi * np.arange(spokes) / spokes
+            r = radius * np.sqrt((1 + square) / 2)
+            disc = (r[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], -1)).reshape(-1, 2)
+            part = np.repeat(weight / spokes, spokes)
+    places = np.column_stack([np.tile(disc, (len(along), 1)), np.repeat(along, len(disc))])
+    return places, np.outer(share, part).ravel()
+
+
+def _of_a_mesh(vertices: Array, faces: Triangles) -> tuple[Array, Array]:
+    """Two dipoles on either side of the centroid, along each of the two longer axes of its second moments."""
+    _, centroid, second = mesh_moments(vertices, faces)
+    spread, axes = np.linalg.eigh(second)
+    arms = [math.sqrt(2 * max(spread[k] - spread[0], 0.0)) * axes[:, k] for k in (1, 2)]
+    return centroid + np.array([sign * arm for arm in arms for sign in (-1, 1)]), np.full(4, 0.25)
+
+
+class _Cut:
+    """A body and the dipoles that stand for it, finer the nearer they are seen from."""
+
+    def __init__(self, body: Body) -> None:
+        self.body = body
+        self._moment = body.volume_m3 * body.rotation @ body.magnetization
+        self._sets: dict[int, tuple[Array, Array]] = {}
+        self.near = 0.0  # a sphere's dipole is exact outside of it
+        if body.shape == "mesh":
+            self.near = MESH_SIZES * float(body.size_m.max())
+        elif body.shape != "sphere":
+            distance = float(body.size_m.max()) * LADDER**16
+            while _how_many(body, distance) <= MOST_DIPOLES:
+                self.near, distance = distance, distance / LADDER
+
+    def dipoles(self, rung: int) -> tuple[Array, Array]:
+        """Places [m] and moments [A m2] in world that stand for it from near * LADDER^rung of its box on."""
+        if rung not in self._sets:
+            places, shares = _dipoles_of(self.body, self.near * LADDER**rung)
+            self._sets[rung] = (
+                self.body.p_world + places @ self.body.rotation.T,
+                shares[:, None] * self._moment,
+            )
+        return self._sets[rung]
+
+
+class Bodies:
+    """Magnetised bodies and dipoles, made ready for their field to be asked for.
+
+    Near a body its field is exact; farther on it is that of as many dipoles as `TOLERANCE` asks for at that
+    distance, chosen by cells of space: what a point is told depends on its place alone, but for rounding.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[Body] = (),
+        p_world_dipole: ArrayLike = (),
+        m_world: ArrayLike = (),
+    ) -> None:
+        """Take in bodies, and dipoles: places [m] and moments [A m2] in world, each of shape (D, 3)."""
+        self.bodies = tuple(bodies)
+        self._cuts = [_Cut(body) for body in self.bodies if np.any(body.magnetization)]
+        self._dipoles = (
+            np.asarray(p_world_dipole, float).reshape(-1, 3),
+            np.asarray(m_world, float).reshape(-1, 3),
+        )
+        solid = [cut.body for cut in self._cuts]
+        self._near = np.array([cut.near for cut in self._cuts])
+        self._laddered = np.array([cut.body.shape in ("cuboid", "cylinder") for cut in self._cuts], bool)
+        self._rotation = np.array([b.rotation for b in solid]).reshape(-1, 3, 3)
+        self._half = np.array([b.size_m / 2 for b in solid]).reshape(-1, 3)
+        self._middle = np.array([b.p_world + b.rotation @ b.middle for b in solid]).reshape(-1, 3)
+
+    def field_nt(self, p_world: ArrayLike) -> Array:
+        """Their field.
+
+        Args:
+            p_world: Points [m], shape (..., 3).
+
+        Returns:
+            Field in world axes [nT], shape (..., 3); not finite at a dipole itself and where a point is not.
+        """
+        p = np.asarray(p_world, float)
+        if p.ndim == 0 or p.shape[-1] != 3:
+            raise InputError(f"p_world must have shape (..., 3), got {p.shape}")
+        return self._evaluate(p.reshape(-1, 3), None)[0].reshape(p.shape)
+
+    def field_and_rate_nt(self, p_world: ArrayLike, v_world: ArrayLike) -> tuple[Array, Array]:
+        """Their field at points that move, and how fast it changes there, (v . grad) B.
+
+        The rate is analytic where dipoles stand for a body, and where its field is exact the difference of
+        that over 20 um along the motion.
+
+        Args:
+            p_world: Points [m], shape (..., 3).
+            v_world: Their velocities [m/s], shape (..., 3).
+
+        Returns:
+            Field [nT] and its rate of change [nT/s] in world axes, each of shape (..., 3).
+        """
+        p, v = np.asarray(p_world, float), np.asarray(v_world, float)
+        if p.ndim == 0 or p.shape[-1] != 3 or v.shape != p.shape:
+            raise InputError(f"p_world and v_world must have one shape (..., 3), got {p.shape} and {v.shape}")
+        field, rate = self._evaluate(p.reshape(-1, 3), v.reshape(-1, 3))
+        return field.reshape(p.shape), rate.reshape(p.shape)
+
+    def _evaluate(self, p: Array, v: Array | None) -> tuple[Array, Array]:
+        field, rate = np.zeros(p.shape), np.zeros(p.shape)
+        known = np.isfinite(p).all(axis=1)
+        field[~known], rate[~known] = np.nan, np.nan
+        exact: list[list[Rows]] = [[] for _ in self._cuts]
+        works = [self._work(p, rows, centre, exact) for rows, centre in _cells(p, np.flatnonzero(known))]
+
+        def add(work: list[tuple[Rows, Array, Array]]) -> None:
+            for rows, places, moments in work:
+                for some in in_blocks(len(rows), len(places)):
+                    k = rows[some]
+                    b, change = dipole_block(p[k], None if v is None else v[k], places, moments)
+                    field[k] += b
+                    if v is not None:
+                        rate[k] += change
+
+        in_two_threads(add, works, pairs=sum(len(r) * len(d) for work in works for r, d, _ in work))
+        for cut, parts in zip(self._cuts, exact, strict=True):
+            if parts:
+                k = np.concatenate(parts)
+                field[k] += cut.body.exact_field_nt(p[k])
+                if v is not None:
+                    rate[k] += _difference(cut.body, p[k], v[k])
+        return field, rate
+
+    def seen_from(self, centre: Array) -> tuple[Array, Array, list[Body]]:
+        """What the field in a cell of space, of side `CELL_M`, is made of.
+
+        Args:
+            centre: Middle of the cell [m], shape (3,).
+
+        Returns:
+            Places [m] and moments [A m2] in world, each of shape (D, 3), of all dipoles and of those that
+            stand for the bodies that are far enough; and the bodies that are not.
+        """
+        places, moments, near = self._seen_from(centre)
+        return places, moments, [self._cuts[k].body for k in near]
+
+    def _seen_from(self, centre: Array) -> tuple[Array, Array, list[int]]:
+        turned = np.einsum("bij,bi->bj", self._rotation, centre - self._middle)
+        beyond = np.maximum(np.abs(turned) - self._half, 0)
+        apart = np.sqrt(np.square(beyond).sum(axis=1)) - math.sqrt(0.75) * CELL_M
+        far = (apart >= self._near) & (apart > 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rungs = np.log(apart / self._near) / math.log(LADDER)
+        rungs = np.where(self._laddered & far, np.clip(rungs, 0, RUNGS), 0).astype(int)
+        whole = [
+            cut.dipoles(rung)
+            for cut, rung in zip(compress(self._cuts, far), rungs[far].tolist(), strict=True)
+        ]
+        whole.append(self._dipoles)
+        places, moments = (np.concatenate(part) for part in zip(*whole, strict=True))
+        return places, moments, np.flatnonzero(~far).tolist()
+
+    def _work(
+        self, p: Array, rows: Rows, centre: Array, exact: list[list[Rows]]
+    ) -> list[tuple[Rows, Array, Array]]:
+        """The dipoles to add up for the points of a cell; notes in `exact` who is near which body."""
+        places, moments, close = self._seen_from(centre)
+        work = []
+        for k in close:
+            cut = self._cuts[k]
+            clearance = cut.body.clearance(p[rows])
+            near = clearance < cut.near if cut.near else clearance == 0
+            if near.any():
+                exact[k].append(rows[near])
+            if not near.all():
+                work.append((rows[~near], *cut.dipoles(0)))
+        return [(rows, places, moments), *work]
+
+
+def _cells(p: Array, known: Rows) -> Iterator[tuple[Rows, Array]]:
+    """The rows of `known` by the cell of space that they lie in, with its centre [m]."""
+    cell = np.clip(np.floor(p[known] / CELL_M), -FARTHEST_CELL, FARTHEST_CELL - 1).astype(np.int64)
+    key = (
+        ((cell[:, 0] + FARTHEST_CELL) << 40)
+        + ((cell[:, 1] + FARTHEST_CELL) << 20)
+        + cell[:, 2]
+        + FARTHEST_CELL
+    )
+    order = np.argsort(key, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+        if len(rows):
+            yield known[rows], CELL_M * (cell[rows[0]] + 0.5)
+
+
+def _difference(body: Body, p: Array, v: Array) -> Array:
+    """Rate of a body's exact field at moving points [nT/s], by the central difference along the motion."""
+    speed = np.sqrt(np.square(v).sum(axis=1, keepdims=True))
+    ahead = STEP_M * np.divide(v, speed, out=np.zeros_like(v), where=speed > 0)
+    change = body.exact_field_nt(p + ahead) - body.exact_field_nt(p - ahead)
+    return np.asarray(change / (2 * STEP_M) * speed)

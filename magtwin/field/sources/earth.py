@@ -1,0 +1,60 @@
+"""The Earth's main field at a place and a day, by the IGRF."""
+
+import datetime
+
+import numpy as np
+
+from magtwin.errors import InputError
+from magtwin.field.days import parse_day
+from magtwin.frames import quat_from_yaw, rotate
+
+MODEL = "the IGRF-14"
+
+SPAN = (datetime.date(1900, 1, 1), datetime.date(2030, 1, 1))
+"""First and last day of its coefficients."""
+
+
+def earth_field_nt(
+    latitude_deg: float,
+    longitude_deg: float,
+    height_m: float,
+    date: str | datetime.date,
+    *,
+    north_deg: float = 0.0,
+) -> tuple[float, float, float]:
+    """The field of the IGRF-14 (Alken et al. 2021 and its 2024 revision), to degree 13, by ppigrf.
+
+    Args:
+        latitude_deg: Geodetic latitude [deg], -90 to 90, the poles themselves left out.
+        longitude_deg: Longitude [deg], east of Greenwich.
+        height_m: Height above the WGS 84 ellipsoid [m].
+        date: The day, or its name YYYY-MM-DD. Its field is that of its first moment, 00:00 UTC, as tables
+            of the IGRF have it; within a day it changes by some tenths of a nT.
+        north_deg: Where true north lies in world: angle from world +y about world +z, counter-clockwise
+            seen from above [deg].
+
+    Returns:
+        Field in world axes [nT]; with true north along +y these are its east, north and up parts.
+
+    Raises:
+        InputError: The day is none, or the model does not reach it; the place is none on Earth.
+    """
+    import ppigrf  # its pandas takes 0.3 s
+
+    day = parse_day(date)
+    first, last = SPAN
+    if not first <= day <= last:
+        raise InputError(f"date {day} lies beyond {MODEL}, which holds from {first} to {last}")
+    if not (abs(latitude_deg) < 90 and np.isfinite(longitude_deg)):
+        raise InputError(
+            f"latitude must lie between -90 and 90 deg, both left out, and longitude be a number, "
+            f"got {latitude_deg!r}, {longitude_deg!r}"
+        )
+    if not np.isfinite(north_deg):
+        raise InputError(f"north_deg must be a number, got {north_deg!r}")
+    if not -10e3 <= height_m <= 1000e3:
+        raise InputError(f"height must lie in -10,000..1,000,000 m above the ellipsoid, got {height_m!r}")
+    midnight = datetime.datetime.combine(day, datetime.time())
+    east, north, up = ppigrf.igrf(longitude_deg, latitude_deg, height_m / 1000, midnight)
+    x, y, z = rotate(quat_from_yaw(np.radians(north_deg)), [float(east[0]), float(north[0]), float(up[0])])
+    return float(x), float(y), float(z)

@@ -1,0 +1,1 @@
+"""Surveys: readings at known poses, gridded surveys, stuck and outlying readings."""

@@ -1,0 +1,103 @@
+"""Bins: readings averaged where they crowd, and how densely a survey was walked."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.survey.readings import Readings
+
+Array = NDArray[np.float64]
+
+PROBES = 40_000
+"""Points at which the distance to the nearest reading is asked, for the spacing of a scattered survey."""
+
+MEDIAN_OF_GRID = (2 * np.pi) ** -0.5
+"""Median distance to the nearest node of a square grid of spacing 1: circles of this radius cover half."""
+
+GRAIN_M = 1e-4
+"""Readings closer than this are at one place, whatever the survey."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bins:
+    """Means of readings that share a cell of the floor, a sector of heading and, where wanted, a run."""
+
+    p_xy: Array
+    """Mean places [m], shape (M, 2)."""
+
+    yaw: Array
+    """Mean headings, on the circle [rad], shape (M,)."""
+
+    b_nt: Array
+    """Mean magnitudes [nT], shape (M,)."""
+
+    count: NDArray[np.intp]
+    """Readings in each, shape (M,)."""
+
+    run: NDArray[np.intp]
+    """Run that each is of, shape (M,); 0 where runs were not kept apart."""
+
+
+def bin_readings(
+    readings: Readings, cell_m: float, *, sectors: int = 1, by_run: bool = False
+) -> tuple[Bins, NDArray[np.intp]]:
+    """Average the good readings that lie together.
+
+    Args:
+        readings: A survey.
+        cell_m: Side of a cell of the floor [m].
+        sectors: Sectors of heading that are kept apart; 1 averages all headings.
+        by_run: Whether runs are kept apart.
+
+    Returns:
+        The bins, ordered by run, sector, row and column; and the bin of each good reading, shape (good,).
+    """
+    rows = np.flatnonzero(readings.good)
+    p, yaw, b = readings.p_xy[rows], readings.yaw[rows], readings.b_nt[rows]
+    column, row = np.floor(p / cell_m).astype(np.int64).T
+    sector = np.floor(yaw / (2 * np.pi) * sectors).astype(np.int64) % sectors
+    run = readings.run[rows] if by_run else np.zeros(len(rows), np.intp)
+    keys, index, count = np.unique(
+        np.column_stack([run, sector, row, column]), axis=0, return_inverse=True, return_counts=True
+    )
+    index = index.ravel()
+    mean = lambda values: np.bincount(index, values) / count  # noqa: E731
+    turned = np.arctan2(mean(np.sin(yaw)), mean(np.cos(yaw)))
+    return Bins(np.column_stack([mean(p[:, 0]), mean(p[:, 1])]), turned, mean(b), count, keys[:, 0]), index
+
+
+def spacing_m(readings: Readings) -> float:
+    """Distance between the nodes of the square grid that is as dense as a survey.
+
+    For a gridded survey its own, the shorter of the two. For a scattered one that of the grid whose median
+    distance from a point of the floor to the nearest node is as large as that to the nearest good reading,
+    over the points of the readings' bounding box within its longer side's tenth of any.
+
+    Raises:
+        InputError: All good readings are at one place.
+    """
+    if readings.grid is not None:
+        return min(readings.grid.cell_m)
+    from scipy.spatial import cKDTree
+
+    p = readings.p_xy[readings.good]
+    low, high = p.min(axis=0), p.max(axis=0)
+    longer = float((high - low).max())
+    if not longer > GRAIN_M:
+        raise InputError(f"all {len(p)} readings are at one place, ({low[0]:g}, {low[1]:g}) m; move about")
+    step = max(float(np.sqrt(np.prod(high - low) / PROBES)), longer / PROBES)
+    axes = [
+        np.arange(a + step / 2, b, step) if b - a > step else np.array([(a + b) / 2])
+        for a, b in zip(low, high, strict=True)
+    ]
+    probes = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    far = distance_m(cKDTree(p), probes)
+    near = far[far <= longer / 10]
+    return max(float(np.median(near if len(near) else far)) / MEDIAN_OF_GRID, GRAIN_M)
+
+
+def distance_m(tree: object, p_xy: ArrayLike) -> Array:
+    """Distance from points to the nearest of a tree's [m], shape (...)."""
+    return np.asarray(tree.query(np.asarray(p_xy, float))[0])  # type: ignore[attr-defined]

@@ -1,0 +1,232 @@
+"""Readings: what a magnetometer said at known poses, the stuff that maps are made of."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.days import check_texts
+from magtwin.field.grid import Grid
+from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary, listed, rectangle, span
+
+Array = NDArray[np.float64]
+
+FARTHEST_M = 1e8
+"""Distance from the origin beyond which a coordinate is none: twice round the Earth [m]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Readings(Summarized):
+    """Readings of a magnetometer on a robot at known poses, one row each.
+
+    A reading has a magnitude, a vector, or both. Arrays are copied at birth and cannot be written to.
+    """
+
+    p_xy: Array
+    """Where base_link was, world x and y [m], shape (N, 2)."""
+
+    yaw: Array
+    """Heading of the robot, as recorded [rad], shape (N,)."""
+
+    b_nt: Array = None  # type: ignore[assignment]
+    """Magnitude of the field [nT], shape (N,); that of `b_body_nt` unless given."""
+
+    b_body_nt: Array | None = None
+    """Field in the robot's axes, forward, left, up [nT], shape (N, 3); none where only
+    magnitudes are known."""
+
+    run: NDArray[np.intp] = None  # type: ignore[assignment]
+    """Which of `runs` each row belongs to, shape (N,); all to the first unless given."""
+
+    runs: tuple[str, ...] = ("",)
+    """Names of the runs, or of the files, that the rows come from."""
+
+    t: Array | None = None
+    """Time of each row in its run [s], shape (N,); none where unknown."""
+
+    good: NDArray[np.bool_] = None  # type: ignore[assignment]
+    """Rows that are field, shape (N,): not latched, not stuck; all of them unless given."""
+
+    grid: Grid | None = None
+    """Nodes that the survey was to stand on; none where it was not gridded."""
+
+    node: NDArray[np.intp] | None = None
+    """Node of `grid` that each row stands on, heading, row, column, shape (N, 3); given with `grid`."""
+
+    height_m: float | None = None
+    """Height of the sensor above the floor [m]; none where unknown."""
+
+    name: str = ""
+    """What the survey is called."""
+
+    source: str = ""
+    """Files that the rows come from, with checksums."""
+
+    licence: str = ""
+    """SPDX name of the licence that they are under."""
+
+    created: str = ""
+    """Day of the survey, YYYY-MM-DD; "" where unknown."""
+
+    frame: str = ""
+    """Axes that x, y and heading are in, such as "world: x east, y north, z up"; "" where unknown."""
+
+    datum: str = ""
+    """Where that frame lies: its origin in the room or on Earth; "" where unknown."""
+
+    earth_nt: tuple[float, float, float] | None = None
+    """The Earth's field in that frame [nT]; none where unknown."""
+
+    def __post_init__(self) -> None:
+        p = np.asarray(self.p_xy, float)
+        if p.ndim != 2 or p.shape[1] != 2 or not len(p):
+            raise InputError(f"p_xy of Readings must have shape (N, 2), N 1 or more, got {p.shape}")
+        n = len(p)
+        body = self.b_body_nt
+        if self.b_nt is None:
+            if body is None:
+                raise InputError("Readings need b_nt or b_body_nt, got neither")
+            object.__setattr__(self, "b_nt", np.linalg.norm(np.asarray(body, float), axis=-1))
+        if self.run is None:
+            object.__setattr__(self, "run", np.zeros(n, np.intp))
+        if self.good is None:
+            object.__setattr__(self, "good", np.ones(n, bool))
+        for name, (columns, kind) in SHAPES.items():
+            given = getattr(self, name)
+            if given is None:
+                continue
+            array: NDArray[Any] = np.array(given, kind)
+            shape = (n, columns) if columns else (n,)
+            if array.shape != shape:
+                raise InputError(f"{name} of Readings must have shape {shape}, got {array.shape}")
+            if not np.all(np.isfinite(array)):
+                row = int(np.argwhere(~np.isfinite(array))[0][0])
+                raise InputError(f"{name} of Readings must be finite, got {array[row]} in row {row}")
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        beyond = np.argwhere(np.abs(self.p_xy) > FARTHEST_M)
+        if len(beyond):
+            row = int(beyond[0][0])
+            raise InputError(
+                f"p_xy of Readings lies within {FARTHEST_M:g} m of the origin, got {self.p_xy[row]} in row "
+                f"{row}"
+            )
+        if not np.all(self.b_nt > 0):
+            raise InputError(
+                f"b_nt of Readings is a magnitude, above 0 nT, got {self.b_nt.min():g} in row "
+                f"{self.b_nt.argmin()}"
+            )
+        if self.height_m is not None and not 0 <= self.height_m < np.inf:
+            raise InputError(
+                f"height_m of Readings is a height above the floor, 0 m or more, got {self.height_m!r}"
+            )
+        if self.earth_nt is not None:
+            object.__setattr__(self, "earth_nt", checked_earth_nt(self.earth_nt))
+        if not (self.run.min() >= 0 and self.run.max() < len(self.runs)):
+            raise InputError(
+                f"run of Readings must index runs ({len(self.runs)}), got {self.run.min()}..{self.run.max()}"
+            )
+        check_texts(self, TEXTS)
+        if (self.grid is None) != (self.node is None):
+            raise InputError("Readings of a gridded survey need both grid and node, got one of them")
+        if self.grid is None or self.node is None:
+            return
+        if self.node.min() < 0 or np.any(self.node.max(axis=0) >= self.grid.shape):
+            raise InputError(f"node of Readings must lie in the grid's {self.grid.shape}")
+
+    def __len__(self) -> int:
+        return len(self.p_xy)
+
+    def take(self, rows: ArrayLike) -> "Readings":
+        """Some of the readings.
+
+        Args:
+            rows: Their indices, or flags of shape (N,).
+
+        Returns:
+            Readings with these rows, in that order; all else as here.
+        """
+        index = np.asarray(rows)
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        some: dict[str, Any] = {k: None if given[k] is None else given[k][index] for k in SHAPES}
+        return Readings(**{**given, **some})
+
+    def report(self) -> Report:
+        """The figures that tell one survey from another, over its good readings."""
+        good = self.take(self.good) if self.good.any() else self
+        (x0, y0), (x1, y1) = good.p_xy.min(axis=0), good.p_xy.max(axis=0)
+        figures = [
+            Figure("readings", len(self), note="with vectors" if self.b_body_nt is not None else ""),
+            Figure("good readings", int(self.good.sum())),
+            Figure("runs", len(self.runs)),
+            Figure("extent", f"x {x0:.3f}..{x1:.3f}, y {y0:.3f}..{y1:.3f}", "m"),
+            Figure("mean", round(float(good.b_nt.mean()), 1), "nT", spread=round(float(good.b_nt.std()), 1)),
+            Figure("least", round(float(good.b_nt.min()), 1), "nT"),
+            Figure("greatest", round(float(good.b_nt.max()), 1), "nT"),
+        ]
+        files = [part for part in self.source.split("; ") if not part.startswith(TAKEN)]
+        facts = {"source": files, "licence": self.licence, "created": self.created}
+        return Report(f"readings {self.name}", tuple(figures), {k: v for k, v in facts.items() if v})
+
+    def with_(self, **changes: Any) -> "Readings":
+        """The same readings with other values of some fields, such as `good`."""
+        return Readings(**{**{f.name: getattr(self, f.name) for f in fields(self)}, **changes})
+
+    def _summary(self) -> Summary:
+        """Name and number; extent; range; runs; day, height and licence."""
+        good = self.b_nt[self.good] if self.good.any() else self.b_nt
+        (x0, y0), (x1, y1) = self.p_xy.min(axis=0), self.p_xy.max(axis=0)
+        bad = len(self) - int(self.good.sum())
+        about = [self.created or "day unknown"]
+        about.append("height unknown" if self.height_m is None else f"sensor at {self.height_m:.3g} m")
+        about += [text for text in (self.licence, self.frame) if text]
+        gridded = "" if self.grid is None else f", on a grid of {' x '.join(map(str, self.grid.shape))}"
+        return Summary(
+            f"Readings {self.name or 'without a name'}: {len(self):,} rows"
+            + (f", {bad:,} of them not field" if bad else ""),
+            (
+                ("over", rectangle(x0, x1, y0, y1) + gridded),
+                (
+                    "field",
+                    f"{span(good.min(), good.max(), 'nT')}, mean {good.mean():,.0f} nT"
+                    + (", with vectors" if self.b_body_nt is not None else ""),
+                ),
+                ("runs", f"{len(self.runs):,}: {listed(self.runs)}" if any(self.runs) else ""),
+                ("known", ", ".join(about)),
+                ("source", self.source),
+            ),
+        )
+
+
+TAKEN = "taken "
+"""How a part of `source` begins that says what was found by a name or a size."""
+
+TEXTS = ("name", "source", "licence", "created", "frame", "datum")
+"""What readings say of themselves in words."""
+
+
+def checked_earth_nt(earth_nt: ArrayLike) -> tuple[float, float, float]:
+    """The Earth's field in world axes [nT], refused where it is not three numbers that are not all 0."""
+    field = np.asarray(earth_nt, float)
+    if field.shape != (3,) or not np.all(np.isfinite(field)) or not np.any(field):
+        raise InputError(
+            f"earth_nt must be three numbers [nT], those of the world's x, y and z, got {earth_nt!r}"
+        )
+    x, y, z = field.tolist()
+    return x, y, z
+
+
+SHAPES: dict[str, tuple[int, type]] = {
+    "p_xy": (2, float),
+    "yaw": (0, float),
+    "b_nt": (0, float),
+    "b_body_nt": (3, float),
+    "run": (0, np.intp),
+    "t": (0, float),
+    "good": (0, bool),
+    "node": (3, np.intp),
+}
+"""Columns of a row's share in each array, 0 for a plain column, and its kind."""

@@ -1,0 +1,477 @@
+"""Latched, stuck and outlying readings of a survey, found without being told where.
+
+Three tests, each with its rate of false alarms:
+
+- **Stuck.** A sensor that is stuck gives the same number to the last digit while the robot moves; a
+  field seldom does. Over a way d it stays within the sensor's resolution q by chance with probability
+  q f / d, with f the density at 0 of the field's slopes thereabouts; ways of `REACH_M` count as
+  independent. Of the stretches found one in a hundred is false, and one sound survey in a hundred
+  shows any (Benjamini & Hochberg 1995, at `FALSE_STUCK`).
+- **Latched.** A sensor that lost lock reads about one level wherever it is and however it is turned.
+  Where stretches that are stuck agree on a level, every node (every stretch of a drive) near that
+  level is asked which is likelier: that its readings are the level's, or that they are the field that
+  their neighbours in place and heading, latched ones left out, say they should be. They are masked
+  where the odds for latched, prior included, are 19 to 1 or better (`SURE`), so that of a hundred
+  readings masked fewer than five are field; the report states the expected number. On a drive a
+  stretch that stays within the sensor's noise is also asked whether its neighbours refute it, at
+  `FALSE_FLAT` a survey.
+- **Outlying.** A reading that differs from what the others say more than one in a whole survey does by
+  chance is named, with its size, and left in: it may be iron.
+
+Not seen are a sensor that clips on a drive without repeating itself, for its neighbours are clipped as it
+is, and more levels than one.
+
+Chance is Student's t with 4 degrees of freedom about a Gaussian process on the nearest readings
+(`magtwin.field.survey.local`).
+"""
+
+import itertools
+from dataclasses import dataclass
+from math import lgamma
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.field.survey.local import FREEDOM, LEAST, LocalFit, deviation
+from magtwin.field.survey.readings import Readings
+from magtwin.frames import wrap_angle
+from magtwin.report import Figure, Report
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+FALSE_STUCK = 0.01
+"""Share of stuck stretches that are false, and of sound surveys that show any."""
+
+FALSE_FLAT = 0.01
+"""Flat stretches refuted by their neighbours that a drive with a sound sensor is expected to show."""
+
+SURE = 0.95
+"""Probability from which a reading counts as latched."""
+
+REACH_M = 0.1
+"""Distance over which the slope of the field is taken to stay the same."""
+
+BESIDE = 48
+"""Slopes nearest to a stretch that tell how rough the field is there; those of 0 tell nothing."""
+
+WIDTH = 12.0
+"""How far from the level latched readings are looked for, in sds of the stuck stretches' levels."""
+
+CELL_M = 0.05
+"""Length of a drive whose readings count as one where the field is fitted."""
+
+LEAST_SLOPES = 8
+"""With fewer slopes nothing is known of the field's roughness, and no stretch is called stuck."""
+
+FLAT_M = 0.25
+"""Length from which a stretch of a drive without change is suspect."""
+
+MOST_TOGETHER = 12
+"""Readings of one place that are asked about together, evenly through it where there are more."""
+
+ROUNDS = 4
+"""Rounds in which level, spread and share of latched readings settle."""
+
+SPREAD_ROWS = 51
+"""Readings of a drive from which the usual size of a jump is taken."""
+
+NAMED = 20
+"""Outliers that the report names, the largest first."""
+
+
+def mask_latched(readings: Readings) -> tuple[Readings, Report]:
+    """Find the readings that are not field, and take them out of the good ones.
+
+    Args:
+        readings: A survey; rows that are not `good` already stay so and count for nothing.
+
+    Returns:
+        The readings with stuck and latched ones no longer good. And what was found: numbers of stuck
+        and of latched readings, the level, the nodes that are latched at every heading, the expected
+        number of readings masked falsely, outliers with place and size.
+    """
+    found = find_latched(readings)
+    good = readings.good & ~found.stuck & ~found.latched
+    return readings.with_(good=good), found.report(readings)
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What is wrong with which readings."""
+
+    stuck: NDArray[np.bool_]
+    """Repeats to the last digit, shape (N,)."""
+
+    latched: NDArray[np.bool_]
+    """On the level of a sensor that lost lock, shape (N,); a stuck reading may be one as well."""
+
+    doubt: Array
+    """Probability that a latched reading is field after all, shape (N,); 0 where it is not latched."""
+
+    outlier: Array
+    """Difference from what the others say [nT], shape (N,); 0 where it is nothing unusual."""
+
+    level_nt: float | None
+    """Level at which the sensor latches; none where no stretches agree on one."""
+
+    spread_nt: float
+    """Standard deviation of latched readings about the level [nT]."""
+
+    judged: bool
+    """Whether there were readings enough to say what neighbours make likely."""
+
+    def report(self, readings: Readings) -> Report:
+        """The figures of the findings."""
+        masked = self.stuck | self.latched
+        figures = [
+            Figure("stuck readings", int(self.stuck.sum()), note="repeat to the last digit, robot moving"),
+            Figure("latched readings", int(masked.sum()), note="stuck ones included"),
+        ]
+        facts: dict[str, object] = {}
+        if self.level_nt is not None:
+            figures.append(
+                Figure("latch level", round(self.level_nt, 1), "nT", spread=round(self.spread_nt, 1))
+            )
+        if masked.any():
+            doubt = float(self.doubt[masked].sum())
+            figures.append(
+                Figure("masked falsely", round(doubt, 2), "readings", note="expected number of them")
+            )
+            if readings.grid is not None and readings.node is not None:
+                at = np.zeros(readings.grid.shape, bool)
+                at[tuple(readings.node[masked].T)] = True
+                every = int(at.all(axis=0).sum())
+                figures.append(Figure("latched nodes", int(at.any(axis=0).sum()), note="at any heading"))
+                figures.append(Figure("latched at every heading", every, "nodes"))
+                facts["latched"] = {
+                    f"{np.degrees(h):g} deg": f"{int(layer.sum())} nodes"
+                    for h, layer in zip(readings.grid.headings_rad, at, strict=True)
+                }
+            else:
+                facts["latched"] = {
+                    readings.runs[r] or f"run {r}": f"{int(masked[readings.run == r].sum())} readings"
+                    for r in np.unique(readings.run[masked])
+                }
+        outliers = np.flatnonzero(self.outlier)
+        figures.append(Figure("outliers", len(outliers), note="left in"))
+        if not self.judged:
+            facts["note"] = f"fewer than {LEAST} good readings: only repeats were looked for"
+        if len(outliers):
+            first = outliers[np.argsort(-np.abs(self.outlier[outliers]), kind="stable")][:NAMED]
+            facts["outliers"] = [_say(readings, int(row), float(self.outlier[row])) for row in first]
+        return Report(f"latched and outlying readings of {readings.name}", tuple(figures), facts)
+
+
+def find_latched(readings: Readings) -> Findings:
+    """What `mask_latched` masks and reports, as flags of rows."""
+    count, b = len(readings), readings.b_nt
+    stretches = _stuck(readings)
+    stuck = np.zeros(count, bool)
+    for rows in stretches:
+        stuck[rows] = True
+    latched, doubt, outlier = np.zeros(count, bool), np.zeros(count), np.zeros(count)
+    level, spread = _level(np.unique([b[rows[0]] for rows in stretches]), b[readings.good])
+    sound = readings.good & ~stuck
+    cells, cell = _cells(readings)
+    near_level = np.zeros(count, bool) if level is None else np.abs(b - level) <= WIDTH * spread
+    flats = _flats(readings, sound & ~near_level) if readings.grid is None else []
+    suspect = readings.good & (stuck | near_level)
+    for rows in flats:
+        suspect[rows] = True
+    pool = np.flatnonzero(np.bincount(cell, suspect | ~readings.good, len(cells)) == 0)
+    if len(pool) < LEAST or np.ptp(cells.b_nt[pool]) == 0:
+        return Findings(stuck, latched, doubt, outlier, level, spread, judged=False)
+    fit = LocalFit.to(cells, pool)
+    for rows in _refuted(flats, cell, fit, pool):
+        latched[rows] = True
+        doubt[rows] = FALSE_FLAT / len(flats)
+    if level is not None:
+        places = _places(readings, near_level & readings.good)
+        held = [np.unique(cell[rows]) for rows in places]
+        known = np.array([bool(stuck[rows].any()) for rows in places])
+        sure, level, spread = _odds(cells, held, known, fit, pool, level, spread)
+        for rows, probability in zip(places, sure, strict=True):
+            if probability >= SURE:
+                latched[rows] = True
+                doubt[rows] = 1 - probability
+    kept = np.bincount(cell, latched | stuck | ~readings.good, len(cells)) == 0
+    outlier = _outliers(readings, cells, cell, fit, np.flatnonzero(kept))
+    return Findings(stuck, latched, doubt, outlier, level, spread, judged=True)
+
+
+def _sequences(readings: Readings) -> list[Rows]:
+    """Good rows in the orders in which neighbours follow each other: rows and columns of nodes, or runs."""
+    good = np.flatnonzero(readings.good)
+    if readings.node is None:
+        clock = np.zeros(len(readings)) if readings.t is None else readings.t
+        keys: list[tuple[NDArray[Any], ...]] = [(clock, readings.run)]
+    else:
+        h, j, i = readings.node.T
+        keys = [(i, j, h), (j, i, h)]
+    sequences = []
+    for inner, *outer in keys:
+        order = good[np.lexsort((inner[good], *(o[good] for o in outer)))]
+        new = np.any([np.diff(o[order]) != 0 for o in outer], axis=0)
+        sequences += np.split(order, np.flatnonzero(new) + 1)
+    return sequences
+
+
+def _moved(readings: Readings, rows: Rows) -> Array:
+    """How far the sensor came from one row to the next [m]; a radian counts as `REACH_M`."""
+    way = np.diff(readings.p_xy[rows], axis=0)
+    turn = wrap_angle(np.diff(readings.yaw[rows]))
+    return np.asarray(np.hypot(way[:, 0], way[:, 1]) + REACH_M * np.abs(turn))
+
+
+def _stuck(readings: Readings) -> list[Rows]:
+    """Rows of each stretch that repeats to the last digit too long for chance."""
+    b = readings.b_nt
+    gaps = np.diff(np.unique(b[readings.good]))
+    sequences = _sequences(readings)
+    if not gaps.size:  # one number everywhere
+        still = len(sequences) == 0 or np.ptp(readings.p_xy[readings.good], axis=0).max() == 0
+        return [] if still or readings.good.sum() <= LEAST_SLOPES else [np.flatnonzero(readings.good)]
+    resolution = float(gaps.min())
+    place, slope = _slopes(readings, sequences)
+    found = []
+    for rows in sequences:
+        same = np.diff(b[rows]) == 0
+        if readings.b_body_nt is not None:
+            same &= np.all(np.diff(readings.b_body_nt[rows], axis=0) == 0, axis=1)
+        for part in _stretches(same):
+            held = rows[part.start : part.stop + 1]
+            p = readings.p_xy[held]
+            way = float(np.linalg.norm(np.ptp(p, axis=0)) + REACH_M * np.ptp(np.unwrap(readings.yaw[held])))
+            if way == 0 or len(slope) < LEAST_SLOPES:
+                continue
+            near = np.argsort(np.linalg.norm(place - p.mean(axis=0), axis=1), kind="stable")[:BESIDE]
+            usual = float(np.quantile(slope[near], 0.25))
+            trials = max(1, min(len(held) - 1, int(way / REACH_M)))
+            if usual * way / trials < 3 * resolution:
+                continue  # the sensor is too coarse for this place to tell
+            chance = resolution * 0.25 / (2 * usual) * trials / way  # a quarter of slopes lie within +-usual
+            found.append((trials * np.log(min(1.0, chance)), held))
+    found.sort(key=lambda one: one[0])
+    tests = sum(len(rows) - 1 for rows in sequences)
+    allowed = np.log(FALSE_STUCK / max(tests, 1) * np.arange(1, len(found) + 1))
+    passed = [k for k, (chance, _) in enumerate(found) if chance <= allowed[k]]
+    return [held for _, held in found[: passed[-1] + 1]] if passed else []
+
+
+def _slopes(readings: Readings, sequences: list[Rows]) -> tuple[Array, Array]:
+    """Places (N, 2) and sizes [nT/m] of the field's slopes along the way, over `REACH_M` or more."""
+    places, slopes = [], []
+    for rows in sequences:
+        moved = _moved(readings, rows)
+        if len(moved) and moved.min() < REACH_M:  # a drive
+            way = np.concatenate([[0.0], np.cumsum(moved)])
+            _, first = np.unique((way / REACH_M).astype(np.intp), return_index=True)
+            rows = rows[first]
+            moved = _moved(readings, rows)
+        change = np.abs(np.diff(readings.b_nt[rows]))
+        kept = (moved > 0) & (change > 0)
+        places.append((readings.p_xy[rows][1:] + readings.p_xy[rows][:-1])[kept] / 2)
+        slopes.append(change[kept] / moved[kept])
+    return np.concatenate(places), np.concatenate(slopes)
+
+
+def _stretches(flags: NDArray[np.bool_]) -> list[slice]:
+    """Where flags are true without a break."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _level(levels: Array, b_nt: Array) -> tuple[float | None, float]:
+    """Level that stuck stretches agree on, and its spread [nT]; three of them at least have to."""
+    if len(levels) < 3:
+        return None, 0.0
+    spread = deviation(levels)
+    if spread > deviation(b_nt) / 10:
+        return None, 0.0
+    gap = float(np.diff(levels).min())
+    return float(np.median(levels)), max(spread, gap)
+
+
+def _cells(readings: Readings) -> tuple[Readings, Rows]:
+    """The survey with the rows of `CELL_M` of a drive as one reading, their median; and each row's cell."""
+    if readings.node is not None:
+        return readings, np.arange(len(readings))
+    cell = np.empty(len(readings), np.intp)
+    first = 0
+    for rows in _sequences(readings.with_(good=np.ones(len(readings), bool))):
+        way = np.concatenate([[0.0], np.cumsum(_moved(readings, rows))])
+        _, cell[rows] = np.unique((way / CELL_M).astype(np.intp), return_inverse=True)
+        cell[rows] += first
+        first = int(cell[rows].max()) + 1
+    order = np.lexsort((readings.b_nt, cell))
+    starts = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    size = np.diff(np.append(starts, len(order)))
+
+    def mean(values: Array) -> Array:
+        return np.asarray(np.add.reduceat(values[order], starts, axis=0).T / size).T
+
+    return Readings(
+        p_xy=mean(readings.p_xy),
+        yaw=np.arctan2(mean(np.sin(readings.yaw)), mean(np.cos(readings.yaw))),
+        b_nt=readings.b_nt[order][starts + size // 2],
+    ), cell
+
+
+def _driven(readings: Readings, rows: Rows) -> list[Rows]:
+    """The parts of a sequence without a jump: from one to the next the field is like itself."""
+    return np.split(rows, np.flatnonzero(_moved(readings, rows) > REACH_M) + 1)
+
+
+def _flats(readings: Readings, sound: NDArray[np.bool_]) -> list[Rows]:
+    """Stretches of a drive that stay within the sensor's noise over `FLAT_M` or more."""
+    flats = []
+    drives = (_driven(readings, rows) for rows in _sequences(readings.with_(good=sound)))
+    for rows in itertools.chain.from_iterable(drives):
+        b, p = readings.b_nt[rows], readings.p_xy[rows]
+        if len(rows) < 8:
+            continue
+        band = (
+            6 * deviation(np.diff(b, 2)) / np.sqrt(6)
+        )  # second differences have 6 times the noise's variance
+        at = 0
+        while at < len(rows) - 1:
+            end, low, high = at, b[at], b[at]
+            while end < len(rows) and max(high, b[end]) - min(low, b[end]) <= band:
+                low, high, end = min(low, b[end]), max(high, b[end]), end + 1
+            long = float(np.linalg.norm(np.ptp(p[at:end], axis=0))) >= FLAT_M
+            if long:
+                flats.append(rows[at:end])
+            at = end if long else at + max(1, (end - at) // 4)
+    return flats
+
+
+def _refuted(flats: list[Rows], cell: Rows, fit: LocalFit, pool: Rows) -> list[Rows]:
+    """The flat stretches that their neighbours refute."""
+    from scipy.special import fdtrc
+
+    refuted = []
+    for rows in flats:
+        held = _thinned(np.unique(cell[rows])[1:-1])
+        if not len(held):
+            continue
+        residual, covariance = fit.together(held, pool)
+        size = residual @ np.linalg.solve(covariance, residual) / len(held)
+        if fdtrc(len(held), FREEDOM, size) <= FALSE_FLAT / len(flats):
+            refuted.append(rows)
+    return refuted
+
+
+def _places(readings: Readings, rows: NDArray[np.bool_]) -> list[Rows]:
+    """Rows that stand or fall together: those at one node, or without a break on a drive."""
+    if readings.node is not None:
+        index = np.flatnonzero(rows)
+        place = readings.node[index, 1] * (readings.node[:, 2].max() + 1) + readings.node[index, 2]
+        order = np.argsort(place, kind="stable")
+        return np.split(index[order], np.flatnonzero(np.diff(place[order])) + 1) if len(index) else []
+    return [part[stretch] for part in _sequences(readings) for stretch in _stretches(rows[part])]
+
+
+def _odds(
+    cells: Readings,
+    places: list[Rows],
+    known: NDArray[np.bool_],
+    fit: LocalFit,
+    pool: Rows,
+    level: float,
+    spread: float,
+) -> tuple[Array, float, float]:
+    """Probability that each place is latched, and the level and its spread that follow.
+
+    Bayes' rule between two densities of a place's readings: Student's t about the level, and about
+    what the neighbours say, with the share of latched cells as the prior. Share, level and spread
+    are those that the answers give (empirical Bayes), found in `ROUNDS` rounds from the stuck ones.
+    """
+    held = [_thinned(cell) for cell in places]
+    field = np.array([_log_t(*fit.together(cell, pool)) for cell in held])
+    sure = known.astype(float)
+    for _ in range(ROUNDS):
+        share = sum(p * len(cell) for p, cell in zip(sure, places, strict=True)) / len(cells)
+        share = min(max(share, 1 / len(cells)), 0.5)
+        latched = [
+            float(np.sum(_log_t1((cells.b_nt[cell] - level) / spread) - np.log(spread))) for cell in held
+        ]
+        odds = np.log(share / (1 - share)) + np.array(latched) - field
+        sure = 1 / (1 + np.exp(-np.clip(odds, -500, 500)))
+        on_level = np.concatenate([cells.b_nt[cell] for p, cell in zip(sure, held, strict=True) if p >= SURE])
+        if len(on_level) >= 3:
+            level, spread = float(np.median(on_level)), max(deviation(on_level), spread)
+    return sure, level, spread
+
+
+def _thinned(rows: Rows) -> Rows:
+    """At most `MOST_TOGETHER` of the rows, evenly through them."""
+    picked = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_TOGETHER)).astype(np.intp))
+    return rows[picked]
+
+
+def _log_t(residual: Array, covariance: Array) -> float:
+    """Logarithm of the multivariate t density (Kotz & Nadarajah 2004, eq. 1.1) with `FREEDOM`."""
+    count = len(residual)
+    size = residual @ np.linalg.solve(covariance, residual)
+    constant = lgamma((FREEDOM + count) / 2) - lgamma(FREEDOM / 2) - count / 2 * np.log(FREEDOM * np.pi)
+    tail = (FREEDOM + count) / 2 * np.log1p(size / FREEDOM)
+    return float(constant - np.linalg.slogdet(covariance)[1] / 2 - tail)
+
+
+def _log_t1(z: Array) -> Array:
+    """Logarithm of the t density of each of `z`."""
+    constant = lgamma((FREEDOM + 1) / 2) - lgamma(FREEDOM / 2) - np.log(FREEDOM * np.pi) / 2
+    return np.asarray(constant - (FREEDOM + 1) / 2 * np.log1p(z**2 / FREEDOM))
+
+
+def _outliers(readings: Readings, cells: Readings, cell: Rows, fit: LocalFit, pool: Rows) -> Array:
+    """Difference of each outlying reading from what the others say [nT], shape (N,); 0 for all others."""
+    from scipy.special import stdtrit
+
+    outlier = np.zeros(len(readings))
+    limit = float(stdtrit(FREEDOM, 1 - 1 / (2 * len(pool))))
+    scaled, residual = fit.left_out(pool, pool)
+    for at in np.flatnonzero(np.abs(scaled) > limit):
+        rows = np.flatnonzero(cell == pool[at])
+        outlier[rows[len(rows) // 2]] = residual[at]
+    if readings.node is None:
+        for sequence in _sequences(readings):
+            for rows in _driven(readings, sequence):  # a field may jump with the pose
+                off = _spikes(readings.b_nt[rows])
+                outlier[rows[off != 0]] = off[off != 0]
+    return outlier
+
+
+def _spikes(b: Array) -> Array:
+    """Difference of each spike of a drive from the mean of the readings beside it [nT], 0 for all others.
+
+    Hampel's filter: the scale is the median of such differences over `SPREAD_ROWS`, for they grow with
+    speed and with the field's curvature. Of two side by side the larger is the spike.
+    """
+    from scipy.ndimage import maximum_filter1d, median_filter
+    from scipy.special import stdtrit
+
+    if len(b) < SPREAD_ROWS:
+        return np.zeros(len(b))
+    off = np.zeros(len(b))
+    off[1:-1] = b[1:-1] - (b[:-2] + b[2:]) / 2
+    size = np.abs(off)
+    gaps = np.diff(np.unique(b))
+    rounding = float(gaps.min()) * np.sqrt(1.5 / 12) if gaps.size else 0.0  # sd of it in such a difference
+    scale = 1.4826 * np.maximum(median_filter(size, SPREAD_ROWS, mode="reflect"), np.median(size))
+    scale = np.maximum(scale, rounding)
+    limit = float(stdtrit(FREEDOM, 1 - 1 / (2 * len(b))))
+    spike = (size > limit * scale) & (size == maximum_filter1d(size, 3)) & (size > 0)
+    return np.where(spike, off, 0.0)
+
+
+def _say(readings: Readings, row: int, off_nt: float) -> str:
+    """Where an outlier is and how far it is off."""
+    x, y = readings.p_xy[row]
+    run = readings.runs[readings.run[row]]
+    return (
+        f"{off_nt:+,.0f} nT at ({x:g}, {y:g}) m, heading {np.degrees(readings.yaw[row]) % 360:.0f} deg"
+        f", reads {readings.b_nt[row]:,.0f} nT" + (f", in {run}" if run else "")
+    )

@@ -1,0 +1,1 @@
+"""Plots, pages, pictures and films."""

@@ -1,0 +1,488 @@
+"""Pictures: a stage as a PNG, drawn off screen, with or without a graphics card."""
+
+import ctypes
+import itertools
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.figures.cutaway import Cutaway
+from magtwin.files import output
+from magtwin.frames import rotate
+from magtwin.spec.scene import Vec3
+from magtwin.usd.geometry import (
+    ColourScale,
+    Shape,
+    read_colour_scale,
+    read_links,
+    read_shapes,
+    srgb_from_linear,
+)
+from magtwin.usd.layers import open_stage
+
+MARGIN = 1.08
+"""How much farther away the camera stands than what is seen would need."""
+
+AROUND_M = 0.7
+"""How far around and above a heat-map, or a run's path, a camera over the lab sees at least [m]."""
+
+LAB_ELEVATION_DEG = 36.0
+"""Height of a camera over a lab above its target's horizon [deg]."""
+
+BAR_SHARE = 0.12
+"""Share of a picture's width, at its right, that the colour bar takes."""
+
+GL_PACKAGES = "libegl1 libgl1-mesa-dri libx11-6"
+"""Debian's packages that draw without a screen: EGL, Mesa's drivers for it, and what VTK loads first."""
+
+BACKGROUND = "#e9edf1"
+
+INK = "#20262d"
+
+
+LIGHTS = (
+    ((0.6, 0.9, 1.4), 0.75),
+    ((0.9, -1.0, 0.5), 0.45),
+    ((-0.9, 0.2, 0.6), 0.4),
+    ((0.1, 0.0, -1.0), 0.3),
+)
+"""Direction that light comes from, in world, and its strength."""
+
+AMBIENT, DIFFUSE = 0.22, 0.8
+"""Shares of a thing's colour that it shows in no light, and in light that meets it upright."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where a picture is taken from."""
+
+    azimuth_deg: float = 40.0
+    """Direction from the target to the camera about world z, from x towards y [deg]."""
+
+    elevation_deg: float = 22.0
+    """Height of the camera above the target's horizon [deg]."""
+
+    distance_m: float | None = None
+    """Distance from the target [m]; none means that everything just fits."""
+
+    target: Vec3 | None = None
+    """Point in the middle of the picture, in world [m]; none means the middle of everything."""
+
+    view_angle_deg: float = 30.0
+    """Angle between the upper and the lower edge [deg]."""
+
+    def __post_init__(self) -> None:
+        if not (-90 <= self.elevation_deg <= 90):
+            raise InputError(f"elevation_deg of Camera must lie in -90..90, got {self.elevation_deg!r}")
+        if not (1 <= self.view_angle_deg <= 120):
+            raise InputError(f"view_angle_deg of Camera must lie in 1..120, got {self.view_angle_deg!r}")
+        if self.distance_m is not None and not self.distance_m > 0:
+            raise InputError(f"distance_m of Camera must be above 0, got {self.distance_m!r}")
+
+
+def picture_of_stage(
+    path: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    size: tuple[int, int] = (1600, 1000),
+    camera: Camera | None = None,
+    title: str | None = None,
+    legend: bool = True,
+    ground: bool | None = None,
+    force: bool = False,
+) -> Path:
+    """Draw a stage as it stands and write a PNG.
+
+    Args:
+        path: USD file.
+        out: PNG to write.
+        size: Width and height [pixel].
+        camera: Where from; by default three quarters from the front, with everything in view, or, in a lab,
+            its heat-map. What stands between the camera and a heat-map or robot is drawn as a veil.
+        title: A line at the top.
+        legend: Whether a stage with an anomaly map gets the colour bar of its heat-map.
+        ground: Whether to draw a floor below everything; by default where the stage has nothing but
+            moving bodies, a robot alone, and the camera looks down on them.
+        force: Whether a file that is there is replaced.
+
+    Returns:
+        `out`.
+
+    Raises:
+        InputError: The stage is missing, is not USD or shows nothing; `out` is no PNG or is there
+            already; or this machine has nothing to draw with (the packages are named).
+    """
+    out = check_png(out)
+    check_size(size)
+    with output(out, force=force) as aside:
+        plotter = plotter_of(size)
+        try:
+            drawn = _draw(plotter, path, size, camera, legend=legend, ground=ground)
+            if title:
+                plotter.add_text(
+                    title, position=(0.02, 0.93), viewport=True, font_size=round(size[1] / 80), color=INK
+                )
+            write_png(Cutaway(plotter, size, drawn.screens).image(), aside)
+        finally:
+            plotter.close()
+    return out
+
+
+def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1000)) -> None:
+    """Show a stage as it stands in a window, to be turned by the mouse; returns when it is closed.
+
+    Args:
+        path: USD file.
+        size: Width and height of the window [pixel].
+
+    Raises:
+        InputError: The stage is missing, is not USD or shows nothing; or there is no display.
+    """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise InputError(f"{path}: there is no display to show it on; magtwin picture draws it to a file")
+    plotter = plotter_of(size, window=True)
+    try:
+        _draw(plotter, path, size, None)
+        plotter.show(title=str(path))
+    finally:
+        plotter.close()
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """What `_draw` put before the camera."""
+
+    around: NDArray[np.float64]
+    """Points that a camera without a distance of its own keeps in view [m], shape (N, 3)."""
+
+    screens: list[Any]
+    """Actors that may hide the subject of the picture."""
+
+    bar: bool
+    """Whether there is a colour bar."""
+
+
+def is_subject(shape: Shape, scale: ColourScale | None) -> bool:
+    """Whether a shape must not be hidden: a heat-map, or a part of a robot."""
+    return bool(shape.link) or (scale is not None and shape.prim == scale.prim)
+
+
+def room_above(points: ArrayLike) -> NDArray[np.float64]:
+    """Corners of the box around points, `AROUND_M` more on all sides and above [m], shape (8, 3)."""
+    points = np.asarray(points, float)
+    low, high = points.min(axis=0), points.max(axis=0)
+    low[:2] -= AROUND_M
+    high[:2] += AROUND_M
+    ends = zip((*low[:2], min(low[2], 0.0)), (*high[:2], max(low[2] + AROUND_M, high[2])), strict=True)
+    return np.array(list(itertools.product(*ends)))
+
+
+def _draw(
+    plotter: Any,
+    path: str | os.PathLike[str],
+    size: tuple[int, int],
+    camera: Camera | None,
+    *,
+    legend: bool = True,
+    ground: bool | None = None,
+    soft: bool = True,
+) -> "_Drawn":
+    """Draw a stage as it stands, lit, before a camera; arguments as for `picture_of_stage`."""
+    stage = open_stage(path)
+    shapes = read_shapes(stage)
+    if not shapes:
+        raise InputError(f"{path}: shows nothing; a picture needs at least one visible shape")
+    links = read_links(stage)
+    worlds = [
+        rotate(links[s.link].q_world_link_xyzw, s.vertices) + links[s.link].p_world_link
+        if s.link
+        else s.vertices.astype(float)
+        for s in shapes
+    ]
+    everything, scale = np.vstack(worlds), read_colour_scale(stage)
+    subject = [is_subject(s, scale) for s in shapes]
+    around = everything
+    if scale is not None and any(s.prim == scale.prim for s in shapes):
+        camera = camera or Camera(elevation_deg=LAB_ELEVATION_DEG)
+        around = room_above(np.vstack([v for v, chosen in zip(worlds, subject, strict=True) if chosen]))
+    camera, screens = camera or Camera(), []
+    for shape, vertices, chosen in zip(shapes, worlds, subject, strict=True):
+        actor = _add(plotter, shape, vertices)
+        if not chosen and any(subject):
+            screens.append(actor)
+    if ground is None:
+        ground = camera.elevation_deg > 0 and all(s.link for s in shapes)
+    if ground:
+        _add_ground(plotter, everything)
+    light(plotter, everything, soft=soft)
+    bar = scale is not None and legend
+    aim(plotter, camera, around, size, bar=bar)
+    if scale is not None and legend:
+        add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
+    return _Drawn(around, screens, bar)
+
+
+def turntable(
+    path: str | os.PathLike[str], count: int, *, size: tuple[int, int], camera: Camera | None = None
+) -> Iterator[NDArray[np.uint8]]:
+    """Pictures of a stage as it stands, from once round it, the last one step before the first.
+
+    Args:
+        path: USD file.
+        count: Number of pictures.
+        size: Width and height [pixel].
+        camera: Where from at first; all are taken from one distance, where everything is always in view.
+
+    Yields:
+        Arrays of shape (height, width, 3).
+
+    Raises:
+        InputError: As for `picture_of_stage`.
+    """
+    check_size(size)
+    first = camera or Camera()
+    cameras = [replace(first, azimuth_deg=first.azimuth_deg + 360 * k / count) for k in range(count)]
+    plotter = plotter_of(size)
+    try:
+        drawn = _draw(plotter, path, size, first, soft=False)
+        farthest = max(distance_of(camera, drawn.around, size, bar=drawn.bar) for camera in cameras)
+        cutaway = Cutaway(plotter, size, drawn.screens)
+        for camera in cameras:
+            aim(plotter, replace(camera, distance_m=farthest), drawn.around, size)
+            yield cutaway.image()
+    finally:
+        plotter.close()
+
+
+def view_distance(
+    points: ArrayLike, target: ArrayLike, axes: ArrayLike, half_angles: tuple[float, float]
+) -> float:
+    """Least distance at which a camera sees all points.
+
+    A point at (r, u, b) along the camera's right, up and back axes stands D - b before it, and is seen
+    where |r| <= (D - b) tan(h), |u| <= (D - b) tan(v).
+
+    Args:
+        points: Points in world [m], shape (N, 3).
+        target: Point that the camera looks at [m], shape (3,).
+        axes: Right, up and back axes of the camera in world, rows, shape (3, 3).
+        half_angles: Half the horizontal and vertical angle of view [rad].
+
+    Returns:
+        Distance D from the target [m].
+    """
+    r, u, b = ((np.asarray(points, float) - target) @ np.asarray(axes, float).T).T
+    h, v = half_angles
+    return float(np.max(b + np.maximum(np.abs(r) / np.tan(h), np.abs(u) / np.tan(v))))
+
+
+def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
+    """A plotter, off screen or in a window.
+
+    Raises:
+        InputError: There is nothing to draw with. VTK itself would end the process.
+    """
+    import vtkmodules.vtkRenderingOpenGL2
+    from vtkmodules.vtkCommonCore import vtkLogger
+    from vtkmodules.vtkRenderingCore import vtkRenderWindow
+
+    refusal = InputError(
+        f"no OpenGL here, so no picture can be drawn; install it: apt-get install {GL_PACKAGES}"
+    )
+    if sys.platform == "linux" and not _loads("libX11.so", "libX11.so.6"):  # screen or none
+        raise refusal
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it tells of each way to draw that is not there
+    drawn_by = vtkRenderWindow()  # VTK picks the first that works: a screen, EGL, at last OSMesa, untried
+    software = isinstance(drawn_by, vtkmodules.vtkRenderingOpenGL2.vtkOSOpenGLRenderWindow)
+    if software and not _loads("libOSMesa.so", "libOSMesa.so.8", "libOSMesa.so.6"):
+        raise refusal
+    import pyvista
+
+    plotter = pyvista.Plotter(off_screen=not window, window_size=list(size), lighting="none")
+    plotter.set_background(BACKGROUND)
+    plotter.enable_anti_aliasing("ssaa")
+    return plotter
+
+
+def _loads(*names: str) -> bool:
+    """Whether one of the shared libraries is there."""
+    for name in names:
+        try:
+            ctypes.CDLL(name)
+        except OSError:
+            continue
+        return True
+    return False
+
+
+def check_png(out: str | os.PathLike[str]) -> Path:
+    """`out` if it is named as a PNG."""
+    out = Path(out)
+    if out.suffix.lower() != ".png":
+        raise InputError(f"{out}: pictures are PNG; give it the suffix .png")
+    return out
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """Refuse a size that cannot be drawn."""
+    if not (min(size) >= 16 and max(size) <= 16384):
+        raise InputError(f"size must lie in 16..16384 pixels each way, got {size[0]} x {size[1]}")
+
+
+def write_png(image: NDArray[np.uint8], path: Path) -> None:
+    """Write an image, shape (height, width, 3)."""
+    from PIL import Image
+
+    Image.fromarray(image).save(path, format="png", optimize=True)
+
+
+def style_of(flat: bool) -> dict[str, Any]:
+    """How a mesh of `mesh_of` is shaded; a map's colours mean numbers, so light must not change them."""
+    lit = {
+        "ambient": AMBIENT,
+        "diffuse": DIFFUSE,
+        "specular": 0.25,
+        "specular_power": 25,
+        "smooth_shading": True,
+    }
+    return {"scalars": "rgb", "rgb": True, **({"lighting": False} if flat else lit)}
+
+
+def mesh_of(shape: Shape, vertices: NDArray) -> Any:
+    """A shape as a mesh with its colours at its points, and normals for shading unless a map's."""
+    import pyvista
+
+    mesh = pyvista.PolyData.from_regular_faces(np.asarray(vertices, np.float32), shape.faces)
+    if shape.vertex_colours is not None:
+        mesh["rgb"] = (255 * srgb_from_linear(shape.vertex_colours)).round().astype(np.uint8)
+        return mesh
+    mesh = mesh.compute_normals(
+        cell_normals=False, split_vertices=True, feature_angle=35, consistent_normals=False
+    )
+    colour = (255 * np.array(srgb_from_linear(shape.colour[:3]))).round().astype(np.uint8)
+    mesh["rgb"] = np.tile(colour, (mesh.n_points, 1))
+    return mesh
+
+
+def bake(mesh: Any) -> None:
+    """Put the light of `LIGHTS` into the colours of what does not move, which is then drawn without any."""
+    normals = np.asarray(mesh.point_data.active_normals, float)
+    shade = np.full(len(normals), AMBIENT)
+    for direction, strength in LIGHTS:
+        towards = np.array(direction) / np.linalg.norm(direction)
+        shade += DIFFUSE * strength * np.maximum(normals @ towards, 0.0)
+    mesh["rgb"] = np.minimum(mesh["rgb"] * shade[:, None], 255).round().astype(np.uint8)
+
+
+def _add(plotter: Any, shape: Shape, vertices: NDArray) -> Any:
+    """One shape in its colours, shaded smooth but for its creases; returns its actor."""
+    flat = shape.vertex_colours is not None
+    return plotter.add_mesh(mesh_of(shape, vertices), opacity=shape.colour[3], **style_of(flat))
+
+
+def _add_ground(plotter: Any, everything: NDArray) -> None:
+    """A floor just below everything, of the background's colour: it shows by what stands on it only."""
+    import pyvista
+
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    reach = 3 * float(np.max(high - low))
+    middle = (*((low + high) / 2)[:2], low[2] - 1e-3 * reach)
+    floor = pyvista.Disc(center=middle, inner=0, outer=reach, normal=(0, 0, 1), c_res=64)
+    plotter.add_mesh(floor, color=BACKGROUND, ambient=1.0, diffuse=0.0, specular=0.0)
+
+
+def light(plotter: Any, everything: NDArray, *, soft: bool = True) -> None:
+    """Light from four sides, the strongest from the upper left, and soft shadow in corners if wanted."""
+    import pyvista
+
+    middle = everything.mean(axis=0)
+    reach = float(np.linalg.norm(np.ptp(everything, axis=0)))
+    for direction, strength in LIGHTS:
+        light = pyvista.Light(
+            position=middle + 3 * reach * np.array(direction), focal_point=middle, intensity=strength
+        )
+        light.positional = False
+        plotter.add_light(light)
+    if soft:
+        plotter.enable_ssao(radius=0.08 * reach, bias=0.002 * reach, kernel_size=64, blur=True)
+
+
+def aim(
+    plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int], *, bar: bool = False
+) -> None:
+    """Set the camera, at the distance from which everything is seen unless it gives its own.
+
+    Args:
+        plotter: Plotter whose camera is set.
+        camera: Where it stands.
+        everything: Points to keep in view [m], shape (N, 3).
+        size: Width and height [pixel].
+        bar: Whether to keep the points to the left of a colour bar; a camera that gives its distance has
+            its target in the middle all the same.
+    """
+    target, axes = _target(camera, everything), _axes(camera)
+    plotter.camera.position = target + distance_of(camera, everything, size, bar=bar) * axes[2]
+    plotter.camera.SetWindowCenter(BAR_SHARE if bar and camera.distance_m is None else 0.0, 0.0)
+    plotter.camera.focal_point = target
+    plotter.camera.up = axes[1]
+    plotter.camera.view_angle = camera.view_angle_deg
+    plotter.renderer.ResetCameraClippingRange()
+
+
+def distance_of(camera: Camera, everything: NDArray, size: tuple[int, int], *, bar: bool = False) -> float:
+    """Distance of a camera from its target [m]; where it gives none, everything is just seen."""
+    v = np.radians(camera.view_angle_deg) / 2
+    h = np.arctan(np.tan(v) * size[0] / size[1] * (1 - BAR_SHARE * bar))
+    target, axes = _target(camera, everything), _axes(camera)
+    return camera.distance_m or MARGIN * view_distance(everything, target, axes, (h, v))
+
+
+def _target(camera: Camera, everything: NDArray) -> NDArray[np.float64]:
+    middle: NDArray[np.float64] = (everything.min(axis=0) + everything.max(axis=0)) / 2
+    return middle if camera.target is None else np.array(camera.target, float)
+
+
+def _axes(camera: Camera) -> NDArray[np.float64]:
+    """Right, up and back axes of a camera in world, rows, shape (3, 3)."""
+    a, e = np.radians([camera.azimuth_deg, camera.elevation_deg])
+    back = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.array([-np.sin(a), np.cos(a), 0.0])
+    return np.array([right, np.cross(back, right), back])
+
+
+def add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: str) -> None:
+    """A colour bar, in µT where the map is in nT."""
+    import pyvista
+
+    unit, factor = ("µT", 1e-3) if unit == "nT" else (unit, 1.0)
+    table = pyvista.LookupTable(colour_map, scalar_range=(least * factor, greatest * factor))
+    points = pyvista.PolyData(np.zeros((2, 3)))
+    points["field"] = np.array([least, greatest]) * factor
+    actor = plotter.add_mesh(points, scalars="field", cmap=table, opacity=0, show_scalar_bar=False)
+    letters = max(8, round(min(plotter.window_size[1], plotter.window_size[0] / 1.6) / 42))
+    bar = plotter.add_scalar_bar(
+        title=f"total field [{unit}]",
+        mapper=actor.mapper,
+        vertical=True,
+        position_x=0.92,
+        position_y=0.2,
+        height=0.6,
+        width=0.05,
+        fmt="%.1f",
+        color=INK,
+        title_font_size=letters,
+        label_font_size=letters,
+    )
+    bar.DrawBackgroundOn()  # so that it can be read before anything
+    bar.GetBackgroundProperty().SetColor(pyvista.Color(BACKGROUND).float_rgb)
+    bar.GetBackgroundProperty().SetOpacity(0.7)
+    bar.GetTitleTextProperty().SetBackgroundColor(pyvista.Color(BACKGROUND).float_rgb)
+    bar.GetTitleTextProperty().SetBackgroundOpacity(0.7)
+    bar.SetVerticalTitleSeparation(round(plotter.window_size[1] / 60))  # else it touches the top number

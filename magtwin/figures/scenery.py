@@ -1,0 +1,478 @@
+"""Scenery: a run set up to be drawn: the lab that stands still, the robot that moves in it, and its trail."""
+
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.author.scene import read_scene
+from magtwin.errors import InputError
+from magtwin.field.maps.colours import COLOUR_MAP, colour_limits
+from magtwin.figures.cutaway import Cutaway
+from magtwin.figures.pictures import (
+    BACKGROUND,
+    INK,
+    LAB_ELEVATION_DEG,
+    Camera,
+    add_bar,
+    aim,
+    bake,
+    check_png,
+    check_size,
+    is_subject,
+    light,
+    mesh_of,
+    plotter_of,
+    room_above,
+    style_of,
+    write_png,
+)
+from magtwin.files import output
+from magtwin.frames import matrix_from_quat, quat_from_yaw
+from magtwin.run.compare import FIELDS, HEADINGS, POSITIONS
+from magtwin.run.run import Run
+from magtwin.spec.scene import Vec3
+from magtwin.usd.geometry import ColourScale, Link, Shape, read_colour_scale, read_links, read_shapes
+from magtwin.usd.layers import open_stage
+
+Array = NDArray[np.float64]
+
+ORBIT_DEG_S = 5.0
+"""How fast the camera that circles the lab goes round [deg/s of what is seen]."""
+
+CHASE_BACK_M, CHASE_UP_M, CHASE_AHEAD_M = 1.3, 0.75, 0.3
+"""Where the camera that follows is, behind and above the robot, and how far ahead of it it looks [m]."""
+
+CHASE_ANGLE_DEG = 50.0
+
+CHASE_S = 0.7
+"""Time over which the camera that follows evens out turns, before and after [s]."""
+
+WALL_M, WALL_LENGTH_M = 0.1, 1.0
+"""How near the camera that follows comes to the ends of the lab and to what is as high as itself and at least
+so long [m]; narrower things are seen through."""
+
+TRAIL_STEP_M = 0.01
+"""Step of the trail [m]."""
+
+TRAIL = ((0.065, 0.008, (32, 38, 45)), (0.05, 0.011, (255, 255, 255)), (0.026, 0.014, None))
+"""Half the width of the trail's dark edge, of its white edge and of its middle [m], their heights above the
+floor [m], and their colours; the middle has the field's. The map below has the field's colours too, and one
+of the two edges differs from each of them."""
+
+TRAIL_SPAN_M = 6.0
+"""Length of a path from which on its trail is drawn wider, so that it stays visible from farther away [m]."""
+
+UNKNOWN = (150, 150, 150)
+"""Colour of the trail where the field is not known."""
+
+SAMPLES = 4
+"""Samples a pixel of a film's frames."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Where a run is seen from."""
+
+    kind: str
+    """"top", "orbit", "chase", or "fixed" for a place of its own."""
+    place: Vec3 = (0.0, 0.0, 0.0)
+    """Where a fixed camera is [m]."""
+    target: Vec3 = (0.0, 0.0, 0.0)
+    """What it looks at [m]."""
+
+    @classmethod
+    def of(cls, text: str) -> "View":
+        """What a text names: top, orbit, chase, or `x,y,z:x,y,z`, place and target in world [m].
+
+        Raises:
+            InputError: It names none.
+        """
+        if text in KINDS:
+            return cls(text)
+        words = re.split("[,:]", text)
+        try:
+            x, y, z, tx, ty, tz = (float(word) for word in words)
+        except ValueError:
+            x = math.nan
+        if not (text.count(":") == 1 and math.isfinite(x) and all(map(math.isfinite, (y, z, tx, ty, tz)))):
+            raise InputError(
+                f"no camera {text!r}; known: {', '.join(KINDS)}; or x,y,z:x,y,z, from where to where"
+            )
+        if (x, y, z) == (tx, ty, tz):
+            raise InputError(f"the camera {text!r} looks at the place where it is; give another target")
+        return cls("fixed", (x, y, z), (tx, ty, tz))
+
+    def camera(self, seen_s: float = 0.0) -> Camera:
+        """The camera over a lab, after some time of looking [s]; that which follows begins as orbit does."""
+        if self.kind == "top":
+            return Camera(azimuth_deg=-90.0, elevation_deg=90.0)
+        if self.kind == "fixed":
+            back = np.subtract(self.place, self.target)
+            distance = float(np.linalg.norm(back))
+            return Camera(
+                azimuth_deg=math.degrees(math.atan2(back[1], back[0])),
+                elevation_deg=math.degrees(math.asin(back[2] / distance)),
+                distance_m=distance,
+                target=self.target,
+                view_angle_deg=40.0,
+            )
+        return Camera(azimuth_deg=40.0 + ORBIT_DEG_S * seen_s, elevation_deg=LAB_ELEVATION_DEG)
+
+
+KINDS: Mapping[str, str] = MappingProxyType(
+    {
+        "orbit": "from above at a slant, going slowly round the lab",
+        "top": "straight from above, x to the right",
+        "chase": "from behind the robot",
+    }
+)
+"""Cameras by name, and what they see."""
+
+
+class Scenery:
+    """A run in its lab, before a camera.
+
+    The lab is put up once, as one body of each kind; between frames only the robot's bodies are moved, the
+    trail grows and the camera goes on.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        scene_file: str | os.PathLike[str],
+        times: ArrayLike,
+        *,
+        view: View,
+        size: tuple[int, int],
+        speed: float = 1.0,
+        fine: bool = False,
+    ) -> None:
+        """Put it up.
+
+        Args:
+            run: What happened; it needs t and a position, of the truth, motion capture or odometry.
+            scene_file: The stage that it happened in.
+            times: When it will be looked at, in order, on the run's clock [s].
+            view: Where from.
+            size: Width and height [pixel].
+            speed: How many times faster it is shown than it happened.
+            fine: Whether frames may take seconds each: smoother edges, and shadow in corners.
+
+        Raises:
+            InputError: A column is missing, a time lies outside the run, the stage shows nothing or has no
+                robot, or there is nothing to draw with.
+        """
+        check_size(size)
+        self._times, self._speed, self._view, self._size = np.asarray(times, float), speed, view, size
+        self._position = _position(run)
+        self._pose(run)
+        stage, scene = open_stage(scene_file), read_scene(scene_file, check_network=False)
+        shapes, links = read_shapes(stage), read_links(stage)
+        moving = _links_of(links, [placed.robot.name for placed in scene.robots], run)
+        drive = scene.led_by(str(run.facts["robot"])).robot.drive if scene.others else scene.robot.drive
+        self._sides = {drive.left_wheel_joint: 0, drive.right_wheel_joint: 1}
+        still = [shape for shape in shapes if shape.link not in moving]
+        if not shapes:
+            raise InputError(f"{scene_file}: shows nothing")
+        self.plotter = plotter_of(size)
+        try:
+            scale = read_colour_scale(stage)
+            self._put_up(still, links, [s for s in shapes if s.link in moving], moving, fine, scale)
+            self._put_up_trail(run, (scale.least, scale.greatest) if scale else None)
+            light(self.plotter, self._everything, soft=fine)
+            if not fine:
+                self.plotter.disable_anti_aliasing()
+                self.plotter.enable_anti_aliasing("msaa", multi_samples=SAMPLES)
+            self._label = self.plotter.add_text(
+                " ", position=(0.02, 0.93), viewport=True, font_size=max(8, round(size[1] / 60)), color=INK
+            )
+            self._label.prop.background_color, self._label.prop.background_opacity = BACKGROUND, 0.7
+            self._cutaway = Cutaway(self.plotter, size, self._screens)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "Scenery":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Take it down."""
+        self.plotter.close()
+
+    def __len__(self) -> int:
+        """Number of frames, one a time."""
+        return len(self._times)
+
+    def frame(self, k: int, *, whole: bool = False) -> NDArray[np.uint8]:
+        """Draw the k-th time.
+
+        Args:
+            k: Number of the frame.
+            whole: Whether objects may hide the floor and the robot.
+
+        Returns:
+            Image, shape (height, width, 3).
+        """
+        for name, T_world_link in self.poses(k).items():
+            self._actors[name].user_matrix = T_world_link
+        quads = max(0, int(np.searchsorted(self._trail_t, self._times[k], side="right")) - 1)
+        for mesh, actor, faces in self._ribbons:
+            actor.visibility = quads > 0
+            if quads:
+                mesh.faces = faces[:quads].ravel()
+        self._label.input = self._words[k]
+        self._aim(k)
+        return self._cutaway.image(whole=whole)
+
+    def poses(self, k: int) -> dict[str, Array]:
+        """Where the robot's visible bodies are at the k-th time: T_world_link (4, 4) by the link's name."""
+        base = _matrix(self._p[k], self._q[k])
+        poses = {}
+        for name, link in self._links.items():
+            T_base_link = _matrix(link.p_base_link, link.q_base_link_xyzw)
+            side = self._sides.get(link.joint)
+            if side is not None and link.axis_link is not None:
+                half = self._wheels[k, side] / 2
+                T_base_link = T_base_link @ _matrix(
+                    (0, 0, 0), (*np.multiply(link.axis_link, np.sin(half)), np.cos(half))
+                )
+            poses[name] = base @ T_base_link
+        return poses
+
+    def _pose(self, run: Run) -> None:
+        """Where the robot is at each time, how far its wheels have turned, and what is said of it."""
+        position, orientation = self._position, HEADINGS[self._position]
+        facing = (orientation,) if orientation in run else ("yaw",) if "yaw" in run else ()
+        names = [n for n in ("wheel_angle", "v_base") if n in run]
+        field = next((n for n in FIELDS if n in run and np.isfinite(run[n]).any()), None)
+        self._field = field
+        if not facing:
+            raise InputError(f"the run says where the robot was and not where it faced: no {orientation}")
+        if run.rows < 2:
+            raise InputError(f"the run has {run.rows} readings; two or more are needed to show it")
+        wanted = run.select("t", position, *facing, *names, *([field] if field else []))
+        seen = wanted.resample(self._times)
+        self._p = seen[position]
+        self._q = seen[orientation] if orientation in seen else quat_from_yaw(seen["yaw"])
+        for name, values in ((position, self._p), (facing[0], self._q)):
+            if not np.isfinite(values).all():
+                raise InputError(f"the run does not know {name} all the time that is to be shown")
+        self._wheels = seen["wheel_angle"] if "wheel_angle" in seen else np.zeros((len(self._times), 2))
+        fast = f"   x{self._speed:.3g}" if self._speed != 1 else ""
+        words = [f"{t - run['t'][0]:.1f} s" for t in self._times]
+        if field:
+            words = [f"{w}   {b / 1000:.2f} µT" for w, b in zip(words, seen[field], strict=True)]
+        if "v_base" in seen:
+            speeds = np.round(seen["v_base"][:, 0], 2) + 0.0  # no "-0.00"
+            words = [f"{w}   {v:.2f} m/s" for w, v in zip(words, speeds, strict=True)]
+        self._words = [w + fast for w in words]
+
+    def _put_up(
+        self,
+        still: Sequence[Shape],
+        links: Mapping[str, Link],
+        carried: Sequence[Shape],
+        moving: Mapping[str, Link],
+        fine: bool,
+        scale: ColourScale | None,
+    ) -> None:
+        """What stands still, one body a look; and each of the robot's links."""
+        bodies: dict[tuple[bool, bool, float], list[Any]] = {}
+        placed = [_placed(shape, links[shape.link]) if shape.link else shape.vertices for shape in still]
+        self._subjects = [v for s, v in zip(still, placed, strict=True) if is_subject(s, scale)]
+        for shape, vertices in zip(still, placed, strict=True):
+            mesh, flat = mesh_of(shape, vertices), shape.vertex_colours is not None
+            if not flat and not fine:  # half the work of a frame would be to light what does not change
+                bake(mesh)
+                flat = True
+            bodies.setdefault((is_subject(shape, scale), flat, shape.colour[3]), []).append(mesh)
+        self._screens = []
+        for (subject, flat, opacity), meshes in bodies.items():
+            whole = meshes[0] if len(meshes) == 1 else meshes[0].append_polydata(*meshes[1:])
+            actor = self.plotter.add_mesh(whole, opacity=opacity, **style_of(flat))
+            if not subject:
+                self._screens.append(actor)
+        self._actors: dict[str, Any] = {}
+        self._links: dict[str, Link] = {}
+        for name, link in moving.items():
+            meshes = [mesh_of(s, s.vertices) for s in carried if s.link == name and s.vertex_colours is None]
+            if not meshes:
+                continue
+            whole = meshes[0] if len(meshes) == 1 else meshes[0].append_polydata(*meshes[1:])
+            self._actors[name] = self.plotter.add_mesh(whole, **style_of(False))
+            self._links[name] = link
+        self._everything = np.vstack([*placed, self._p]).astype(float)
+        boxes = np.array([(v.min(axis=0), v.max(axis=0)) for v in placed]).reshape(-1, 2, 3)
+        self._walls = boxes[np.ptp(boxes[..., :2], axis=1).max(axis=1) >= WALL_LENGTH_M]
+
+    def _put_up_trail(self, run: Run, limits: tuple[float, float] | None) -> None:
+        """The whole trail, edged and coloured by the field; a frame shows the part driven until then."""
+        import pyvista
+        from matplotlib import colormaps
+
+        p_xy = run[self._position][:, :2]
+        rows = _steps(p_xy)
+        self._around = room_above(np.column_stack([p_xy[rows], np.zeros(len(rows))]))
+        wider = max(1.0, float(np.max(np.ptp(p_xy[rows], axis=0))) / TRAIL_SPAN_M)
+        rows = rows[: int(np.searchsorted(run["t"][rows], self._times[-1], side="right"))]
+        self._trail_t, self._ribbons = run["t"][rows], []
+        self._bar = len(rows) >= 2 and self._field is not None
+        if len(rows) < 2:
+            return
+        colours = np.tile(np.array(UNKNOWN, np.uint8), (len(rows), 1))
+        if self._field:
+            b = run[self._field][rows]
+            low, high = limits or colour_limits(b)
+            known = np.isfinite(b)
+            share = (b[known] - low) / max(high - low, 1e-9)
+            colours[known] = (255 * colormaps[COLOUR_MAP](share)[:, :3]).round().astype(np.uint8)
+            add_bar(self.plotter, COLOUR_MAP, low, high, "nT")
+        along = np.gradient(p_xy[rows], axis=0)
+        along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+        left = np.column_stack([-along[:, 1], along[:, 0]])
+        first = 2 * np.arange(len(rows) - 1)[:, None]
+        faces = np.hstack([np.full_like(first, 4), first, first + 2, first + 3, first + 1])
+        for half_m, z_m, rgb in TRAIL:
+            half = wider * half_m * left
+            edges = np.stack([p_xy[rows] + half, p_xy[rows] - half], axis=1).reshape(-1, 2)
+            points = np.column_stack([edges, np.full(len(edges), wider * z_m)])
+            mesh = pyvista.PolyData(points, faces=faces.ravel())
+            mesh["rgb"] = np.repeat(colours if rgb is None else np.full_like(colours, rgb), 2, axis=0)
+            actor = self.plotter.add_mesh(mesh, scalars="rgb", rgb=True, lighting=False)
+            self._ribbons.append((mesh, actor, faces))
+
+    def _aim(self, k: int) -> None:
+        if self._view.kind != "chase":
+            seen_s = (self._times[k] - self._times[0]) / self._speed
+            camera, around = self._view.camera(seen_s), self._around
+            if self._view.kind == "top":  # the whole map, as a picture of the stage shows it
+                around = np.vstack([around, *self._subjects])
+            aim(self.plotter, camera, around, self._size, bar=self._bar)
+            return
+        near = np.abs(self._times - self._times[k]) <= CHASE_S * self._speed
+        ahead = matrix_from_quat(self._q[near])[:, :2, 0].mean(axis=0)
+        ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
+        low, high = self._everything[:, :2].min(axis=0) + WALL_M, self._everything[:, :2].max(axis=0) - WALL_M
+        p, camera = self._p[k], self.plotter.camera
+        eye, back = np.array([p[0], p[1], p[2] + CHASE_UP_M]), np.array([*(-CHASE_BACK_M * ahead), 0.0])
+        back *= _free_share(eye, back, self._walls)
+        camera.position = (*np.clip((eye + back)[:2], low, high), eye[2])
+        camera.focal_point = (*(p[:2] + CHASE_AHEAD_M * ahead), p[2] + 0.2)
+        camera.up = (0.0, 0.0, 1.0)
+        camera.view_angle = CHASE_ANGLE_DEG
+        self.plotter.renderer.ResetCameraClippingRange()
+
+
+def picture_of_run(
+    run: Run,
+    scene_file: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    time_s: float | None = None,
+    camera: str = "orbit",
+    size: tuple[int, int] = (1600, 1000),
+    force: bool = False,
+) -> Path:
+    """Draw a moment of a run in its lab, with the trail until then, and write a PNG.
+
+    Args:
+        run: What happened.
+        scene_file: The stage that it happened in.
+        out: PNG to write.
+        time_s: Which moment, on the run's clock [s]; its end unless given.
+        camera: "top", "orbit", "chase" or "x,y,z:x,y,z", as for `View.of`.
+        size: Width and height [pixel].
+        force: Whether a file that is there is replaced.
+
+    Raises:
+        InputError: As for `Scenery`; or `out` is no PNG or is there already.
+    """
+    out, view = check_png(out), View.of(camera)
+    if not run.rows or "t" not in run:
+        raise InputError("the run has no readings, so there is nothing to show")
+    t = float(run["t"][-1]) if time_s is None else time_s
+    if not run["t"][0] <= t <= run["t"][-1]:
+        raise InputError(
+            f"the run goes from {run['t'][0]:g} to {run['t'][-1]:g} s; there is no {t:g} s in it"
+        )
+    with (
+        output(out, force=force) as aside,
+        Scenery(run, scene_file, [t], view=view, size=size, fine=True) as scenery,
+    ):
+        write_png(scenery.frame(0), aside)
+    return out
+
+
+def _position(run: Run) -> str:
+    """The best column of position that a run has."""
+    for name in POSITIONS:
+        if name in run and np.isfinite(run[name]).all(axis=1).any():
+            return name
+    raise InputError(f"the run does not say where the robot was: it has none of {', '.join(POSITIONS)}")
+
+
+def _links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dict[str, Link]:
+    """The links of the robot that a run is of; other robots of a scene stand where it has them.
+
+    Raises:
+        InputError: There is none, or the run does not say which of several it is of.
+    """
+    bases = list(dict.fromkeys(link.base for link in links.values() if link.joint))
+    if not bases:
+        raise InputError("the scene has no robot that could move")
+    name = str(run.facts.get("robot", robots[0] if len(robots) == 1 else ""))
+    if len(robots) > 1 and name not in robots:
+        raise InputError(f"the run does not say of which robot it is; the scene has {', '.join(robots)}")
+    base = bases[robots.index(name)] if len(robots) == len(bases) and name in robots else bases[0]
+    return {name: link for name, link in links.items() if link.base == base}
+
+
+def _free_share(p: Array, d: Array, boxes: Array) -> float:
+    """Share of a segment before it comes within `WALL_M` of the first box.
+
+    Args:
+        p: Start in world [m], shape (3,).
+        d: Way to the end [m], shape (3,).
+        boxes: Least and greatest corners of boxes along the world's axes [m], shape (N, 2, 3).
+    """
+    low, high = boxes[:, 0] - WALL_M, boxes[:, 1] + WALL_M
+    d = np.where(np.abs(d) < 1e-12, 1e-12, d)
+    ends = np.sort(np.stack([(low - p) / d, (high - p) / d]), axis=0)  # slab by slab
+    enters, leaves = ends[0].max(axis=1), ends[1].min(axis=1)
+    met = (enters <= leaves) & (enters > 0) & (enters < 1)
+    return float(enters[met].min()) if met.any() else 1.0
+
+
+def _steps(p_xy: Array) -> NDArray[np.intp]:
+    """Rows at which a trail has gone a step further."""
+    rows: list[int] = []
+    x0 = y0 = math.inf
+    for i, (x, y) in enumerate(p_xy.tolist()):
+        if not (x - x0) ** 2 + (y - y0) ** 2 < TRAIL_STEP_M**2 and math.isfinite(x + y):
+            rows.append(i)
+            x0, y0 = x, y
+    return np.array(rows, np.intp)
+
+
+def _placed(shape: Shape, link: Link) -> Array:
+    """Vertices of a body that nothing moves, in world [m]."""
+    T = _matrix(link.p_world_link, link.q_world_link_xyzw)
+    return shape.vertices @ T[:3, :3].T + T[:3, 3]
+
+
+def _matrix(p: ArrayLike, q_xyzw: ArrayLike) -> Array:
+    """The transform (4, 4) of a pose."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = matrix_from_quat(q_xyzw), p
+    return T

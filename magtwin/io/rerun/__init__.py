@@ -1,0 +1,1 @@
+"""Rerun recordings: written, read and shown."""

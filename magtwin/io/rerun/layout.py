@@ -1,0 +1,514 @@
+"""Layout: which plots and views a recording opens with, and what they show."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
+
+from magtwin.io.rerun.series import (
+    COLUMNS_ENTITY,
+    DERIVED,
+    DERIVED_ENTITY,
+    STATES,
+    TIMELINE,
+    derived,
+    entity_of,
+)
+from magtwin.run.run import COLUMNS, Run
+from magtwin.spec.scene import LabSpec, Vec3
+
+Array = NDArray[np.float64]
+
+_ROOM = 0.08
+"""Room beyond the values and the ticks of an axis, as a share of the values' range."""
+
+_LEGEND_ROW, _LEGEND_MOST = 0.1, 0.65
+"""Height of a legend's row, as a share of the tall first plot, and the most that a legend may take."""
+
+_LEGEND_WIDTH, _LEGEND_LETTER = 0.07, 0.01
+"""Width of a legend without text, and of a letter, as shares of a plot's."""
+
+_LOOKED_AT = 4000
+"""Readings of a series by which its legend is placed."""
+
+Colour = tuple[int, int, int]
+
+RUN_COLOURS: tuple[Colour, ...] = (
+    (86, 156, 255),
+    (255, 158, 64),
+    (92, 200, 120),
+    (226, 92, 160),
+    (170, 130, 255),
+    (224, 208, 80),
+    (80, 210, 214),
+    (240, 98, 82),
+)
+"""Colours of runs that are compared, over again where there are more."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """A line of a plot: a column, or one part of it."""
+
+    column: str
+    name: str
+    colour: Colour
+    part: str = ""
+    """Name of the part, such as x, of a column that has several."""
+    width: float = 1.5
+    """Width of the line [points]; wide ones stand under narrow ones that they would hide."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A plot: series of one unit."""
+
+    title: str
+    series: tuple[Series, ...]
+
+
+_BLUE, _ORANGE, _GREEN, _GREY = (86, 156, 255), (255, 158, 64), (92, 200, 120), (165, 165, 165)
+_DIM = (118, 106, 150)
+
+FIELD_PANEL = Panel(
+    "Total field [nT]",
+    (
+        Series("b_total_nt", "total = map + disturbance", _ORANGE, width=4.0),
+        Series("b_measured_nt", "measured", _GREEN, width=1.0),
+        Series("b_map_nt", "map", _BLUE),
+        Series("b_truth_nt", "truth", _GREY),
+        Series("interval_low_nt", "90 % interval", _DIM),
+        Series("interval_high_nt", "90 % interval", _DIM),
+    ),
+)
+DISTURBANCE_PANEL = Panel("Disturbance [nT]", (Series("b_disturbance_nt", "disturbance", _ORANGE),))
+ERROR_PANEL = Panel(
+    "Error [nT]",
+    (
+        Series("error_nt", "total - truth", _ORANGE, width=3.0),
+        Series("measured_error_nt", "measured - truth", _GREEN, width=1.0),
+        Series("error_low_nt", "90 % interval", _DIM),
+        Series("error_high_nt", "90 % interval", _DIM),
+    ),
+)
+SPEED_PANEL = Panel(
+    "Speed [m/s]",
+    (
+        Series("odom_v", "odometry", _GREY, "x", width=3.0),
+        Series("v_base", "true", _BLUE, "x"),
+        Series("v_cmd", "commanded", _ORANGE),
+    ),
+)
+YAW_RATE_PANEL = Panel(
+    "Yaw rate [rad/s]",
+    (
+        Series("imu_w", "gyroscope", _GREY, "z", width=3.0),
+        Series("w_base", "true", _BLUE, "z"),
+        Series("w_cmd", "commanded", _ORANGE),
+    ),
+)
+ACCELERATION_PANEL = Panel(
+    "Accelerometer [m/s2]",
+    (
+        Series("imu_a", "forward", _BLUE, "x"),
+        Series("imu_a", "left", _ORANGE, "y"),
+        Series("imu_a", "up", _GREY, "z"),
+    ),
+)
+TILT_PANEL = Panel(
+    "Gyroscope, tilting [rad/s]",
+    (Series("imu_w", "roll", _BLUE, "x"), Series("imu_w", "pitch", _ORANGE, "y")),
+)
+BATTERY_PANELS = (
+    Panel("Battery voltage [V]", (Series("battery_v", "voltage", _GREEN),)),
+    Panel("Battery current [A]", (Series("battery_a", "current", _ORANGE),)),
+    Panel("Battery charge [0..1]", (Series("battery_fraction", "charge", _GREEN),)),
+)
+PANELS = (
+    FIELD_PANEL,
+    DISTURBANCE_PANEL,
+    ERROR_PANEL,
+    SPEED_PANEL,
+    YAW_RATE_PANEL,
+    ACCELERATION_PANEL,
+    TILT_PANEL,
+    *BATTERY_PANELS,
+)
+"""Every plot of the recording; series that a run has not got, or that are nan throughout, are left out."""
+
+_COMPARED = (
+    ("Total field [nT]", "b_total_nt", ""),
+    ("Disturbance [nT]", "b_disturbance_nt", ""),
+    ("Error, total - truth [nT]", "error_nt", ""),
+    ("Speed [m/s]", "v_base", "x"),
+    ("Heading [rad]", "yaw", ""),
+    ("Battery voltage [V]", "battery_v", ""),
+)
+"""Plots of runs that are compared: title, column, part; a line a run."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A run whose series are plotted."""
+
+    run: Run
+    """Its columns, with those that are derived for the plots."""
+
+    name: str = ""
+    """What it is called among others; "" where it is alone."""
+
+    offset_s: float = 0.0
+    """What is added to its times [s]."""
+
+    colour: Colour = _ORANGE
+
+    @classmethod
+    def of(cls, run: Run, **rest: Any) -> "Shown":
+        """A run, with what is derived from it."""
+        return cls(run.with_columns(**derived(run)), **rest)
+
+    def values(self, series: Series) -> Array | None:
+        """What a series shows, shape (N,); none where the run has nothing of it."""
+        column = self.run.columns.get(series.column)
+        if column is None:
+            return None
+        if series.part:
+            column = column[:, COLUMNS[series.column].parts.index(series.part)]
+        return column if np.isfinite(column).any() else None
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """First and last time on the timeline [s]."""
+        t = self.run["t"]
+        return float(t[0]) + self.offset_s, float(t[-1]) + self.offset_s
+
+
+def plotted(run: Run) -> bool:
+    """Whether a run has anything that a plot shows."""
+    shown = Shown.of(run)
+    return any(shown.values(series) is not None for panel in PANELS for series in panel.series)
+
+
+def layout(
+    run: Run,
+    lab: LabSpec | None = None,
+    *,
+    heading: float = 0.0,
+    events: Sequence[str] | None = None,
+    whole: bool = True,
+) -> rrb.Blueprint:
+    """The views of a run, on its timeline; the lab and the robot in 3D first, where a lab is given.
+
+    Args:
+        run: What its plots show.
+        lab: The room; none for plots only.
+        heading: Heading of the map on its floor [rad], for the title.
+        events: Flags that may yet be raised, of a run that goes on; none takes those that the run raised.
+        whole: Whether the run is whole; of one that goes on, axes grow with it.
+    """
+    shown = Shown.of(run)
+    axis = _whole([shown]) if whole else None
+    series = _stacked(
+        [(shown, FIELD_PANEL)], [(shown, DISTURBANCE_PANEL)], [(shown, ERROR_PANEL)], whole=axis, tall=0
+    )
+    tabs = [
+        rrb.Vertical(*views, name=name)
+        for name, panels in (
+            ("Drive", (SPEED_PANEL, YAW_RATE_PANEL)),
+            ("IMU", (ACCELERATION_PANEL, TILT_PANEL)),
+            ("Battery", BATTERY_PANELS),
+        )
+        if (views := _stacked(*([(shown, panel)] for panel in panels), whole=axis))
+    ]
+    shares = [2.2, 1.2, 1.2][: len(series)]
+    side = rrb.Vertical(
+        *series, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=[*shares, *([2.6] if tabs else [])]
+    )
+    if events is None:
+        events = [key for key in STATES if _raised(run, key)]
+    lanes = [STATES[key].name for key in STATES if key == "lidar_on" or key in events]
+    states = rrb.StateTimelineView(
+        origin="states", contents=[f"$origin/{name}" for name in lanes], name="States", time_view=axis
+    )
+    pages = rrb.Tabs(_event_view(), rrb.TextDocumentView(origin="facts", name="Run"))
+    about = rrb.Vertical(states, pages, row_shares=[1.2, 1.4])
+    if lab is None:
+        root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
+    else:
+        below = rrb.Horizontal(_robot_view(), _floor_view(lab, [""]), about, column_shares=[0.9, 1.1, 1.6])
+        left = rrb.Vertical(_lab_view(lab, heading, [""]), below, row_shares=[2.0, 1.0])
+        root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
+    return _blueprint(root)
+
+
+def comparison_layout(
+    runs: Sequence[Shown], lab: LabSpec | None = None, *, heading: float = 0.0
+) -> rrb.Blueprint:
+    """The views of several runs on a common timeline, a colour each.
+
+    Args:
+        runs: What is compared.
+        lab: The room that they were driven in; none for plots only.
+        heading: Heading of the map on its floor [rad], for the title.
+    """
+    whole = _whole(runs)
+    rows = [
+        [(one, Panel(title, (Series(column, one.name, one.colour, part),))) for one in runs]
+        for title, column, part in _COMPARED
+    ]
+    side = rrb.Vertical(*_stacked(*rows, whole=whole, tall=0))
+    facts = [rrb.TextDocumentView(origin=entity_of("facts", one.name), name=one.name) for one in runs]
+    about = rrb.Tabs(_event_view(), *facts)
+    if lab is None:
+        root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
+    else:
+        names = [one.name for one in runs]
+        below = rrb.Horizontal(_floor_view(lab, names), about)
+        left = rrb.Vertical(_lab_view(lab, heading, names), below, row_shares=[1.6, 1.0])
+        root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
+    return _blueprint(root)
+
+
+def _blueprint(root: Any) -> rrb.Blueprint:
+    return rrb.Blueprint(
+        root,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
+    )
+
+
+def _whole(runs: Sequence[Shown]) -> rrb.TimeAxis:
+    """The axis on which all of the runs are seen."""
+    ends = np.array([one.ends for one in runs])
+    return rrb.TimeAxis(
+        view_range=rr.TimeRange(
+            start=rrb.TimeRangeBoundary.absolute(seconds=float(ends.min())),
+            end=rrb.TimeRangeBoundary.absolute(seconds=float(ends.max())),
+        )
+    )
+
+
+def _raised(run: Run, column: str) -> bool:
+    return column in run.columns and bool(run[column].any())
+
+
+def _stacked(
+    *rows: Sequence[tuple[Shown, Panel]], whole: rrb.TimeAxis | None, tall: int | None = None
+) -> list[rrb.TimeSeriesView]:
+    """A plot each of the panels that have a series; the one of number `tall` has the room of two."""
+    plots = []
+    for number, row in enumerate(rows):
+        lines = [
+            (one, series, values)
+            for one, panel in row
+            for series in panel.series
+            if (values := one.values(series)) is not None
+        ]
+        if lines:
+            plots.append(_plot(row[0][1].title, lines, whole, tall=number == tall))
+    return plots
+
+
+def _plot(
+    title: str, lines: Sequence[tuple[Shown, Series, Array]], whole: rrb.TimeAxis | None, *, tall: bool
+) -> rrb.TimeSeriesView:
+    """Lines of one unit, the legend in the corner where it needs least room of its own."""
+    legend = len(lines) > 1
+    corner = rrb.Corner2D.LeftTop
+    ends = value_range(np.array([(np.nanmin(values), np.nanmax(values)) for _, _, values in lines]))
+    if legend and ends:
+        height = min(
+            _LEGEND_MOST, len({series.name for _, series, _ in lines}) * _LEGEND_ROW * (1.0 if tall else 2.0)
+        )
+        width = _LEGEND_WIDTH + _LEGEND_LETTER * max(len(series.name) for _, series, _ in lines)
+        t, values = [], []
+        for one, _, line in lines:
+            step = max(1, len(line) // _LOOKED_AT)
+            t.append(one.run["t"][::step] + one.offset_s)
+            values.append(line[::step])
+        order = np.argsort(np.concatenate(t), kind="stable")
+        corner, ends = legend_corner(
+            np.concatenate(values)[order, None], np.concatenate(t)[order], ends, (width, height)
+        )
+    overrides: dict[str, list[rrb.Visualizer]] = {}
+    for one, series, _ in lines:
+        overrides.setdefault(_entity_of(one, series), []).append(_line(series))
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=[f"/{entity}" for entity in overrides],
+        name=title,
+        axis_x=whole,
+        axis_y=rrb.ScalarAxis(range=ends) if ends and whole else None,
+        plot_legend=rrb.PlotLegend(corner, visible=legend),
+        overrides={f"/{entity}": lines for entity, lines in overrides.items()},
+    )
+
+
+def _entity_of(shown: Shown, series: Series) -> str:
+    """The entity whose component a series shows."""
+    return entity_of(DERIVED_ENTITY if series.column in DERIVED else COLUMNS_ENTITY, shown.name)
+
+
+def _line(series: Series) -> rrb.Visualizer:
+    """How the component of a column is drawn."""
+    source = VisualizerComponentMapping(
+        "Scalars:scalars",
+        ComponentSourceKind.SourceComponent,
+        source_component=series.column,
+        selector=f".{series.part}" if series.part else None,
+    )
+    style = rr.SeriesLines(names=[series.name], colors=[series.colour], widths=[series.width])
+    return style.visualizer(mappings=[source])
+
+
+def value_range(values: Array) -> tuple[float, float] | None:
+    """Ends of a plot's axis: room beyond the values, and beyond every tick, so that no label is cut.
+
+    Args:
+        values: What is plotted, any shape; nan is not.
+
+    Returns:
+        Least and greatest value of the axis; none for values that do not vary, where the viewer's own
+        choice is as good.
+    """
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    if high - low <= 1e-9 * max(abs(low), abs(high)):
+        return None
+    room = _ROOM * (high - low)
+    tick = 10.0 ** math.floor(math.log10(high - low))
+    return (
+        min(low - room, math.ceil((low - room) / tick) * tick - room),
+        max(high + room, math.floor((high + room) / tick) * tick + room),
+    )
+
+
+def legend_corner(
+    values: Array, t: Array, ends: tuple[float, float], size: tuple[float, float]
+) -> tuple[rrb.Corner2D, tuple[float, float]]:
+    """The corner in which a legend hides no line, and the axis that this takes.
+
+    Args:
+        values: Series of a plot, shape (N, S).
+        t: Their times, ascending [s], shape (N,).
+        ends: Ends of the axis that all values fit in.
+        size: Width and height of the legend, as shares of the plot.
+
+    Returns:
+        The corner for which the axis grows least, and the ends of the axis then. A hundredth of the
+        readings beside the legend may be under it: the ramp with which a run begins.
+    """
+    low, high = ends
+    width, height = size
+    span = (t[-1] - t[0]) * width
+    found = []
+    for corner, beside in (
+        (rrb.Corner2D.LeftTop, t <= t[0] + span),
+        (rrb.Corner2D.RightTop, t >= t[-1] - span),
+        (rrb.Corner2D.LeftBottom, t <= t[0] + span),
+        (rrb.Corner2D.RightBottom, t >= t[-1] - span),
+    ):
+        part = values[beside]
+        part = part[np.isfinite(part)]
+        if corner in (rrb.Corner2D.LeftTop, rrb.Corner2D.RightTop):
+            most = float(np.quantile(part, 0.99)) if part.size else low
+            grown = (low, max(high, (most - height * low) / (1 - height)))
+        else:
+            least = float(np.quantile(part, 0.01)) if part.size else high
+            grown = (min(low, (least - height * high) / (1 - height)), high)
+        found.append((grown[1] - grown[0], corner, grown))
+    _, corner, grown = min(found, key=lambda f: f[0])
+    return corner, grown
+
+
+def lab_eye(lab: LabSpec) -> tuple[Vec3, Vec3]:
+    """Position and target of the eye that sees a lab whole [m], in world.
+
+    It is above the near edge of the floor, inside the capture frame, so that no rail crosses the floor.
+    """
+    x, y = lab.floor_m
+    height = max(0.9 * max(x, 1.7 * y), 1.5 * lab.post_height_m)
+    return (0, -0.45 * y, height), (0, -0.09 * y, 0)
+
+
+def _lab_view(lab: LabSpec, heading: float, names: Sequence[str]) -> rrb.Spatial3DView:
+    """The lab seen whole, with what each of the runs named left in it."""
+    position, target = lab_eye(lab)
+    return _view_3d(
+        "world",
+        f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, "
+        + ("readings along the path" if names == [""] else "a robot and its path for each run"),
+        names,
+        without="world/robot/sensors",
+        position=position,
+        look_target=target,
+    )
+
+
+def _robot_view() -> rrb.Spatial3DView:
+    """The robot from behind its left shoulder; the view's axes are the robot's, so that it stays in sight."""
+    return _view_3d(
+        "world/robot",
+        "Robot",
+        [""],
+        without="world/scale",
+        position=(-0.62, 0.42, 0.55),
+        look_target=(0.08, 0, 0.17),
+    )
+
+
+def _floor_view(lab: LabSpec, names: Sequence[str]) -> rrb.Spatial2DView:
+    """The map from above, with the paths on it; x to the right and y up, in metres."""
+    x, y = (0.5 * side + lab.wall_thickness_m for side in lab.floor_m)
+    return rrb.Spatial2DView(
+        origin="floor",
+        name="Map from above [m]",
+        background=(24, 26, 31),
+        visual_bounds=rrb.VisualBounds2D(x_range=(-x, x), y_range=(-y, y)),
+        overrides={entity_of("floor/paths/driven", name): _visible(all_time=True) for name in names},
+    )
+
+
+def _event_view() -> rrb.TextLogView:
+    return rrb.TextLogView(
+        origin="events",
+        name="Events",
+        columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["loglevel", "body"]),
+    )
+
+
+def _visible(*, all_time: bool) -> rrb.VisibleTimeRanges:
+    """What is seen of an entity that piles up: all of it at once, or what has come by the time shown."""
+    infinite = rrb.TimeRangeBoundary.infinite()
+    end = infinite if all_time else rrb.TimeRangeBoundary.cursor_relative()
+    return rrb.VisibleTimeRanges(rrb.VisibleTimeRange(TIMELINE, start=infinite, end=end))
+
+
+def _view_3d(
+    origin: str,
+    title: str,
+    names: Sequence[str],
+    *,
+    without: str,
+    position: tuple[float, ...],
+    look_target: tuple[float, ...],
+) -> rrb.Spatial3DView:
+    """The world in the axes of `origin`, from a position [m]; readings appear as time goes on."""
+    piling_up: dict[Any, Any] = {entity_of("world/driven", name): _visible(all_time=True) for name in names}
+    piling_up |= {entity_of("world/readings", name): _visible(all_time=False) for name in names}
+    return rrb.Spatial3DView(
+        origin=origin,
+        contents=["/world/**", f"- /{without}/**"],
+        name=title,
+        background=(24, 26, 31),
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(position=position, look_target=look_target, eye_up=(0, 0, 1)),
+        overrides=piling_up,
+    )

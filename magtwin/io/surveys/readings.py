@@ -1,0 +1,573 @@
+"""Readings from files: gridded surveys, tables, runs, bags; and Readings kept as Parquet, exactly."""
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from glob import has_magic
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.grid import Grid
+from magtwin.field.survey.gridded import read_grid
+from magtwin.field.survey.readings import FARTHEST_M, SHAPES, TAKEN, Readings
+from magtwin.field.units import check_unit, nt_per, unit_by_size
+from magtwin.files import existing, output, sha256
+from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
+from magtwin.io.surveys.columns import FIELDS, HEADINGS, TIMES, VECTORS, Columns
+from magtwin.io.surveys.table import Sheet, read_csv, read_parquet_sheet
+from magtwin.run.run import Run
+
+Array = NDArray[np.float64]
+Source = str | os.PathLike[str]
+
+BAGS = (".mcap", ".db3")
+"""Endings of rosbag2's storage files."""
+
+PARQUET = (".parquet", ".pq")
+
+LARGEST_TURN = 2 * np.pi + 0.01
+"""Headings beyond this are taken for degrees unless the caller says that they are radians."""
+
+APART = 2.0
+"""Times that vectors may be longer or shorter than magnitudes read beside them, in the median."""
+
+TURNED = 0.7
+"""Length of the mean of the headings' unit vectors above which a survey hardly turned."""
+
+ALIGNED = 0.8
+"""Part of the level field that its mean keeps, above which it keeps one direction."""
+
+_SURVEY = b"magtwin_readings"
+_PARTS = {"p_xy": ("x", "y"), "b_body_nt": ("x", "y", "z"), "node": ("heading", "row", "column")}
+_UNITS = {"p_xy": "m", "yaw": "rad", "b_nt": "nT", "b_body_nt": "nT", "t": "s", "good": "bool"}
+_FRAMES = {"p_xy": "world", "yaw": "world", "b_body_nt": "base_link"}
+_TEXTS = ("name", "source", "licence", "created")
+_PLACES = ("frame", "datum")
+
+
+def read_readings(
+    *sources: Source,
+    columns: Columns | None = None,
+    name: str | None = None,
+    licence: str = "",
+    created: str = "",
+    height_m: float | None = None,
+    frame: str = "",
+    datum: str = "",
+    headings_deg: tuple[float, ...] | None = None,
+    pose_topic: str | None = None,
+    field_topic: str | None = None,
+) -> Readings:
+    """The readings of a survey, whatever form it is in.
+
+    A source is a folder of one CSV a heading (`magtwin.field.survey.gridded`); a table of readings, CSV or
+    Parquet; several files whose rows belong together, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`;
+    those after the first are looked for beside it); a Run's Parquet; Readings' own Parquet; or a
+    rosbag2, its folder or its storage file. Several sources are several runs of one survey; so are the
+    files that match a pattern (`drives/*.parquet`), and the Parquet files of a folder, in the order of
+    their names.
+
+    Args:
+        sources: One or more of them.
+        columns: Which columns of a table hold what, in which units.
+        name: What the survey is called; after the first source unless given.
+        licence: SPDX name of the licence; where the source knows its own, "" keeps that.
+        created: Day of the survey, YYYY-MM-DD; likewise.
+        height_m: Height of the sensor above the floor [m]; likewise.
+        frame: Axes that x, y and heading are in, in words; likewise.
+        datum: Where that frame lies, in words; likewise.
+        headings_deg: Headings of a folder of CSVs [deg], for one that is not whole.
+        pose_topic: Topic of a bag's poses, where there are several.
+        field_topic: Topic of a bag's field, where there are several.
+
+    Returns:
+        Readings, in the order of the sources. Rows without a value (a cell that is empty or nan) are
+        left out, and `source` tells how many.
+
+    Raises:
+        InputError: A source is missing, damaged, or of no known form; no file matches a pattern; a column
+            is not there (the
+            near one is named); a cell is no number, with file and line; the unit cannot be.
+    """
+    columns = Columns() if columns is None else columns
+    if not sources:
+        raise InputError("no source of readings given")
+    parts = []
+    for source in _each(sources):
+        path = _first(source)
+        if path.is_dir() or path.suffix in BAGS:
+            _only_unit(path, columns)
+        if path.suffix in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
+            from magtwin.io.bags.rosbag import read_bag_readings
+
+            parts.append(
+                read_bag_readings(
+                    path,
+                    pose_topic=pose_topic,
+                    field_topic=field_topic,
+                    unit=columns.unit,
+                    scale=columns.scale,
+                )
+            )
+        elif path.is_dir():
+            parts.append(
+                read_grid(path, headings_deg=headings_deg, unit=columns.unit or "nT", scale=columns.scale)
+            )
+        else:
+            parts.append(_of_file(str(source), path, columns))
+    readings = parts[0] if len(parts) == 1 else _together(parts)
+    own = {"licence": licence, "created": created, "height_m": height_m, "name": name}
+    own |= {"frame": frame, "datum": datum}
+    return readings.with_(**{key: value for key, value in own.items() if value not in (None, "")})
+
+
+def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
+    """The readings of a Run: what its magnetometer measured where base_link truly was.
+
+    Args:
+        run: A run with p_world_base, yaw and b_measured_nt, or b_total_nt.
+        name: What the readings are called.
+        source: Where the run is from.
+
+    Returns:
+        Its readings; rows whose field is nan (off the map) are left out, and those with lock lost
+        are not good.
+
+    Raises:
+        InputError: A column is missing, or no row has a field.
+    """
+    field = next((c for c in ("b_measured_nt", "b_total_nt") if c in run and np.isfinite(run[c]).any()), None)
+    if field is None:
+        raise InputError(
+            f"{source or 'run'}: b_measured_nt and b_total_nt hold no field, only nan or nothing"
+        )
+    b, p, yaw, t = run[field], run["p_world_base"], run["yaw"], run["t"]
+    known = np.isfinite(b) & np.isfinite(p).all(axis=1) & np.isfinite(yaw) & np.isfinite(t)
+    lost = run["flag_lost_lock"] if "flag_lost_lock" in run else np.zeros(len(b), bool)
+    return Readings(
+        p_xy=p[known, :2],
+        yaw=yaw[known],
+        b_nt=b[known],
+        t=t[known],
+        good=~lost[known],
+        runs=(name,),
+        name=name,
+        source=source + _left_out(known),
+    )
+
+
+def save_readings(readings: Readings, path: Source, *, force: bool = False) -> None:
+    """Write readings as Parquet; the same readings give the same bytes.
+
+    Every Arrow field says its unit and frame; the file's metadata `magtwin_readings` holds, in JSON,
+    the runs, the grid, the height and where all of it is from.
+
+    Args:
+        readings: The readings.
+        path: The file to make.
+        force: Whether one that exists is replaced.
+
+    Raises:
+        InputError: The file exists and `force` was not given.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    fields, arrays = [], []
+    for key, (width, _) in SHAPES.items():
+        values = getattr(readings, key)
+        if values is None:
+            continue
+        for i, part in enumerate(_PARTS[key] if width else ("",)):
+            array = pa.array(np.ascontiguousarray(values[:, i] if width else values))
+            said = {"column": key, "part": part, "unit": _UNITS.get(key, ""), "frame": _FRAMES.get(key, "")}
+            said = {k: text for k, text in said.items() if text}
+            label = f"{key}_{part}" if part else key
+            fields.append(pa.field(label, array.type, nullable=False, metadata=said))
+            arrays.append(array)
+    about: dict[str, Any] = {key: getattr(readings, key) for key in (*_TEXTS, *_PLACES)}
+    about |= {"runs": readings.runs, "height_m": readings.height_m, "earth_nt": readings.earth_nt}
+    about["grid"] = None if readings.grid is None else asdict(readings.grid)
+    schema = pa.schema(fields, metadata={_SURVEY: json.dumps(about, ensure_ascii=False)})
+    split = {f.name: "BYTE_STREAM_SPLIT" for f in fields if pa.types.is_floating(f.type)}
+    with output(path, force=force) as aside:
+        pq.write_table(
+            pa.Table.from_arrays(arrays, schema=schema),
+            aside,
+            compression="zstd",
+            use_dictionary=False,
+            column_encoding=split,
+        )
+
+
+def load_readings(path: Source) -> Readings:
+    """The readings that `save_readings` wrote, to the last bit.
+
+    Raises:
+        InputError: The file is missing, is not Parquet, was cut short, or holds no Readings.
+    """
+    path = existing(path, "Parquet file")
+    sheet, metadata = read_parquet_sheet(path), _metadata(path)
+    if _SURVEY not in metadata:
+        raise InputError(f"{path}: no Readings: metadata {_SURVEY.decode()!r} is missing")
+    try:
+        about = json.loads(metadata[_SURVEY])
+        grid = about["grid"] and Grid(
+            **{**about["grid"], "headings_rad": tuple(about["grid"]["headings_rad"])}
+        )
+        given = {key: about[key] for key in (*_TEXTS, "height_m")} | {"runs": tuple(about["runs"])}
+        given |= {key: about.get(key, "") for key in _PLACES} | {"earth_nt": about.get("earth_nt")}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        if isinstance(error, InputError):
+            raise InputError(f"{path}: {error}") from error
+        raise InputError(
+            f"{path}: metadata {_SURVEY.decode()!r} is damaged ({type(error).__name__}: {error})"
+        ) from error
+    names = set(sheet.names)
+    arrays: dict[str, ArrayLike] = {}
+    for key, (width, kind) in SHAPES.items():
+        labels = [f"{key}_{part}" for part in _PARTS[key]] if width else [key]
+        if names.isdisjoint(labels) and key in ("b_body_nt", "t", "node"):
+            continue
+        cells: list[NDArray[Any]] = [sheet.numbers(label).astype(kind) for label in labels]
+        arrays[key] = np.column_stack(cells) if width else cells[0]
+    try:
+        return Readings(**arrays, grid=grid or None, **given)  # type: ignore[arg-type]
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def is_pattern(source: Source) -> bool:
+    """Whether a source is a pattern, not a file whose name has such characters."""
+    return has_magic(str(source)) and not Path(source).exists()
+
+
+def _each(sources: Sequence[Source]) -> Iterator[Source]:
+    """The sources, with the files of patterns and of folders of Parquet files in their place.
+
+    Raises:
+        InputError: Nothing matches a pattern.
+    """
+    for source in sources:
+        path = Path(source)
+        if is_pattern(source):
+            root = Path(path.anchor)
+            found = root.glob(str(path.relative_to(path.anchor)))
+            matches = sorted(match for match in found if not match.name.startswith("."))
+            if not matches:
+                raise InputError(f"no file or folder matches {str(source)!r}; check the pattern")
+            yield from matches
+        elif path.is_dir() and not (path / "metadata.yaml").is_file():
+            tables = sorted(file for file in path.iterdir() if file.suffix in PARQUET)
+            if tables:
+                yield from tables
+            else:
+                yield source
+        else:
+            yield source
+
+
+def _first(source: Source) -> Path:
+    """The path of a source, or of the first of its joined files."""
+    path = Path(source)
+    if path.exists() or "+" not in str(source):
+        return existing(path, "source of readings")
+    return existing(Path(str(source).split("+")[0]), "source of readings")
+
+
+def _only_unit(path: Path, columns: Columns) -> None:
+    """Refuse columns that are named for a source that has none to choose from."""
+    if replace(columns, unit=None, scale=None) != Columns():
+        raise InputError(f"{path}: its columns are known; columns are named for tables of your own")
+
+
+def _of_file(source: str, path: Path, columns: Columns) -> Readings:
+    if path.suffix in (".usd", ".usda", ".usdc"):
+        raise InputError(
+            f"{path}: a stage or a map, not readings; give the survey that it was made from, or survey a "
+            "scene (magtwin map survey)"
+        )
+    if path.suffix in PARQUET and path == Path(source):
+        metadata = _metadata(path)
+        if _SURVEY in metadata or b"magtwin_facts" in metadata:
+            _only_unit(path, columns)
+            if columns.scale is not None:
+                raise InputError(f"{path}: its field is in nT already; leave out --scale")
+        if _SURVEY in metadata:
+            return load_readings(path)
+        if b"magtwin_facts" in metadata:
+            from magtwin.io.tables import read_parquet
+
+            return readings_of_run(read_parquet(path), name=path.stem, source=_sum(path))
+    paths = [path]
+    if path != Path(source):
+        paths += [_beside(path, word) for word in source.split("+")[1:]]
+    sheet = _sheet(paths[0])
+    for other in paths[1:]:
+        sheet = sheet.beside(_sheet(other))
+    return _of_sheet(sheet, paths, columns)
+
+
+def _beside(first: Path, word: str) -> Path:
+    """A joined file: beside the first one, or at a path of its own."""
+    beside = first.parent / word
+    return existing(beside if beside.exists() or not Path(word).exists() else Path(word), "file of readings")
+
+
+def _sheet(path: Path) -> Sheet:
+    return read_parquet_sheet(path) if path.suffix in PARQUET else read_csv(path)
+
+
+def _of_sheet(sheet: Sheet, paths: list[Path], columns: Columns) -> Readings:
+    """The readings in a table."""
+    columns, taken = _told(sheet, columns)
+    p = np.column_stack([sheet.numbers(columns.x), sheet.numbers(columns.y)])
+    turn = _turn(sheet, columns)
+    vector, b = _field(sheet, columns)
+    t = sheet.numbers(columns.time) if columns.time else None
+    some = [p, b[:, None]] + [v.reshape(len(p), -1) for v in (turn, vector, t) if v is not None]
+    known: NDArray[np.bool_] = np.all(np.isfinite(np.hstack(some)), axis=1)
+    if not known.any():
+        raise InputError(f"{sheet.path}: no row has all its values; {len(known)} have a cell empty or nan")
+    away = np.flatnonzero(known & (np.abs(p) > FARTHEST_M).any(axis=1))
+    if len(away):
+        row = int(away[0])
+        where = sheet.column(columns.x).where(row)
+        raise InputError(f"{where}: x and y are metres, within {FARTHEST_M:g} of the origin, got {p[row]}")
+    if turn is not None and turn.ndim == 2:
+        length = np.linalg.norm(turn, axis=1)
+        off = np.flatnonzero(known & (np.abs(length - 1) > 0.01))
+        if len(off):
+            where = sheet.column(columns.several("quaternion")[0]).where(int(off[0]))
+            raise InputError(f"{where}: a quaternion's length is 1, got {length[off[0]]:.4g}")
+        turn = turn / length[:, None]
+    elif turn is None:
+        if vector is None or columns.axes != "world":
+            raise InputError(
+                f"{sheet.path}: no heading: no column is called {', '.join(HEADINGS)}; name it with "
+                "--heading or --quaternion, for a robot's readings turn with it; only vectors in world axes "
+                "do without"
+            )
+        turn = np.zeros(len(p))
+    yaw = turn if turn.ndim == 1 else yaw_from_quat(turn)
+    nought = np.flatnonzero(known & (b <= 0))
+    if len(nought):
+        where = _magnitude(sheet, columns)
+        raise InputError(f"{where.where(int(nought[0]))}: a magnitude is above 0, got {b[nought[0]]:g} nT")
+    check_unit(
+        b[known],
+        str(sheet.path),
+        _magnitude(sheet, columns).name or columns.field or columns.vector,
+        columns.unit or "nT",
+        lambda k: _magnitude(sheet, columns).where(int(np.flatnonzero(known)[k])),
+        columns.scale,
+    )
+    if vector is not None:
+        _check_sizes(vector[known], b[known], sheet, columns)
+        _check_axes(vector[known], yaw[known], sheet, columns)
+    run, runs = _runs(sheet, columns, paths[0].stem, known)
+    return Readings(
+        p_xy=p[known],
+        yaw=yaw[known],
+        b_nt=b[known],
+        b_body_nt=None if vector is None else levelled(vector, turn, columns.axes or "body")[known],
+        t=None if t is None else t[known],
+        run=run,
+        runs=runs,
+        name=paths[0].stem,
+        source="; ".join([*map(_sum, paths)]) + _left_out(known) + "".join(f"; {TAKEN}{t}" for t in taken),
+    )
+
+
+def _told(sheet: Sheet, columns: Columns) -> tuple[Columns, list[str]]:
+    """The columns and the unit, those that are not given found by their names and size; what was found so."""
+    taken = list[str]()
+    lower: dict[str, str] = {}
+    for label in sheet.names:
+        lower.setdefault(label.strip().lower(), label)
+    if not (columns.heading or columns.quaternion):
+        label = next((name for name in HEADINGS if name in sheet.names), "")
+        columns = replace(columns, heading=label or next((lower[n] for n in HEADINGS if n in lower), ""))
+    if not columns.time and (label := next((lower[name] for name in TIMES if name in lower), "")):
+        columns = replace(columns, time=label)
+    if not columns.field and not columns.vector:
+        three = next((names for names in VECTORS if set(names) <= lower.keys()), ())
+        if label := next((lower[name] for name in FIELDS if name in lower), ""):
+            columns = replace(columns, field=label)
+        elif three:
+            columns = replace(columns, vector=",".join(lower[name] for name in three))
+            if columns.axes is None:
+                taken.append(f"{columns.vector} as the field in the robot's axes, forward, left, up (--axes)")
+        else:
+            named = [label for label in sheet.names if not label.isdigit()]
+            known = (
+                f"columns: {', '.join(named)}" if named else f"{len(sheet.columns)} columns without a header"
+            )
+            raise InputError(
+                f"{sheet.path}: no column of the field was found by its name ({known}); name the magnitude "
+                "with --field NAME, or the components with --vector BX,BY,BZ"
+            )
+    if columns.unit is None and columns.scale is None:
+        _, b = _field(sheet, replace(columns, unit="nT"))
+        unit = unit_by_size(b)
+        if unit not in (None, "nT"):
+            columns = replace(columns, unit=unit)  # type: ignore[arg-type]
+            taken.append(f"{columns.field or columns.vector} in {unit}, as its size tells (--unit)")
+    return columns, taken
+
+
+def _check_axes(vector_nt: Array, yaw: Array, sheet: Sheet, columns: Columns) -> None:
+    """Refuse vectors whose level part keeps its direction in the other axes than those that were said."""
+    if np.hypot(np.cos(yaw).mean(), np.sin(yaw).mean()) > TURNED:
+        return  # one heading: nothing tells the axes apart
+    level = vector_nt[:, 0] + 1j * vector_nt[:, 1]
+    size = np.abs(level).mean()
+    if not size > 0:
+        return
+    as_world, as_body = abs(level.mean()) / size, abs((level * np.exp(1j * yaw)).mean()) / size
+    said = columns.axes or "body"
+    here, there = (as_body, as_world) if said == "body" else (as_world, as_body)
+    if there > ALIGNED and here < ALIGNED / 2:
+        other = "world" if said == "body" else "body"
+        raise InputError(
+            f"{sheet.path}: {columns.vector} are taken to be in {said} axes, but they keep one direction "
+            f"({100 * there:.0f} % of them) in {other} axes, as the Earth's field does: give --axes {other}, "
+            "or correct the headings or the order of the components"
+        )
+
+
+def levelled(vector_nt: Array, turn: Array, axes: str) -> Array:
+    """Vectors in the axes of a robot that stands upright: forward, left, up.
+
+    Args:
+        vector_nt: Field in body or world axes, shape (N, 3).
+        turn: Headings [rad], shape (N,), or orientations xyzw of the body in world, shape (N, 4).
+        axes: "body" or "world", what `vector_nt` is in.
+
+    Returns:
+        Field in level axes that are turned by the heading alone, shape (N, 3).
+    """
+    if turn.ndim == 1:
+        if axes == "body":
+            return vector_nt
+        return rotate(quat_conjugate(quat_from_yaw(turn)), vector_nt)
+    world = rotate(turn, vector_nt) if axes == "body" else vector_nt
+    return rotate(quat_conjugate(quat_from_yaw(yaw_from_quat(turn))), world)
+
+
+def _turn(sheet: Sheet, columns: Columns) -> Array | None:
+    """Headings [rad], shape (N,), or quaternions xyzw, shape (N, 4); none where there is no such column."""
+    if columns.quaternion:
+        return np.column_stack([sheet.numbers(name) for name in columns.several("quaternion")])
+    name = columns.heading or next((name for name in HEADINGS if name in sheet.names), "")
+    if not name:
+        return None
+    heading = sheet.numbers(name)
+    if columns.heading_unit == "deg":
+        return np.radians(heading)
+    beyond = np.flatnonzero(np.abs(heading) > LARGEST_TURN)
+    if columns.heading_unit is None and len(beyond):
+        where = sheet.column(name).where(int(beyond[0]))
+        raise InputError(
+            f"{where}: heading {heading[beyond[0]]:g} is beyond a full turn in radians; "
+            "give --heading-unit deg, or rad where it counts turns"
+        )
+    return heading
+
+
+def _magnitude(sheet: Sheet, columns: Columns) -> Any:
+    """The column that a fault of the magnitude is told of."""
+    if columns.field:
+        return sheet.column(columns.field)
+    if columns.vector:
+        return sheet.column(columns.several("vector")[0])
+    return sheet.column(next((name for name in FIELDS if name in sheet.names), FIELDS[0]))
+
+
+def _field(sheet: Sheet, columns: Columns) -> tuple[Array | None, Array]:
+    """Vectors, where there are, and magnitudes [nT], shapes (N, 3) and (N,)."""
+    vector, factor = None, nt_per(columns.unit, columns.scale)
+    if columns.vector:
+        names = columns.several("vector")
+        vector = factor * np.column_stack([sheet.numbers(name) for name in names])
+    if columns.field or vector is None:
+        return vector, factor * sheet.numbers(_magnitude(sheet, columns).name or columns.field)
+    return vector, np.linalg.norm(vector, axis=1)
+
+
+def _check_sizes(vector_nt: Array, b_nt: Array, sheet: Sheet, columns: Columns) -> None:
+    """Refuse vectors that are not of their magnitudes' size: of another unit, or other columns."""
+    ratio = float(np.median(np.linalg.norm(vector_nt, axis=1) / b_nt))
+    if not 1 / APART <= ratio <= APART:
+        raise InputError(
+            f"{sheet.path}: {columns.vector} is {ratio:.3g} times as long as {columns.field} in the median; "
+            "give both in one unit, and the components of the whole field"
+        )
+
+
+def _runs(sheet: Sheet, columns: Columns, stem: str, known: NDArray[np.bool_]) -> Any:
+    """Which run each of the known rows belongs to, and the runs' names."""
+    if not columns.run_column:
+        return None, (stem,)
+    words = [word for word, is_known in zip(sheet.texts(columns.run_column), known, strict=True) if is_known]
+    runs = list(dict.fromkeys(words))
+    index = {word: i for i, word in enumerate(runs)}
+    return np.array([index[word] for word in words]), tuple(f"{stem} {word}" for word in runs)
+
+
+def _together(parts: Sequence[Readings]) -> Readings:
+    """Several surveys as the runs of one."""
+    gridded = [part for part in parts if part.grid is not None]
+    if gridded:
+        raise InputError(
+            f"survey {gridded[0].name!r} is gridded and cannot be one of several sources; read it alone"
+        )
+    first = np.cumsum([0] + [len(part.runs) for part in parts])
+    arrays: dict[str, Any] = {"run": np.concatenate([p.run + n for p, n in zip(parts, first, strict=False)])}
+    for key in ("p_xy", "yaw", "b_nt", "b_body_nt", "t", "good"):
+        values = [getattr(part, key) for part in parts]
+        arrays[key] = None if any(v is None for v in values) else np.concatenate(values)
+    same: dict[str, Any] = {}
+    for key, unknown in (
+        ("created", ""),
+        ("frame", ""),
+        ("datum", ""),
+        ("height_m", None),
+        ("earth_nt", None),
+    ):
+        found = {getattr(part, key) for part in parts}
+        same[key] = found.pop() if len(found) == 1 else unknown
+    same["licence"] = "; ".join(dict.fromkeys(part.licence for part in parts if part.licence))
+    runs = tuple(run for part in parts for run in part.runs)
+    source = "; ".join(part.source for part in parts)
+    return Readings(**arrays, **same, runs=runs, name=parts[0].name, source=source)
+
+
+def _metadata(path: Path) -> dict[bytes, bytes]:
+    """The metadata of a Parquet file."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from magtwin.io.tables import check_parquet
+
+    check_parquet(path)
+    try:
+        return dict(pq.read_schema(path).metadata or {})
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
+
+
+def _sum(path: Path) -> str:
+    return f"{path.name} sha256:{sha256(path)}"
+
+
+def _left_out(known: NDArray[np.bool_]) -> str:
+    """A remark on rows without a value."""
+    missing = int(np.count_nonzero(~known))
+    return f" ({missing} of {len(known)} rows without a value left out)" if missing else ""

@@ -1,0 +1,252 @@
+"""Sheet: rows of numbers in columns, from CSV or Parquet, that know file and line of every cell."""
+
+import csv
+import math
+import os
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError, hint
+from magtwin.files import existing
+
+Array = NDArray[np.float64]
+
+LONGEST_LINE = 65_536
+"""Characters; a longer line is no row of numbers."""
+
+SAID = 60
+"""Characters of a file's own text that a refusal quotes."""
+
+_NUMBER = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
+_NOTHING = {"", "nan", "na", "null", "none"}
+
+_REMARK = re.compile(r"\s*#\s*\w+:\s")
+"""A comment line `# KEY: VALUE`, as maps that are written as CSVs have them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """A column of a sheet."""
+
+    name: str
+    """Its name; "" in a file without a header."""
+
+    cells: Any
+    """Texts of the cells, a list, or numbers, an array with nan for nothing; N of them."""
+
+    path: Path
+    """File that it is from."""
+
+    lines: Sequence[int] | None
+    """Line of each cell in the file; none in a file that has no lines."""
+
+    def where(self, row: int) -> str:
+        """File and line of a cell."""
+        return f"{self.path}:{self.lines[row]}" if self.lines is not None else f"{self.path}, row {row}"
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """Equally long columns, side by side."""
+
+    columns: tuple[Column, ...]
+    """In the order of the file, or of the files."""
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return len(self.columns[0].cells)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the columns; "1", "2", ... where they have none."""
+        return [column.name or str(i) for i, column in enumerate(self.columns, 1)]
+
+    @property
+    def path(self) -> Path:
+        """The file, or the first of them."""
+        return self.columns[0].path
+
+    def column(self, name: str) -> Column:
+        """A column by its name, or by its number from 1.
+
+        Raises:
+            InputError: No such column (the near one is named), or two of that name.
+        """
+        found = [column for column in self.columns if column.name == name]
+        if len(found) > 1:
+            raise InputError(f"{self.path}: {len(found)} columns are called {name!r}; name it by its number")
+        if found:
+            return found[0]
+        if name.isascii() and name.isdigit() and 1 <= int(name) <= len(self.columns):
+            return self.columns[int(name) - 1]
+        named = [column.name[:SAID] for column in self.columns if column.name]
+        known = hint(name, named) if named else f"no header: name columns by number, 1 to {len(self.columns)}"
+        raise InputError(f"{self.path}: no column {name!r}; {known}")
+
+    def numbers(self, name: str) -> Array:
+        """The numbers of a column, shape (N,); nan where a cell is empty or says so.
+
+        Raises:
+            InputError: No such column, or a cell is neither; with file and line.
+        """
+        column = self.column(name)
+        if isinstance(column.cells, np.ndarray):
+            if column.cells.dtype.kind not in "fiub":
+                raise InputError(f"{column.path}: column {name!r} must hold numbers, got texts")
+            values = column.cells.astype(float)
+        else:
+            values = np.array([_number(cell) for cell in column.cells])
+            wrong = np.flatnonzero(np.isneginf(values))
+            if len(wrong):
+                row = int(wrong[0])
+                text = column.cells[row].strip()
+                raise InputError(f"{column.where(row)}: {name} must be a finite number, got {text[:SAID]!r}")
+        infinite = np.flatnonzero(np.isinf(values))
+        if len(infinite):
+            row = int(infinite[0])
+            raise InputError(f"{column.where(row)}: {name} must be a finite number, got {values[row]}")
+        return values
+
+    def texts(self, name: str) -> list[str]:
+        """The cells of a column as text, without blanks around."""
+        column = self.column(name)
+        return [str(cell).strip() for cell in column.cells]
+
+    def beside(self, other: "Sheet") -> "Sheet":
+        """This sheet with the columns of another to the right.
+
+        Raises:
+            InputError: They have not equally many rows.
+        """
+        if self.rows != other.rows:
+            raise InputError(
+                f"{other.path}: {other.rows} rows, but {self.path} has {self.rows}; "
+                "files joined side by side have a row each for every reading"
+            )
+        return Sheet(self.columns + other.columns)
+
+
+def read_csv(path: str | os.PathLike[str]) -> Sheet:
+    """The sheet of a text file: values between commas, semicolons, tabs or blanks.
+
+    The header is the first line where any of its words is no number; else the last comment line above the
+    rows that has as many words as they have. Other lines that begin with `#`, such as `# KEY: VALUE`, and
+    empty ones are passed over.
+
+    Raises:
+        InputError: The file is missing, no text, empty, has lines too long or of uneven width.
+    """
+    path = existing(path, "file of readings")
+    if path.is_dir():
+        raise InputError(f"{path}: a folder; name the file in it")
+    lines = list(_lines(path))
+    above: list[tuple[int, str]] = []
+    while lines and lines[0][1].lstrip().startswith("#"):
+        number, line = lines.pop(0)
+        if not _REMARK.match(line):
+            above.append((number, line.lstrip().lstrip("#")))
+    lines = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
+    if not lines:
+        raise InputError(f"{path}: empty; expected a row of numbers for every reading")
+    between = next((mark for mark in ",;\t" if mark in lines[0][1]), None)
+    words = _words(path, lines, between)
+    names: list[str] = []
+    if any(math.isinf(_number(word)) for word in words[0]):
+        names = [word.strip() for word in words.pop(0)]
+        lines.pop(0)
+    else:
+        for comment in above:
+            with suppress(InputError):  # a remark in words, with quotes of its own
+                (said,) = _words(path, [comment], between)
+                names = [word.strip() for word in said] if len(said) == len(words[0]) else names
+    if not words:
+        raise InputError(f"{path}: no rows below the header; expected one for every reading")
+    width = len(names) or len(words[0])
+    for (number, _), row in zip(lines, words, strict=True):
+        if len(row) != width:
+            raise InputError(f"{path}:{number}: {width} values expected, got {len(row)}")
+    numbers = [number for number, _ in lines]
+    return Sheet(
+        tuple(
+            Column(name, list(cells), path, numbers)
+            for name, cells in zip(names or [""] * width, zip(*words, strict=True), strict=True)
+        )
+    )
+
+
+def read_parquet_sheet(path: str | os.PathLike[str]) -> Sheet:
+    """The sheet of a Parquet file; columns of lists and the like are left out.
+
+    Raises:
+        InputError: The file is missing, is not Parquet, was cut short, or has no rows.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    from magtwin.io.tables import check_parquet
+
+    path = existing(path, "Parquet file")
+    check_parquet(path)
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
+    columns = []
+    for field, values in zip(table.schema, table.columns, strict=True):
+        kind = field.type
+        if pa.types.is_dictionary(kind):
+            values, kind = values.cast(kind.value_type), kind.value_type
+        if pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind):
+            plain = values.cast(pa.float64(), safe=False) if values.null_count else values
+            columns.append(Column(field.name, plain.to_numpy(), path, None))
+        elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
+            columns.append(Column(field.name, np.array(values.to_pylist(), object), path, None))
+    if not columns or not table.num_rows:
+        raise InputError(f"{path}: no rows of numbers in it; expected one for every reading")
+    return Sheet(tuple(columns))
+
+
+def _lines(path: Path) -> Any:
+    """Number and text of every line that is not blank."""
+    with open(path, encoding="utf-8-sig", newline=None) as file:
+        number = 0
+        try:
+            while line := file.readline(LONGEST_LINE + 1):
+                number += 1
+                if len(line) > LONGEST_LINE:
+                    raise InputError(
+                        f"{path}:{number}: longer than {LONGEST_LINE:,} characters; no row of numbers is"
+                    )
+                if line.strip():
+                    yield number, line.rstrip("\n")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path}: not a text file ({error}); readings are CSV in UTF-8") from error
+
+
+def _words(path: Path, lines: list[tuple[int, str]], between: str | None) -> list[list[str]]:
+    if between is None:
+        return [line.split() for _, line in lines]
+    rows = []
+    for number, line in lines:
+        try:
+            rows.append(next(csv.reader([line], delimiter=between, strict=True)))
+        except csv.Error as error:
+            raise InputError(f"{path}:{number}: not CSV: {error}, in {line[:SAID]!r}") from None
+    return rows
+
+
+def _number(word: str) -> float:
+    """A word as a number; nan where it says nothing, -inf where it is none."""
+    if _NUMBER.fullmatch(word):
+        value = float(word)
+        return value if math.isfinite(value) else -math.inf
+    return math.nan if word.strip().lower() in _NOTHING else -math.inf

@@ -1,0 +1,288 @@
+"""Features: what a neural magnetometer reads from a Run, by name, in the units it was trained on."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError, find
+from magtwin.run.run import COLUMNS, Run
+
+Array = NDArray[np.float64]
+
+
+Convert = Callable[..., NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One input of a network: a number made of columns of a Run, in the unit in which it is read."""
+
+    columns: tuple[str, ...]
+    """Columns of the Run it is made of."""
+
+    index: int | None
+    """Which number of each row of what they give; None where that holds one."""
+
+    unit: str
+    """Unit in which the network reads it, "" for numbers without one."""
+
+    convert: Convert | None = None
+    """From the columns, each (N,) or (N, width), to what the network reads, (N,) or (N, width'), row by row:
+    no row of it depends on another. None takes the one column as it is."""
+
+
+def degrees_0_360(yaw: NDArray[Any]) -> Array:
+    """Headings [rad] as degrees in [0, 360), any shape."""
+    deg = np.degrees(yaw) % 360.0
+    return np.where(deg >= 360.0, 0.0, deg)  # -1e-17 % 360 is 360
+
+
+def circle(yaw: NDArray[Any]) -> Array:
+    """Headings [rad], shape (N,), as sin, cos and those of twice the heading, shape (N, 4).
+
+    The field of hard iron goes once about with the heading, that of soft iron twice.
+    """
+    return np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2 * yaw), np.cos(2 * yaw)])
+
+
+def carried(gradient_nt_m: NDArray[Any], odom_v: NDArray[Any]) -> Array:
+    """Gradients forward and to the left [nT/m], (N, 2), times the forward speed [m/s] of (N, 3): [nT/s].
+
+    A reading that is late by tau errs by tau of the first, as a lever arm l does by l of the gradient.
+    """
+    return gradient_nt_m * odom_v[:, :1]
+
+
+def lags(v_cmd: NDArray[Any], w_cmd: NDArray[Any], odom_v: NDArray[Any], odom_w: NDArray[Any]) -> Array:
+    """What is commanded beyond what is driven, forward [m/s] and turning [rad/s], shape (N, 2).
+
+    The motors' torque, and so their current, goes with it while the robot gains speed or loses it.
+    """
+    return np.column_stack([v_cmd - odom_v[:, 0], w_cmd - odom_w[:, 2]])
+
+
+def turned(yaw: NDArray[Any], *signals: NDArray[Any]) -> Array:
+    """Signals (N,) or (N, width) times sin and cos of the heading, shape (N, 2 x their numbers).
+
+    A current's field is fixed to the robot, beside which the Earth's turns: of its level part
+    the magnitude sees what lies along the Earth's.
+    """
+    each = np.column_stack(signals)
+    return np.column_stack([w * s for s in each.T for w in (np.sin(yaw), np.cos(yaw))])
+
+
+def turned_motion(yaw: NDArray[Any], odom_v: NDArray[Any], odom_w: NDArray[Any]) -> Array:
+    """Speed and turning, signed and by size, times sin and cos of the heading, shape (N, 6)."""
+    return turned(yaw, odom_v[:, 0], odom_w[:, 2], np.abs(odom_w[:, 2]))
+
+
+def turned_lags(
+    yaw: NDArray[Any], v_cmd: NDArray[Any], w_cmd: NDArray[Any], odom_v: NDArray[Any], odom_w: NDArray[Any]
+) -> Array:
+    """`lags` times sin and cos of the heading, shape (N, 4)."""
+    return turned(yaw, lags(v_cmd, w_cmd, odom_v, odom_w))
+
+
+def turning_size(odom_w: NDArray[Any]) -> Array:
+    """How fast a robot turns, to either side [rad/s], shape (N,): friction does not know the side."""
+    return np.abs(odom_w[:, 2])
+
+
+def direction_cosines(b_vector_nt: NDArray[Any]) -> Array:
+    """Unit vectors along fields, shape (N, 3); nan for a field of 0.
+
+    Their size is left out on purpose: it is the very field that is to be predicted.
+    """
+    size = np.linalg.norm(b_vector_nt, axis=1, keepdims=True)
+    return np.divide(b_vector_nt, size, out=np.full(b_vector_nt.shape, np.nan), where=size > 0)
+
+
+def induced_products(b_vector_nt: NDArray[Any]) -> Array:
+    """Products of direction cosines xx, xy, xz, yy, yz, shape (N, 5); zz is 1 less xx and yy.
+
+    Tolles and Lawson's induced terms (Leliak 1961), without the field's size.
+    """
+    x, y, z = direction_cosines(b_vector_nt).T
+    return np.column_stack([x * x, x * y, x * z, y * y, y * z])
+
+
+def eddy_products(b_vector_nt: NDArray[Any], imu_w: NDArray[Any]) -> Array:
+    """Products u_i du_j/dt of direction cosines and their rates [1/s], j = x, y of i = x, y, z: (N, 6).
+
+    Tolles and Lawson's eddy terms (Leliak 1961). In a field that stands still a turning body sees
+    du/dt = -w x u, so the gyroscope gives the rates of a row without its neighbours; on a floor that of z
+    is about 0.
+    """
+    u = direction_cosines(b_vector_nt)
+    rate = -np.cross(imu_w, u)
+    return np.column_stack([u[:, i] * rate[:, j] for i in range(3) for j in range(2)])
+
+
+def _canonical(q: NDArray[Any]) -> Array:
+    """Quaternions (N, 4) with w >= 0; a factor of +-1, three times as fast as choosing whole rows."""
+    return q * np.where(q[:, 3:] < 0, -1.0, 1.0)
+
+
+def _vector(prefix: str, column: str, convert: Convert | None = None) -> dict[str, Feature]:
+    """A feature for each number of a vector column: `prefix` and the name of its part."""
+    spec = COLUMNS[column]
+    return _named({f"{prefix}_{part}": spec.unit for part in spec.parts}, convert, column)
+
+
+def _named(units: Mapping[str, str], convert: Convert | None, *columns: str) -> dict[str, Feature]:
+    """A feature for each number that `convert` makes of the columns."""
+    return {name: Feature(columns, i, unit, convert) for i, (name, unit) in enumerate(units.items())}
+
+
+_B = "b_vector_measured_nt"
+CIRCLE = ("yaw_sin", "yaw_cos", "yaw_sin_2", "yaw_cos_2")
+GRADIENT = ("map_gradient_forward", "map_gradient_left")
+CARRIED = ("speed_map_gradient_forward", "speed_map_gradient_left")
+COSINES = ("cosine_x", "cosine_y", "cosine_z")
+INDUCED = ("induced_xx", "induced_xy", "induced_xz", "induced_yy", "induced_yz")
+LAGS = ("lag_v", "lag_w")
+TURNED = tuple(f"{signal}_yaw_{part}" for signal in ("lidar_on", "battery_a") for part in ("sin", "cos"))
+TURNED_MOTION = tuple(
+    f"{signal}_yaw_{part}" for signal in ("odom_v_x", "odom_w_z", "turning") for part in ("sin", "cos")
+)
+TURNED_LAGS = tuple(f"{signal}_yaw_{part}" for signal in LAGS for part in ("sin", "cos"))
+EDDY = ("eddy_xdx", "eddy_xdy", "eddy_ydx", "eddy_ydy", "eddy_zdx", "eddy_zdy")
+
+FEATURES: Mapping[str, Feature] = MappingProxyType(
+    {
+        "yaw_deg": Feature(("yaw",), None, "deg", degrees_0_360),
+        **_vector("odom_v", "odom_v"),
+        **_vector("odom_w", "odom_w"),
+        **_vector("imu_q", "imu_q_xyzw", _canonical),
+        **_vector("imu_w", "imu_w"),
+        **_vector("imu_a", "imu_a"),
+        "battery_v": Feature(("battery_v",), None, "V"),
+        "battery_fraction": Feature(("battery_fraction",), None, ""),
+        "lidar_on": Feature(("lidar_on",), None, "0 or 1"),
+        **_named(dict.fromkeys(CIRCLE, ""), circle, "yaw"),
+        "battery_a": Feature(("battery_a",), None, "A"),
+        **_named(dict.fromkeys(GRADIENT, "nT/m"), None, "b_map_gradient_nt_m"),
+        **_named(dict.fromkeys(CARRIED, "nT/s"), carried, "b_map_gradient_nt_m", "odom_v"),
+        **_named({"lag_v": "m/s", "lag_w": "rad/s"}, lags, "v_cmd", "w_cmd", "odom_v", "odom_w"),
+        "turning": Feature(("odom_w",), None, "rad/s", turning_size),
+        **_named(
+            dict(zip(TURNED, ("0 or 1", "0 or 1", "A", "A"), strict=True)),
+            turned,
+            "yaw",
+            "lidar_on",
+            "battery_a",
+        ),
+        **_named(
+            dict(zip(TURNED_MOTION, ("m/s",) * 2 + ("rad/s",) * 4, strict=True)),
+            turned_motion,
+            *("yaw", "odom_v", "odom_w"),
+        ),
+        **_named(
+            dict(zip(TURNED_LAGS, ("m/s",) * 2 + ("rad/s",) * 2, strict=True)),
+            turned_lags,
+            *("yaw", "v_cmd", "w_cmd", "odom_v", "odom_w"),
+        ),
+        **_named(dict.fromkeys(COSINES, ""), direction_cosines, _B),
+        **_named(dict.fromkeys(INDUCED, ""), induced_products, _B),
+        **_named(dict.fromkeys(EDDY, "1/s"), eddy_products, _B, "imu_w"),
+    }
+)
+"""Every feature by name. Names are kept in weights: they are added to, and never change what they mean."""
+
+FULL: tuple[str, ...] = (
+    "yaw_deg",
+    *("odom_v_x", "odom_v_y", "odom_v_z"),
+    *("odom_w_x", "odom_w_y", "odom_w_z"),
+    *("imu_q_x", "imu_q_y", "imu_q_z", "imu_q_w"),
+    *("imu_w_x", "imu_w_y", "imu_w_z"),
+    *("imu_a_x", "imu_a_y", "imu_a_z"),
+    *("battery_v", "battery_fraction", "lidar_on"),
+)
+"""The 20 inputs of the paper's network, in its order: true heading, odometry's linear and angular
+velocity, IMU's orientation, rates and acceleration, battery voltage and charge, LiDAR on or off."""
+
+CIRCULAR: tuple[str, ...] = (
+    *CIRCLE,
+    *("odom_v_x", "odom_w_z"),
+    *("imu_w_x", "imu_w_y", "imu_w_z"),
+    *("imu_a_x", "imu_a_y", "imu_a_z"),
+    *("battery_a", "lidar_on"),
+)
+"""What a robot's field depends on, and nothing that tells one session from another: no level of charge or
+voltage, no orientation from a zero of the IMU's own."""
+
+SETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "full": FULL,
+        "correlated": ("yaw_deg", "odom_v_x", "imu_q_x", "imu_q_y", "imu_q_z", "imu_q_w"),
+        "circular": CIRCULAR,
+        "gradient": (*CIRCULAR, *GRADIENT, *CARRIED),
+        "platform": (*CIRCULAR, *GRADIENT, *CARRIED, *LAGS, "turning", *TURNED, *TURNED_MOTION, *TURNED_LAGS),
+        "vector": (*CIRCULAR, *GRADIENT, *CARRIED, *COSINES, *INDUCED, *EDDY),
+    }
+)
+"""Features by the name of a set. "correlated" holds those whose Spearman correlation with the
+disturbance exceeds 0.04 in the paper's Figure 2; "gradient" adds to "circular" what a lever arm and a
+latency make of the map; "platform" what a field that is fixed to the robot makes of currents, torques and the
+LiDAR as the robot turns; "vector" what the vector axes tell of the platform's attitude in the field."""
+
+
+def feature_names(names: str | Sequence[str]) -> tuple[str, ...]:
+    """The features of a named set, or the names given, each known and none twice.
+
+    Args:
+        names: A name of `SETS`; a feature, or several with commas between; or their names.
+
+    Raises:
+        InputError: An unknown set or feature (the text names the near one), or one named twice.
+    """
+    if isinstance(names, str):
+        if "," not in names and names not in FEATURES:
+            return find("feature set", names, SETS)
+        names = [name.strip() for name in names.split(",") if name.strip()]
+    for name in names:
+        find("feature", name, FEATURES)
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if list(names).count(name) > 1)
+        raise InputError(f"feature {twice!r} is named twice; name each input once")
+    return tuple(names)
+
+
+def features(run: Run, names: str | Sequence[str] = "full") -> Array:
+    """Inputs of a network for each reading of a run.
+
+    Args:
+        run: Needs the columns that the features are taken from.
+        names: A set of `SETS` or names of features, in the order of the network's inputs.
+
+    Returns:
+        Features in the units of `FEATURES`, shape (N, F), rows contiguous.
+
+    Raises:
+        InputError: An unknown feature or set, or a column that the run lacks.
+    """
+    names = feature_names(names)
+    x = np.empty((run.rows, len(names)))
+    made: dict[tuple[Any, ...], NDArray[Any]] = {}  # a quaternion is made canonical once, not four times
+    for i, name in enumerate(names):
+        feature = FEATURES[name]
+        key = (feature.convert, feature.columns)
+        if key not in made:
+            columns = [run[column] for column in feature.columns]
+            made[key] = feature.convert(*columns) if feature.convert else columns[0]
+        values = made[key]
+        x[:, i] = values if feature.index is None else values[:, feature.index]
+    return x
+
+
+def columns_of(names: str | Sequence[str]) -> tuple[str, ...]:
+    """Columns of a Run that features are made of, each once; `names` as for `features`.
+
+    Raises:
+        InputError: An unknown feature or set.
+    """
+    return tuple(dict.fromkeys(c for name in feature_names(names) for c in FEATURES[name].columns))

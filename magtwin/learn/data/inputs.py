@@ -1,0 +1,138 @@
+"""Inputs: what a predictor reads in a row, how it is scaled, and what it was trained within."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.learn.data.features import feature_names
+from magtwin.summary import Summarized
+
+Array = NDArray[np.float64]
+
+SCALERS = ("x_mean", "x_scale", "x_min", "x_max")
+"""Tensors of a weights file that hold scaler and ranges."""
+
+FAR = 5.0
+"""Scales from the mean beyond which an input is outside, where the training range is unknown."""
+
+_BLOCK = 512
+"""Rows compared at once, so that what is compared stays in a core's cache."""
+
+
+@dataclass(frozen=True, repr=False)
+class Inputs(Summarized):
+    """The features of a row in order, with the scaler and the ranges of the training rows."""
+
+    features: tuple[str, ...]
+    """Names, of `magtwin.learn.data.features.FEATURES`."""
+
+    mean: Array
+    """Means of the training inputs, in the units of the features, shape (F,)."""
+
+    scale: Array
+    """Scales of the training inputs, shape (F,), above 0."""
+
+    low: Array
+    """Smallest training inputs, shape (F,); nan where unknown."""
+
+    high: Array
+    """Largest training inputs, shape (F,); nan where unknown."""
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """What a weights file holds of them, by name, float64."""
+        values = (self.mean, self.scale, self.low, self.high)
+        return {name: torch.as_tensor(value) for name, value in zip(SCALERS, values, strict=True)}
+
+    def grown(self, of: "Inputs") -> "Inputs":
+        """The same scaler, with ranges that hold those of other rows too, or stay unknown.
+
+        Raises:
+            InputError: The others are of other features.
+        """
+        if of.features != self.features:
+            raise InputError(
+                f"the model to go on from has inputs {', '.join(self.features)}, this training "
+                f"{', '.join(of.features)}; give it the same features"
+            )
+        low, high = np.minimum(self.low, of.low), np.maximum(self.high, of.high)
+        return Inputs(self.features, self.mean, self.scale, low, high)
+
+    def checked(self, x: ArrayLike) -> Array:
+        """`x` as rows of float64, if they are as wide as the features are many.
+
+        Raises:
+            InputError: They are not.
+        """
+        x = np.ascontiguousarray(x, float)
+        wanted = len(self.features)
+        if x.ndim != 2 or x.shape[1] != wanted:
+            raise InputError(
+                f"this network reads {wanted} features a row, shape (N, {wanted}); got {x.shape}"
+            )
+        return x
+
+    def scaled(self, x: ArrayLike) -> Array:
+        """Rows (x - mean) / scale, shape (N, F)."""
+        return (np.asarray(x, float) - self.mean) / self.scale
+
+    @property
+    def within(self) -> tuple[Array, Array]:
+        """Least and greatest inputs that are not outside, each (F,).
+
+        Where the training range is unknown (the released weights do not hold it), they lie 5 scales from the
+        mean.
+        """
+        low = np.where(np.isnan(self.low), self.mean - FAR * self.scale, self.low)
+        high = np.where(np.isnan(self.high), self.mean + FAR * self.scale, self.high)
+        slack = 1e-9 * np.maximum(np.abs(low), np.abs(high))  # rounding of inputs that never vary
+        return low - slack, high + slack
+
+    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
+        """Whether an input of a row left what it was trained `within`, shape (N,); nan is outside."""
+        x = self.checked(x)
+        low, high = self.within
+        inside = np.empty(len(x), bool)
+        for start in range(0, len(x), _BLOCK):
+            block = x[start : start + _BLOCK]
+            np.all((block >= low) & (block <= high), axis=1, out=inside[start : start + _BLOCK])
+        return ~inside
+
+
+def inputs_of(x: ArrayLike, features: str | Sequence[str]) -> Inputs:
+    """Scaler and ranges of training rows.
+
+    Args:
+        x: Features, shape (N, F). One that does not vary keeps a scale of 1.
+        features: Their names, or that of a set of them.
+    """
+    x = np.asarray(x, float)
+    scale = x.std(axis=0)
+    scale[scale < 1e-12 * np.maximum(1.0, np.abs(x).max(axis=0))] = 1.0
+    return Inputs(feature_names(features), x.mean(axis=0), scale, x.min(axis=0), x.max(axis=0))
+
+
+def scaler_tensors(count: int) -> dict[str, torch.Tensor]:
+    """Tensors of the names, shapes and types in which a weights file holds so many inputs."""
+    return dict.fromkeys(SCALERS, torch.ones(count, dtype=torch.float64))
+
+
+def inputs_from(features: Sequence[str], tensors: Mapping[str, torch.Tensor], path: Path) -> Inputs:
+    """Scaler and ranges of a weights file.
+
+    Args:
+        features: Names of the inputs.
+        tensors: Those of `scaler_tensors`, and others.
+        path: The file, for refusals.
+
+    Raises:
+        InputError: A scale is not above 0.
+    """
+    mean, scale, low, high = (tensors[name].numpy() for name in SCALERS)
+    if not (scale > 0).all():
+        raise InputError(f"{path}: a scale of its scalers is not above 0")
+    return Inputs(tuple(features), mean, scale, low, high)

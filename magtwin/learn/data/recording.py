@@ -1,0 +1,172 @@
+"""Recordings: what goes into a data set, and what comes out of it."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.run.run import Run
+from magtwin.summary import Summarized
+
+Array = NDArray[np.float64]
+
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,199}")
+_SHA = re.compile("[0-9a-f]{64}")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording that goes into a data set."""
+
+    name: str
+    """What it is called; letters, digits and _ . + - make the name of its shard."""
+
+    read: Callable[[], Run]
+    """Gives the run; called once, or twice where an alignment is fitted."""
+
+    session: str = ""
+    """What it shares with others that were recorded between two switchings on; its run's own unless given."""
+
+    path: str = ""
+    """What was driven; its run's own unless given."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording of a data set."""
+
+    name: str
+    """What it is called."""
+
+    session: str
+    """What was switched on and off with it; its own name where nobody said."""
+
+    path: str
+    """What was driven; its own name where nobody said."""
+
+    rows: int
+    """Readings."""
+
+    labelled: int
+    """Readings that have a label."""
+
+    duration_s: float
+    """From the first reading to the last [s]."""
+
+    sha256: str
+    """Checksum of its shard."""
+
+    label_mean_nt: float
+    """Mean of its labels [nT]."""
+
+    label_sd_nt: float
+    """Standard deviation of its labels [nT]."""
+
+    def __post_init__(self) -> None:
+        for name in ("name", "session", "path", "sha256"):
+            if not isinstance(getattr(self, name), str):
+                raise InputError(f"{name} of a recording must be a text, got {getattr(self, name)!r}")
+        for name in ("rows", "labelled"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+                raise InputError(f"{name} of a recording must be a whole number from 0, got {value!r}")
+        if self.labelled > self.rows:
+            raise InputError(f"{self.name[:80]!r} has {self.rows} rows and {self.labelled} labels")
+        for name in ("duration_s", "label_mean_nt", "label_sd_nt"):
+            value = getattr(self, name)
+            if not isinstance(value, int | float) or not np.isfinite(value):
+                raise InputError(f"{name} of a recording must be a finite number, got {value!r}")
+        if not _NAME.fullmatch(self.name) or ".." in self.name:
+            raise InputError(f"a recording is named by letters, digits and _ . + -, got {self.name[:80]!r}")
+        if not _SHA.fullmatch(self.sha256):
+            raise InputError(f"sha256 of recording {self.name!r} is not one: {self.sha256[:80]!r}")
+
+
+@dataclass(frozen=True, repr=False)
+class Rows(Summarized):
+    """What a network learns from: inputs and labels, row by row."""
+
+    x: Array
+    """Features in the units of `FEATURES`, shape (N, F); none is nan."""
+
+    y: Array
+    """Labels [nT], shape (N,)."""
+
+    sd: Array
+    """How well the map is known there [nT], shape (N,)."""
+
+    recording: NDArray[np.intp]
+    """Which of `names` each row is of, shape (N,), ascending."""
+
+    names: tuple[str, ...]
+    """Recordings."""
+
+    features: tuple[str, ...]
+    """Names of the columns of `x`."""
+
+    left_out: Mapping[str, int]
+    """How many rows there were without a label, and how many labelled ones with an input that is nan."""
+
+    row: NDArray[np.intp]
+    """Which row of its recording each is, shape (N,)."""
+
+    beside: Array
+    """Other features that were asked for on the same rows, shape (N, K); nan where unknown."""
+
+
+def sources_of(recordings: Mapping[str, Run] | Sequence[Source]) -> list[Source]:
+    """Sources of runs by name, or as given, each with a name of its own.
+
+    Raises:
+        InputError: There is none, a name cannot be that of a file, or two have one.
+    """
+    if isinstance(recordings, Mapping):
+        sources = [Source(name, lambda run=run: run) for name, run in recordings.items()]  # type: ignore[misc]
+    else:
+        sources = list(recordings)
+    if not sources:
+        raise InputError("a data set needs one recording at least, got none")
+    seen: set[str] = set()
+    for source in sources:
+        if not _NAME.fullmatch(source.name) or ".." in source.name:
+            raise InputError(
+                f"a recording is named by letters, digits and _ . + -, got {source.name[:80]!r}; rename it"
+            )
+        if source.name.casefold() in seen:
+            raise InputError(f"two recordings are called {source.name!r}; rename one")
+        seen.add(source.name.casefold())
+    return sources
+
+
+def read(source: Source) -> Run:
+    """The run of a source, that it can be labelled.
+
+    Raises:
+        InputError: It tells no pose, or no field, or a field that a network or a map made up.
+    """
+    run = source.read()
+    posed = {"mocap_p", "mocap_q_xyzw"} <= set(run) or {"p_world_base", "yaw"} <= set(run)
+    if not posed or "b_measured_nt" not in run:
+        wanted = "b_measured_nt" if posed else "mocap_p with mocap_q_xyzw, or p_world_base with yaw"
+        raise InputError(f"{source.name}: nothing to label: it has no column {wanted}")
+    if (kind := run.facts.get("magnetometer")) in ("neural", "map-only"):
+        raise InputError(
+            f"{source.name}: its readings are those of a {kind} magnetometer, and what learns from them "
+            "learns that model; record a robot, or drive the twin with --magnetometer physical"
+        )
+    return run
+
+
+def thinned(run: Run, rate_hz: float | None) -> Run:
+    """Every second, third, ... row, so that there are not more than some a second."""
+    if rate_hz is None or run.rows < 2:
+        return run
+    step = float(np.median(np.diff(run["t"])))
+    every = max(1, int(np.ceil(0.99 / (step * rate_hz))))  # to 1 %, as wall clocks go
+    if every == 1:
+        return run
+    columns = {name: values[::every] for name, values in run.items()}
+    return Run(columns, {**run.facts, "every": every}, run.specs)

@@ -1,0 +1,1 @@
+"""Evaluation of magnetometer models: scores and error budgets."""

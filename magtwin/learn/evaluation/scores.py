@@ -1,0 +1,219 @@
+"""Score: errors in figures, with intervals that know how alike the readings of a run err."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.summary import Summarized
+from magtwin.verdict import Z_90
+
+Array = NDArray[np.float64]
+Interval = tuple[float, float]
+
+BLOCK_S = 5.0
+"""Length of the blocks of time that are drawn anew [s]: the robot's own field changes within seconds, a map's
+error with the place, which is another 1 m on."""
+
+DRAWS = 1000
+"""How often everything is drawn anew."""
+
+LEVEL = 0.95
+"""Share of the draws within an interval."""
+
+COVERED = 0.9
+"""Share of the errors that a predicted interval is to hold."""
+
+_ABS, _SQUARE, _SUM, _KNOWN, _WITHIN, _OUTSIDE = range(6)
+
+
+@dataclass(frozen=True)
+class Score:
+    """Errors of one model on some readings, each interval of `LEVEL`."""
+
+    rows: int
+    """Readings."""
+
+    mae_nt: float
+    """Mean absolute error [nT]."""
+    mae_interval_nt: Interval
+    """Where it lies, by resampling [nT]."""
+
+    ratio: float
+    """`mae_nt` by that of the naive model on the same readings."""
+    ratio_interval: Interval
+    """Where that lies, both drawn together."""
+
+    rmse_nt: float
+    """Root mean square error [nT]."""
+
+    bias_nt: float
+    """Mean error, predicted less measured [nT]."""
+
+    coverage: float
+    """Share of the readings in the predicted interval of 90 %; nan where none is predicted."""
+    coverage_interval: Interval
+    """Where that lies."""
+
+    outside: float
+    """Share of the readings with an input beyond the training ranges."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Errors(Summarized):
+    """Errors of several models on the readings of one run."""
+
+    session: str
+    """What was switched on and off with it."""
+
+    group: str
+    """The case that it is of."""
+
+    t: Array
+    """Times, shape (N,) [s]."""
+
+    error_nt: Array
+    """Predicted less measured [nT], shape (M, N); all finite."""
+
+    sd_nt: Array
+    """Predicted standard deviations [nT], shape (M, N); nan where there is none."""
+
+    outside: NDArray[np.bool_]
+    """Whether an input was beyond the training ranges, shape (M, N)."""
+
+    def sums(self) -> tuple[Array, Array]:
+        """Readings in each block of `BLOCK_S`, (K,), and sums of what scores are made of, (K, M, 6)."""
+        block = ((self.t - self.t[0]) // BLOCK_S).astype(int)
+        block = np.unique(block, return_inverse=True)[1]
+        size = np.abs(self.error_nt)
+        known = np.isfinite(self.sd_nt)
+        within = known & (size <= Z_90 * np.where(known, self.sd_nt, 0.0))
+        parts = (size, size**2, self.error_nt, known, within, self.outside)
+        count = int(block.max()) + 1
+        made: Array = np.array([[np.bincount(block, row, count) for row in part] for part in parts], float)
+        return np.bincount(block, minlength=count).astype(float), np.moveaxis(made, (0, 1, 2), (2, 1, 0))
+
+
+def scores(
+    runs: Sequence[Errors], *, rng: np.random.Generator, draws: int = DRAWS
+) -> tuple[dict[str, tuple[Score, ...]], tuple[Score, ...], tuple[Score, ...]]:
+    """Scores of each model in each group, on all readings, and in the mean of the groups; the first is naive.
+
+    Intervals are percentiles of a bootstrap that draws as the data came about: sessions, then runs within
+    each group of a session, then blocks of time within each run, all with replacement (Davison and Hinkley
+    1997, section 3.8; Künsch 1989 for blocks). Of one session, or one run, only what lies below is drawn, and
+    the interval says nothing of other days.
+
+    Args:
+        runs: Errors by run, of the same models.
+        rng: Source of the draws.
+        draws: How many.
+
+    Returns:
+        By group, in order of first appearance, a Score a model; those of all readings; and those of the
+        mean over groups, whose figures are means of the groups' figures.
+
+    Raises:
+        InputError: There is no run.
+    """
+    if not runs:
+        raise InputError("no run to score")
+    groups = list(dict.fromkeys(run.group for run in runs))
+    children = iter(rng.spawn(len(groups) + 1))
+    told: dict[str, tuple[Score, ...]] = {}
+    for group in groups:
+        own = [run for run in runs if run.group == group]
+        rows, whole, drawn = _resampled(own, [group], next(children), draws)
+        told[group] = _scored(rows[0], whole[0], drawn[0])
+    rows, whole, drawn = _resampled(runs, groups, next(children), draws)
+    every = _scored(rows.sum(), whole.sum(axis=0), drawn.sum(axis=0))
+    if len(groups) == 1:
+        return told, every, every
+    figures = [_figures(whole[i]) for i in range(len(groups))]
+    spreads = [_figures(drawn[i]) for i in range(len(groups))]
+    mean = [np.mean([one[k] for one in figures], axis=0) for k in range(len(_FIGURES))]
+    spread = [np.mean([one[k] for one in spreads], axis=0) for k in range(len(_FIGURES))]
+    return told, every, _told(int(rows.sum()), mean, spread)
+
+
+def _resampled(
+    runs: Sequence[Errors], groups: Sequence[str], rng: np.random.Generator, draws: int
+) -> tuple[NDArray[np.intp], Array, Array]:
+    """Rows (C,), sums as they are (C, M, 7), and as drawn (C, D, M, 7), the last of the seven the rows."""
+    sessions = list(dict.fromkeys(run.session for run in runs))
+    models = len(runs[0].error_nt)
+    rows = np.zeros(len(groups), np.intp)
+    whole, drawn = np.zeros((len(groups), models, 7)), np.zeros((len(groups), draws, models, 7))
+    often = rng.multinomial(len(sessions), np.full(len(sessions), 1 / len(sessions)), draws)
+    for s, session in enumerate(sessions):
+        for g, group in enumerate(groups):
+            own = [run for run in runs if (run.session, run.group) == (session, group)]
+            if not own:
+                continue
+            of_runs = rng.multinomial(often[:, s] * len(own), np.full(len(own), 1 / len(own)))
+            for r, run in enumerate(own):
+                count, sums = run.sums()
+                sums = np.concatenate([sums, np.broadcast_to(count[:, None, None], (*sums.shape[:2], 1))], 2)
+                of_blocks = rng.multinomial(of_runs[:, r] * len(count), np.full(len(count), 1 / len(count)))
+                rows[g] += len(run.t)
+                whole[g] += sums.sum(axis=0)
+                drawn[g] += np.tensordot(of_blocks, sums, axes=1)
+    return rows, whole, drawn
+
+
+_FIGURES = ("mae", "ratio", "rmse", "bias", "coverage", "outside")
+
+
+def _figures(sums: Array) -> list[Array]:
+    """What `_FIGURES` names of sums (..., M, 7), each (..., M); nan of a draw without readings."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        count = sums[..., 6]
+        mae = sums[..., _ABS] / count
+        coverage = np.where(sums[..., _KNOWN] == count, sums[..., _WITHIN] / count, np.nan)
+        return [
+            mae,
+            mae / mae[..., :1],
+            np.sqrt(sums[..., _SQUARE] / count),
+            sums[..., _SUM] / count,
+            coverage,
+            sums[..., _OUTSIDE] / count,
+        ]
+
+
+def _scored(rows: np.intp, whole: Array, drawn: Array) -> tuple[Score, ...]:
+    return _told(int(rows), _figures(whole), _figures(drawn))
+
+
+def _told(rows: int, figures: Sequence[Array], spreads: Sequence[Array]) -> tuple[Score, ...]:
+    """A Score a model from its figures (M,), and those of the draws (D, M)."""
+    found = []
+    for m in range(len(figures[0])):
+        mae, ratio, rmse, bias, coverage, outside = (float(figure[m]) for figure in figures)
+        around = dict(zip(_FIGURES, (_interval(spread[:, m]) for spread in spreads), strict=True))
+        found.append(
+            Score(
+                rows,
+                mae,
+                around["mae"],
+                ratio,
+                around["ratio"],
+                rmse,
+                bias,
+                coverage,
+                around["coverage"],
+                outside,
+            )
+        )
+    return tuple(found)
+
+
+def _interval(values: Array) -> Interval:
+    """The middle `LEVEL` of the draws that had readings."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return math.nan, math.nan
+    low, high = np.quantile(known, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return float(low), float(high)

@@ -1,0 +1,1 @@
+"""Magnetometer models and their weights."""

@@ -1,0 +1,255 @@
+"""Training: from features and labels to a FieldNet, judged on runs that it never saw."""
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError, find
+from magtwin.learn.data.features import feature_names
+from magtwin.learn.models.descent import Course, Epoch, check_device, descend
+from magtwin.learn.models.network import Fact, FieldNet
+from magtwin.learn.models.state import digest
+
+Array = NDArray[np.float64]
+
+
+def train(
+    x: ArrayLike,
+    y: ArrayLike,
+    x_val: ArrayLike,
+    y_val: ArrayLike,
+    *,
+    rng: np.random.Generator,
+    weight: ArrayLike | None = None,
+    features: str | Sequence[str] = "full",
+    layers: Sequence[int] = (512, 512, 512, 512),
+    dropout: float = 0.3,
+    epochs: int = 20,
+    batch: int = 1024,
+    lr: float = 1e-3,
+    patience: int | None = None,
+    facts: Mapping[str, Fact] | None = None,
+    init: FieldNet | None = None,
+    freeze: Sequence[str] = (),
+    checkpoint: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    device: str = "cpu",
+    progress: Callable[[Epoch], None] | None = None,
+    advance: Callable[[int, int], None] | None = None,
+) -> tuple[FieldNet, tuple[Epoch, ...]]:
+    """Fit a network by Adam to the mean squared error of scaled labels.
+
+    The step size rises over the first half epoch and then falls to 0 along half a cosine. The weights of the
+    epoch that did best on the validation rows are kept; these have to come from other runs than the
+    training rows, because rows of one run are alike and a network can know a run by its battery.
+
+    Args:
+        x: Training features, in the units of `magtwin.learn.data.features`, shape (N, F).
+        y: Training labels: true or measured field minus map [nT], shape (N,).
+        x_val: Features of other runs, shape (M, F).
+        y_val: Their labels [nT], shape (M,).
+        rng: Source of the first weights, the order of rows and dropout. One state, one machine, one device
+            and one number of threads give the same weights, bit for bit.
+        weight: How much each training row counts, shape (N,), of any scale; all alike unless given.
+        features: Names of the features, in order, or of a set of them.
+        layers: Widths of the hidden layers.
+        dropout: Share of units dropped in training, to the nearest 65,536th.
+        epochs: Passes over the training rows.
+        batch: Rows a step.
+        lr: Largest step size of Adam.
+        patience: Stop after so many epochs without a better one; None runs them all.
+        facts: Provenance to keep in the weights file.
+        init: Network of the same inputs and layers whose weights and scalers are gone on from. It is an
+            epoch 0 of its own, so that what is kept is never worse on the validation rows than it was.
+        freeze: Names of layers that stay as `init` has them: "layers.0" is the first.
+        checkpoint: File that the state of the training is written to after each epoch.
+        resume: Go on from `checkpoint`; the weights are those of a training that was never stopped.
+        device: Where it is trained, as torch calls it: "cpu", "cuda". The network comes back to the CPU.
+        progress: Called after each epoch.
+        advance: Called after each step with how many rows are done, and of how many in all epochs.
+
+    Returns:
+        The network, in evaluation mode, its `residual_sd_nt` the root mean square error on the
+        validation rows, and how each epoch went.
+
+    Raises:
+        InputError: Rows that are nan or of the wrong shape, a label that never varies, a step size at
+            which training diverged, a device that is not there, an `init` of other inputs or layers, or a
+            checkpoint of another training.
+    """
+    names = feature_names(features)
+    x, y = _rows("training", x, y, names)
+    x_val, y_val = _rows("validation", x_val, y_val, names)
+    counts: Array | None = None
+    if weight is not None:
+        counts = np.array(weight, float)
+        if counts.shape != y.shape or not (np.isfinite(counts).all() and (counts > 0).all()):
+            raise InputError(f"weight must be above 0 and finite, one for each of {len(y)} training rows")
+        counts /= counts.mean()
+    if y.std() < 1e-9:
+        raise InputError(f"the label is {y[0]:g} nT in every training row; there is nothing to learn")
+    if not (epochs > 0 and batch > 0 and lr > 0):
+        raise InputError(f"epochs, batch and lr must be above 0, got {epochs}, {batch} and {lr}")
+    if patience is not None and patience < 1:
+        raise InputError(f"patience must be 1 epoch at least, got {patience}; leave it out to run them all")
+    check_device(device)
+    seed = int(rng.integers(2**62))
+    with torch.random.fork_rng(devices=[]):  # first weights are drawn from torch's own generator
+        torch.manual_seed(seed)
+        net = FieldNet(names, layers, dropout=dropout, facts=facts)
+    if init is None:
+        net.set_scalers(x, y)
+    else:
+        _go_on_from(net, init, x)
+    _freeze(net, freeze, init)
+    settings = {
+        "features": list(names),
+        "layers": list(net.hidden),
+        "dropout": dropout,
+        "freeze": sorted(freeze),
+        "device": device,
+        "threads": torch.get_num_threads(),
+        "torch": str(torch.__version__),
+    }
+    if checkpoint is not None:
+        settings["rows"] = digest(x, y, x_val, y_val, *([] if counts is None else [counts]))
+        settings["init"] = digest(*init.state_dict().values()) if init is not None else ""
+    history = descend(
+        _Rows(
+            net, x, y, counts, x_val, y_val, Dropout(dropout, torch.Generator(device).manual_seed(seed + 1))
+        ),
+        Course(epochs=epochs, batch=batch, lr=lr, patience=patience, seed=seed),
+        settings,
+        started=init is not None,
+        checkpoint=checkpoint,
+        resume=resume,
+        progress=progress,
+        advance=advance,
+    )
+    net.requires_grad_(True)
+    net.residual_sd_nt = min(epoch.val_rmse_nt for epoch in history)
+    return net, history
+
+
+class _Rows:
+    """Rows as a network learns them, on the device that its dropout draws on."""
+
+    def __init__(
+        self,
+        net: FieldNet,
+        x: Array,
+        y: Array,
+        weight: Array | None,
+        x_val: Array,
+        y_val: Array,
+        drop: "Dropout",
+    ) -> None:
+        self.module, self.drop, device = net, drop, drop.generator.device
+        self.z = ((torch.from_numpy(x) - net.x_mean) / net.x_scale).float().to(device)
+        self.label = ((torch.from_numpy(y) - net.y_mean) / net.y_scale).float().to(device)
+        self.weight = None if weight is None else torch.from_numpy(weight).float().to(device)
+        self.x_val, self.y_val = torch.from_numpy(x_val).to(device), y_val
+        self.square_nt2 = float(net.y_scale) ** 2
+        self.generators = {"dropout": drop.generator}
+        net.to(device)
+
+    @property
+    def items(self) -> int:
+        return len(self.z)
+
+    rows = items
+
+    def loss(self, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        z, label = self.z[chosen], self.label[chosen]
+        out = self._forward(z) if self.module.training else self.module.body(z)
+        if self.weight is None:
+            loss = torch.nn.functional.mse_loss(out, label)
+            return loss, loss.detach() * (len(chosen) * self.square_nt2)
+        squares = (out - label) ** 2
+        return (self.weight[chosen] * squares).mean(), squares.detach().sum() * self.square_nt2
+
+    def errors_nt(self) -> Array:
+        parts = [self.module(part).cpu().numpy() for part in self.x_val.split(8192)]
+        return np.concatenate(parts) - self.y_val
+
+    def _forward(self, z: torch.Tensor) -> torch.Tensor:
+        """Scaled labels, shape (B,), from scaled features, shape (B, F), units dropped."""
+        *inner, last = self.module.linears
+        for i, layer in enumerate(inner):
+            z = torch.relu(layer(z))
+            if i < len(inner) - 1:
+                z = self.drop(z)
+        return last(z).squeeze(-1)
+
+
+class Dropout:
+    """Drops a share of units and scales the others up, by 16 random bits a unit.
+
+    torch's own draws a number for each unit, which takes a fifth of all time of a training on a CPU; this
+    takes a twentieth.
+    """
+
+    def __init__(self, share: float, generator: torch.Generator) -> None:
+        """A dropout of a share of the units, to the nearest 65,536th, by the bits of a generator."""
+        self.generator = generator
+        dropped = min(round(share * 65_536), 65_535)
+        self._least = dropped - 32_768
+        """Least of 16 bits, read as a number from -32,768 up, that a unit is kept by."""
+
+        self._scale = 65_536 / (65_536 - dropped)
+        self._bits = torch.empty(0, dtype=torch.int64, device=generator.device)
+
+    def __call__(self, h: torch.Tensor) -> torch.Tensor:
+        """The units with some of them dropped, shape as they have."""
+        if self._scale == 1:
+            return h
+        words = -(-h.numel() // 4)
+        if len(self._bits) < words:
+            self._bits = torch.empty(words, dtype=torch.int64, device=h.device)
+        bits = self._bits[:words].random_(-(2**63), None, generator=self.generator)
+        kept = bits.view(torch.int16)[: h.numel()].view(h.shape) >= self._least
+        return h * kept.to(h.dtype).mul_(self._scale)
+
+
+def _go_on_from(net: FieldNet, init: FieldNet, x: Array) -> None:
+    """Take over weights and scalers; the training ranges grow by the new rows, or stay unknown."""
+    if init.features != net.features or init.hidden != net.hidden:
+        raise InputError(
+            f"the network to go on from has inputs {', '.join(init.features)} and layers of {init.hidden}, "
+            f"this training {', '.join(net.features)} and {net.hidden}; give it the same features and layers"
+        )
+    net.load_state_dict(init.state_dict())
+    net.x_min.copy_(torch.from_numpy(np.minimum(net.x_min.numpy(), x.min(axis=0))))
+    net.x_max.copy_(torch.from_numpy(np.maximum(net.x_max.numpy(), x.max(axis=0))))
+
+
+def _freeze(net: FieldNet, names: Sequence[str], init: FieldNet | None) -> None:
+    """Leave layers out of the training."""
+    if names and init is None:
+        raise InputError("freeze keeps layers of trained weights: give init too")
+    layers = {f"layers.{i}": layer for i, layer in enumerate(net.linears)}
+    for name in names:
+        find("layer", name, layers).requires_grad_(False)
+    if set(names) == set(layers):
+        raise InputError("every layer is frozen; there is nothing left to train")
+
+
+def _rows(kind: str, x: ArrayLike, y: ArrayLike, names: Sequence[str]) -> tuple[Array, Array]:
+    """Features and labels as float64 arrays that fit each other and hold no nan."""
+    x, y = np.ascontiguousarray(x, float), np.ascontiguousarray(y, float)
+    if x.ndim != 2 or y.shape != x.shape[:1] or x.shape[1] != len(names) or not len(y):
+        raise InputError(
+            f"{kind} rows must be features (N, {len(names)}) and labels (N,), got {x.shape} and {y.shape}"
+        )
+    bad = ~(np.isfinite(x).all(axis=1) & np.isfinite(y))
+    if bad.any():
+        row = int(np.argmax(bad))
+        column = next((n for n, v in zip(names, x[row], strict=True) if not math.isfinite(v)), "label")
+        raise InputError(
+            f"{int(bad.sum())} {kind} rows hold nan or inf, first row {row} in {column}; leave them out"
+        )
+    return x, y

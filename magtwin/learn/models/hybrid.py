@@ -1,0 +1,109 @@
+"""Hybrid: a linear base, and a small network for what the base leaves, where that does better."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from magtwin.errors import InputError
+from magtwin.learn.data.inputs import Array, Inputs
+from magtwin.learn.models.linear import Linear, like, linear_from
+from magtwin.learn.models.network import FieldNet, net_of
+from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.weights import Weights
+from magtwin.report import Figure
+
+
+@dataclass(kw_only=True, repr=False)
+class Hybrid(Regressor):
+    """A disturbance y = base(x) + net(x clipped to the training ranges), or the base alone.
+
+    Outside the training ranges the network stays as it is at their edge, while the base goes on as a straight
+    line: what is extrapolated is what physics extrapolates.
+    """
+
+    inputs: Inputs = field(init=False)
+    """Those of the base."""
+
+    base: Linear
+    net: FieldNet | None
+    """What the base leaves [nT]; none where the base alone does better on recordings it never saw."""
+
+    sd_factor: float = 1.0
+    """What the spread of the base is multiplied by."""
+
+    kind = "hybrid"
+    context = 0
+    step_s = 0.0
+
+    def __post_init__(self) -> None:
+        self.inputs = self.base.inputs
+
+    @property
+    def layers_text(self) -> str:
+        """Terms of the base, and layers of the network."""
+        return self.base.layers_text + (f" + {self.net.layers_text}" if self.net else "")
+
+    @property
+    def parameters_count(self) -> int:
+        """Coefficients of the base, weights and biases of the network."""
+        return self.base.parameters_count + (self.net.parameters_count if self.net else 0)
+
+    def predict(self, x: ArrayLike) -> tuple[Array, Array]:
+        """Disturbances and standard deviations of their errors [nT], each (N,), from features (N, F)."""
+        x = self.inputs.checked(x)
+        mean, sd = self.base.predict(x)
+        if self.net is not None:
+            mean += self.net.predict(np.clip(x, self.inputs.low, self.inputs.high))[0]
+        return mean, sd * self.sd_factor
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Those of the base and those of the network, under the names of both."""
+        tensors = {f"base.{name}": value for name, value in self.base.tensors().items()}
+        if self.net is not None:
+            tensors |= {f"net.{name}": value for name, value in self.net.state_dict().items()}
+        return tensors
+
+    def settings(self) -> dict[str, Any]:
+        """Those of the base, dropout of the network, and the factor of the spread."""
+        dropout = self.net.dropout if self.net else 0.0
+        return {**self.base.settings(), "dropout": dropout, "sd_factor": self.sd_factor}
+
+    def figures(self) -> list[Figure]:
+        """The network's layers, the base's terms, and the spread of its errors."""
+        return [
+            Figure("layers", self.layers_text),
+            Figure("parameters", self.parameters_count),
+            Figure("constant", self.base.constant_nt, "nT", note="of the base, at the means"),
+            *self.base.terms(),
+            Figure("sd at the means", math.sqrt(self.base.spread.floor_nt2) * self.sd_factor, "nT"),
+        ]
+
+
+def hybrid_of(weights: Weights) -> Hybrid:
+    """The hybrid that a weights file holds.
+
+    Raises:
+        InputError: Its parts do not fit each other.
+    """
+    found = {part: _part(weights.tensors, f"{part}.") for part in ("base", "net")}
+    extra = [name for name in weights.tensors if not name.startswith(("base.", "net."))]
+    if extra:
+        raise InputError(f"{weights.path}: tensor {extra[0]!r} belongs to no layer of a hybrid")
+    base = weights.with_tensors(found["base"]).fit(like(len(weights.features)))
+    net = net_of(weights.with_tensors(found["net"])) if found["net"] else None
+    return Hybrid(
+        base=linear_from(weights, base),
+        net=net,
+        sd_factor=weights.number("sd_factor", above=0.0),
+        residual_sd_nt=weights.residual_sd_nt,
+        facts=dict(weights.about["facts"]),
+    )
+
+
+def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
+    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

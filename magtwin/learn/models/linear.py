@@ -1,0 +1,298 @@
+"""Linear: a disturbance as a weighted sum of named features, by ridge regression over whole recordings.
+
+With heading harmonics, current, LiDAR, speed and turning as features (the set "circular") it is the scalar
+form of Tolles and Lawson's compensation: hard iron goes once about with the heading, soft iron twice.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.learn.data.features import FEATURES
+from magtwin.learn.data.inputs import Array, Inputs, inputs_from, inputs_of, scaler_tensors
+from magtwin.learn.models.calibration import Spread, few_groups_factor, fit_spread, quantile_factor
+from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.weights import Weights
+from magtwin.report import Figure
+
+PENALTIES = tuple(float(p) for p in np.logspace(-8, 1, 19))
+"""Penalties that cross-validation chooses among."""
+
+FALLBACK_PENALTY = 1e-3
+"""The penalty where there is one group of recordings alone, and nothing can be left out."""
+
+MOST_FOLDS = 10
+"""Groups are left out one at a time up to so many; more are dealt to so many folds."""
+
+Weighting = Literal["auto", "label_sd", "none"]
+
+
+@dataclass(kw_only=True, repr=False)
+class Linear(Regressor):
+    """A disturbance constant + sum_j c_j z_j with z = (x - mean) / scale, and the spread of its errors."""
+
+    constant_nt: float
+    """Disturbance at the means of the inputs [nT]."""
+
+    coefficients_nt: Array
+    """What a scale of each input adds [nT], shape (F,)."""
+
+    spread: Spread
+    """Of errors on recordings left out."""
+
+    penalty: float
+    """Of the ridge, as a share of the rows' own curvature."""
+
+    weighted: bool = False
+    """Whether rows counted by how well the map is known there."""
+
+    kind = "linear"
+    context = 0
+    step_s = 0.0
+
+    @property
+    def layers_text(self) -> str:
+        """How many terms it has."""
+        return f"linear in {len(self.features)}"
+
+    @property
+    def parameters_count(self) -> int:
+        """Coefficients and the constant."""
+        return len(self.features) + 1
+
+    def mean_nt(self, z: Array) -> Array:
+        """Disturbances [nT], shape (N,), from scaled inputs, shape (N, F)."""
+        found = np.full(len(z), self.constant_nt)
+        for j, value in enumerate(self.coefficients_nt):  # column by column: a row never sees its neighbours
+            found += value * z[:, j]
+        return found
+
+    def predict(self, x: ArrayLike) -> tuple[Array, Array]:
+        """Disturbances and standard deviations of their errors [nT], each (N,), from features (N, F)."""
+        z = self.inputs.scaled(self.inputs.checked(x))
+        return self.mean_nt(z), self.spread.sd_nt(z)
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Scaler, ranges, coefficients and spread, float64."""
+        spread = self.spread
+        return {
+            **self.inputs.tensors(),
+            "constant_nt": torch.tensor(self.constant_nt, dtype=torch.float64),
+            "coefficients_nt": torch.as_tensor(self.coefficients_nt),
+            "spread_floor_nt2": torch.tensor(spread.floor_nt2, dtype=torch.float64),
+            "spread_slopes_nt2": torch.as_tensor(spread.slopes_nt2),
+        }
+
+    def settings(self) -> dict[str, Any]:
+        """Penalty and weighting."""
+        return {"penalty": self.penalty, "weighted": self.weighted}
+
+    def figures(self) -> list[Figure]:
+        """Its terms, and the spread of its errors."""
+        constant = Figure("constant", self.constant_nt, "nT", note="at the means")
+        return [constant, *self.terms(), Figure("sd at the means", math.sqrt(self.spread.floor_nt2), "nT")]
+
+    def terms(self) -> list[Figure]:
+        """Coefficients in the features' own units, and the penalty that held them down."""
+        figures = []
+        for name, value, scale in zip(self.features, self.coefficients_nt, self.inputs.scale, strict=True):
+            unit = FEATURES[name].unit
+            per = f"nT per {unit}" if unit else "nT"
+            note = f"{value:+.3g} nT a standard deviation"
+            figures.append(Figure(name, float(value / scale), per, note=note))
+        note = "rows weighted by how well the map is known" if self.weighted else ""
+        return [*figures, Figure("ridge penalty", self.penalty, note=note)]
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A linear model, and what it says of rows by fits that had left their recordings out."""
+
+    model: Linear
+
+    held_out_nt: Array
+    """For each row, the disturbance by a fit without its group [nT], shape (N,)."""
+
+    groups: NDArray[np.intp]
+    """Which group of recordings each row is of, shape (N,)."""
+
+    weight: Array | None = None
+    """How much each row counted, shape (N,); none where all count alike."""
+
+
+def fit_linear(
+    x: ArrayLike,
+    y: ArrayLike,
+    groups: NDArray[np.intp],
+    *,
+    features: str | Sequence[str],
+    sd: ArrayLike | None = None,
+    penalty: float | None = None,
+    weighting: Weighting = "auto",
+    start: Linear | None = None,
+    inputs: Inputs | None = None,
+) -> Fitted:
+    """Fit features to labels by ridge regression: least squares with |c|^2 held down.
+
+    The penalty is chosen by cross-validation over groups of rows, never over rows: those of one recording
+    are alike. The intercept bears no penalty. What the fits without a group say of that group tells how
+    large errors are on recordings that were never seen, offsets between days included: `Linear.spread`.
+
+    Args:
+        x: Features, shape (N, F), none nan.
+        y: Labels [nT], shape (N,).
+        groups: Which session, recording or path each row is of, shape (N,).
+        features: Names of the columns of `x`, or that of a set.
+        sd: How well the map is known there [nT], shape (N,); none where it is not known.
+        penalty: As a share of the rows' own curvature; None chooses among `PENALTIES`.
+        weighting: "label_sd" weighs rows by 1 / (s0^2 + sd^2), s0 the error that is left where the map is
+            known; "none" weighs all alike; "auto" takes what does better on groups left out.
+        start: A model of the same features to go on from: coefficients are pulled towards its own in place
+            of 0, and its scaler is kept.
+        inputs: Scaler and ranges to use in place of those of the rows.
+
+    Raises:
+        InputError: A label that never varies, or `start` of other features.
+    """
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    if y.std() < 1e-9:
+        raise InputError(f"the label is {y[0]:g} nT in every training row; there is nothing to learn")
+    of = inputs or inputs_of(x, features)
+    if start is not None:
+        of = start.inputs.grown(of)
+    z = np.column_stack([of.scaled(x), np.ones(len(x))])
+    towards = np.zeros(z.shape[1]) if start is None else np.append(start.coefficients_nt, start.constant_nt)
+    folds, groups = _folds(groups)
+    label_sd = np.zeros(len(y)) if sd is None else np.asarray(sd, float)
+    solve = _Ridge(z, y, folds, towards, penalty)
+    best, weight = solve(np.ones(len(y))), None
+    if weighting != "none" and label_sd.any():
+        left = float(np.mean((best.held_out - y) ** 2))
+        s0_squared = max(left - float(np.mean(label_sd**2)), 0.05 * left)
+        weight = s0_squared / (s0_squared + label_sd**2)
+        other = solve(weight)
+        error, its = (np.abs(one.held_out - y).mean() for one in (best, other))
+        if weighting == "label_sd" or its < error:
+            best = _Solved(other.beta, other.penalty, other.held_out, weighted=True)
+    error = best.held_out - y
+    spread = fit_spread(z[:, :-1], error)
+    factor = quantile_factor(error, spread.sd_nt(z[:, :-1]), groups) * few_groups_factor(error, groups)
+    model = Linear(
+        inputs=of,
+        constant_nt=float(best.beta[-1]),
+        coefficients_nt=best.beta[:-1].copy(),
+        spread=spread.scaled(factor),
+        penalty=best.penalty,
+        weighted=best.weighted,
+    )
+    return Fitted(model, best.held_out, groups, weight if best.weighted else None)
+
+
+def linear_of(weights: Weights) -> Linear:
+    """The linear model that a weights file holds.
+
+    Raises:
+        InputError: Its parts do not fit each other.
+    """
+    model = linear_from(weights, weights.fit(like(len(weights.features))))
+    model.residual_sd_nt = weights.residual_sd_nt
+    model.facts = dict(weights.about["facts"])
+    return model
+
+
+def linear_from(weights: Weights, tensors: Mapping[str, torch.Tensor]) -> Linear:
+    """A linear model from its tensors, and penalty and weighting from a file's metadata.
+
+    Raises:
+        InputError: A scale is not above 0, a variance below it, or the metadata lack a key.
+    """
+    held = {name: value.numpy() for name, value in tensors.items()}
+    if held["spread_floor_nt2"] <= 0 or (held["spread_slopes_nt2"] < 0).any():
+        raise InputError(f"{weights.path}: a variance of its spread is below 0")
+    return Linear(
+        inputs=inputs_from(weights.features, tensors, weights.path),
+        constant_nt=float(held["constant_nt"]),
+        coefficients_nt=held["coefficients_nt"],
+        spread=Spread(float(held["spread_floor_nt2"]), held["spread_slopes_nt2"]),
+        penalty=weights.number("penalty"),
+        weighted=weights.expect("weighted", bool),
+    )
+
+
+def like(count: int) -> dict[str, torch.Tensor]:
+    """Tensors of the names, shapes and types that a linear model of so many features has."""
+    ones, one = torch.ones(count, dtype=torch.float64), torch.ones((), dtype=torch.float64)
+    wide = ("coefficients_nt", "spread_slopes_nt2")
+    return (
+        scaler_tensors(count)
+        | dict.fromkeys(wide, ones)
+        | dict.fromkeys(("constant_nt", "spread_floor_nt2"), one)
+    )
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """Coefficients with the intercept last, and what fits without a row's fold say of it."""
+
+    beta: Array
+    penalty: float
+    held_out: Array
+    weighted: bool = False
+
+
+class _Ridge:
+    """Solves (Z'WZ + p tr D)(beta - towards) = Z'W (y - Z towards) with and without each fold."""
+
+    def __init__(
+        self, z: Array, y: Array, folds: NDArray[np.intp], towards: Array, penalty: float | None
+    ) -> None:
+        self.z, self.y, self.folds, self.towards, self.penalty = z, y, folds, towards, penalty
+        self.rows = [np.flatnonzero(folds == k) for k in range(int(folds.max()) + 1)]
+
+    def __call__(self, weight: Array) -> _Solved:
+        """Weights of rows, shape (N,)."""
+        curved, sloped, squares = [], [], []
+        for rows in self.rows:
+            z, w = self.z[rows], weight[rows]
+            left = self.y[rows] - z @ self.towards
+            curved.append(z.T @ (w[:, None] * z))
+            sloped.append(z.T @ (w * left))
+            squares.append(float(w @ left**2))
+        whole, slope = np.sum(curved, axis=0), np.sum(sloped, axis=0)
+        if len(self.rows) == 1:
+            penalty = FALLBACK_PENALTY if self.penalty is None else self.penalty
+            beta = self._solve(whole, slope, penalty)
+            return _Solved(beta, penalty, self.z @ beta)
+        parts = list(zip(curved, sloped, squares, strict=True))
+
+        def loss(penalty: float) -> float:
+            total = 0.0
+            for a, b, c in parts:
+                step = self._solve(whole - a, slope - b, penalty) - self.towards
+                total += c - 2 * float(step @ b) + float(step @ a @ step)
+            return total
+
+        penalty = min(PENALTIES, key=loss) if self.penalty is None else self.penalty
+        held_out = np.empty(len(self.y))
+        for rows, (a, b, _) in zip(self.rows, parts, strict=True):
+            held_out[rows] = self.z[rows] @ self._solve(whole - a, slope - b, penalty)
+        return _Solved(self._solve(whole, slope, penalty), penalty, held_out)
+
+    def _solve(self, curved: Array, sloped: Array, penalty: float) -> Array:
+        """Coefficients; the intercept, last, bears no penalty."""
+        # z has unit variance, so that the intercept's own entry is the sum of all weights
+        held = np.full(len(curved), penalty * curved[-1, -1])
+        held[-1] = 0.0
+        return self.towards + np.linalg.lstsq(curved + np.diag(held), sloped, rcond=None)[0]
+
+
+def _folds(groups: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Folds that groups are dealt to, and groups numbered from 0, each shape (N,)."""
+    numbers = np.unique(groups, return_inverse=True)[1].astype(np.intp)
+    return numbers % MOST_FOLDS, numbers

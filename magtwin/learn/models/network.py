@@ -1,0 +1,313 @@
+"""FieldNet: a network that predicts the disturbance, with all it needs to be used, in one file."""
+
+import itertools
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.files import existing, sha256
+from magtwin.learn.data.features import FULL, feature_names
+from magtwin.learn.data.inputs import Inputs, inputs_of
+from magtwin.learn.models.checkpoint import read_checkpoint
+from magtwin.learn.models.perceptron import outputs
+from magtwin.learn.models.regressor import summary_of
+from magtwin.learn.models.weights import Fact, Weights, is_checkpoint, read_weights, say, shown, write_weights
+from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary
+
+Array = NDArray[np.float64]
+
+_SCALERS = ("x_mean", "x_scale", "x_min", "x_max", "y_mean", "y_scale")
+
+
+class FieldNet(Summarized, torch.nn.Module):
+    """Disturbance of the field's magnitude [nT] from features of a Run, (B, F) -> (B,).
+
+    A multilayer perceptron between two scalers:
+
+        y = y_mean + y_scale * W_L relu(... relu(W_1 z + b_1) ...) + b_L,   z = (x - x_mean) / x_scale
+
+    Inputs are scaled in float64, because folding the scaler into float32 weights raises the error
+    from 0.003 to 0.1 nT. In training, dropout follows every hidden layer but the last.
+    """
+
+    kind = "mlp"
+    """Among the predictors: a multilayer perceptron."""
+
+    context = 0
+    """A row's prediction looks at no earlier one."""
+    step_s = 0.0
+
+    x_mean: torch.Tensor
+    """Means of the training inputs, in the units of the features, shape (F,), float64."""
+    x_scale: torch.Tensor
+    """Scales of the training inputs, shape (F,), float64, above 0."""
+    x_min: torch.Tensor
+    """Smallest training inputs, shape (F,), float64; nan where unknown."""
+    x_max: torch.Tensor
+    """Largest training inputs, shape (F,), float64; nan where unknown."""
+    y_mean: torch.Tensor
+    """Mean of the training labels [nT], shape (), float64."""
+    y_scale: torch.Tensor
+    """Scale of the training labels [nT], shape (), float64, above 0."""
+
+    def __init__(
+        self,
+        features: str | Sequence[str] = "full",
+        hidden: Sequence[int] = (512, 512, 512, 512),
+        *,
+        dropout: float = 0.3,
+        residual_sd_nt: float = math.nan,
+        facts: Mapping[str, Fact] | None = None,
+    ) -> None:
+        """A network with random weights and scalers that change nothing.
+
+        Args:
+            features: Names of the inputs, in order, or of a set of them.
+            hidden: Widths of the hidden layers.
+            dropout: Share of units dropped in training.
+            residual_sd_nt: Standard deviation of label minus prediction on held-out runs [nT]; nan
+                where unknown.
+            facts: Provenance: on what it was trained, source, licence.
+        """
+        super().__init__()
+        self.features = feature_names(features)
+        self.dropout = dropout
+        self.residual_sd_nt = residual_sd_nt
+        self.facts: dict[str, Fact] = dict(facts or {})
+        if not hidden or not all(width > 0 for width in hidden) or not 0 <= dropout < 1:
+            raise InputError(
+                f"a network needs hidden layers above 0 wide and dropout in 0..1, "
+                f"got {tuple(hidden)} and {dropout}"
+            )
+        widths = [len(self.features), *hidden, 1]
+        self.layers = torch.nn.ModuleList(torch.nn.Linear(a, b) for a, b in itertools.pairwise(widths))
+        ones = torch.ones(len(self.features), dtype=torch.float64)
+        for name, value in (
+            ("x_mean", 0 * ones),
+            ("x_scale", ones),
+            ("x_min", math.nan * ones),
+            ("x_max", math.nan * ones),
+            ("y_mean", 0 * ones[0]),
+            ("y_scale", ones[0].clone()),
+        ):
+            self.register_buffer(name, value)
+
+    @property
+    def hidden(self) -> tuple[int, ...]:
+        """Widths of the hidden layers."""
+        return tuple(layer.out_features for layer in self.linears[:-1])
+
+    @property
+    def linears(self) -> list[torch.nn.Linear]:
+        """The linear layers, first to last."""
+        return [layer for layer in self.layers if isinstance(layer, torch.nn.Linear)]
+
+    @property
+    def parameters_count(self) -> int:
+        """Number of weights and biases."""
+        return sum(p.numel() for p in self.parameters())
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Disturbances [nT], shape (B,), float64, from features in their units, shape (B, F)."""
+        h = ((x - self.x_mean) / self.x_scale).to(self.linears[0].weight.dtype)
+        return self.y_mean + self.y_scale * self.body(h).to(self.y_mean.dtype)
+
+    def body(self, z: torch.Tensor) -> torch.Tensor:
+        """Scaled labels, shape (B,), from scaled features, shape (B, F): what training works on."""
+        *inner, last = self.linears
+        for i, layer in enumerate(inner):
+            z = torch.relu(layer(z))
+            if i < len(inner) - 1:
+                z = torch.nn.functional.dropout(z, self.dropout, self.training)
+        return last(z).squeeze(-1)
+
+    @property
+    def layers_text(self) -> str:
+        """Widths from inputs to output, as 20-512-1."""
+        return "-".join(str(n) for n in (len(self.features), *self.hidden, 1))
+
+    @property
+    def inputs(self) -> Inputs:
+        """Scaler and ranges of the inputs."""
+        scalers = (self.x_mean, self.x_scale, self.x_min, self.x_max)
+        return Inputs(self.features, *(value.detach().cpu().numpy() for value in scalers))
+
+    def predict(self, x: ArrayLike) -> tuple[Array, Array]:
+        """Disturbances and their standard deviations [nT], each (N,), from features in their units (N, F).
+
+        The standard deviation is `residual_sd_nt` on every row. A row with a nan gives nan. Products are
+        float32, scaling is float64: against float64 throughout the released network errs by under 0.01 nT.
+        """
+        inputs = self.inputs
+        layers = [(layer.weight.detach(), layer.bias.detach()) for layer in self.linears]
+        found = outputs(layers, inputs, inputs.checked(x))[:, 0]
+        return float(self.y_mean) + float(self.y_scale) * found, np.full(len(found), self.residual_sd_nt)
+
+    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
+        """Whether an input of a row left the range of the training rows; see `Inputs.outside`."""
+        return self.inputs.outside(x)
+
+    def set_scalers(self, x: ArrayLike, y: ArrayLike) -> None:
+        """Take scalers and training ranges from training rows.
+
+        Args:
+            x: Features, shape (N, F). One that does not vary keeps a scale of 1.
+            y: Labels [nT], shape (N,).
+        """
+        x, y = np.asarray(x, float), np.asarray(y, float)
+        of = inputs_of(x, self.features)
+        for name, value in (
+            ("x_mean", of.mean),
+            ("x_scale", of.scale),
+            ("x_min", of.low),
+            ("x_max", of.high),
+            ("y_mean", y.mean()),
+            ("y_scale", y.std()),
+        ):
+            getattr(self, name).copy_(torch.as_tensor(value))
+
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write weights, scalers and everything else to one safetensors file; same net, same bytes.
+
+        Raises:
+            InputError: The file exists and `force` was not given.
+        """
+        write_weights(
+            path,
+            self.kind,
+            self.state_dict(),
+            features=self.features,
+            residual_sd_nt=self.residual_sd_nt,
+            facts=self.facts,
+            hidden=self.hidden,
+            dropout=self.dropout,
+            force=force,
+        )
+
+    def report(self, title: str) -> Report:
+        """What the network is, in figures."""
+        figures = [
+            Figure("layers", self.layers_text),
+            Figure("parameters", self.parameters_count),
+            Figure("inputs", ", ".join(self.features)),
+            Figure("label mean", float(self.y_mean), "nT"),
+            Figure("label sd", float(self.y_scale), "nT"),
+        ]
+        if not math.isnan(self.residual_sd_nt):
+            figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out runs"))
+        return Report(title, tuple(figures), shown(self.facts))
+
+    def _summary(self) -> Summary:
+        return summary_of(self, "FieldNet")
+
+
+def load_net(path: str | os.PathLike[str]) -> FieldNet:
+    """A network from its file: magtwin's safetensors, or a released `.pth`; in evaluation mode.
+
+    Raises:
+        InputError: Neither of the two, damaged, or parts that do not fit each other.
+    """
+    if is_checkpoint(path):
+        return net_of_checkpoint(path)
+    weights = read_weights(path)
+    if weights.kind != "mlp":
+        raise InputError(f"{path}: holds a {weights.kind}, no multilayer perceptron; give one of those")
+    return net_of(weights)
+
+
+def convert(
+    checkpoint: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    licence: str = "",
+    force: bool = False,
+) -> FieldNet:
+    """Turn a released `.pth` into safetensors, once; its inputs are the paper's 20.
+
+    Args:
+        checkpoint: The `.pth`, read as data (see `magtwin.learn.models.checkpoint`).
+        out: The safetensors file to write.
+        licence: Licence of the weights, which no checkpoint says; kept in their facts.
+        force: Whether one that exists is replaced.
+
+    Raises:
+        InputError: Not such a checkpoint, or `out` exists.
+    """
+    net = net_of_checkpoint(existing(checkpoint, "checkpoint"))
+    if licence:
+        net.facts["licence"] = licence
+    net.save(out, force=force)
+    return net
+
+
+def net_of_checkpoint(path: str | os.PathLike[str]) -> FieldNet:
+    """The network of a released `.pth`, in evaluation mode.
+
+    Raises:
+        InputError: Not such a checkpoint.
+    """
+    path = Path(path)
+    saved = read_checkpoint(path, len(FULL))
+    net = FieldNet(
+        FULL,
+        [len(bias) for _, bias in saved.layers[:-1]],
+        facts={
+            "source": path.name,
+            "source_sha256": sha256(path),
+            "scalers_by": saved.written_by,
+            "training_rows": saved.samples,
+        },
+    )
+    state: dict[str, Any] = {}
+    for i, (weight, bias) in enumerate(saved.layers):
+        state |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
+    nan = np.full(len(FULL), math.nan)
+    state |= {"x_mean": saved.x_mean, "x_scale": saved.x_scale, "x_min": nan, "x_max": nan}
+    state |= {"y_mean": np.float64(saved.y_mean), "y_scale": np.float64(saved.y_scale)}
+    net.load_state_dict({name: torch.tensor(value) for name, value in state.items()})
+    return net.eval()
+
+
+def net_of(weights: Weights) -> FieldNet:
+    """The network that a weights file of the kind "mlp" holds, in evaluation mode.
+
+    Raises:
+        InputError: Its parts do not fit each other.
+    """
+    path, tensors = weights.path, weights.tensors
+    dropout = weights.expect("dropout", float)
+    layers = sum(name.startswith("layers.") and name.endswith(".weight") for name in tensors)
+    missing = [name for name in _SCALERS if name not in tensors]
+    missing += [f"layers.{i}.{p}" for i in range(max(layers, 2)) for p in ("weight", "bias")
+                if f"layers.{i}.{p}" not in tensors]  # fmt: skip
+    if missing:
+        raise InputError(f"{path}: tensor {missing[0]!r} is missing; train or convert the network again")
+    held = [tensors[f"layers.{i}.weight"] for i in range(layers)]
+    for i, weight in enumerate(held):
+        if weight.ndim != 2:
+            raise InputError(
+                f"{path}: tensor 'layers.{i}.weight' is {say(weight)}; a layer's have shape (out, in)"
+            )
+    try:
+        net = FieldNet(
+            weights.features,
+            [len(weight) for weight in held[:-1]],
+            dropout=dropout,
+            residual_sd_nt=weights.residual_sd_nt,
+            facts=weights.about["facts"],
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    state = weights.fit(net.state_dict())
+    if not (bool((tensors["x_scale"] > 0).all()) and bool(tensors["y_scale"] > 0)):
+        raise InputError(f"{path}: a scale of its scalers is not above 0")
+    net.load_state_dict(state)
+    return net.eval()

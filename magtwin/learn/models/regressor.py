@@ -1,0 +1,101 @@
+"""Regressor: what every kind but the perceptron shares: inputs, provenance, its file and its report."""
+
+import math
+import os
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.learn.data.inputs import Inputs
+from magtwin.learn.models.weights import Fact, shown, write_weights
+from magtwin.report import Figure, Report
+from magtwin.summary import Summarized, Summary, listed
+
+
+@dataclass(kw_only=True, repr=False)
+class Regressor(Summarized, ABC):
+    """A predictor that is kept as tensors and settings; a kind tells which, and its figures."""
+
+    inputs: Inputs
+    residual_sd_nt: float = math.nan
+    facts: dict[str, Fact] = field(default_factory=dict)
+
+    kind: ClassVar[str]
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Names of the inputs, in order."""
+        return self.inputs.features
+
+    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
+        """Whether an input of a row left the range of the training rows; see `Inputs.outside`."""
+        return self.inputs.outside(x)
+
+    @abstractmethod
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Every array that its file holds, by name."""
+
+    @abstractmethod
+    def settings(self) -> dict[str, Any]:
+        """What its file says beside them, as JSON has it."""
+
+    @abstractmethod
+    def figures(self) -> list[Figure]:
+        """What it is, in figures."""
+
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write it to one safetensors file; the same model, the same bytes.
+
+        Raises:
+            InputError: The file exists and `force` was not given.
+        """
+        write_weights(
+            path,
+            self.kind,
+            self.tensors(),
+            features=self.features,
+            residual_sd_nt=self.residual_sd_nt,
+            facts=self.facts,
+            force=force,
+            **self.settings(),
+        )
+
+    def report(self, title: str) -> Report:
+        """Its kind, its figures, and its error on recordings that it never saw, where that is known."""
+        figures = [Figure("kind", self.kind), *self.figures()]
+        if not math.isnan(self.residual_sd_nt):
+            figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out recordings"))
+        return Report(title, tuple(figures), shown(self.facts))
+
+    def _summary(self) -> Summary:
+        return summary_of(self, type(self).__name__)
+
+
+def summary_of(net: Any, title: str, *facts: tuple[str, str]) -> Summary:
+    """Kind, layers, inputs, error and provenance of a predictor."""
+    error = (
+        "unknown"
+        if math.isnan(net.residual_sd_nt)
+        else f"{net.residual_sd_nt:.4g} nT rms on held-out recordings"
+    )
+    trained = [
+        f"{name} {net.facts[name]}"
+        for name in ("dataset", "map", "created", "licence", "source")
+        if name in net.facts
+    ]
+    return Summary(
+        f"{title}: {net.kind}, {net.parameters_count:,} parameters",
+        (
+            ("layers", net.layers_text),
+            ("inputs", f"{len(net.features)}: {listed(net.features)}"),
+            ("error", error),
+            *facts,
+            ("facts", ", ".join(trained) or listed(tuple(net.facts))),
+        ),
+        ("fact", "value"),
+        [(name, str(value)) for name, value in net.facts.items()],
+    )

@@ -1,0 +1,1 @@
+"""Training of magnetometer models: configuration, data, fitters, results."""

@@ -1,0 +1,1 @@
+"""Run: one table on one clock; resampling and comparison."""

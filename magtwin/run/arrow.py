@@ -1,0 +1,158 @@
+"""Arrow: a Run as an Arrow table, which Parquet and CSV are written from, and back.
+
+A vector column of a Run becomes one table column a part (`p_world_base_x`, `p_world_base_y`, ...), not
+a column of lists: pandas then holds plain float64 (lists would be Python objects), SQL in DuckDB and
+expressions in polars need no indexing, one part can be read alone, and byte-stream-split coding works.
+What a flat table cannot say stands in the metadata: on every Arrow field `column`, `part`, `unit`,
+`frame`, `doc` and `interpolation`; on the table `magtwin_facts`, the Run's facts in JSON.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.run.resample import RULES
+from magtwin.run.run import COLUMNS, Column, Run, check_clock
+
+FACTS = b"magtwin_facts"
+
+
+def table_of(run: Run) -> pa.Table:
+    """A run as a table.
+
+    Raises:
+        InputError: It has no clock or one that does not ascend, or a column cannot stand in a table.
+    """
+    check_clock(run, "the run to write")
+    flat = run.members()
+    fields = [
+        pa.field(
+            name,
+            pa.from_numpy_dtype(values.dtype),
+            nullable=False,
+            metadata=said_of(run.spec(column), column, part),
+        )
+        for name, (column, part, values) in flat.items()
+    ]
+    schema = pa.schema(fields, metadata={FACTS: facts_to_json(run)})
+    return pa.Table.from_arrays([pa.array(values) for _, _, values in flat.values()], schema=schema)
+
+
+def run_of(table: pa.Table, path: Path) -> Run:
+    """The run that a table holds; what another program wrote too, where it has the column names.
+
+    Args:
+        table: With the metadata of `table_of`, or without, and then without facts.
+        path: Where it was read, for refusals.
+
+    Raises:
+        InputError: It holds no run.
+    """
+    if twice := sorted({name for name in table.column_names if table.column_names.count(name) > 1}):
+        raise InputError(f"{path}: two columns are called {twice[0]!r}; rename one")
+    columns, specs = {}, {}
+    for name, members in _members(table.schema, path).items():
+        parts = [_numpy(table, member, path) for member in members]
+        said = {key.decode(): text.decode() for key, text in _metadata(table, members[0]).items()}
+        vector = COLUMNS[name].width > 1 if name in COLUMNS else "part" in said
+        columns[name] = np.column_stack(parts) if vector else parts[0]
+        if name in COLUMNS:
+            _check_flags(columns[name], name, path)
+        elif "column" in said:
+            named = tuple(_metadata(table, member)[b"part"].decode() for member in members) if vector else ()
+            specs[name] = spec_said(said, named)
+    run = Run(columns, facts_from_json((table.schema.metadata or {}).get(FACTS, b"{}"), path), specs)
+    check_clock(run, str(path))
+    return run
+
+
+def said_of(spec: Column, name: str, part: str = "") -> dict[str, str]:
+    """What is said of a table column beside its values."""
+    said = {"column": name, "part": part, "unit": spec.unit, "frame": spec.frame, "doc": spec.doc}
+    said["interpolation"] = spec.interpolation if name not in COLUMNS else ""
+    return {key: text for key, text in said.items() if text}
+
+
+def spec_said(said: dict[str, str], parts: tuple[str, ...]) -> Column:
+    """What a column holds, as `said_of` said it; a rule that is unknown is "linear"."""
+    rule: Any = said.get("interpolation", "linear")
+    unit, frame, doc = (said.get(key, "") for key in ("unit", "frame", "doc"))
+    return Column(unit, frame, doc, len(parts) or 1, parts, rule if rule in RULES else "linear")
+
+
+def facts_to_json(run: Run) -> str:
+    """The facts of a run as a JSON object.
+
+    Raises:
+        InputError: One is no text, number or truth value.
+    """
+    for key, value in run.facts.items():
+        if not isinstance(value, str | int | float | bool):
+            raise InputError(f"fact {key!r} must be a text, a number, or true or false, got {value!r}")
+    return json.dumps(dict(run.facts), ensure_ascii=False)
+
+
+def facts_from_json(text: str | bytes, path: Path) -> dict[str, str | int | float | bool]:
+    """The facts that `facts_to_json` wrote.
+
+    Raises:
+        InputError: They are not JSON, or no object of texts, numbers and truth values.
+    """
+    try:
+        facts = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: metadata {FACTS.decode()!r} is not JSON: {error}") from error
+    if not isinstance(facts, dict):
+        raise InputError(f"{path}: metadata {FACTS.decode()!r} must be an object, got {text[:40]!r}")
+    for key, value in facts.items():
+        if not isinstance(value, str | int | float | bool):
+            raise InputError(
+                f"{path}: fact {key!r} must be a text, a number, or true or false, got {value!r}"
+            )
+    return facts
+
+
+def _metadata(table: pa.Table, name: str) -> dict[bytes, bytes]:
+    return table.schema.field(name).metadata or {}
+
+
+def _members(schema: pa.Schema, path: Path) -> dict[str, list[str]]:
+    """For each column of the Run the table columns that hold it, in the order of its parts."""
+    known = {f"{name}_{part}": name for name, column in COLUMNS.items() for part in column.parts}
+    members: dict[str, list[str]] = {}
+    for field in schema:
+        said = (field.metadata or {}).get(b"column")
+        home = said.decode() if said else known.get(field.name, field.name)
+        members.setdefault(home, []).append(field.name)
+    for name in members.keys() & COLUMNS.keys():
+        wanted = [f"{name}_{part}" for part in COLUMNS[name].parts] or [name]
+        missing = [key for key in wanted if key not in members[name]]
+        if missing:
+            raise InputError(f"{path}: column {missing[0]!r} is missing beside {members[name][0]!r}")
+        members[name] = wanted
+    return members
+
+
+def _numpy(table: pa.Table, name: str, path: Path) -> NDArray[Any]:
+    column = table.column(name)
+    kind = column.type
+    if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)):
+        raise InputError(f"{path}: column {name!r} must hold numbers or flags, got {kind}")
+    if column.null_count:
+        row = column.is_null().to_numpy().argmax()
+        raise InputError(f"{path}: column {name!r}, row {row}: no value; write nan where nothing is known")
+    return column.to_numpy()
+
+
+def _check_flags(values: NDArray[Any], name: str, path: Path) -> None:
+    """Refuse numbers other than 0 and 1 where flags belong."""
+    if COLUMNS[name].unit == "bool" and values.dtype.kind != "b":
+        wrong = (values != 0) & (values != 1)
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise InputError(f"{path}: column {name!r}, row {row}: a flag is 0 or 1, got {values[row]}")

@@ -1,0 +1,429 @@
+"""Comparison: two runs laid over each other, and how far they are apart in pose and in field."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.frames import wrap_angle, yaw_from_quat
+from magtwin.run.run import Run
+from magtwin.summary import Summarized, Summary
+
+Array = NDArray[np.float64]
+Align = Literal["time", "path", "none"]
+
+POSITIONS = ("p_world_base", "mocap_p", "odom_p")
+"""Columns of position, the best first; the first that both runs have is compared."""
+
+HEADINGS = {"p_world_base": "q_world_base_xyzw", "mocap_p": "mocap_q_xyzw", "odom_p": "odom_q_xyzw"}
+"""The orientation that goes with each."""
+
+FIELDS = ("b_measured_nt", "b_total_nt", "b_truth_nt", "b_map_nt", "b_disturbance_nt")
+"""Columns of the field that are compared where both runs have them."""
+
+GRID = 4000
+"""Places at which two runs are compared to find the shift between them."""
+
+LEAST_OVERLAP = 0.5
+"""Share of the shorter run that must lie over the longer one."""
+
+SAME_M = 0.01
+"""Root mean square distances that differ by less are as good as each other: the longer overlap wins [m]."""
+
+STEP_M = 0.01
+"""Driven path is counted in steps of this length, so that noise of a standing robot counts for none [m]."""
+
+GAP_S, GAP_M = 1.0, 0.25
+"""Gaps between readings across which nothing is interpolated [s], [m]."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How one quantity of two runs differs, B less A."""
+
+    name: str
+    unit: str
+    count: int
+    """Places at which both are known."""
+    mean: float
+    rms: float
+    mae: float
+    """Mean absolute difference."""
+    greatest: float
+    """Greatest absolute difference."""
+    correlation: float | None = None
+    """Pearson's, of the two quantities themselves; none for what is only known as a difference."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Summarized):
+    """Run B laid over run A, at the readings of A over which B lies."""
+
+    align: Align
+    shift: float
+    """What is added to B's clock [s], or to its driven length [m], to lay it over A."""
+
+    at: Array
+    """Time on A's clock [s], or length that A has driven [m], shape (N,)."""
+
+    rows: NDArray[np.intp]
+    """Rows of A, shape (N,)."""
+
+    along_m: Array
+    """B's position ahead of A's, along A's heading [m], shape (N,); empty without poses."""
+
+    cross_m: Array
+    """B's position to the left of A's [m], shape (N,); empty without poses."""
+
+    heading_rad: Array
+    """B's heading less A's, in [-pi, pi) [rad], shape (N,); empty without headings."""
+
+    fields: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+    """Columns of A and of B at the same places [nT], each of shape (N,)."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of `at` and `shift`."""
+        return "m" if self.align == "path" else "s"
+
+    def agreements(self) -> tuple[Agreement, ...]:
+        """Each quantity that both runs have, in figures; what is nowhere known in both is left out."""
+        poses = (
+            ("along-track", "m", self.along_m),
+            ("cross-track", "m", self.cross_m),
+            ("heading", "deg", np.degrees(self.heading_rad)),
+        )
+        found = [agreement(name, unit, difference) for name, unit, difference in poses]
+        for name, (a, b) in self.fields.items():
+            found.append(agreement(name, "nT", b - a, _correlation(a, b)))
+        return tuple(one for one in found if one is not None)
+
+    def summary(self) -> dict[str, Any]:
+        """The comparison in plain figures, for JSON."""
+        return {
+            "align": self.align,
+            "shift": self.shift,
+            "shift_unit": self.unit,
+            "readings": len(self.at),
+            "agreements": {
+                one.name: {k: v for k, v in vars(one).items() if k != "name" and v is not None}
+                for one in self.agreements()
+            },
+        }
+
+    def to_json(self) -> str:
+        """The comparison as one JSON object."""
+        return json.dumps(self.summary(), indent=2)
+
+    def _summary(self) -> Summary:
+        """How B was laid over A, and how each quantity agrees."""
+        agreements = [
+            (one.name, f"mean {one.mean:.4g}, rms {one.rms:.4g}, largest {one.greatest:.4g} {one.unit}")
+            for one in self.agreements()
+        ]
+        by = (
+            "as they are"
+            if self.align == "none"
+            else f"by {self.align}, B shifted by {self.shift:.4g} {self.unit}"
+        )
+        return Summary(f"Comparison: {len(self.at):,} readings of A, aligned {by}", tuple(agreements))
+
+
+DRAWN = "b_model_error_nt"
+
+ERRORS: Mapping[str, tuple[str, tuple[str, ...], str]] = MappingProxyType(
+    {
+        "map": ("b_map_nt", ("b_truth_nt",), "error of the map at the sensor"),
+        "disturbance": ("b_total_nt", ("b_truth_nt",), "error of the prediction, map plus disturbance"),
+        "model error": (DRAWN, (), "error drawn for the network's prediction"),
+        "noise": ("b_measured_nt", ("b_total_nt", DRAWN), "noise of the sensor"),
+        "total": ("b_measured_nt", ("b_truth_nt",), "error of the reading"),
+    }
+)
+"""Errors of a run by source: a column, those that are subtracted from it, and what it means. Runs without
+`b_model_error_nt` have none."""
+
+
+def errors_of(run: Run) -> dict[str, Agreement]:
+    """The errors of a run in figures, by the names of `ERRORS`; those that are nowhere known are left out."""
+    found = {}
+    for name, (seen, others, _) in ERRORS.items():
+        others = tuple(other for other in others if other != DRAWN or DRAWN in run)
+        if not {seen, *others} <= set(run) or (seen == DRAWN and not run[DRAWN].any()):
+            continue
+        one = agreement(name, "nT", sum((-run[other] for other in others), run[seen]))
+        if one is not None:
+            found[name] = one
+    return found
+
+
+def compare(a: Run, b: Run, *, align: Align = "time") -> Comparison:
+    """Lay run B over run A and take their differences.
+
+    Aligned by time, B's clock is shifted by the one offset tau that minimises the mean square distance of
+    the positions, sum |p_A(t) - p_B(t - tau)|^2 / n over the overlap: by cross-correlation on a grid, then
+    by Gauss-Newton steps. Aligned by path, the same is done with the driven length in place of the time, so
+    that runs of different speeds lie over each other place by place. B is interpolated linearly.
+
+    Args:
+        a: The run whose readings, and whose axes, differences are given at and in.
+        b: The other run.
+        align: "time", "path", or "none" for clocks as they are.
+
+    Raises:
+        InputError: A run has fewer than two readings, one lacks what is to be compared, or they do not lie
+            over each other.
+    """
+    for name, run in (("first", a), ("second", b)):
+        if run.rows < 2:
+            raise InputError(f"the {name} run has {run.rows} readings; two or more are needed to compare")
+        if "t" not in run or not (np.diff(run["t"]) > 0).all():
+            raise InputError(f"the {name} run has no time that goes on from reading to reading")
+    position = next((name for name in POSITIONS if _known(a, name) and _known(b, name)), None)
+    if position is None and align != "none":
+        raise InputError(
+            f"runs are aligned by their positions, and no column of {', '.join(POSITIONS)} is known in both; "
+            "compare them as their clocks stand (align none)"
+        )
+    fields = [name for name in FIELDS if name in a and name in b]
+    if position is None and not fields:
+        raise InputError(
+            f"nothing to compare: neither a position nor a field of {', '.join(FIELDS)} is in both"
+        )
+    track_a, track_b = _Track.of(a, position, align, "first"), _Track.of(b, position, align, "second")
+    shift = 0.0 if position is None or align == "none" else _shift(track_a, track_b)
+    wanted = track_a.place - shift
+    over = (wanted >= track_b.place[0]) & (wanted <= track_b.place[-1])
+    after = np.clip(np.searchsorted(track_b.place, wanted), 1, len(track_b.place) - 1)
+    over &= np.diff(track_b.place)[after - 1] <= (GAP_M if align == "path" else GAP_S)
+    if np.count_nonzero(over) < 2:
+        unit = "m" if align == "path" else "s"
+        spans = [f"{track.place[0]:g} to {track.place[-1]:g} {unit}" for track in (track_a, track_b)]
+        advice = "; align them by time, which finds the offset" if align == "none" else ""
+        raise InputError(f"the runs do not lie over each other: {spans[0]} and {spans[1]}{advice}")
+    rows, wanted = track_a.rows[over], wanted[over]
+    none = np.empty(0)
+    along, cross, heading = none, none, none
+    if position is not None:
+        x, y = (track_b.at(wanted, b[position][:, k]) - a[position][rows, k] for k in (0, 1))
+        yaw_a, yaw_b = _yaw(a, position), _yaw(b, position)
+        if yaw_a is not None and yaw_b is not None:
+            turned = np.interp(wanted, track_b.place, np.unwrap(yaw_b[track_b.rows]))
+            heading = wrap_angle(turned - yaw_a[rows])
+        facing = _direction(a, position)[rows] if yaw_a is None else yaw_a[rows]
+        along, cross = (x * np.cos(facing) + y * np.sin(facing), y * np.cos(facing) - x * np.sin(facing))
+    return Comparison(
+        align=align,
+        shift=shift,
+        at=track_a.place[over],
+        rows=rows,
+        along_m=along,
+        cross_m=cross,
+        heading_rad=heading,
+        fields={name: (a[name][rows], track_b.at(wanted, b[name])) for name in fields},
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Traversals:
+    """One path driven twice, as in Figure 8 of the paper: with the clocks as they stand, and laid over."""
+
+    a: Run
+    b: Run
+    """Both with their own start at 0 s."""
+
+    recorded: Comparison
+    """Second by second from each run's own start."""
+
+    timed: Comparison
+    """With B's clock moved to where the positions lie closest."""
+
+    placed: Comparison
+    """Place by place, whatever the speeds."""
+
+    def summary(self) -> dict[str, Any]:
+        """The three comparisons in plain figures, for JSON."""
+        return {name: getattr(self, name).summary() for name in ("recorded", "timed", "placed")}
+
+
+def traversals(a: Run, b: Run) -> Traversals:
+    """Lay two drives of one path over each other, with and without alignment.
+
+    Two robots that drive one path at speeds of their own drift apart, so that fields compared second by
+    second differ though each may be right where it is; place by place they are compared as fields.
+
+    Args:
+        a: The run whose readings differences are given at.
+        b: Another: by another engine, with another seed, or recorded.
+
+    Raises:
+        InputError: As for `compare`.
+    """
+    a, b = (run.with_columns(t=run["t"] - run["t"][0]) if run.rows else run for run in (a, b))
+    return Traversals(a, b, *(compare(a, b, align=how) for how in _HOW))
+
+
+_HOW: tuple[Align, ...] = ("none", "time", "path")
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """The readings of a run that can be laid over another's, in order of where they were taken."""
+
+    rows: NDArray[np.intp]
+    place: Array
+    """Time [s] or driven length [m] of each, ascending."""
+    p_xy: Array
+    """Position of each [m], shape (N, 2); no columns without positions."""
+
+    @classmethod
+    def of(cls, run: Run, position: str | None, align: Align, which: str) -> "_Track":
+        if position is None:
+            return cls(np.arange(run.rows), run["t"], np.empty((run.rows, 0)))
+        p_xy = run[position][:, :2]
+        rows = np.flatnonzero(np.isfinite(p_xy).all(axis=1))
+        place = run["t"][rows]
+        if align == "path":
+            place = driven_m(p_xy[rows])
+            on = np.diff(place, prepend=-1.0) > 0
+            rows, place = rows[on], place[on]
+        if len(rows) < 2:
+            what = (
+                f"its robot moves no {STEP_M:g} m; align by time"
+                if align == "path"
+                else "its positions are unknown"
+            )
+            raise InputError(f"the {which} run cannot be laid over the other: {what}")
+        return cls(rows, place, p_xy[rows])
+
+    def at(self, place: Array, values: NDArray[Any]) -> Array:
+        """A column between its readings, linearly."""
+        return np.interp(place, self.place, values[self.rows])
+
+
+def driven_m(p_xy: Array) -> Array:
+    """Length driven until each of many positions, counted in steps of `STEP_M`.
+
+    Args:
+        p_xy: Positions in order of time [m], shape (N, 2).
+
+    Returns:
+        Length [m], shape (N,); within a step, and at rest, it grows evenly from reading to reading.
+    """
+    corners, (x0, y0) = [0], p_xy[0].tolist()
+    for i, (x, y) in enumerate(p_xy.tolist()):
+        if (x - x0) ** 2 + (y - y0) ** 2 >= STEP_M**2:
+            corners.append(i)
+            x0, y0 = x, y
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(p_xy[corners], axis=0).T))])
+    return np.interp(np.arange(len(p_xy)), corners, length)
+
+
+def _shift(a: _Track, b: _Track) -> float:
+    """What is to be added to B's places for its positions to lie over A's."""
+    span = max(a.place[-1] - a.place[0], b.place[-1] - b.place[0])
+    step = span / GRID
+    curve_a, curve_b = (_on_grid(track, step) for track in (a, b))
+    lag = _best_lag(curve_a, curve_b, math.hypot(*np.ptp(a.p_xy, axis=0)))
+    shift = float(a.place[0] - b.place[0]) + lag * step
+    for _ in range(8):
+        wanted = a.place - shift
+        over = (wanted >= b.place[0]) & (wanted <= b.place[-1])
+        if np.count_nonzero(over) < 2:
+            break
+        behind, there, ahead = (
+            np.column_stack([np.interp(wanted[over] + d, b.place, b.p_xy[:, k]) for k in (0, 1)])
+            for d in (-step, 0.0, step)
+        )
+        slope = (ahead - behind) / (2 * step)
+        steepness = float((slope**2).sum())
+        if steepness < 1e-12:
+            break
+        move = float(((there - a.p_xy[over]) * slope).sum()) / steepness
+        shift += float(np.clip(move, -2 * step, 2 * step))
+        if abs(move) < 1e-9 * span:
+            break
+    return shift
+
+
+def _on_grid(track: _Track, step: float) -> Array:
+    """Positions at even places, from the first on, shape (N, 2)."""
+    count = int((track.place[-1] - track.place[0]) / step + 1e-9) + 1
+    places = track.place[0] + step * np.arange(count)
+    return np.column_stack([np.interp(places, track.place, track.p_xy[:, k]) for k in (0, 1)])
+
+
+def _best_lag(a: Array, b: Array, size_m: float) -> int:
+    """Places by which B lies later than A where their mean square distance is least.
+
+    sum |a_i - b_(i-k)|^2 = sum |a_i|^2 + sum |b_j|^2 - 2 sum a_i . b_(i-k), the last by FFT.
+    """
+    centre = a.mean(axis=0)  # near the origin nothing cancels
+    a, b = a - centre, b - centre
+    lags = np.arange(-(len(b) - 1), len(a))
+    size = len(a) + len(b) - 1
+    length = 1 << (size - 1).bit_length()
+    cross = sum(
+        np.fft.irfft(np.fft.rfft(a[:, k], length) * np.fft.rfft(b[::-1, k], length), length)[:size]
+        for k in (0, 1)
+    )
+    first, last = np.maximum(lags, 0), np.minimum(lags + len(b), len(a))  # rows of A under B
+    squares = [np.concatenate([[0.0], np.cumsum((curve**2).sum(axis=1))]) for curve in (a, b)]
+    total = squares[0][last] - squares[0][first] + squares[1][last - lags] - squares[1][first - lags]
+    count = last - first
+    rms = np.sqrt(np.maximum(total - 2 * cross, 0.0) / count)
+    rms[count < LEAST_OVERLAP * min(len(a), len(b))] = np.inf
+    good = np.flatnonzero(rms <= rms.min() + min(SAME_M, 0.01 * size_m))
+    best = good[count[good] == count[good].max()]
+    return int(lags[best[np.argmin(rms[best])]])
+
+
+def _yaw(run: Run, position: str) -> Array | None:
+    """Heading that goes with a position [rad], shape (N,); none where it is not known."""
+    if position == "p_world_base" and _known(run, "yaw"):
+        return run["yaw"]
+    name = HEADINGS[position]
+    return yaw_from_quat(run[name]) if _known(run, name) else None
+
+
+def _direction(run: Run, position: str) -> Array:
+    """Direction of travel [rad], shape (N,), for runs that do not say where the robot faces."""
+    step = np.gradient(run[position][:, :2], axis=0)
+    return np.arctan2(step[:, 1], step[:, 0])
+
+
+def _known(run: Run, name: str) -> bool:
+    """Whether a column is there and anywhere known."""
+    return name in run and bool(np.isfinite(run[name]).reshape(run.rows, -1).all(axis=1).any())
+
+
+def agreement(name: str, unit: str, difference: Array, correlation: float | None = None) -> Agreement | None:
+    """A difference in figures; none where it is nowhere known."""
+    known = difference[np.isfinite(difference)]
+    if not len(known):
+        return None
+    size = np.abs(known)
+    return Agreement(
+        name,
+        unit,
+        len(known),
+        float(known.mean()),
+        float(np.sqrt(np.mean(known**2))),
+        float(size.mean()),
+        float(size.max()),
+        correlation,
+    )
+
+
+def _correlation(a: Array, b: Array) -> float | None:
+    """Pearson's correlation where both are known; none where one does not change."""
+    known = np.isfinite(a) & np.isfinite(b)
+    if np.count_nonzero(known) < 3 or min(np.ptp(a[known]), np.ptp(b[known])) == 0:
+        return None
+    return float(np.corrcoef(a[known], b[known])[0, 1])

@@ -1,0 +1,126 @@
+"""Resampling: a signal known at some instants, read at others.
+
+Every rule takes the values at the instants that are known and where each wanted instant lies between them,
+as `bracket` finds it. None reads a value that is not there: a wanted instant that is a known one gives its
+value to the bit, and what lies between a known value and nan is nan.
+"""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.frames import wrap_angle
+
+Array = NDArray[np.float64]
+Interpolation = Literal["linear", "hold", "angle", "quaternion"]
+
+MOST_ROWS = 50_000_000
+"""Most instants of a grid."""
+
+
+def bracket(t: Array, at: Array) -> tuple[NDArray[np.intp], Array]:
+    """Where instants lie among known ones.
+
+    Args:
+        t: Known instants, ascending [s], shape (N,).
+        at: Wanted ones, none before the first or after the last [s], shape (M,).
+
+    Returns:
+        Index of the last known instant that is not after each, and the share of the way from there to
+        the next, in [0, 1), both of shape (M,).
+    """
+    before = np.searchsorted(t, at, side="right") - 1
+    step = t[np.minimum(before + 1, len(t) - 1)] - t[before]
+    return before, np.divide(at - t[before], step, out=np.zeros(len(at)), where=step > 0)
+
+
+def hold(values: NDArray[Any], before: NDArray[np.intp], share: Array) -> NDArray[Any]:
+    """The latest value known at each instant: of flags, commands, and sensors that speak less often."""
+    return values[before]
+
+
+def linear(values: NDArray[Any], before: NDArray[np.intp], share: Array) -> Array:
+    """Values on the straight line between neighbours."""
+    a, b, s = _neighbours(values, before, share)
+    with np.errstate(invalid="ignore"):  # inf - inf
+        return np.where(s > 0, a + s * (b - a), a)
+
+
+def angle(values: NDArray[Any], before: NDArray[np.intp], share: Array) -> Array:
+    """Angles on the shorter way round between neighbours, in [-pi, pi) [rad]."""
+    a, b, s = _neighbours(values, before, share)
+    return np.where(s > 0, wrap_angle(a + s * wrap_angle(b - a)), a)
+
+
+def quaternion(values: NDArray[Any], before: NDArray[np.intp], share: Array) -> Array:
+    """Turns at constant rate between neighbours (Shoemake 1985), the shorter way round.
+
+    q(s) = (sin((1 - s) a) q0 + sin(s a) q1) / sin(a), cos(a) = q0 . q1
+
+    where a is half the angle between them; q1 is taken with the sign that makes a at most pi / 2.
+    """
+    q0, q1, s = _neighbours(values, before, share)
+    dot = np.sum(q0 * q1, axis=-1, keepdims=True)
+    q1, dot = np.where(dot < 0, -q1, q1), np.clip(np.abs(dot), 0, 1)
+    a = np.arccos(dot)
+    small = a < 1e-6  # there sine and angle are one, and the line between them an arc
+    sin_a = np.where(small, 1.0, np.sin(a))
+    w0 = np.where(small, 1 - s, np.sin((1 - s) * a) / sin_a)
+    w1 = np.where(small, s, np.sin(s * a) / sin_a)
+    q = w0 * q0 + w1 * q1
+    return np.where(s > 0, q / np.linalg.norm(q, axis=-1, keepdims=True), q0)
+
+
+RULES: Mapping[str, Callable[[NDArray[Any], NDArray[np.intp], Array], NDArray[Any]]] = MappingProxyType(
+    {"linear": linear, "hold": hold, "angle": angle, "quaternion": quaternion}
+)
+"""Rules by their names."""
+
+
+def grid(start_s: float, end_s: float, rate_hz: float) -> Array:
+    """Instants from `start_s` on, `rate_hz` a second, none after `end_s` [s].
+
+    Raises:
+        InputError: The rate is not above 0, not finite, or gives more than `MOST_ROWS`.
+    """
+    if not 0 < rate_hz < np.inf:
+        raise InputError(f"rate_hz must be above 0 Hz and finite, got {rate_hz!r}")
+    count = (end_s - start_s) * rate_hz
+    if count > MOST_ROWS:
+        raise InputError(
+            f"rate_hz {rate_hz:g} gives {count:.3g} rows in {end_s - start_s:g} s; at most {MOST_ROWS:,}"
+        )
+    return np.minimum(start_s + np.arange(int(count + 1e-9) + 1) / rate_hz, end_s)
+
+
+def check_instants(t: ArrayLike, what: str) -> Array:
+    """`t` as an array of shape (N,), if it is finite and strictly ascending.
+
+    Raises:
+        InputError: It is not; the text names the first row that is wrong.
+    """
+    t = np.asarray(t)
+    if t.ndim != 1 or t.dtype.kind not in "fiu":
+        raise InputError(f"{what}: t must be numbers of shape (N,), got {t.dtype} of shape {t.shape}")
+    t = t.astype(float, copy=False)
+    if not np.isfinite(t).all():
+        row = int(np.argmin(np.isfinite(t)))
+        raise InputError(f"{what}: t must be finite, got {t[row]} in row {row}")
+    if (wrong := np.diff(t) <= 0).any():
+        row = int(np.argmax(wrong)) + 1
+        raise InputError(
+            f"{what}: t must ascend from row to row, but row {row} has {t[row]:.9g} s "
+            f"after {t[row - 1]:.9g} s; sort the rows, or drop those that repeat"
+        )
+    return t
+
+
+def _neighbours(values: NDArray[Any], before: NDArray[np.intp], share: Array) -> tuple[Array, Array, Array]:
+    """The values on either side, and the share with as many axes as they have."""
+    values = np.asarray(values, float)
+    a, b = values[before], values[np.minimum(before + 1, len(values) - 1)]
+    return a, b, share.reshape(-1, *(1,) * (values.ndim - 1))

@@ -1,0 +1,1 @@
+"""What moves a robot: the kinematic engine, Newton, or a recorded run."""

@@ -1,0 +1,90 @@
+"""Replay: a recorded Run driven once more, so that sensors set anew read what they would have read on it.
+
+What follows from how speeds change, the motors' torque above all, is only as good as what is known of them
+between rows. Rows of the kinematic engine, with one or more in each control step and no first ones cut off,
+tell its steps, and the drive is itself again. Of others speeds go evenly from row to row.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magtwin.errors import InputError
+from magtwin.frames import yaw_from_quat
+from magtwin.run.run import Run
+from magtwin.sim.engines.sampled import SampledMotion
+from magtwin.sim.motion.drive import wheel_rates
+from magtwin.sim.motion.follow import CONTROL_RATE_HZ
+from magtwin.spec.scene import DriveSpec
+
+
+def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
+    """The motion that a Run recorded, from its first row on.
+
+    Args:
+        run: It needs t, p_world_base, and yaw or q_world_base_xyzw. Where v_base or w_base are missing,
+            speeds follow from the poses; where wheel_angle is missing, the wheels roll without slip;
+            commands that are missing are not known.
+        drive: The robot's wheels.
+
+    Returns:
+        The motion, one mean interval longer than the rows, so that at the rate of the Run it has as many
+        readings as the Run has rows.
+
+    Raises:
+        InputError: A column is missing, there are fewer than two rows, time does not go on, or a pose is
+            not finite; the text gives the row.
+    """
+    lacking = [name for name in ("t", "p_world_base") if name not in run]
+    if "yaw" not in run and "q_world_base_xyzw" not in run:
+        lacking.append("yaw or q_world_base_xyzw")
+    if lacking:
+        raise InputError(
+            f"a run to replay needs {', '.join(lacking)}, and has only {', '.join(run)}; a script of "
+            "t,v,w is for --commands"
+        )
+    if run.rows < 2:
+        raise InputError(f"a run of {run.rows} rows is no motion to replay; two or more are needed")
+    t = run["t"]
+    yaw = run["yaw"] if "yaw" in run else yaw_from_quat(run["q_world_base_xyzw"])
+    pose = np.column_stack([run["p_world_base"][:, :2], yaw])
+    for broken, what in (
+        (~np.isfinite(t), "its time is not finite"),
+        (np.diff(t, prepend=-np.inf) <= 0, "its time is not after that of the row before"),
+        (~np.isfinite(pose).all(axis=1), "its pose is not finite"),
+    ):
+        rows = np.flatnonzero(broken)
+        if len(rows):
+            raise InputError(
+                f"row {rows[0] + 1} of {run.rows} of the run to replay: {what} (t = {t[rows[0]]:g} s); leave "
+                "such rows out"
+            )
+    from_start = t[0] == 0
+    t = t - t[0]
+    pose[:, 2] = np.unwrap(pose[:, 2])
+    if "v_base" in run and "w_base" in run:
+        v, w = run["v_base"][:, 0], run["w_base"][:, 2]
+    else:
+        way = np.gradient(pose, t, axis=0)
+        v = way[:, 0] * np.cos(pose[:, 2]) + way[:, 1] * np.sin(pose[:, 2])
+        w = way[:, 2]
+    if "wheel_angle" in run:
+        wheels = run["wheel_angle"] - run["wheel_angle"][0]
+    else:
+        rates = wheel_rates(v, w, drive)
+        turned = np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(t)[:, None], axis=0)
+        wheels = np.vstack([[0.0, 0.0], turned])
+    unknown = np.full(len(t), np.nan)
+    motion = SampledMotion(
+        t=t,
+        pose=pose,
+        v=v,
+        w=w,
+        wheel_angle=wheels,
+        v_cmd=run.get("v_cmd", unknown),
+        w_cmd=run.get("w_cmd", unknown),
+        bump=run["flag_bump"] if "flag_bump" in run else np.zeros(len(t), bool),
+        duration_s=float(t[-1] * len(t) / (len(t) - 1)),
+    )
+    step_s = 1 / CONTROL_RATE_HZ
+    return replace(motion, step_s=step_s) if from_start and motion.has_steps(step_s) else motion

@@ -1,0 +1,161 @@
+"""A motion that is known at samples: what a physics engine did, or what a Run recorded."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.sim.motion.drive import Moment, advance
+
+Array = NDArray[np.float64]
+
+SAME = 1e-9
+"""Rounding that poses of a drive are forgiven [m, rad]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SampledMotion:
+    """A motion between whose samples position and heading are cubics with the sampled velocities.
+
+    At a sample it gives what was sampled, to the last bit; before the first and after the last the robot
+    stands. Where the twist is constant between samples h apart, a cubic is v w^3 h^4 / 384 off the arc:
+    nothing to speak of at 135 Hz, 0.3 mm at 2 Hz and the drive's limits. Of a drive whose speeds were held
+    for control steps, each with a sample, it is that drive itself: speeds jump where the steps did, and
+    positions go on along arcs.
+    """
+
+    t: Array
+    """Times of the samples since the start, the first at 0, ascending [s], shape (K,), K >= 2."""
+
+    pose: Array
+    """x [m], y [m], yaw [rad] of base_link in world, shape (K, 3); yaw without jumps."""
+
+    v: Array
+    """Forward speed [m/s], shape (K,)."""
+
+    w: Array
+    """Yaw rate [rad/s], shape (K,)."""
+
+    wheel_angle: Array
+    """Angle turned by the left and the right wheel since the start [rad], shape (K, 2)."""
+
+    v_cmd: Array
+    """Commanded forward speed [m/s], shape (K,); nan where it is not known."""
+
+    w_cmd: Array
+    """Commanded yaw rate [rad/s], shape (K,); nan where it is not known."""
+
+    bump: NDArray[np.bool_]
+    """Whether an obstacle was touched, shape (K,)."""
+
+    duration_s: float
+    """Time from the start to the end [s], at least that of the last sample."""
+
+    step_s: float | None = None
+    """Length of the control steps, the first from 0 on, in which speeds are held [s]; None where they go
+    evenly from sample to sample."""
+
+    def __post_init__(self) -> None:
+        count = len(self.t)
+        shapes = {"pose": (count, 3), "wheel_angle": (count, 2)}
+        for name in ("t", "pose", "v", "w", "wheel_angle", "v_cmd", "w_cmd", "bump"):
+            array = np.asarray(getattr(self, name), bool if name == "bump" else float)
+            if array.shape != shapes.get(name, (count,)):
+                raise InputError(
+                    f"{name} of a motion of {count} samples must have shape {shapes.get(name, (count,))}, "
+                    f"got {array.shape}"
+                )
+            object.__setattr__(self, name, array)
+        if self.step_s is not None and not self.has_steps(self.step_s):
+            raise InputError(f"a motion has no sample, or speeds that change, in a step of {self.step_s:g} s")
+        if count < 2 or self.t[0] != 0 or not np.all(np.diff(self.t) > 0):
+            raise InputError("a motion needs two samples or more, the first at 0 s, in order of time")
+        for name in ("t", "pose", "v", "w", "wheel_angle"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise InputError(f"{name} of a motion is not finite")
+
+    def at(self, t: ArrayLike) -> Moment:
+        """Pose, speeds and wheels at times `t`.
+
+        Args:
+            t: Times since the start, from 0 [s], shape (N,).
+        """
+        t = np.asarray(t, float)
+        if self.step_s is not None:
+            return self._held(t, self.step_s)
+        k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
+        h = self.t[k + 1] - self.t[k]
+        u = np.clip((t - self.t[k]) / h, 0.0, 1.0)
+        v0, v1, w0, w1 = self.v[k], self.v[k + 1], self.w[k], self.w[k + 1]
+        a, b = self.pose[k], self.pose[k + 1]
+        da = np.column_stack([v0 * np.cos(a[:, 2]), v0 * np.sin(a[:, 2]), w0])
+        db = np.column_stack([v1 * np.cos(b[:, 2]), v1 * np.sin(b[:, 2]), w1])
+        s, hh = u[:, None], h[:, None]
+        r = 1.0 - s
+        pose = r * r * ((1 + 2 * s) * a + s * hh * da) + s * s * ((1 + 2 * r) * b - r * hh * db)
+        held = np.where(u < 1.0, k, k + 1)
+        moving = t <= self.t[-1]
+        return Moment(
+            pose=pose,
+            v=(v0 + u * (v1 - v0)) * moving,
+            w=(w0 + u * (w1 - w0)) * moving,
+            a=np.interp(t, self.t, self.acceleration) * moving,
+            wheel_angle=r * self.wheel_angle[k] + s * self.wheel_angle[k + 1],
+            v_cmd=self.v_cmd[held] * moving,
+            w_cmd=self.w_cmd[held] * moving,
+            bump=self.bump[held],
+        )
+
+    def has_steps(self, step_s: float) -> bool:
+        """Whether this is a drive whose speeds were held for steps from 0 on, with a sample in each.
+
+        Args:
+            step_s: Length of the steps [s].
+        """
+        step = _steps(self.t, step_s)
+        same = np.diff(step) == 0
+        if np.any(np.diff(step) > 1) or not np.any(same):
+            return False
+        held = all(np.all((np.diff(x) == 0)[same]) for x in (self.v, self.w))
+        along = advance(self.pose[:-1], self.v[:-1], self.w[:-1], np.diff(self.t)) - self.pose[1:]
+        return held and bool(np.all(np.abs(along[same]) < SAME))
+
+    def _held(self, t: Array, step_s: float) -> Moment:
+        """`at` of speeds that are held: each time takes the sample of its step that is next to it."""
+        step, of = _steps(t, step_s), _steps(self.t, step_s)
+        k = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 1)
+        after = np.minimum(k + 1, len(self.t) - 1)
+        own = np.where(step > of[k], after, k)
+        moving = t <= self.t[-1]
+        first = np.flatnonzero(np.diff(of, prepend=-1))
+        a = np.diff(self.v[first], prepend=0.0) / step_s
+        # A wheel's rate is that between two samples of a step, or of a step with one, of both its sides.
+        rates = np.diff(self.wheel_angle, axis=0) / np.diff(self.t)[:, None]
+        before, behind = np.vstack([rates[:1], rates]), np.vstack([rates, rates[-1:]])
+        inside = np.diff(of) == 0
+        with_last, with_next = np.append(False, inside)[:, None], np.append(inside, False)[:, None]
+        rate = np.where(with_next, behind, np.where(with_last, before, (before + behind) / 2))
+        into = np.where(moving, t - self.t[own], 0.0)
+        v, w = self.v[own], self.w[own]
+        return Moment(
+            pose=advance(self.pose[own], v, w, into),
+            v=v * moving,
+            w=w * moving,
+            a=a[np.clip(step, 0, len(a) - 1)] * moving,
+            wheel_angle=self.wheel_angle[own] + rate[own] * into[:, None],
+            v_cmd=self.v_cmd[own] * moving,
+            w_cmd=self.w_cmd[own] * moving,
+            bump=self.bump[own],
+        )
+
+    @property
+    def acceleration(self) -> Array:
+        """Forward acceleration at the samples, by central differences of the speed [m/s2], shape (K,)."""
+        return np.gradient(self.v, self.t)
+
+
+def _steps(t: Array, step_s: float) -> NDArray[np.intp]:
+    """Which control step times fall into, as `magtwin.sim.motion.drive.Motion.at` has it, shape (N,)."""
+    starts = np.arange(int(np.max(t, initial=0.0) / step_s) + 2) * step_s
+    return np.searchsorted(starts, t, side="right") - 1

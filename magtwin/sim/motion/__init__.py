@@ -1,0 +1,1 @@
+"""Motion of a robot: paths, controllers, drive and closed loop."""

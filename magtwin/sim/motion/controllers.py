@@ -1,0 +1,196 @@
+"""Controllers: what a robot is commanded, step by step, from where it is.
+
+A controller of one's own is any object with what `Controller` names. Those of magtwin are `Guide`s, made by
+name from a path, or from a script of commands; what each of them computes stands in `loop.py`.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError, find
+from magtwin.path import Path
+from magtwin.sim.motion import loop
+from magtwin.sim.motion.plan import LIMIT_SHARE, drivable, plan
+from magtwin.spec.scene import DriveSpec
+
+Array = NDArray[np.float64]
+
+CONTROLLERS: Mapping[str, int] = MappingProxyType(
+    {
+        "follower": loop.FOLLOWER,
+        "release": loop.RELEASE,
+        "stanley": loop.STANLEY,
+        "pure_pursuit": loop.PURE_PURSUIT,
+    }
+)
+"""Controllers that follow a path: ours; that of the released package, as it drives the real robot; Stanley's
+(Hoffmann et al. 2007); pure pursuit (Coulter 1992)."""
+
+RELEASE_GAIN = 0.5
+"""k of the released follower [1/s], as published."""
+
+LOST_M = 0.05
+"""Distance from the path beyond which the robot drives straight back to where it left it [m]."""
+
+CREEP = 0.01
+"""Speed at which a piece is begun and ended [m/s]; one step of it is 0.2 mm."""
+
+AHEAD_M: Mapping[str, float] = MappingProxyType({"stanley": 0.06, "pure_pursuit": 0.15})
+"""How far Stanley's steered wheel is ahead of the axle, and pure pursuit's goal along the path [m]; ours."""
+
+
+class Controller(Protocol):
+    """What commands a robot."""
+
+    @property
+    def done(self) -> bool:
+        """Whether it has nothing more to command; the run then ends when the robot stands."""
+
+    def command(
+        self, t: float, x: float, y: float, yaw: float, v: float, w: float
+    ) -> tuple[float, float] | None:
+        """The next forward speed [m/s] and yaw rate [rad/s]; the drive keeps them within its limits.
+
+        Args:
+            t: Time since the start [s].
+            x: Position in world [m].
+            y: Position in world [m].
+            yaw: Heading in world [rad], which goes on beyond pi.
+            v: Forward speed, as the wheels turn [m/s].
+            w: Yaw rate, as the wheels turn [rad/s].
+
+        Returns:
+            None says nothing: the last command then holds, until the drive's command_timeout_s is over.
+        """
+
+
+@dataclass(eq=False)
+class Guide:
+    """A controller of magtwin's own, which can be compiled."""
+
+    law: int
+    """Which: a number of `loop.py`."""
+
+    table: Array
+    """What it follows, as `loop.drive_on` reads it, shape (loop.TABLE, M)."""
+
+    gains: tuple[float, float, float, float, float, float, float, float]
+    """As `loop.along_path` takes them."""
+
+    timeout_s: float
+    """Age at which a scripted command is void [s]."""
+
+    pose0: tuple[float, float, float] | None = None
+    """x [m], y [m], yaw [rad] at which what it follows begins; none for a script."""
+
+    node: int = 0
+    """Node that is next; their number when it is done."""
+
+    driven_m: float = 0.0
+    """Way since that changed [m]."""
+
+    @cached_property
+    def columns(self) -> list[list[float]]:
+        """`table` as lists, which plain Python reads faster."""
+        columns: list[list[float]] = self.table.tolist()
+        return columns
+
+    @property
+    def done(self) -> bool:
+        """Whether its end was reached; it then commands a stand."""
+        return self.node >= self.table.shape[1]
+
+    def command(self, t: float, x: float, y: float, yaw: float, v: float, w: float) -> tuple[float, float]:
+        """As for `Controller`."""
+        v_cmd, w_cmd, self.node, self.driven_m = loop.commanded(
+            self.law,
+            self.columns,
+            self.gains,
+            self.timeout_s,
+            self.node,
+            self.driven_m,
+            t,
+            x,
+            y,
+            yaw,
+            v,
+            w,
+        )
+        return v_cmd, w_cmd
+
+
+def guide_along(name: str, path: Path, drive: DriveSpec, *, speed: float, dt: float) -> Guide:
+    """A controller that follows a path.
+
+    Args:
+        name: One of `CONTROLLERS`.
+        path: Where to drive, taken as an open line.
+        drive: Its limits, and its motors' lag, which all but the release's foresee.
+        speed: Wanted forward speed [m/s].
+        dt: Time between commands [s].
+
+    Raises:
+        UnknownNameError: No such controller; the text names the nearest one.
+        InputError: `speed` is out of range, or the path too small to be driven.
+    """
+    law = find("controller", name, CONTROLLERS)
+    way = drivable(path)
+    pieces = plan(way, drive, speed=speed)
+    if law == loop.RELEASE:
+        p = path.p_xy  # the release pursues the points as they stand in its file
+        unused = np.zeros((loop.TABLE - 2, len(p)))
+        (x, y), (dx, dy) = p[0].tolist(), (p[1] - p[0]).tolist()
+        gains = (dt, dt, speed, speed, 0.0, 0.0, 0.0, RELEASE_GAIN)
+        return Guide(
+            law, np.vstack([p.T, unused]), gains, drive.command_timeout_s, (x, y, math.atan2(dy, dx))
+        )
+    columns = ("x", "y", "heading", "curvature", "speed2", "left_m")
+    table = np.vstack([np.concatenate([getattr(piece, column) for piece in pieces]) for column in columns])
+    gains = (
+        dt,
+        dt + drive.motor_lag_s,
+        speed,
+        min(CREEP, speed),
+        2 * LIMIT_SHARE * drive.a_max,
+        (LOST_M + drive.v_max * dt) ** 2,
+        LIMIT_SHARE * drive.w_max,
+        AHEAD_M.get(name, 0.0),
+    )
+    x, y, yaw = table[:3, 0].tolist()
+    return Guide(law, table, gains, drive.command_timeout_s, (x, y, yaw))
+
+
+def guide_by_commands(commands: ArrayLike, drive: DriveSpec) -> Guide:
+    """A controller that plays a script: each command holds until the next, or until it is too old.
+
+    Args:
+        commands: Time since the start [s], forward speed [m/s] and yaw rate [rad/s] of each, shape (K, 3).
+        drive: Whose command_timeout_s makes a command void.
+
+    Raises:
+        InputError: They are not of that shape, not finite, or not in order of time; the text gives the row.
+    """
+    rows = np.asarray(commands, float)
+    if rows.ndim != 2 or rows.shape[1] != 3 or not len(rows):
+        raise InputError(f"commands must be rows of t, v, w, of shape (K, 3), got {rows.shape}")
+    broken = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if len(broken):
+        i = int(broken[0])
+        raise InputError(f"command {i + 1} of {len(rows)} is not finite: t, v, w = {rows[i].tolist()}")
+    back = np.flatnonzero(np.diff(rows[:, 0], prepend=-1e-300) <= 0)
+    if len(back):
+        i = int(back[0])
+        raise InputError(
+            f"commands must come in order of time, from 0 s up: command {i + 1} of {len(rows)} has "
+            f"t = {rows[i, 0]:g} s" + (f" after {rows[i - 1, 0]:g} s" if i else "")
+        )
+    table = np.vstack([rows.T, np.zeros((loop.TABLE - 3, len(rows)))])
+    none = (0.0,) * 8
+    return Guide(loop.COMMANDS, table, none, drive.command_timeout_s)  # type: ignore[arg-type]

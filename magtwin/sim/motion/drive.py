@@ -1,0 +1,248 @@
+"""The differential drive: exact integration of twists, wheels, limits."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.sim.motion.loop import limited
+from magtwin.spec.scene import DriveSpec
+
+Array = NDArray[np.float64]
+Pose = tuple[float, float, float]
+"""x [m], y [m], yaw [rad] in world."""
+
+
+def advance(pose: ArrayLike, v: ArrayLike, w: ArrayLike, duration: ArrayLike) -> Array:
+    """Poses of a unicycle after a constant twist, without Euler's error.
+
+    The way is an arc of angle a = w t; its chord, v t sin(a/2) / (a/2), points halfway between the
+    headings at its ends.
+
+    Args:
+        pose: x [m], y [m], yaw [rad] before, in world, shape (..., 3).
+        v: Forward speeds [m/s], shape (...).
+        w: Yaw rates [rad/s], shape (...).
+        duration: How long each twist lasts, t [s], shape (...).
+
+    Returns:
+        x, y, yaw after, shape (..., 3); yaw goes on beyond pi.
+    """
+    pose = np.asarray(pose, float)
+    half = np.asarray(w, float) * duration / 2
+    chord = np.asarray(v, float) * duration * np.sinc(half / np.pi)
+    mid = pose[..., 2] + half
+    return np.stack(
+        [pose[..., 0] + chord * np.cos(mid), pose[..., 1] + chord * np.sin(mid), mid + half], axis=-1
+    )
+
+
+def integrate_twist(v: ArrayLike, w: ArrayLike, dt: float, pose0: Pose = (0.0, 0.0, 0.0)) -> Array:
+    """Poses of a unicycle under piecewise constant twists; each step as in `advance`.
+
+    Args:
+        v: Forward speeds [m/s], shape (K,).
+        w: Yaw rates [rad/s], shape (K,).
+        dt: Length of a step [s].
+        pose0: First x [m], y [m], yaw [rad] in world.
+
+    Returns:
+        x, y, yaw at the start and after each step, shape (K + 1, 3).
+    """
+    turn = np.asarray(w, float) * dt
+    yaw = pose0[2] + np.concatenate([[0.0], np.cumsum(turn)])
+    start = np.zeros((len(turn), 3))
+    start[:, 2] = yaw[:-1]
+    steps = advance(start, v, w, dt)[:, :2]
+    xy = np.vstack([[0.0, 0.0], np.cumsum(steps, axis=0)]) + pose0[:2]
+    return np.column_stack([xy, yaw])
+
+
+def wheel_rates(v: ArrayLike, w: ArrayLike, drive: DriveSpec) -> Array:
+    """Rates of the left and the right wheel [rad/s]: (v -+ w b / 2) / r, shape (...) -> (..., 2)."""
+    v, w = np.asarray(v, float), np.asarray(w, float)
+    side = w * drive.wheel_separation_m / 2
+    return np.stack([v - side, v + side], axis=-1) / drive.wheel_radius_m
+
+
+def limits(drive: DriveSpec, dt: float) -> tuple[float, float, float, float, float, float]:
+    """A drive's limits as `magtwin.sim.motion.loop.limited` takes them, for steps of `dt` [s]."""
+    rim = drive.wheel_rate_max * drive.wheel_radius_m
+    return (
+        drive.v_max,
+        drive.w_max,
+        drive.a_max * dt,
+        drive.alpha_max * dt,
+        rim,
+        drive.wheel_separation_m / 2,
+    )
+
+
+def limiter(drive: DriveSpec, dt: float) -> Callable[[float, float, float, float], tuple[float, float]]:
+    """What a drive makes of a command: a function of scalars, to be called at each control step.
+
+    Returns:
+        `limit(v_wanted, w_wanted, v, w) -> (v, w)`: the twist nearest to the wanted one that keeps
+        v_max, w_max and the highest rate of a wheel, and differs from the last one by at most a_max dt and
+        alpha_max dt; see `magtwin.sim.motion.loop.limited`.
+    """
+    return partial(limited, limits(drive, dt))
+
+
+def draw_wheel_errors(drive: DriveSpec, rng: np.random.Generator) -> tuple[float, float]:
+    """How far the wheels are from their nominal size in one run: of radius and separation, relative.
+
+    What the runs of a session share, and what this run draws beside it.
+    """
+    radius, separation = rng.standard_normal(2).tolist()
+    shared = drive.wheel_errors
+    return (
+        shared[0] + drive.wheel_radius_error_std * radius,
+        shared[1] + drive.wheel_separation_error_std * separation,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A motion at given times; arrays of shape (N,) unless said."""
+
+    pose: Array
+    """x [m], y [m], yaw [rad] of base_link in world, shape (N, 3); yaw goes on beyond pi."""
+
+    v: Array
+    """Forward speed [m/s]."""
+
+    w: Array
+    """Yaw rate [rad/s]."""
+
+    a: Array
+    """Forward acceleration [m/s2]: the change of speed that began the step, over the step."""
+
+    wheel_angle: Array
+    """Angle turned by the left and the right wheel since the start [rad], shape (N, 2)."""
+
+    v_cmd: Array
+    """Commanded forward speed [m/s]; nan where it is not known."""
+
+    w_cmd: Array
+    """Commanded yaw rate [rad/s]; nan where it is not known."""
+
+    bump: NDArray[np.bool_]
+    """Whether the robot touches what stopped it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What a differential drive did: a twist for each control step, from rest at `pose0`.
+
+    Of a drive that is ideal no more need be said. Columns that are not given follow from the others: the
+    wheels roll without slip, what was done was commanded, and nothing was touched.
+    """
+
+    drive: DriveSpec
+
+    dt: float
+    """Length of a control step [s]."""
+
+    v: Array
+    """Forward speed in each step [m/s], shape (K,)."""
+
+    w: Array
+    """Yaw rate in each step [rad/s], shape (K,)."""
+
+    pose0: Pose = (0.0, 0.0, 0.0)
+    """First x [m], y [m], yaw [rad] in world."""
+
+    wheel_v: Array | None = field(default=None, kw_only=True, repr=False)
+    """Forward speed that the wheels would give at their nominal size without slip [m/s], shape (K,)."""
+
+    wheel_w: Array | None = field(default=None, kw_only=True, repr=False)
+    """Yaw rate that they would give [rad/s], shape (K,)."""
+
+    v_cmd: Array | None = field(default=None, kw_only=True, repr=False)
+    """Forward speed that was commanded in each step [m/s], shape (K,)."""
+
+    w_cmd: Array | None = field(default=None, kw_only=True, repr=False)
+    """Yaw rate that was commanded [rad/s], shape (K,)."""
+
+    bump: NDArray[np.bool_] | None = field(default=None, kw_only=True, repr=False)
+    """Whether an obstacle shortened the step, or the robot has not left it since, shape (K,)."""
+
+    poses: Array | None = field(default=None, kw_only=True, repr=False)
+    """x, y, yaw at the start and after each step, shape (K + 1, 3); yaw goes on beyond pi."""
+
+    wheel_rates: Array = field(init=False, repr=False)
+    """Rates of the left and the right wheel in each step [rad/s], shape (K, 2)."""
+
+    acceleration: Array = field(init=False, repr=False)
+    """Change of speed that begins each step, over the step [m/s2], shape (K,)."""
+
+    wheel_angles: Array = field(init=False, repr=False)
+    """Angle turned by left and right wheel at the start and after each step [rad], shape (K + 1, 2)."""
+
+    _steps: Array = field(init=False, repr=False)
+    """What holds in each step, to be taken at once: its first pose (3), wheel angles (2) and rates (2), v, w,
+    acceleration, v_cmd, w_cmd, whether an obstacle is touched; shape (K, 13)."""
+
+    def __post_init__(self) -> None:
+        v, w = np.asarray(self.v, float), np.asarray(self.w, float)
+        if v.ndim != 1 or v.shape != w.shape or not len(v):
+            raise InputError(f"v and w of a Motion must have one shape (K,), got {v.shape} and {w.shape}")
+        if not (np.isfinite(v).all() and np.isfinite(w).all()):
+            raise InputError("a speed or yaw rate of a Motion is not finite")
+        known = {
+            "v": v,
+            "w": w,
+            "wheel_v": v,
+            "wheel_w": w,
+            "v_cmd": v,
+            "w_cmd": w,
+            "bump": np.zeros(len(v), bool),
+        }
+        for name, default in known.items():
+            given = getattr(self, name)
+            array = default if given is None else np.asarray(given, default.dtype)
+            if array.shape != v.shape:
+                raise InputError(f"{name} of a Motion must have shape {v.shape}, got {array.shape}")
+            known[name] = array
+        poses = integrate_twist(v, w, self.dt, self.pose0) if self.poses is None else np.asarray(self.poses)
+        if poses.shape != (len(v) + 1, 3):
+            raise InputError(f"poses of a Motion must have shape {(len(v) + 1, 3)}, got {poses.shape}")
+        rates = wheel_rates(known["wheel_v"], known["wheel_w"], self.drive)
+        known |= {
+            "poses": poses,
+            "wheel_rates": rates,
+            "wheel_angles": np.vstack([[0.0, 0.0], np.cumsum(rates, axis=0) * self.dt]),
+            "acceleration": np.diff(v, prepend=0.0) / self.dt,
+        }
+        parts = (poses[:-1], known["wheel_angles"][:-1], rates, v, w, known["acceleration"])
+        known["_steps"] = np.column_stack([*parts, known["v_cmd"], known["w_cmd"], known["bump"]])
+        for name, array in known.items():
+            object.__setattr__(self, name, array)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the start to the end of the last step [s]."""
+        return len(self.v) * self.dt
+
+    def at(self, t: ArrayLike) -> Moment:
+        """Pose, speeds and wheels at times `t`, exact within the steps; after the last it stands.
+
+        Args:
+            t: Times since the start, from 0 [s], shape (N,).
+        """
+        t = np.asarray(t, float)
+        starts = np.arange(len(self.v)) * self.dt
+        k = np.searchsorted(starts, t, side="right") - 1
+        into = np.clip(t - starts[k], 0.0, self.dt)
+        then = self._steps.take(k, axis=0)
+        v, w, a, v_cmd, w_cmd, bump = then[:, 7:].T
+        pose = advance(then[:, :3], v, w, into)
+        turned = then[:, 3:5] + then[:, 5:7] * into[:, None]
+        moving = t < self.duration_s
+        if not moving.all():
+            v, w, a, v_cmd, w_cmd = (column * moving for column in (v, w, a, v_cmd, w_cmd))
+        return Moment(pose=pose, v=v, w=w, a=a, wheel_angle=turned, v_cmd=v_cmd, w_cmd=w_cmd, bump=bump > 0)

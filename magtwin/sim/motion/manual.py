@@ -1,0 +1,168 @@
+"""Manual driving: keys of a terminal, or the sticks of a gamepad, as commands."""
+
+import struct
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from magtwin.sim.motion.commands import Commands
+from magtwin.sim.motion.controllers import guide_by_commands
+from magtwin.sim.motion.course import Chassis, Course
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.scene import DriveSpec
+
+V_STEP, W_STEP = 0.05, 0.25
+"""By how much a key changes speed [m/s] and yaw rate [rad/s]."""
+
+KEYS = {
+    **dict.fromkeys(("w", "W", "\x1b[A", "\x1bOA"), "faster"),
+    **dict.fromkeys(("s", "S", "\x1b[B", "\x1bOB"), "slower"),
+    **dict.fromkeys(("a", "A", "\x1b[D", "\x1bOD"), "left"),
+    **dict.fromkeys(("d", "D", "\x1b[C", "\x1bOC"), "right"),
+    **dict.fromkeys(("x", "X"), "straight"),
+    " ": "stop",
+    **dict.fromkeys(("q", "Q", "\x04", "\x03", ""), "end"),
+}
+"""What keys do, by what a terminal sends: WASD or arrows; x, space, q; Ctrl-C, Ctrl-D and a closed line."""
+
+HELP = "w/s or up/down: speed, a/d or left/right: turn, x: straight on, space: stop, q: end"
+
+
+class Hand(Protocol):
+    """Whoever drives by hand: what was put in so far is the command that holds."""
+
+    command: tuple[float, float]
+    """Forward speed [m/s] and yaw rate [rad/s]."""
+
+    done: bool
+    """Whether the drive is to end."""
+
+    def feed(self, data: bytes) -> None:
+        """Take what a device sent, in pieces as they come; no bytes are the end of it."""
+
+
+class Keyboard:
+    """A terminal's keys. It tells of no key that is let go, so each changes the speeds by a step."""
+
+    def __init__(self, drive: DriveSpec) -> None:
+        """Stand still."""
+        self._drive = drive
+        self._rest = b""
+        self.command = 0.0, 0.0
+        self.done = False
+
+    def feed(self, data: bytes) -> None:
+        """As for `Hand`; keys that do nothing are passed over."""
+        for key in self._keys(data):
+            self._press(KEYS.get(key, "nothing"))
+
+    def _keys(self, data: bytes) -> Iterator[str]:
+        if not data:
+            yield ""
+        data, self._rest = self._rest + data, b""
+        while data:
+            length = 3 if data[:2] in (b"\x1b[", b"\x1bO") else 1
+            if len(data) < length or data == b"\x1b":
+                self._rest = data  # an arrow of which the rest is on its way
+                return
+            yield data[:length].decode("latin-1")
+            data = data[length:]
+
+    def _press(self, what: str) -> None:
+        v, w = self.command
+        drive = self._drive
+        if what in ("faster", "slower"):
+            v += V_STEP if what == "faster" else -V_STEP
+        elif what in ("left", "right"):
+            w += W_STEP if what == "left" else -W_STEP
+        elif what == "straight":
+            w = 0.0
+        elif what in ("stop", "end"):
+            v = w = 0.0
+            self.done = self.done or what == "end"
+        v = min(max(round(v, 9), -drive.v_max), drive.v_max)
+        self.command = v, min(max(round(w, 9), -drive.w_max), drive.w_max)
+
+
+class Gamepad:
+    """A gamepad as Linux tells of it (/dev/input/js0): left stick drives, Start ends.
+
+    Its events are 8 bytes: time [ms], value, type (1 button, 2 axis; 128 more for how it stands at first),
+    and number (Linux, Documentation/input/joydev/joystick-api).
+    """
+
+    DEAD = 0.08
+    """Share of a stick's way that is none."""
+
+    END = (7, 9)
+    """Numbers of Start, on the pads of two makers."""
+
+    def __init__(self, drive: DriveSpec) -> None:
+        """Stand still."""
+        self._drive = drive
+        self._rest = b""
+        self.command = 0.0, 0.0
+        self.done = False
+
+    def feed(self, data: bytes) -> None:
+        """As for `Hand`."""
+        if not data:
+            self.command, self.done = (0.0, 0.0), True
+        data = self._rest + data
+        whole = len(data) // 8 * 8
+        self._rest = data[whole:]
+        for _, value, kind, number in struct.iter_unpack("<IhBB", data[:whole]):
+            v, w = self.command
+            share = max(-1.0, -value / 32767)  # forward and left are below 0
+            share = 0.0 if abs(share) < self.DEAD else share
+            if kind & 0x7F == 2 and number == 1:
+                self.command = share * self._drive.v_max, w
+            elif kind & 0x7F == 2 and number == 0:
+                self.command = v, share * self._drive.w_max
+            elif kind == 1 and value and number in self.END:
+                self.command, self.done = (0.0, 0.0), True
+
+
+class Recorder:
+    """A robot that is driven by hand, and the commands that were given."""
+
+    def __init__(self, chassis: Chassis, hand: Hand, dt: float) -> None:
+        """Begin where the chassis stands."""
+        self.chassis, self._hand, self._dt = chassis, hand, dt
+        self._rows: list[tuple[float, float, float]] = []
+
+    def step(self) -> None:
+        """Drive on for one control step by the command that holds."""
+        self._rows.append((len(self._rows) * self._dt, *self._hand.command))
+        self.chassis.step(self._hand.command)
+
+    def commands(self, name: str) -> Commands:
+        """All commands, a row a control step, and a stand at the end."""
+        rows: Sequence[tuple[float, float, float]] = [*self._rows, (len(self._rows) * self._dt, 0.0, 0.0)]
+        return Commands(name, np.array(rows))
+
+
+def at_start(
+    drive: DriveSpec,
+    start: tuple[float, float, float],
+    obstacles: Obstacles,
+    footprint_radius_m: float,
+    wheel_errors: tuple[float, float],
+    dt: float,
+) -> Chassis:
+    """A robot to be driven by hand, as `magtwin.sim.motion.follow.play` will drive it by the commands.
+
+    Raises:
+        InputError: It would begin in an obstacle.
+    """
+    course = Course(
+        drive=drive,
+        guide=guide_by_commands([[0.0, 0.0, 0.0]], drive),
+        dt=dt,
+        pose0=start,
+        steps=1,
+        footprint_radius_m=footprint_radius_m,
+        wheel_errors=wheel_errors,
+    )
+    return Chassis(course, obstacles)

@@ -1,0 +1,1 @@
+"""Runs: one robot, many robots, robots that share a lab, live robots."""

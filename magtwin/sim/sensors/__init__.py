@@ -1,0 +1,1 @@
+"""Sensors of a robot, one module each."""

@@ -1,0 +1,70 @@
+"""Model error: how a neural magnetometer's reading is off what its network predicts.
+
+A network gives the mean of the disturbance and the standard deviation of its error. A reading is one draw
+from that distribution, not its mean. The error has a part that stays for a session and a part that changes
+over seconds, as on recordings that the network never saw.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.sim.sensors.noise import gauss_markov
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """Statistics of the error of a network's predictions."""
+
+    offset_sd_nt: float
+    """Standard deviation of the part that is constant in a session [nT]."""
+
+    time_s: float
+    """Correlation time of the rest [s]."""
+
+    offset: float = 0.0
+    """The session's own number, standard normal; see `in_session`."""
+
+    def in_session(self, rng: np.random.Generator) -> "ModelError":
+        """The same statistics with the number of one session drawn."""
+        return replace(self, offset=float(rng.standard_normal()))
+
+    def error_nt(self, sd_nt: ArrayLike, process: ArrayLike, offset: ArrayLike | None = None) -> Array:
+        """Errors of readings from normal numbers of unit variance.
+
+            e_t = c_t o + sqrt(sd_t^2 - c_t^2) u_t,   c_t = min(offset_sd, sd_t)
+
+        so that e_t has the variance sd_t^2 everywhere, and its offset is a constant wherever sd_t is above
+        offset_sd.
+
+        Args:
+            sd_nt: Predicted standard deviations [nT], shape (N,); where unknown (nan) the error is 0.
+            process: u at each reading, shape (N,).
+            offset: o of each reading, shape (N,), where readings are of several sessions; default: the
+                session's own.
+
+        Returns:
+            Errors [nT], shape (N,).
+        """
+        sd = np.nan_to_num(np.asarray(sd_nt, float))
+        constant = np.minimum(self.offset_sd_nt, sd)
+        rest = np.sqrt(np.maximum(sd * sd - constant * constant, 0.0))
+        o = self.offset if offset is None else np.asarray(offset, float)
+        return np.asarray(constant * o + rest * np.asarray(process, float))
+
+    def process(self, white: ArrayLike, rate_hz: float) -> Array:
+        """U of successive readings, a Gauss-Markov process of correlation time `time_s`.
+
+        Args:
+            white: Standard normal numbers, shape (N,).
+            rate_hz: Readings a second [Hz].
+        """
+        return gauss_markov(white, self.time_s, rate_hz)
+
+    def decay(self, step_s: float) -> float:
+        """Share of u that is left after a step [s]."""
+        return math.exp(-step_s / self.time_s) if self.time_s > 0 else 0.0

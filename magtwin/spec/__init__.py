@@ -1,0 +1,1 @@
+"""Plain data: what a scene, its robot and its sensors are."""

@@ -1,0 +1,1 @@
+"""What a robot description contains: links, joints, sensors, drives."""

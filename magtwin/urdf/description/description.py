@@ -1,0 +1,292 @@
+"""Description: a URDF that was read and checked, links and joints in the order of their tree.
+
+Links, joints and materials are values, see `model`; what is not of URDF's grammar (`<gazebo>` and the like)
+stays at hand in the XML.
+"""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError, hint
+from magtwin.urdf.description.grammar import check_grammar
+from magtwin.urdf.description.model import (
+    Inertial,
+    Joint,
+    Link,
+    Material,
+    Shape,
+    read_joint,
+    read_link,
+    read_material,
+)
+from magtwin.urdf.source.source import Source, read_source
+
+JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating")
+"""Joints that can be converted."""
+
+AXIAL = JOINT_TYPES[1:5]
+"""Those with an axis; a planar joint's is the normal of its plane."""
+
+MOVING = JOINT_TYPES[1:4]
+"""Those with one degree of freedom."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """A robot as its URDF has it: a tree of links held by joints."""
+
+    source: Source
+    """The file, with what lies around it."""
+
+    name: str
+    """Name of the robot."""
+
+    root: str
+    """Name of the link that no joint holds."""
+
+    links: Mapping[str, Link]
+    """Links by name, parents before children."""
+
+    joints: Mapping[str, Joint]
+    """Joints by the name of the link that they hold, parents before children."""
+
+    materials: Mapping[str | None, Material] = field(default_factory=dict)
+    """Robot-wide materials by name."""
+
+    notes: list[str] = field(default_factory=list)
+    """What was repaired, guessed or left out on the way to USD: one line each, nothing silent."""
+
+    dropped: list[str] = field(default_factory=list)
+    """Those of the notes that tell of something lost."""
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.source.path
+
+    @property
+    def xml(self) -> ElementTree.Element:
+        """The whole `<robot>`, for what `links` and `joints` do not hold."""
+        return self.source.xml
+
+    def where(self, element: ElementTree.Element | None) -> str:
+        """`file:line` of an element of `xml`."""
+        return self.source.where(element)
+
+    def find_file(self, filename: str, what: str) -> Path:
+        """The file that a `filename=` means, such as a mesh's: see `Source.find_file`.
+
+        Raises:
+            MissingFileError: It is not there.
+            InputError: It may not be read, or its package is not there.
+        """
+        named = (e for e in self.xml.iter() if e.get("filename") == filename)
+        try:
+            return self.source.find_file(filename, what, next(named, None))
+        finally:
+            self._take_notes()
+
+    def note(self, text: str, *, lost: bool = False) -> None:
+        """Put down something that the user ought to know of the conversion, once.
+
+        Args:
+            text: What was repaired, guessed or left out, and where.
+            lost: Whether the stage has less than the description: `Options.strict` refuses that.
+        """
+        if text not in self.notes:
+            self.notes.append(text)
+            if lost:
+                self.dropped.append(text)
+
+    def refused(self, kind: str, name: str, text: str) -> InputError:
+        """A refusal that names the line of the link or joint called `name`."""
+        element = next((e for e in self.xml.findall(kind) if e.get("name") == name), None)
+        return InputError(f"{self.source.where(element)}: {kind} {name!r} {text}")
+
+    def _take_notes(self) -> None:
+        """Put down what was met while reading, which goes on as files are looked for."""
+        for note in (*self.source.notes, *self.source.packages.notes):
+            self.note(note)
+
+    def poses(self) -> dict[str, NDArray[np.float64]]:
+        """T_root_link of each link with every joint at zero, shape (4, 4)."""
+        poses = {self.root: np.eye(4)}
+        for child, joint in self.joints.items():
+            poses[child] = poses[joint.parent] @ origin_of(joint)
+        return poses
+
+
+def origin_of(part: Joint | Shape | Inertial) -> NDArray[np.float64]:
+    """Pose of a joint, visual, collision or inertial in its link, shape (4, 4); identity if none is given."""
+    return np.eye(4) if part.origin is None else part.origin
+
+
+def read_description(source: Source | str | os.PathLike[str]) -> Description:
+    """Read and check a URDF.
+
+    Args:
+        source: What `read_source` gave, or a file for it to read without options.
+
+    Raises:
+        InputError: See `read_source`; or a link or joint is not as the URDF grammar has it; or links and
+            joints are not one tree. File and line are given.
+    """
+    if not isinstance(source, Source):
+        source = read_source(source)
+    _check_names(source)
+    description = Description(source=source, name=source.xml.get("name", ""), root="", links={}, joints={})
+    description._take_notes()
+    clean = [
+        check_grammar(part, description.where, description.note)
+        for part in source.xml
+        if part.tag in ("link", "joint", "material")
+    ]
+    links = [_without_empty(read_link(e), description) for e in clean if e.tag == "link"]
+    joints = [read_joint(e) for e in clean if e.tag == "joint"]
+    materials = [read_material(e) for e in clean if e.tag == "material"]
+    held = {joint.child: joint for joint in joints}
+    description = replace(
+        description,
+        links={link.name: link for link in links},
+        joints=held,
+        materials=MappingProxyType({m.name: m for m in materials}),
+    )
+    _check_joints(description, joints)
+    roots = [name for name in description.links if name not in held]
+    if not roots:
+        first = joints[0].name
+        raise description.refused("joint", first, "closes a circle: no link is the root; remove one joint")
+    if len(roots) > 1:
+        raise description.refused(
+            "link", roots[1], f"hangs in the air: a robot has one root, this has {', '.join(roots)}"
+        )
+    order = _order(roots[0], joints)
+    if len(order) < len(description.links):
+        astray = next(name for name in description.links if name not in order)
+        raise description.refused("joint", held[astray].name, "closes a circle; remove one joint of it")
+    return replace(
+        description,
+        root=roots[0],
+        links=MappingProxyType({name: description.links[name] for name in order}),
+        joints=MappingProxyType({name: held[name] for name in order if name in held}),
+    )
+
+
+def _check_names(source: Source) -> None:
+    """Every link and joint has a name, and no two have the same."""
+    xml, where = source.xml, source.where
+    if not xml.get("name"):
+        raise InputError(f"{where(xml)}: <robot> has no name")
+    for kind in ("link", "joint"):
+        seen: dict[str, ElementTree.Element] = {}
+        for element in xml.findall(kind):
+            name = element.get("name")
+            if not name:
+                raise InputError(f"{where(element)}: a <{kind}> has no name")
+            if name in seen:
+                file, line = source.places[seen[name]]
+                first = f"line {line}" if file == source.places[element][0] else f"{file}:{line}"
+                raise InputError(
+                    f"{where(element)}: {kind} {name!r} is there twice, first on {first}; rename one"
+                )
+            seen[name] = element
+    if not xml.findall("link"):
+        raise InputError(f"{where(xml)}: the robot has no <link>")
+    for joint in xml.findall("joint"):
+        for end in ("parent", "child"):
+            named = joint.find(end)
+            if named is None or not named.get("link"):
+                raise InputError(f"{where(joint)}: joint {joint.get('name')!r} has no <{end} link=>")
+
+
+def _without_empty(link: Link, description: Description) -> Link:
+    """A link without its primitives of size 0, which are noted."""
+
+    def kept(shapes: Sequence[Shape], role: str) -> tuple[Shape, ...]:
+        for shape in shapes:
+            if shape.geometry.empty:
+                text = f"link {link.name!r}: a {role} {shape.geometry.kind} of size 0 is left out"
+                description.note(text, lost=True)
+        return tuple(shape for shape in shapes if not shape.geometry.empty)
+
+    return replace(link, visuals=kept(link.visuals, "visual"), collisions=kept(link.collisions, "collision"))
+
+
+def _check_joints(description: Description, joints: Sequence[Joint]) -> None:
+    """Each joint is of a known type, has an axis and a range, and holds a link that no other holds."""
+    held: dict[str, str] = {}
+    named = {joint.name: joint for joint in joints}
+    for joint in joints:
+        if joint.type not in JOINT_TYPES:
+            raise description.refused(
+                "joint",
+                joint.name,
+                f"is of type {joint.type!r}; known: {', '.join(JOINT_TYPES)}",
+            )
+        for link in (joint.parent, joint.child):
+            if link not in description.links:
+                raise description.refused(
+                    "joint", joint.name, f"names no link {link!r}; {hint(link, description.links)}"
+                )
+        if joint.child in held:
+            raise description.refused(
+                "joint", joint.name, f"holds {joint.child!r}, which {held[joint.child]!r} holds already"
+            )
+        held[joint.child] = joint.name
+        if joint.type in AXIAL and not np.linalg.norm(joint.axis) > 0:
+            raise description.refused("joint", joint.name, "moves about an axis of length 0")
+        _check_limit(description, joint)
+        if joint.mimic is not None:
+            _check_mimic(description, joint, named)
+
+
+def _check_limit(description: Description, joint: Joint) -> None:
+    """The range of a joint does not stand on its head."""
+    limit = joint.limit
+    if limit is None or limit.lower is None or limit.upper is None or joint.type in ("fixed", "continuous"):
+        return
+    if limit.lower > limit.upper:
+        raise description.refused(
+            "joint", joint.name, f"has its lower limit {limit.lower:g} above its upper {limit.upper:g}"
+        )
+
+
+def _check_mimic(description: Description, joint: Joint, named: Mapping[str, Joint]) -> None:
+    """What a joint mimics is there, moves, and does not mimic it in turn."""
+    chain = [joint.name]
+    while (mimic := named[chain[-1]].mimic) is not None:
+        if mimic.joint not in named:
+            raise description.refused(
+                "joint", chain[-1], f"mimics no joint {mimic.joint!r}; {hint(mimic.joint, named)}"
+            )
+        if mimic.joint in chain:
+            raise description.refused(
+                "joint", joint.name, f"mimics itself: {' -> '.join([*chain, mimic.joint])}"
+            )
+        chain.append(mimic.joint)
+    if named[chain[-1]].type not in MOVING:
+        raise description.refused(
+            "joint",
+            joint.name,
+            f"mimics {chain[-1]!r}, which is {named[chain[-1]].type}; give one that moves",
+        )
+
+
+def _order(root: str, joints: Sequence[Joint]) -> list[str]:
+    """Links from the root outwards, depth first, each parent's joints in the order of the file."""
+    below: dict[str, list[str]] = {}
+    for joint in joints:
+        below.setdefault(joint.parent, []).append(joint.child)
+    order, pending = [], [root]
+    while pending:
+        link = pending.pop()
+        order.append(link)
+        pending += reversed(below.get(link, []))
+    return order

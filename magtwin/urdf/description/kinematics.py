@@ -1,0 +1,75 @@
+"""Kinematics: where a description's links stand, by yourdfpy, with nothing of a conversion's own."""
+
+import io
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError, find
+from magtwin.urdf.description.description import MOVING, Description, read_description
+from magtwin.urdf.description.grammar import check_grammar
+from magtwin.urdf.source.source import read_source
+
+
+def link_poses(
+    urdf: str | os.PathLike[str],
+    positions: Mapping[str, float] = MappingProxyType({}),
+    *,
+    packages: Mapping[str, Path] = MappingProxyType({}),
+    arguments: Mapping[str, str] = MappingProxyType({}),
+) -> dict[str, NDArray[np.float64]]:
+    """Forward kinematics of a URDF or xacro, to hold a converted stage or a sensor's mount against.
+
+    Args:
+        urdf: The description.
+        positions: Positions of joints by name [rad or m], 0 for others. Those that mimic follow.
+        packages: Folders of packages by name, for a xacro.
+        arguments: Arguments of a xacro.
+
+    Returns:
+        T_root_link of each link, shape (4, 4), parents before children.
+
+    Raises:
+        InputError: The description cannot be used; or a joint is not there, follows another, or has no
+            one position.
+    """
+    import yourdfpy  # here, for it brings trimesh, and takes longer to import than most robots to convert
+
+    description = read_description(read_source(urdf, packages=packages, arguments=arguments))
+    values = _values(description, positions)
+    bare = ElementTree.Element("robot", name=description.name)
+    for part in description.xml:
+        if part.tag == "link":
+            ElementTree.SubElement(bare, "link", name=part.attrib["name"])
+        elif part.tag == "joint":
+            bare.append(check_grammar(part, description.where, description.note))
+            for mimic in bare[-1].findall("mimic"):  # yourdfpy knows no mimic of a mimic
+                bare[-1].remove(mimic)
+    model = yourdfpy.URDF.load(io.BytesIO(ElementTree.tostring(bare)), load_meshes=False)
+    for joint in description.joints.values():
+        if joint.type == "prismatic":  # yourdfpy slides by the axis as it is written, however long
+            values[joint.name] /= float(np.linalg.norm(joint.axis))
+    model.update_cfg(values)
+    return {link: model.get_transform(link, description.root) for link in description.links}
+
+
+def _values(description: Description, positions: Mapping[str, float]) -> dict[str, float]:
+    """Positions of all joints that have one, followers' by their leaders'."""
+    joints = {joint.name: joint for joint in description.joints.values() if joint.type in MOVING}
+    for name in positions:
+        mimic = find("joint with one position", name, joints).mimic
+        if mimic is not None:
+            raise InputError(f"{description.path}: joint {name!r} follows {mimic.joint!r}; give that one's")
+
+    def value(name: str) -> float:
+        mimic = joints[name].mimic
+        if mimic is None:
+            return float(positions.get(name, 0.0))
+        return mimic.multiplier * value(mimic.joint) + mimic.offset
+
+    return {name: value(name) for name in joints}

@@ -1,0 +1,189 @@
+"""Tag: elements that URDF itself gives no meaning, which of them were understood, and what is left."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from xml.etree import ElementTree
+
+import numpy as np
+from pxr import Usd, Vt
+
+from magtwin.errors import InputError
+from magtwin.urdf.description.description import Description
+from magtwin.urdf.description.grammar import CHILDREN
+
+Element = ElementTree.Element
+
+KEPT = "magtwin:unconverted"
+"""Key of a prim's customData under which tags without a meaning here are kept, each as text."""
+
+BEYOND = ("calibration", "safety_controller")
+"""Elements of URDF's own grammar that say nothing of the body: they are read as tags."""
+
+
+class Tags:
+    """The tags of a description: `<gazebo>`, `<ros2_control>`, `<transmission>` and whatever else is there.
+
+    Whoever understands an element says so by reading it through the functions below. What nobody read is
+    kept as text on the prim that it is about, and counted.
+    """
+
+    def __init__(self, description: Description) -> None:
+        self.description = description
+        self._read: set[Element] = set()
+
+    def blocks(self, tag: str) -> list[Element]:
+        """Elements called `tag` right below `<robot>`; having looked at one, read its parts."""
+        found = self.description.xml.findall(tag)
+        self._read.update(found)
+        return found
+
+    def find(self, element: Element | None, *paths: str) -> Element | None:
+        """The first element at one of the paths below another, if any, and with it the way there."""
+        for path in paths:
+            here, way = element, list[Element]()
+            for step in path.split("/"):
+                here = None if here is None else here.find(step)
+                if here is not None:
+                    way.append(here)
+            if here is not None:
+                self._read.update(way)
+                return here
+        return None
+
+    def findall(self, element: Element, tag: str) -> list[Element]:
+        """The children of an element called `tag`."""
+        found = element.findall(tag)
+        self._read.update(found)
+        return found
+
+    def read(self, element: Element) -> Element:
+        """An element that is understood; read its parts too."""
+        self._read.add(element)
+        return element
+
+    def take(self, element: Element) -> Element:
+        """An element that is understood with all that is in it."""
+        self._read.update(element.iter())
+        return element
+
+    def text(self, element: Element | None, *paths: str) -> str:
+        """Text of the first element at one of the paths; "" where there is none."""
+        found = self.find(element, *paths)
+        return "" if found is None else _said(found)
+
+    def number(
+        self,
+        element: Element | None,
+        *paths: str,
+        least: float = -np.inf,
+        above: float = -np.inf,
+    ) -> float | None:
+        """A finite number at one of the paths; None where there is none.
+
+        Raises:
+            InputError: It is not a number, below `least` or not above `above`; the line is given.
+        """
+        found = self.find(element, *paths)
+        if found is None:
+            return None
+        try:
+            value = float(_said(found))
+        except ValueError:
+            value = np.nan
+        if not np.isfinite(value) or value < least or not (value > above or above == -np.inf):
+            want = f" above {above:g}" if above > -np.inf else f" not below {least:g}"
+            want = want if max(least, above) > -np.inf else ""
+            raise InputError(
+                f"{self.description.where(found)}: {found.tag} must be a finite number{want}, "
+                f"got {_said(found)!r}"
+            )
+        return value
+
+    def nothing(self, element: Element | None, *paths: str) -> None:
+        """Read those of the numbers that are 0, which say nothing; others stay unread."""
+        for path in paths:
+            found = None if element is None else element.find(path)
+            if found is not None and _is_zero(found.text):
+                self.find(element, path)
+
+    def flag(self, element: Element | None, *paths: str) -> bool | None:
+        """A true or false at one of the paths; None where there is none.
+
+        Raises:
+            InputError: It is neither; the line is given.
+        """
+        found = self.find(element, *paths)
+        if found is None:
+            return None
+        word = _said(found).lower()
+        if word not in ("true", "false", "1", "0"):
+            where = self.description.where(found)
+            raise InputError(f"{where}: {found.tag} must be true or false, got {word!r}")
+        return word in ("true", "1")
+
+    def keep(self, prim_of: Callable[[str], Usd.Prim]) -> dict[str, int]:
+        """Keep what nobody read as text on the prims that it is about.
+
+        Args:
+            prim_of: Gives the prim of a link or joint by its name, the robot's for any other.
+
+        Returns:
+            How often each path of tags was left, `gazebo/sensor/visualize`.
+        """
+        texts: dict[str, list[str]] = {}
+        counts: Counter[str] = Counter()
+        for name, element in self._foreign():
+            for way, left in self._unread(element, ()):
+                counts["/".join((*(e.tag for e in way), left.tag))] += 1
+                inside = "/".join(_label(e) for e in way)
+                texts.setdefault(name, []).append(f"{inside}: {_plain(left)}" if inside else _plain(left))
+        for name, kept in texts.items():
+            prim = prim_of(name)
+            there = prim.GetCustomDataByKey(KEPT) or ()
+            prim.SetCustomDataByKey(KEPT, Vt.StringArray([*there, *kept]))
+        return dict(sorted(counts.items()))
+
+    def _foreign(self) -> Iterator[tuple[str, Element]]:
+        """Elements outside of URDF's grammar, with the name of what they are about."""
+        for element in self.description.xml:
+            if element.tag not in ("link", "joint", "material"):
+                yield element.get("reference", ""), element
+            elif element.tag != "material":
+                known = [tag for tag in CHILDREN[element.tag] if tag not in BEYOND]
+                for child in element:
+                    if child.tag not in known:
+                        yield element.get("name", ""), child
+
+    def _unread(
+        self, element: Element, way: tuple[Element, ...]
+    ) -> Iterator[tuple[tuple[Element, ...], Element]]:
+        """The outermost elements that nobody read, with those around them."""
+        if element not in self._read:
+            yield way, element
+            return
+        for child in element:
+            yield from self._unread(child, (*way, element))
+
+
+def _said(element: Element) -> str:
+    """What an element says: its text, or its `value`, as `<mu1 value="1"/>` and SDFormat have it."""
+    return (element.text or "").strip() or element.get("value", "").strip()
+
+
+def _is_zero(text: str | None) -> bool:
+    try:
+        return float(text or "") == 0
+    except ValueError:
+        return False
+
+
+def _label(element: Element) -> str:
+    """An element's tag, with its name where it has one."""
+    name = element.get("name")
+    return f"{element.tag}({name})" if name else element.tag
+
+
+def _plain(element: Element) -> str:
+    """An element as text on one line, its attributes in order."""
+    text = ElementTree.canonicalize(ElementTree.tostring(element, encoding="unicode"), strip_text=True)
+    return " ".join(text.split())

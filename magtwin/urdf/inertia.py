@@ -1,0 +1,104 @@
+"""Inertia: what bodies weigh, together too, and a tensor as USD has it, principal moments and their axes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.frames import canonical
+
+NEAR_MISS = 0.02
+"""Part of the largest moment by which it may exceed the sum of the others and still be repaired."""
+
+
+@dataclass(frozen=True)
+class MassProperties:
+    """Mass, centre and inertia of a body in some frame."""
+
+    mass: float
+    """Mass [kg]."""
+
+    centre: NDArray[np.float64]
+    """Centre of mass [m], shape (3,)."""
+
+    inertia: NDArray[np.float64]
+    """Tensor about the centre of mass, in the frame's axes [kg m2], shape (3, 3)."""
+
+    def moved(self, T: ArrayLike) -> "MassProperties":
+        """The body seen from the frame in which its own stands at T, shape (4, 4)."""
+        T = np.asarray(T, float)
+        R = T[:3, :3]
+        return MassProperties(self.mass, R @ self.centre + T[:3, 3], R @ self.inertia @ R.T)
+
+
+def combined(bodies: Sequence[MassProperties]) -> MassProperties:
+    """Bodies of one frame as one, by the parallel axis theorem (Goldstein 2002, section 5.3).
+
+    I = sum_b I_b + m_b (|d_b|^2 1 - d_b d_b^T), d_b = c_b - c, c the common centre.
+    """
+    mass = sum(body.mass for body in bodies)
+    centre = sum((body.mass * body.centre for body in bodies), np.zeros(3)) / mass
+    inertia = np.zeros((3, 3))
+    for body in bodies:
+        d = body.centre - centre
+        inertia += body.inertia + body.mass * (d @ d * np.eye(3) - np.outer(d, d))
+    return MassProperties(mass, centre, inertia)
+
+
+def principal_axes(inertia: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
+    """Principal moments of an inertia tensor, and the rotation from its axes to the principal ones.
+
+    I = R diag(I_1, I_2, I_3) R^T, the columns of R being the principal axes. Among the 24 ways to
+    order and sign them, R is the one nearest to the identity, so that a diagonal tensor keeps its axes.
+    Real bodies have I_i > 0 and I_i + I_j >= I_k (Goldstein 2002, section 5.4).
+
+    Args:
+        inertia: Tensor about the centre of mass [kg m2], shape (3, 3).
+
+    Returns:
+        Moments [kg m2], shape (3,); the quaternion xyzw of R, shape (4,); and whether a moment that
+        exceeded the sum of the others by less than NEAR_MISS of itself was brought down to that sum.
+
+    Raises:
+        InputError: No body has such a tensor; the text gives the moments.
+    """
+    tensor = np.asarray(inertia, float)
+    tensor = (tensor + tensor.T) / 2
+    if np.count_nonzero(tensor - np.diag(np.diag(tensor))) == 0:
+        moments, R = np.diag(tensor).copy(), np.eye(3)
+    else:
+        moments, R = np.linalg.eigh(tensor)
+        best = max(permutations(range(3)), key=lambda order: np.abs(np.diag(R[:, order])).sum())
+        moments, R = moments[list(best)], R[:, best]
+        R = R * np.where(np.diag(R) < 0, -1, 1)
+        if np.linalg.det(R) < 0:
+            R[:, np.argmin(np.diag(R))] *= -1
+    largest = int(np.argmax(moments))
+    others = moments.sum() - moments[largest]
+    text = ", ".join(f"{m:.3g}" for m in moments)
+    if not (np.isfinite(moments).all() and moments.min() > 0):
+        raise InputError(f"no body has principal moments of inertia {text} kg m2; all must be above 0")
+    if moments[largest] > others * (1 + NEAR_MISS):
+        raise InputError(
+            f"no body has principal moments of inertia {text} kg m2; none may exceed the sum of the others"
+        )
+    repaired = bool(moments[largest] > others * (1 + 1e-6))
+    moments[largest] = min(moments[largest], others)
+    return moments, quaternion(R), repaired
+
+
+def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternion xyzw of a rotation matrix: the eigenvector of Bar-Itzhack's symmetric form (2000)."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
+    K = np.array(
+        [
+            [xx - yy - zz, xy + yx, xz + zx, zy - yz],
+            [xy + yx, yy - xx - zz, yz + zy, xz - zx],
+            [xz + zx, yz + zy, zz - xx - yy, yx - xy],
+            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+        ]
+    )
+    return canonical(np.linalg.eigh(K)[1][:, -1])

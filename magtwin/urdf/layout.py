@@ -1,0 +1,309 @@
+"""Layout: one authored layer becomes the layers of Isaac Sim's asset structure 3.0.
+
+    robot.usda                      interface: references base, variant set Physics
+    payloads/base.usda              links, frames and sensors, where they are, what they wear
+    payloads/instances.usda         shapes of each link: visuals and colliders
+    payloads/geometries.usdc        triangles
+    payloads/materials.usda         looks
+    payloads/robot.usda             what Isaac Sim and magtwin know the robot by; a sublayer of base
+    payloads/Physics/physics.usda   bodies, masses, joints, colliders, friction: UsdPhysics and Newton
+    payloads/Physics/physx.usda     PhysX's own attributes, over physics
+    payloads/Physics/mujoco.usda    MuJoCo's own attributes, over physics
+
+Structure and roles are those of NVIDIA's "Asset Structure" (Isaac Sim 6.0.1 documentation). Nothing is
+invented on the way: each opinion of the one layer stands in exactly one of these, so that the asset
+composes to the stage that was authored.
+"""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from pxr import Sdf, UsdUtils
+
+from magtwin.errors import InputError
+from magtwin.files import check_free
+from magtwin.urdf.material import LOOKS
+from magtwin.urdf.shape import COLLISIONS, VISUALS
+
+PAYLOADS = "payloads"
+"""Folder of the layers beside the interface."""
+
+GEOMETRIES = "geometries.usdc"
+
+VARIANT_SET = "Physics"
+
+VARIANTS = {
+    "none": "",
+    "physics": "Physics/physics.usda",
+    "physx": "Physics/physx.usda",
+    "mujoco": "Physics/mujoco.usda",
+}
+"""Variants of the physics, each with its layer below PAYLOADS."""
+
+DEFAULT_VARIANT = "physx"
+"""As Isaac Sim 6.0.1 sets it: Newton and MuJoCo read the neutral attributes that it is built on."""
+
+FILES = {
+    "base": "base.usda",
+    "instances": "instances.usda",
+    "materials": "materials.usda",
+    "robot": "robot.usda",
+    "physics": VARIANTS["physics"],
+    "physx": VARIANTS["physx"],
+    "mujoco": VARIANTS["mujoco"],
+}
+"""Layers that hold opinions, by the name that they have below."""
+
+ROLES = {
+    "base": "links, frames and sensors",
+    "instances": "visuals and colliders of its links",
+    "materials": "looks",
+    "robot": "what it is known by",
+    "physics": "bodies, joints and contact, for any engine",
+    "physx": "what is PhysX's own",
+    "mujoco": "what is MuJoCo's own",
+}
+
+SCHEMAS = (
+    ("Physx", "physx"),
+    ("Mjc", "mujoco"),
+    ("Physics", "physics"),
+    ("Newton", "physics"),
+    ("Isaac", "robot"),
+)
+"""Layer of an applied schema by the start of its name."""
+
+NAMESPACES = (
+    ("physx", "physx"),
+    ("mjc:", "mujoco"),
+    ("physics:", "physics"),
+    ("drive:", "physics"),
+    ("limit:", "physics"),
+    ("newton:", "physics"),
+    ("material:binding:physics", "physics"),
+    ("isaac:", "robot"),
+)
+"""Layer of a property by the start of its name."""
+
+INSTANCES = Sdf.Path("/Instances")
+SHAPES = (VISUALS, COLLISIONS)
+"""Children of a link whose own children are its shapes."""
+
+
+def check_payloads(out: Path, *, force: bool) -> Path:
+    """Folder of the layers of the asset `out`, if it may be written.
+
+    Raises:
+        InputError: It is there and `force` was not given, or it is another asset's or nobody's.
+    """
+    folder = out.parent / PAYLOADS
+    check_free(folder, force=force)
+    if folder.exists():
+        base = folder / FILES["base"]
+        layer = Sdf.Layer.OpenAsAnonymous(str(base)) if base.is_file() else None
+        owner = layer.customLayerData.get("magtwin", {}).get("interface", "") if layer else ""
+        if owner != out.name:
+            whose = f"is of {owner}" if owner else "was not made by a conversion"
+            raise InputError(f"{folder}: {whose}; give each robot a folder of its own")
+    return folder
+
+
+def write_layers(flat: Sdf.Layer, out: Path, folder: Path, final: Path) -> None:
+    """Write an authored layer as an asset of layers.
+
+    Args:
+        flat: Holds the whole robot below its default prim. It stands where `out` will.
+        out: Interface layer to write.
+        folder: Folder to write the other layers to; the geometries are there already.
+        final: Where `out` will stand in the end, beside PAYLOADS.
+    """
+    parts = split(flat)
+    for name, layer in parts.items():
+        path = out if name == "interface" else folder / FILES[name]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        home = final if name == "interface" else final.parent / PAYLOADS / FILES[name]
+        UsdUtils.ModifyAssetPaths(layer, _moved(Path(flat.realPath).parent, final, home))
+        layer.Export(str(path))
+
+
+def split(flat: Sdf.Layer) -> dict[str, Sdf.Layer]:
+    """The layers of an authored one, by the names in FILES and "interface".
+
+    Asset paths to layers among them are written as they are to stand; all others as in `flat`.
+    """
+    robot = flat.GetPrimAtPath(flat.rootPrims[flat.defaultPrim].path)
+    parts = {name: Sdf.Layer.CreateAnonymous(f"{name}.usda") for name in ("interface", *FILES)}
+    with Sdf.ChangeBlock():
+        _Splitter(flat, parts).route(robot)
+    for name, layer in parts.items():
+        layer.RemoveInertSceneDescription()
+        _describe(layer, flat, name, robot.name)
+    _compose(parts, robot)
+    return parts
+
+
+class _Splitter:
+    """Takes the opinions of one layer to several."""
+
+    def __init__(self, flat: Sdf.Layer, parts: dict[str, Sdf.Layer]) -> None:
+        self.flat, self.parts = flat, parts
+
+    def route(self, spec: Sdf.PrimSpec) -> None:
+        """Take a prim and all below it to where they belong."""
+        owner, path = self._owner(spec)
+        home = _prim(self.parts[owner], path)
+        home.specifier = spec.specifier
+        if spec.typeName:
+            home.typeName = spec.typeName
+        for key in spec.ListInfoKeys():
+            if key not in ("specifier", "typeName", "apiSchemas"):
+                home.SetInfo(key, spec.GetInfo(key))
+        if owner == "instances" and spec.name in SHAPES:
+            scope = _prim(self.parts["instances"], INSTANCES)
+            scope.specifier, scope.typeName = Sdf.SpecifierDef, "Scope"
+            self._refer(spec, Sdf.Reference(f"./{FILES['instances']}", path))
+        if owner == "materials" and spec.name == LOOKS:
+            self._refer(spec, Sdf.Reference(f"./{FILES['materials']}"))
+        self._schemas(spec, owner, path)
+        for prop in spec.properties:
+            name = _by_start(prop.name, NAMESPACES, owner)
+            if owner == "instances" and prop.name.startswith("material:binding") and name == owner:
+                name = "base"  # its target lies outside of what base references
+            where = path if name == owner else spec.path
+            _prim(self.parts[name], where)
+            to = where.AppendProperty(prop.name)
+            Sdf.CopySpec(self.flat, prop.path, self.parts[name], to)
+            if where != spec.path:
+                _repoint(self.parts[name].GetPropertyAtPath(to), spec.path, path)
+        for child in spec.nameChildren:
+            self.route(child)
+
+    def _owner(self, spec: Sdf.PrimSpec) -> tuple[str, Sdf.Path]:
+        """The layer that defines a prim, and its path there."""
+        steps = spec.path.GetPrefixes()
+        if spec.typeName.startswith("Physics") or (
+            spec.typeName == "Scope" and _all_physics(spec.nameChildren)
+        ):
+            return "physics", spec.path
+        if len(steps) > 1 and steps[1].name == LOOKS:
+            material = self.flat.GetPrimAtPath(steps[2]) if len(steps) > 2 else None
+            if material is not None and not material.nameChildren:
+                return "physics", spec.path  # a grip: it has no shader
+            return "materials", spec.path.ReplacePrefix(
+                steps[1], Sdf.Path.absoluteRootPath.AppendChild(LOOKS)
+            )
+        if len(steps) > 2 and steps[2].name in SHAPES:
+            prototype = INSTANCES.AppendChild(f"{steps[1].name}_{steps[2].name}")
+            return "instances", spec.path.ReplacePrefix(steps[2], prototype)
+        return "base", spec.path
+
+    def _refer(self, spec: Sdf.PrimSpec, reference: Sdf.Reference) -> None:
+        """Define a prim in base by reference to another layer."""
+        here = _prim(self.parts["base"], spec.path)
+        here.specifier, here.typeName = Sdf.SpecifierDef, spec.typeName
+        here.referenceList.prependedItems.append(reference)
+
+    def _schemas(self, spec: Sdf.PrimSpec, owner: str, path: Sdf.Path) -> None:
+        """Take a prim's applied schemas to their layers, in their order."""
+        names = spec.GetInfo("apiSchemas").GetAppliedItems() if spec.HasInfo("apiSchemas") else []
+        by_layer: dict[str, list[str]] = {}
+        root = spec.path.pathElementCount == 1
+        for name in names:
+            layer = _by_start(name, SCHEMAS, owner)
+            if owner == "instances" and name == "MaterialBindingAPI":
+                layer = "base"
+            if root and name.startswith("Magtwin"):
+                layer = "robot"
+            by_layer.setdefault(layer, []).append(name)
+        for layer, items in by_layer.items():
+            listed = Sdf.TokenListOp()
+            listed.prependedItems = items
+            here = _prim(self.parts[layer], path if layer == owner else spec.path)
+            here.SetInfo("apiSchemas", listed)
+
+
+def _repoint(prop: Sdf.PropertySpec, old: Sdf.Path, new: Sdf.Path) -> None:
+    """Let targets and connections of a property follow the prims that moved with its own."""
+    while old.name == new.name and old.pathElementCount > 1 and new.pathElementCount > 1:
+        old, new = old.GetParentPath(), new.GetParentPath()
+    attribute = isinstance(prop, Sdf.AttributeSpec)
+    listed = prop.connectionPathList if attribute else prop.targetPathList
+    for item in listed.GetAddedOrExplicitItems():
+        if item.HasPrefix(old):
+            listed.ReplaceItemEdits(item, item.ReplacePrefix(old, new))
+
+
+def _by_start(name: str, table: tuple[tuple[str, str], ...], other: str) -> str:
+    """The layer of the first start that a name has."""
+    return next((layer for start, layer in table if name.startswith(start)), other)
+
+
+def _all_physics(specs: Sdf.PrimSpec) -> bool:
+    """Whether there are prims and all are joints."""
+    return len(specs) > 0 and all(spec.typeName.startswith("Physics") for spec in specs)
+
+
+def _prim(layer: Sdf.Layer, path: Sdf.Path) -> Sdf.PrimSpec:
+    """The spec at a path, made as an `over` if it is not there."""
+    return layer.GetPrimAtPath(path) or Sdf.CreatePrimInLayer(layer, path)
+
+
+def _describe(layer: Sdf.Layer, flat: Sdf.Layer, name: str, robot: str) -> None:
+    """Give a layer its units, axis, default prim and a line about it."""
+    for key in ("metersPerUnit", "upAxis", "kilogramsPerUnit"):
+        layer.pseudoRoot.SetInfo(key, flat.pseudoRoot.GetInfo(key))
+    if name == "interface":
+        layer.documentation, layer.customLayerData = flat.documentation, flat.customLayerData
+        layer.defaultPrim = robot
+        return
+    layer.defaultPrim = {"instances": INSTANCES.name, "materials": LOOKS}.get(name, robot)
+    if not layer.GetPrimAtPath(Sdf.Path.absoluteRootPath.AppendChild(layer.defaultPrim)):
+        root = _prim(layer, Sdf.Path.absoluteRootPath.AppendChild(layer.defaultPrim))
+        if name in ("instances", "materials"):
+            root.specifier, root.typeName = Sdf.SpecifierDef, "Scope"
+    layer.documentation = f"{robot}: {ROLES[name]}."
+    facts = {"interface": Path(flat.realPath).name} if name == "base" else {}
+    layer.customLayerData = {"creator": "magtwin", **({"magtwin": facts} if facts else {})}
+
+
+def _compose(parts: dict[str, Sdf.Layer], robot: Sdf.PrimSpec) -> None:
+    """Put the arcs between the layers."""
+    parts["base"].subLayerPaths.append(f"./{FILES['robot']}")
+    for name in ("physx", "mujoco"):
+        parts[name].subLayerPaths.append("./physics.usda")
+    top = _prim(parts["interface"], robot.path)
+    top.specifier, top.typeName = Sdf.SpecifierDef, robot.typeName
+    if robot.HasInfo("kind"):
+        top.SetInfo("kind", robot.GetInfo("kind"))
+    top.referenceList.prependedItems.append(Sdf.Reference(f"./{PAYLOADS}/{FILES['base']}"))
+    top.variantSetNameList.prependedItems.append(VARIANT_SET)
+    variants = Sdf.VariantSetSpec(top, VARIANT_SET)
+    for name, path in VARIANTS.items():
+        variant = Sdf.VariantSpec(variants, name)
+        if path:
+            variant.primSpec.payloadList.prependedItems.append(Sdf.Payload(f"./{PAYLOADS}/{path}"))
+    top.variantSelections[VARIANT_SET] = DEFAULT_VARIANT
+
+
+def _moved(here: Path, final: Path, home: Path) -> Callable[[str], str]:
+    """Asset paths of the layer that was authored in `here`, as seen from the layer at `home`.
+
+    Args:
+        here: Folder that stands for the final one while the asset is written.
+        final: Where the interface will stand.
+        home: Where the layer will stand that has the path.
+    """
+    own = {f"./{path}" for path in FILES.values()} | {"./physics.usda"}
+    own |= {f"./{PAYLOADS}/{path}" for path in (*VARIANTS.values(), FILES["base"]) if path}
+
+    def seen(path: str) -> str:
+        if path in own or not path.startswith(("./", "../")):
+            return path
+        target = Path(os.path.normpath(here / path))
+        if target.is_relative_to(here):
+            target = final.resolve().parent / target.relative_to(here)
+        relative = Path(os.path.relpath(target, home.resolve().parent)).as_posix()
+        return relative if relative.startswith("../") else f"./{relative}"
+
+    return seen

@@ -1,0 +1,204 @@
+"""Material: how a surface looks (UsdPreviewSurface) and how it grips (UsdPhysics)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+
+from magtwin.urdf.description.gazebo import Surface
+from magtwin.usd.geometry import linear_from_srgb
+
+Rgba = tuple[float, float, float, float]
+
+GREY: Rgba = (0.5, 0.5, 0.5, 1.0)
+"""Look of what has none."""
+
+PHYSX_API = "PhysxMaterialAPI"
+"""PhysX's applied schema, by name: its plugin lives elsewhere."""
+
+LOOKS = "Looks"
+"""Scope of all materials below the robot's prim."""
+
+SURFACE, TEXTURE, READER = "surface", "texture", "reader"
+"""Shaders of a look."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a surface looks; colours as screens show them (sRGB), 0 to 1, as URDF has them."""
+
+    rgba: Rgba = GREY
+    """Colour and opacity; of a textured surface, what multiplies it."""
+
+    name: str = ""
+    """Name of the material; "" makes one from the colour."""
+
+    texture: str = ""
+    """Asset path of the picture of its colour; "" for none."""
+
+    mean: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Mean colour of the texture."""
+
+    roughness: float = 0.5
+    """0 is a mirror, 1 is chalk."""
+
+    metallic: float = 0.0
+    """0 is an insulator, 1 is metal."""
+
+    see_through: bool = False
+    """Whether the texture's opacity counts."""
+
+    cutoff: float = 0.0
+    """Opacity below which nothing is shown, and above which all is; 0 blends."""
+
+    by_vertex: bool = False
+    """Whether the mesh's displayColor is shown in place of the colour."""
+
+    @property
+    def display_colour(self) -> tuple[float, float, float]:
+        """Linear colour by which viewers without materials show it."""
+        colour = linear_from_srgb(self.rgba[:3]) * linear_from_srgb(self.mean)
+        r, g, b = (round(float(c), 5) for c in colour)
+        return (r, g, b)
+
+
+def define_look(robot: Usd.Prim, look: Look) -> UsdShade.Material:
+    """The material of a look, shared by all that have it.
+
+    Args:
+        robot: Root prim; looks lie in a scope below it.
+        look: What to author; USD's colours are linear.
+    """
+    stage = robot.GetStage()
+    scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(LOOKS)).GetPath()
+    hexed = "".join(f"{round(c * 255):02x}" for c in look.rgba)
+    stem, number = Tf.MakeValidIdentifier(look.name) if look.name else f"colour_{hexed}", 1
+    path = scope.AppendChild(stem)
+    while stage.GetPrimAtPath(path):
+        material = UsdShade.Material(stage.GetPrimAtPath(path))
+        if _shows(material, look):
+            return material
+        path = scope.AppendChild(f"{stem}_{hexed}" if number == 1 else f"{stem}_{hexed}_{number}")
+        number += 1  # one name is used for two looks
+    material = UsdShade.Material.Define(stage, path)
+    surface = UsdShade.Shader.Define(stage, path.AppendChild(SURFACE))
+    surface.CreateIdAttr("UsdPreviewSurface")
+    for name, kind, value in _inputs(look):
+        surface.CreateInput(name, kind).Set(value)
+    if look.by_vertex:
+        reader = _reader(stage, path, "UsdPrimvarReader_float3", "displayColor", Sdf.ValueTypeNames.Float3)
+        surface.GetInput("diffuseColor").ConnectToSource(reader)
+    elif look.texture:
+        _connect_texture(stage, path, surface, look)
+    surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
+    material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
+    return material
+
+
+def _inputs(look: Look) -> list[tuple[str, Sdf.ValueTypeName, Any]]:
+    """Inputs of a look's UsdPreviewSurface: name, type and value."""
+    kinds = Sdf.ValueTypeNames
+    colour = look.display_colour if look.texture else linear_from_srgb(look.rgba[:3])
+    return [
+        ("diffuseColor", kinds.Color3f, Gf.Vec3f(*(round(float(c), 5) for c in colour))),
+        ("opacity", kinds.Float, round(look.rgba[3], 4)),
+        ("roughness", kinds.Float, round(look.roughness, 4)),
+        ("metallic", kinds.Float, round(look.metallic, 4)),
+        *([("opacityThreshold", kinds.Float, round(look.cutoff, 4))] if look.cutoff else []),
+    ]
+
+
+def _connect_texture(stage: Usd.Stage, path: Sdf.Path, surface: UsdShade.Shader, look: Look) -> None:
+    """Let a texture, laid on by the mesh's `st`, give the colour, and the opacity if it counts."""
+    kinds = Sdf.ValueTypeNames
+    texture = UsdShade.Shader.Define(stage, path.AppendChild(TEXTURE))
+    texture.CreateIdAttr("UsdUVTexture")
+    texture.CreateInput("file", kinds.Asset).Set(Sdf.AssetPath(look.texture))
+    st = _reader(stage, path, "UsdPrimvarReader_float2", "st", kinds.Float2)
+    texture.CreateInput("st", kinds.Float2).ConnectToSource(st)
+    for side in ("wrapS", "wrapT"):
+        texture.CreateInput(side, kinds.Token).Set("repeat")
+    texture.CreateInput("sourceColorSpace", kinds.Token).Set("sRGB")
+    factor = (*linear_from_srgb(look.rgba[:3]), look.rgba[3])
+    if factor != (1, 1, 1, 1):
+        texture.CreateInput("scale", kinds.Float4).Set(Gf.Vec4f(*(round(float(c), 5) for c in factor)))
+    surface.GetInput("diffuseColor").ConnectToSource(texture.CreateOutput("rgb", kinds.Float3))
+    if look.see_through:
+        surface.GetInput("opacity").ConnectToSource(texture.CreateOutput("a", kinds.Float))
+
+
+def _reader(
+    stage: Usd.Stage, path: Sdf.Path, kind: str, primvar: str, type_: Sdf.ValueTypeName
+) -> UsdShade.Output:
+    """Output of a shader that reads a primvar."""
+    reader = UsdShade.Shader.Define(stage, path.AppendChild(READER))
+    reader.CreateIdAttr(kind)
+    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set(primvar)
+    return reader.CreateOutput("result", type_)
+
+
+def _shows(material: UsdShade.Material, look: Look) -> bool:
+    """Whether a material that `define_look` made is that of a look."""
+    stage, path = material.GetPrim().GetStage(), material.GetPath()
+    surface = UsdShade.Shader(stage.GetPrimAtPath(path.AppendChild(SURFACE)))
+    texture = UsdShade.Shader(stage.GetPrimAtPath(path.AppendChild(TEXTURE)))
+    if not surface:
+        return False
+    wanted = {name: np.float32(value).tolist() for name, _, value in _inputs(look)}
+    return (
+        {i.GetBaseName(): np.float32(i.Get()).tolist() for i in surface.GetInputs()} == wanted
+        and (texture.GetInput("file").Get().path if texture else "") == look.texture
+        and surface.GetInput("opacity").HasConnectedSource() == look.see_through
+        and bool(stage.GetPrimAtPath(path.AppendChild(READER))) == bool(look.by_vertex or look.texture)
+    )
+
+
+def define_grip(robot: Usd.Prim, surface: Surface) -> UsdShade.Material:
+    """The physics material of a friction, shared by all that have it.
+
+    Args:
+        robot: Root prim; physics materials lie among its looks.
+        surface: How it grips and bounces; how it gives way is PhysX's own, a compliant contact.
+    """
+    stage = robot.GetStage()
+    scope = UsdGeom.Scope.Define(stage, robot.GetPath().AppendChild(LOOKS)).GetPath()
+    name = f"friction_{surface.friction:g}"
+    for label, value in (
+        ("bounce", surface.restitution or None),
+        ("stiffness", surface.stiffness),
+        ("damping", surface.damping),
+    ):
+        name += "" if value is None else f"_{label}_{value:g}"
+    path = scope.AppendChild(Tf.MakeValidIdentifier(name))
+    if stage.GetPrimAtPath(path):
+        return UsdShade.Material(stage.GetPrimAtPath(path))
+    material = UsdShade.Material.Define(stage, path)
+    api = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+    api.CreateStaticFrictionAttr(surface.friction)
+    api.CreateDynamicFrictionAttr(surface.friction)
+    api.CreateRestitutionAttr(surface.restitution)
+    for what, value in (("Stiffness", surface.stiffness), ("Damping", surface.damping)):
+        if value is not None:
+            if PHYSX_API not in material.GetPrim().GetPrimTypeInfo().GetAppliedAPISchemas():
+                material.GetPrim().AddAppliedSchema(PHYSX_API)
+            attribute = f"physxMaterial:compliantContact{what}"
+            material.GetPrim().CreateAttribute(attribute, Sdf.ValueTypeNames.Float, custom=False).Set(value)
+    return material
+
+
+def wear(prim: Usd.Prim, robot: Usd.Prim, look: Look, grip: UsdShade.Material | None = None) -> None:
+    """Give a gprim, or an Xform over one, its look, and a collider its grip.
+
+    The look is authored as displayColor too, for viewers without materials; one that the mesh's vertices
+    give stands there already.
+    """
+    api = UsdShade.MaterialBindingAPI.Apply(prim)
+    api.Bind(define_look(robot, look))
+    if not look.by_vertex:
+        colour = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(
+            "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.constant
+        )
+        colour.Set([Gf.Vec3f(*look.display_colour)])
+    if grip is not None:
+        api.Bind(grip, UsdShade.Tokens.weakerThanDescendants, "physics")

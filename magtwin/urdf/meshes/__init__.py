@@ -1,0 +1,1 @@
+"""Mesh files of a robot description, and their colliders."""

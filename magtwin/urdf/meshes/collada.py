@@ -1,0 +1,431 @@
+"""COLLADA: triangles of a .dae, its nested transforms, unit, colours, textures and normals.
+
+Read here rather than by pycollada, which drops a geometry whose material it cannot read, and reads
+every array whether it is shown or not. Versions 1.4 and 1.5.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.urdf.meshes.mesh import Paint, Piece, Rgba
+from magtwin.urdf.meshes.polygon import cut_polygons
+from magtwin.urdf.meshes.reading import Reading, numbers
+from magtwin.urdf.meshes.texture import Image, read_image
+from magtwin.urdf.source.markup import parse_markup
+from magtwin.usd.geometry import linear_from_srgb
+
+Element = ElementTree.Element
+
+GREY: Rgba = (0.5, 0.5, 0.5, 1.0)
+"""What a colour that cannot be read is taken for."""
+
+SHADERS = ("phong", "lambert", "blinn", "constant")
+
+POLYGONS = ("triangles", "polylist", "polygons", "tristrips", "trifans")
+"""Primitives that have faces; lines have none."""
+
+NODES = 50_000
+"""Nodes that a scene may show, each as often as it is: nodes of two nodes of two nodes grow without end."""
+
+LUMINANCE = (0.212671, 0.715160, 0.072169)
+"""Of linear red, green and blue, as COLLADA has it."""
+
+
+def read_collada(reading: Reading) -> list[Piece]:
+    """The triangles of a COLLADA file, as `read_mesh` has it."""
+    return _Collada(reading).pieces()
+
+
+@dataclass(frozen=True)
+class _Input:
+    """Where a primitive's corners take some of their values from."""
+
+    semantic: str
+    source: str
+    offset: int
+    set: int
+
+
+class _Collada:
+    """A COLLADA file and what has been read of it."""
+
+    def __init__(self, reading: Reading) -> None:
+        self._reading = reading
+        text = reading.path.read_bytes()
+        if re.match(rb"\s*<\?xml[^>]*encoding", text) is None:  # names in another encoding do no harm
+            text = text.decode("utf-8", errors="replace").encode()
+        markup = parse_markup(text, reading.path)
+        self._root, self._lines = markup.root, markup.lines
+        for element in markup.lines:
+            element.tag = element.tag.rpartition(":")[2]
+        if self._root.tag != "COLLADA":
+            raise InputError(f"{reading.path}: begins with <{self._root.tag}>, a COLLADA file with <COLLADA>")
+        self._ids = {e.get("id"): e for e in markup.lines if e.get("id")}
+        self._visited = 0
+        self._sources: dict[str, NDArray] = {}
+        self._paints: dict[Element, Paint | None] = {}
+
+    def pieces(self) -> list[Piece]:
+        """All that the file's scene shows, in metres."""
+        axis = self._root.findtext("asset/up_axis", "Z_UP").strip()
+        if axis != "Z_UP":
+            self._reading.note(f"its up axis {axis} is not applied, as in RViz; turn the visual instead")
+        scene = self._target(self._root.find("scene/instance_visual_scene"))
+        if scene is None:
+            raise InputError(f"{self._reading.path}: has no scene to show; export it again")
+        unit = self._root.find("asset/unit")
+        metre = float(unit.get("meter", 1)) if unit is not None else 1.0
+        shown: set[Element] = set()
+        pieces = [
+            piece.moved(T)
+            for node in scene.findall("node")
+            for geometry, instance, T in self._walk(node, np.diag([metre, metre, metre, 1.0]), ())
+            for piece in self._geometry(geometry, instance, shown)
+        ]
+        for geometry in self._root.iterfind("library_geometries/geometry"):
+            if geometry not in shown:
+                self._reading.note(
+                    f"geometry {geometry.get('id')!r} is not in the file's scene and is left out"
+                )
+        return pieces
+
+    def _walk(
+        self, node: Element, T: NDArray, above: tuple[Element, ...]
+    ) -> Iterator[tuple[Element, Element, NDArray]]:
+        """Geometries below a node, the elements that place them, and the transforms to metres in the file."""
+        self._visited += 1
+        if self._visited > NODES:
+            raise self._refused(node, f"shows over {NODES} nodes")
+        if node in above:
+            raise self._refused(node, f"node {node.get('id')!r} is within itself")
+        T = T @ self._transform(node)
+        for child in node:
+            if child.tag == "node":
+                yield from self._walk(child, T, (*above, node))
+            elif child.tag == "instance_node":
+                target = self._target(child)
+                if target is None:
+                    self._reading.lose(f"node {child.get('url')!r} is not there")
+                else:
+                    yield from self._walk(target, T, (*above, node))
+            elif child.tag == "instance_geometry":
+                geometry = self._target(child)
+                if geometry is None:
+                    self._reading.lose(f"geometry {child.get('url')!r} is not there")
+                else:
+                    yield geometry, child, T
+            elif child.tag == "instance_controller":
+                yield from self._skinned(child, T)
+
+    def _skinned(self, instance: Element, T: NDArray) -> Iterator[tuple[Element, Element, NDArray]]:
+        """The geometry of a skin, as it stands before its bones move it."""
+        controller = self._target(instance)
+        skin = None if controller is None else controller.find("skin")
+        geometry = None if skin is None else self._ids.get(skin.get("source", "").removeprefix("#"))
+        if skin is None or geometry is None:
+            self._reading.lose(f"controller {instance.get('url')!r} is no skin of a geometry")
+            return
+        self._reading.note(f"skin {controller.get('id')!r} is shown as it is without its bones")  # type: ignore[union-attr]
+        bind = skin.find("bind_shape_matrix")
+        yield geometry, instance, T if bind is None else T @ self._floats(bind, 16).reshape(4, 4)
+
+    def _transform(self, node: Element) -> NDArray:
+        """Product of a node's transforms in the order of the file, shape (4, 4)."""
+        T = np.eye(4)
+        for child in node:
+            if child.tag == "matrix":
+                T = T @ self._floats(child, 16).reshape(4, 4)
+            elif child.tag == "translate":
+                T = T @ _affine(p=self._floats(child, 3))
+            elif child.tag == "scale":
+                T = T @ _affine(np.diag(self._floats(child, 3)))
+            elif child.tag == "rotate":
+                x, y, z, degrees = self._floats(child, 4)
+                T = T @ _affine(_rotation(np.array([x, y, z]), np.radians(degrees)))
+            elif child.tag in ("lookat", "skew"):
+                self._reading.lose(f"<{child.tag}> of node {node.get('id')!r} is not applied")
+        return T
+
+    def _geometry(self, geometry: Element, instance: Element, shown: set[Element]) -> Iterator[Piece]:
+        """Triangles of a geometry in its own frame."""
+        shown.add(geometry)
+        mesh = geometry.find("mesh")
+        if mesh is None:
+            self._reading.lose(f"geometry {geometry.get('id')!r} is no mesh and is left out")
+            return
+        bound = {m.get("symbol"): m for m in instance.iter("instance_material")}
+        for primitive in mesh:
+            if primitive.tag in ("lines", "linestrips"):
+                self._reading.note(f"<{primitive.tag}> of geometry {geometry.get('id')!r} are left out")
+            elif primitive.tag in POLYGONS and primitive.find("p") is not None:
+                yield self._piece(primitive, mesh, bound)
+
+    def _piece(self, primitive: Element, mesh: Element, bound: dict[str | None, Element]) -> Piece:
+        inputs = self._inputs(primitive, mesh)
+        index, counts = self._index(primitive, 1 + max((i.offset for i in inputs), default=0))
+        positions = next((i for i in inputs if i.semantic == "POSITION"), None)
+        if positions is None:
+            raise self._refused(primitive, f"<{primitive.tag}> has no POSITION")
+        points = self._source(positions, 3)
+        corners = index[:, positions.offset]
+        if len(corners) and not 0 <= corners.min() <= corners.max() < len(points):
+            raise self._refused(primitive, f"a face names vertex {corners.max()} of {len(points)}")
+        if primitive.tag in ("tristrips", "trifans"):
+            triangles = _strips(counts, primitive.tag)
+        else:
+            triangles = cut_polygons(points, corners, counts)
+        binding = bound.get(primitive.get("material"))
+        paint = self._paint(primitive, binding)
+        return Piece(
+            points=points,
+            faces=corners[triangles],
+            paint=paint,
+            normals=self._picked(inputs, "NORMAL", 3, index, triangles),
+            uvs=None
+            if paint is not None and paint.image is None
+            else self._picked(inputs, "TEXCOORD", 2, index, triangles, self._uv_set(binding)),
+            colours=None
+            if paint is not None or (c := self._picked(inputs, "COLOR", 3, index, triangles)) is None
+            else linear_from_srgb(c),
+        )
+
+    def _inputs(self, primitive: Element, mesh: Element) -> list[_Input]:
+        """A primitive's inputs, its VERTEX replaced by those of the mesh's vertices."""
+        inputs = []
+        for element in primitive.findall("input"):
+            offset, number = int(element.get("offset", 0)), int(element.get("set", 0))
+            if element.get("semantic") != "VERTEX":
+                inputs.append(
+                    _Input(element.get("semantic", ""), element.get("source", "")[1:], offset, number)
+                )
+                continue
+            for vertex in mesh.findall("vertices/input"):
+                semantic, source = vertex.get("semantic", ""), vertex.get("source", "")[1:]
+                inputs.append(_Input(semantic, source, offset, int(vertex.get("set", 0))))
+        return inputs
+
+    def _index(self, primitive: Element, stride: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Indices at a primitive's corners, shape (C, inputs), and corners of its polygons, shape (P,)."""
+        lists = [numbers(p.text or "", np.int64) for p in primitive.findall("p")]
+        wanted = 3 * stride * int(primitive.get("count", 0)) if primitive.tag == "triangles" else -1
+        for p, values in zip(primitive.findall("p"), lists, strict=True):
+            whole = len(values) == wanted or len(values) == len((p.text or "").split())
+            if len(values) % stride or not whole:
+                raise self._refused(p, f"its indices are not whole numbers in rows of {stride}")
+        index = np.concatenate(lists).reshape(-1, stride)
+        if primitive.tag == "polylist":
+            counts = numbers(primitive.findtext("vcount", ""), np.int64)
+        elif primitive.tag == "triangles":
+            counts = np.full(len(index) // 3, 3)
+        else:
+            counts = np.array([len(values) // stride for values in lists])
+        if counts.sum() != len(index) or (len(counts) and counts.min() < 3):
+            raise self._refused(
+                primitive, f"its polygons have {counts.sum()} corners, its indices are {len(index)}"
+            )
+        return index, counts
+
+    def _picked(
+        self,
+        inputs: list[_Input],
+        semantic: str,
+        width: int,
+        index: NDArray,
+        triangles: NDArray,
+        number: int = -1,
+    ) -> NDArray | None:
+        """Values at the triangles' corners, shape (F, 3, width); none where the file gives none that fit."""
+        found = [i for i in inputs if i.semantic == semantic]
+        chosen = next((i for i in found if i.set == number), found[0] if found else None)
+        if chosen is None:
+            return None
+        values, rows = self._source(chosen, width), index[triangles, chosen.offset]
+        if not len(values) or rows.max(initial=0) >= len(values):
+            self._reading.lose(f"{semantic} {chosen.source!r} has too few values and is left out")
+            return None
+        return values.astype(np.float32)[rows]
+
+    def _source(self, given: _Input, width: int) -> NDArray:
+        """Values of a source, shape (N, width)."""
+        if given.source not in self._sources:
+            element = self._ids.get(given.source)
+            array = None if element is None else element.find("float_array")
+            accessor = None if element is None else element.find("technique_common/accessor")
+            if array is None or accessor is None:
+                raise InputError(
+                    f"{self._reading.path}: source {given.source!r} is not there; export it again"
+                )
+            stride, start = int(accessor.get("stride", 1)), int(accessor.get("offset", 0))
+            count = int(accessor.get("count", 0))
+            values = numbers(array.text or "", float)[start : start + stride * count]
+            if len(values) < stride * count or stride < width:
+                raise self._refused(
+                    array, f"{len(values)} numbers are too few for {count} rows of {max(stride, width)}"
+                )
+            self._sources[given.source] = values.reshape(count, stride)
+        return self._sources[given.source][:, :width]
+
+    def _uv_set(self, binding: Element | None) -> int:
+        """The set of texture coordinates that a material is bound to; -1 leaves it open."""
+        for bind in () if binding is None else binding.findall("bind_vertex_input"):
+            if bind.get("input_semantic") == "TEXCOORD":
+                return int(bind.get("input_set", 0))
+        return -1
+
+    def _paint(self, primitive: Element, binding: Element | None) -> Paint | None:
+        """The paint of a primitive's material; none where it has none, or none that says its colour."""
+        symbol = primitive.get("material")
+        if symbol is None:
+            return None
+        name = (
+            symbol if binding is None else binding.get("target", "")[1:]
+        )  # unbound, it may be the id itself
+        material = self._ids.get(name)
+        if material is None or material.tag != "material":
+            self._reading.lose(f"material {name!r} is not there; shown without it")
+            return None
+        if material not in self._paints:
+            self._paints[material] = self._make(material)
+        return self._paints[material]
+
+    def _make(self, material: Element) -> Paint | None:
+        effect, name = (
+            self._target(material.find("instance_effect")),
+            material.get("name") or material.get("id") or "",
+        )
+        profile = None if effect is None else effect.find("profile_COMMON")
+        shader = None if profile is None else next((e for e in profile.iter() if e.tag in SHADERS), None)
+        if effect is None or profile is None or shader is None:
+            self._reading.lose(f"material {name!r} has no effect that can be read; shown without it")
+            return None
+        diffuse = shader.find("diffuse")
+        if diffuse is None:
+            diffuse = shader.find("emission") if shader.tag == "constant" else None
+        if diffuse is None or not len(diffuse):
+            return None
+        for given in shader:  # of those that are not read, too, whoever made the file ought to know
+            if given.find("color") is not None:
+                self._colour(given, profile)
+        opacity = self._opacity(shader, profile, name)
+        double_sided = any((e.text or "").strip() == "1" for e in effect.iter("double_sided"))
+        texture = diffuse.find("texture")
+        image = None if texture is None else self._image(texture, profile)
+        if image is not None:
+            return Paint(name, (1.0, 1.0, 1.0, opacity), image, double_sided=double_sided)
+        r, g, b, _ = GREY if texture is not None else self._colour(diffuse, profile)
+        return Paint(name, (r, g, b, opacity), double_sided=double_sided)
+
+    def _image(self, texture: Element, profile: Element) -> Image | None:
+        """The picture of a `<texture>`: by sampler and surface, by sampler alone (1.5), or itself."""
+        parameters = {p.get("sid"): p for p in profile.iter("newparam")}
+        name = texture.get("texture", "")
+        for _ in range(2):  # a sampler names a surface, a surface an image
+            parameter = parameters.get(name)
+            if parameter is not None:
+                url = parameter.find("sampler2D/instance_image")
+                name = (
+                    url.get("url", "")[1:]
+                    if url is not None
+                    else (
+                        parameter.findtext("sampler2D/source")
+                        or parameter.findtext("surface/init_from")
+                        or ""
+                    ).strip()
+                )
+        image = self._ids.get(name)
+        file = "" if image is None else (image.findtext("init_from/ref") or image.findtext("init_from") or "")
+        if not file.strip():
+            self._reading.lose(f"texture {texture.get('texture')!r} names no image and is left out")
+            return None
+        return read_image(file.strip(), self._reading)
+
+    def _opacity(self, shader: Element, profile: Element, name: str) -> float:
+        """Opacity of a shader (COLLADA 1.4.1, chapter 7, "Determining Transparency").
+
+        A_ONE: a t. RGB_ZERO: 1 - luminance(r, g, b) t, with the colour (r, g, b, a) of `<transparent>` and
+        t of `<transparency>`. Exporters that mix the two up make surfaces that nobody could see: taken as
+        opaque, with a note.
+        """
+        transparent, strength = shader.find("transparent"), shader.find("transparency")
+        number = None if strength is None else numbers(strength.findtext("float", ""), float)
+        t = float(number[0]) if number is not None and len(number) == 1 else 1.0
+        if transparent is None or all(transparent.find(kind) is None for kind in ("color", "param")):
+            opacity = t
+        else:
+            r, g, b, a = self._colour(transparent, profile)
+            rgb_zero = transparent.get("opaque", "A_ONE") == "RGB_ZERO"
+            opacity = 1 - float(np.dot((r, g, b), LUMINANCE)) * t if rgb_zero else a * t
+        if not opacity > 0:
+            self._reading.note(f"material {name!r} would be invisible; taken as opaque")
+            return 1.0
+        return min(opacity, 1.0)
+
+    def _colour(self, element: Element, profile: Element) -> Rgba:
+        """The `<color>` of an element, or of the parameter that it names, 0 to 1; mended where malformed."""
+        parameter = element.find("param")
+        if parameter is not None:
+            named = {p.get("sid"): p for p in profile.iter("newparam")}.get(parameter.get("ref"))
+            text = "" if named is None else named.findtext("float4") or named.findtext("float3") or ""
+        else:
+            text = element.findtext("color") or ""
+        words = text.split()
+        values = numbers(" ".join(piece for word in words for piece in _part(word)), float)
+        rgba = (*values, 1.0)[:4] if len(values) in (3, 4) and np.isfinite(values).all() else GREY
+        if len(words) != 4 or len(values) != 4:
+            mended = " ".join(f"{c:g}" for c in rgba)
+            self._reading.note(f"malformed colour {text.strip()!r} read as {mended!r}")
+        r, g, b, a = (float(np.clip(c, 0, 1)) for c in rgba)
+        return (r, g, b, a)
+
+    def _floats(self, element: Element, count: int) -> NDArray:
+        values = numbers(element.text or "", float)
+        if len(values) != count or not np.isfinite(values).all():
+            raise self._refused(element, f"<{element.tag}> needs {count} finite numbers")
+        return values
+
+    def _target(self, element: Element | None) -> Element | None:
+        """What an element's `url` names in this file."""
+        return None if element is None else self._ids.get(element.get("url", "").removeprefix("#"))
+
+    def _refused(self, element: Any, text: str) -> InputError:
+        return InputError(f"{self._reading.path}:{self._lines[element]}: {text}; export it again")
+
+
+def _part(word: str) -> list[str]:
+    """Two numbers that were written without a space: "0.01.0" is 0.0 and 1.0."""
+    fused = re.fullmatch(r"(\d+\.\d+?)(\d\.\d+)", word)
+    return [fused[1], fused[2]] if fused else [word]
+
+
+def _affine(A: NDArray | None = None, p: NDArray | None = None) -> NDArray:
+    """A map of linear part A, shape (3, 3), and origin p, shape (3,); shape (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3] = np.eye(3) if A is None else A
+    T[:3, 3] = 0 if p is None else p
+    return T
+
+
+def _rotation(axis: NDArray, angle: float) -> NDArray:
+    """Rotation about an axis [rad], shape (3, 3) (Rodrigues 1840): I + sin a K + (1 - cos a) K^2."""
+    length = np.linalg.norm(axis)
+    x, y, z = axis / length if length > 0 else axis
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+def _strips(counts: NDArray, tag: str) -> NDArray:
+    """Triangles of strips or fans of so many corners each, as indices of corners, shape (F, 3)."""
+    made, start = [], 0
+    for count in counts:
+        i = np.arange(count - 2)
+        rows = (np.zeros_like(i), i + 1, i + 2) if tag == "trifans" else (i, i + 1 + i % 2, i + 2 - i % 2)
+        made.append(start + np.column_stack(rows))
+        start += count
+    return np.concatenate(made)

@@ -1,0 +1,288 @@
+"""glTF: triangles of a .gltf or .glb (version 2.0), its nodes, materials and textures.
+
+Read here rather than by trimesh, for three things that it does otherwise: a texture's file is kept as it
+is, colours are taken as linear (section 3.9.2), and what cannot be read is said.
+"""
+
+import base64
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.frames import matrix_from_quat
+from magtwin.urdf.meshes.mesh import Paint, Piece
+from magtwin.urdf.meshes.reading import Reading
+from magtwin.urdf.meshes.texture import Image, image_of, read_image
+from magtwin.usd.geometry import linear_from_srgb, srgb_from_linear
+
+Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""Turns glTF's Y up to Z up, x staying: (x, y, z) -> (x, -z, y)."""
+
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+
+TRIANGLES, STRIP, FAN = 4, 5, 6
+"""Modes of primitives that have faces."""
+
+SUPPORTED = ("KHR_materials_unlit", "KHR_mesh_quantization", "KHR_materials_emissive_strength")
+"""Extensions without which a file would be read wrongly, and that are understood or change no shape."""
+
+EMPTY = 2**22
+"""Zeros that a file may have without a buffer that holds them."""
+
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+
+
+def read_gltf(reading: Reading) -> list[Piece]:
+    """The triangles of a glTF file, turned to Z up, as `read_mesh` has it."""
+    return _Gltf(reading).pieces()
+
+
+class _Gltf:
+    """A glTF file: its JSON, and the buffers that it points into."""
+
+    def __init__(self, reading: Reading) -> None:
+        self._reading, path = reading, reading.path
+        self._json, self._chunk = _parse(path)
+        version = str(self._json.get("asset", {}).get("version", "none"))
+        if not version.startswith("2."):
+            raise InputError(f"{path}: is glTF of version {version}; only 2.0 is read, export it again")
+        unknown = [e for e in self._json.get("extensionsRequired", ()) if e not in SUPPORTED]
+        if unknown:
+            raise InputError(
+                f"{path}: cannot be read without {', '.join(unknown)}; export it without compression"
+            )
+        self._buffers: dict[int, bytes] = {}
+        self._paints: dict[int, Paint] = {}
+
+    def pieces(self) -> list[Piece]:
+        """All that the file's scene shows, in node order."""
+        scenes, nodes = self._json.get("scenes", []), self._json.get("nodes", [])
+        if scenes:
+            roots = scenes[self._json.get("scene", 0)].get("nodes", [])
+        else:
+            below = {child for node in nodes for child in node.get("children", ())}
+            roots = [i for i in range(len(nodes)) if i not in below]
+        pieces = [piece.moved(T) for node, T in self._walk(roots) for piece in self._mesh(node)]
+        for kind in ("skins", "animations"):
+            if self._json.get(kind):
+                self._reading.lose(f"its {kind} are left out")
+        return pieces
+
+    def _walk(self, roots: list[int]) -> Iterator[tuple[dict[str, Any], NDArray]]:
+        """Nodes with the transform from each to the mesh's frame; nodes in a circle are refused."""
+        pending = [(root, Z_UP) for root in reversed(roots)]
+        seen: set[int] = set()
+        while pending:
+            index, above = pending.pop()
+            if index in seen:
+                raise InputError(f"{self._reading.path}: node {index} has two parents; export it again")
+            seen.add(index)
+            node = self._json["nodes"][index]
+            T = above @ _local(node)
+            yield node, T
+            pending += [(child, T) for child in reversed(node.get("children", []))]
+
+    def _mesh(self, node: dict[str, Any]) -> Iterator[Piece]:
+        if "mesh" not in node:
+            return
+        for primitive in self._json["meshes"][node["mesh"]]["primitives"]:
+            mode, attributes = primitive.get("mode", TRIANGLES), primitive["attributes"]
+            if mode not in (TRIANGLES, STRIP, FAN):
+                self._reading.lose("lines and points are left out")
+                continue
+            points = self._numbers(attributes["POSITION"])
+            order = (
+                self._numbers(primitive["indices"]).ravel().astype(np.int64)
+                if "indices" in primitive
+                else np.arange(len(points))
+            )
+            faces = _triangles(order, mode)
+            if len(faces) and not faces.max() < len(points):
+                raise InputError(
+                    f"{self._reading.path}: a face names vertex {faces.max()} of {len(points)}; "
+                    "export it again"
+                )
+            at = {
+                name: self._numbers(attributes[name])[faces]
+                for name in ("NORMAL", "TEXCOORD_0", "COLOR_0")
+                if name in attributes
+            }
+            paint = self._paint(primitive["material"]) if "material" in primitive else None
+            uvs, colours = at.get("TEXCOORD_0"), at.get("COLOR_0")
+            if colours is not None:
+                colours = np.clip(colours[..., :3], 0, 1)
+                if paint is not None and paint.image is None:  # factors multiply (section 3.9.2)
+                    colours = colours * linear_from_srgb(paint.rgba[:3])
+                    paint = replace(paint, rgba=(1.0, 1.0, 1.0, paint.rgba[3]), by_vertex=True)
+            yield Piece(
+                points=points,
+                faces=faces,
+                paint=paint,
+                normals=at.get("NORMAL"),
+                uvs=None if uvs is None else uvs * (1, -1) + (0, 1),  # from the upper left to the lower
+                colours=colours,
+            )
+
+    def _paint(self, index: int) -> Paint:
+        """A material's paint. Colour factors are linear, and multiply the texture and vertex colours."""
+        if index not in self._paints:
+            material = self._json["materials"][index]
+            surface = material.get("pbrMetallicRoughness", {})
+            r, g, b, a = surface.get("baseColorFactor", (1, 1, 1, 1))
+            image = None
+            if "baseColorTexture" in surface:
+                texture = surface["baseColorTexture"]
+                if texture.get("texCoord", 0) != 0 or "KHR_texture_transform" in texture.get(
+                    "extensions", {}
+                ):
+                    self._reading.lose(f"material {index}'s texture lies on other coordinates than its first")
+                image = self._image(self._json["textures"][texture["index"]])
+            for other in ("normalTexture", "occlusionTexture", "emissiveTexture"):
+                if other in material:
+                    self._reading.lose(f"material {index}'s {other} is left out")
+            if "metallicRoughnessTexture" in surface:
+                self._reading.lose(f"material {index}'s metallicRoughnessTexture is left out")
+            red, green, blue = (float(c) for c in srgb_from_linear((r, g, b)))
+            alpha = material.get("alphaMode", "OPAQUE")
+            self._paints[index] = Paint(
+                name=material.get("name", f"material_{index}"),
+                rgba=(red, green, blue, 1.0 if alpha == "OPAQUE" else float(a)),
+                image=image,
+                roughness=float(surface.get("roughnessFactor", 1.0)),
+                metallic=float(surface.get("metallicFactor", 1.0)),
+                double_sided=bool(material.get("doubleSided", False)),
+                see_through=alpha != "OPAQUE",
+                cutoff=float(material.get("alphaCutoff", 0.5)) if alpha == "MASK" else 0.0,
+            )
+        return self._paints[index]
+
+    def _image(self, texture: dict[str, Any]) -> Image | None:
+        """The picture of a texture: in a file, in the text, or in a buffer."""
+        if "source" not in texture:
+            self._reading.lose("a texture of an unknown format is left out")
+            return None
+        image = self._json["images"][texture["source"]]
+        name = image.get("name") or f"{self._reading.path.stem}_{texture['source']}"
+        if "bufferView" in image:
+            return image_of(self._view(image["bufferView"]), name, self._reading)
+        if image["uri"].startswith("data:"):
+            return image_of(_inline(image["uri"]), name, self._reading)
+        return read_image(image["uri"], self._reading)
+
+    def _numbers(self, index: int) -> NDArray:
+        """An accessor's values, shape (N, width), as floats or whole numbers (section 3.6.2)."""
+        accessor = self._json["accessors"][index]
+        dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
+        count = accessor["count"]
+        if "bufferView" in accessor:
+            view = self._json["bufferViews"][accessor["bufferView"]]
+            data = self._view(accessor["bufferView"])[accessor.get("byteOffset", 0) :]
+            stride = view.get("byteStride", dtype.itemsize * width)
+            if count and len(data) < stride * (count - 1) + dtype.itemsize * width:
+                raise InputError(
+                    f"{self._reading.path}: accessor {index} reaches over its buffer; export it again"
+                )
+            values = np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
+        else:
+            if count > EMPTY:
+                raise InputError(
+                    f"{self._reading.path}: accessor {index} is of {count} zeros, over {EMPTY}; export anew"
+                )
+            values = np.zeros((count, width), dtype)
+        if "sparse" in accessor:
+            values = self._replaced(np.array(values), accessor["sparse"])
+        if accessor.get("normalized"):
+            return np.maximum(values / np.iinfo(dtype).max, -1.0)
+        return values.astype(float) if dtype.kind == "f" else values.astype(np.int64)
+
+    def _replaced(self, values: NDArray, sparse: dict[str, Any]) -> NDArray:
+        """Values with those rows replaced that a sparse accessor lists."""
+        count, where, what = sparse["count"], sparse["indices"], sparse["values"]
+        rows = np.frombuffer(
+            self._view(where["bufferView"]),
+            COMPONENTS[where["componentType"]],
+            count,
+            where.get("byteOffset", 0),
+        )
+        new = np.frombuffer(
+            self._view(what["bufferView"]), values.dtype, count * values.shape[1], what.get("byteOffset", 0)
+        )
+        values[rows] = new.reshape(count, -1)
+        return values
+
+    def _view(self, index: int) -> bytes:
+        view = self._json["bufferViews"][index]
+        start = view.get("byteOffset", 0)
+        data = self._buffer(view["buffer"])[start : start + view["byteLength"]]
+        if len(data) < view["byteLength"]:
+            raise InputError(f"{self._reading.path}: buffer {view['buffer']} is cut short; export it again")
+        return data
+
+    def _buffer(self, index: int) -> bytes:
+        if index not in self._buffers:
+            uri = self._json["buffers"][index].get("uri")
+            if uri is None:
+                self._buffers[index] = self._chunk
+            elif uri.startswith("data:"):
+                self._buffers[index] = _inline(uri)
+            else:
+                file = self._reading.path.parent / unquote(uri)
+                if not self._reading.may_read(file):
+                    raise InputError(
+                        f"{self._reading.path}: buffer {uri!r} lies outside the robot's packages; move it in"
+                    )
+                if not file.is_file():
+                    raise InputError(f"{self._reading.path}: buffer {uri!r} is missing; looked for {file}")
+                self._buffers[index] = file.read_bytes()
+        return self._buffers[index]
+
+
+def _parse(path: Path) -> tuple[dict[str, Any], bytes]:
+    """JSON and binary chunk of a file (section 4)."""
+    data = path.read_bytes()
+    if data[:4] != b"glTF":
+        return json.loads(data), b""
+    if len(data) < 20 or struct.unpack_from("<I", data, 8)[0] > len(data):
+        raise InputError(f"{path}: is cut short; export it again")
+    found: dict[int, bytes] = {}
+    at = 12
+    while at + 8 <= len(data):
+        length, kind = struct.unpack_from("<II", data, at)
+        found.setdefault(kind, data[at + 8 : at + 8 + length])
+        at += 8 + length
+    return json.loads(found[JSON_CHUNK]), found.get(BINARY_CHUNK, b"")
+
+
+def _inline(uri: str) -> bytes:
+    """Bytes of a `data:` URI."""
+    head, _, body = uri.partition(",")
+    return base64.b64decode(body) if head.endswith(";base64") else unquote(body).encode("latin-1")
+
+
+def _local(node: dict[str, Any]) -> NDArray:
+    """Transform of a node in its parent, shape (4, 4): a matrix by columns, or T R S (section 3.5.2)."""
+    if "matrix" in node:
+        return np.reshape(node["matrix"], (4, 4)).T.astype(float)
+    T = np.eye(4)
+    T[:3, :3] = matrix_from_quat(node.get("rotation", (0, 0, 0, 1))) * node.get("scale", (1, 1, 1))
+    T[:3, 3] = node.get("translation", (0, 0, 0))
+    return T
+
+
+def _triangles(order: NDArray, mode: int) -> NDArray:
+    """Corners of the triangles of a list, a strip or a fan of vertices, shape (F, 3)."""
+    if mode == TRIANGLES:
+        return order[: len(order) // 3 * 3].reshape(-1, 3)
+    i = np.arange(max(len(order) - 2, 0))
+    if mode == FAN:
+        return order[np.column_stack([i + 1, i + 2, np.zeros_like(i)])]
+    return order[np.column_stack([i, i + 1 + i % 2, i + 2 - i % 2])]

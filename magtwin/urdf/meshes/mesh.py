@@ -1,0 +1,357 @@
+"""Mesh: the triangles of a mesh file with all that lies on them, in metres."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.urdf.meshes.reading import Note, Reading
+from magtwin.urdf.meshes.texture import Image
+
+SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
+"""Formats that can be read."""
+
+Rgba = tuple[float, float, float, float]
+
+CREASE = np.radians(35)
+"""Faces that meet at a smaller angle than this are shaded as one smooth surface [rad]."""
+
+FAN = 64
+"""Where more faces than this meet, at tips and in the middle of discs, each keeps its own normal."""
+
+
+@dataclass(frozen=True)
+class Paint:
+    """How a mesh file says that some of its triangles look."""
+
+    name: str = ""
+    """Its name in the file."""
+
+    rgba: Rgba = (1.0, 1.0, 1.0, 1.0)
+    """Colour and opacity as screens show them (sRGB), 0 to 1; of a textured surface, what multiplies it."""
+
+    image: Image | None = None
+    """Texture of the colour."""
+
+    roughness: float = 0.5
+    """0 is a mirror, 1 is chalk."""
+
+    metallic: float = 0.0
+    """0 is an insulator, 1 is metal."""
+
+    see_through: bool = False
+    """Whether the texture's opacity counts."""
+
+    cutoff: float = 0.0
+    """Opacity below which nothing is shown, and above which all is; 0 blends."""
+
+    double_sided: bool = False
+    """Whether it is seen from behind."""
+
+    by_vertex: bool = False
+    """Whether the colours at the corners are shown in place of `rgba`."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Triangles of one paint, as a reader finds them. What a file does not give is none."""
+
+    points: NDArray
+    """Vertices [m], shape (V, 3)."""
+
+    faces: NDArray
+    """Corners of the triangles, counter-clockwise from outside, shape (F, 3)."""
+
+    paint: Paint | None = None
+
+    normals: NDArray | None = None
+    """Normal at each corner of each face, shape (F, 3, 3)."""
+
+    uvs: NDArray | None = None
+    """Texture coordinates at each corner from the picture's lower left, shape (F, 3, 2)."""
+
+    colours: NDArray | None = None
+    """Linear red, green, blue at each corner, 0 to 1, shape (F, 3, 3)."""
+
+    def moved(self, T: NDArray) -> "Piece":
+        """The piece under an affine map T, shape (4, 4), still facing outwards where that mirrors.
+
+        Normals turn by the inverse transpose of the linear part A, n' ~ A^-T n, times det A's sign so
+        that they still point outwards.
+        """
+        if np.array_equal(T, np.eye(4)):
+            return self
+        A = T[:3, :3]
+        det = A[0] @ np.cross(A[1], A[2])
+        if det == 0:
+            raise ValueError("a node's transform flattens the mesh")
+        points = self.points @ A.T + T[:3, 3]
+        normals = None if self.normals is None else self.normals @ np.linalg.inv(A)
+        made = replace(self, points=points, normals=normals)
+        return made.flipped() if det < 0 else made
+
+    def flipped(self) -> "Piece":
+        """The piece with its faces wound the other way, their normals as they are."""
+        normals, uvs, colours = (
+            None if values is None else values[:, ::-1] for values in (self.normals, self.uvs, self.colours)
+        )
+        return replace(self, faces=self.faces[:, ::-1], normals=normals, uvs=uvs, colours=colours)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A mesh file. Values at corners are none where no piece gives them, nan at pieces that do not."""
+
+    path: Path
+
+    points: NDArray[np.float32]
+    """Vertices, no two alike [m], shape (V, 3)."""
+
+    faces: NDArray[np.int64]
+    """Corners of the triangles, counter-clockwise from outside, shape (F, 3)."""
+
+    paints: tuple[Paint | None, ...]
+    """Looks that the file gives; none stands for triangles to which it gives no look."""
+
+    paint: NDArray[np.int64]
+    """Index of each triangle's paint, shape (F,)."""
+
+    normals: NDArray | None
+    """Unit normals at the corners, shape (F, 3, 3)."""
+
+    uvs: NDArray | None
+    """Texture coordinates at the corners, shape (F, 3, 2)."""
+
+    colours: NDArray | None
+    """Linear colours at the corners, shape (F, 3, 3)."""
+
+    notes: tuple[Note, ...] = ()
+    """What was repaired, guessed or left out."""
+
+    def shaded(self) -> NDArray[np.float32]:
+        """Unit normals at the corners, the file's where it has them, else from the faces; shape (F, 3, 3)."""
+        if self.normals is not None and np.isfinite(self.normals).all():
+            return self.normals
+        computed = corner_normals(self.points, self.faces)
+        return (
+            computed if self.normals is None else np.where(np.isfinite(self.normals), self.normals, computed)
+        )
+
+
+Reader = Callable[[Reading], list[Piece]]
+
+
+def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mesh:
+    """Read a mesh file.
+
+    COLLADA's unit is applied and its up axis is not; glTF is turned from Y up to Z up: both as RViz
+    does it (rviz_rendering, assimp_loader.cpp).
+
+    Args:
+        path: The file; its suffix says its format.
+        may_read: Whether a file that this one names (a material library, a texture, a buffer) may be
+            read; by default those in its own folder and below.
+
+    Raises:
+        InputError: The file cannot be read, holds no triangle, or points that are no numbers.
+    """
+    folder = path.resolve().parent
+    allowed = may_read or (lambda other: other.resolve().is_relative_to(folder))
+    reading = Reading(path, allowed)
+    try:
+        pieces = _reader(path)(reading)
+    except InputError:
+        raise
+    except Exception as error:  # readers raise whatever they stumble upon in a damaged file
+        reason = str(error).strip().splitlines() or [type(error).__name__]
+        raise InputError(f"{path}: cannot be read as a mesh: {reason[0]}; export it again") from error
+    return _join(reading, pieces)
+
+
+def _reader(path: Path) -> Reader:
+    """The reader of a format, imported when it is first needed."""
+    suffix = path.suffix.lower()
+    if suffix == ".dae":
+        from magtwin.urdf.meshes.collada import read_collada
+
+        return read_collada
+    if suffix in (".glb", ".gltf"):
+        from magtwin.urdf.meshes.gltf import read_gltf
+
+        return read_gltf
+    if suffix == ".obj":
+        from magtwin.urdf.meshes.wavefront import read_wavefront
+
+        return read_wavefront
+    if suffix in (".stl", ".ply"):
+        from magtwin.urdf.meshes.scan import read_scan
+
+        return read_scan
+    raise InputError(f"{path}: is of no known mesh format ({', '.join(SUFFIXES)})")
+
+
+def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
+    """All pieces as one mesh: like points made one, triangles without an area left out."""
+    path, pieces = reading.path, [piece for piece in pieces if len(piece.faces)]
+    if not pieces:
+        raise InputError(f"{path}: holds no triangle; export it again, or use a primitive")
+    for piece in pieces:
+        if not 0 <= piece.faces.min() <= piece.faces.max() < len(piece.points):
+            raise InputError(
+                f"{path}: a face names vertex {piece.faces.max()} of {len(piece.points)}; export it again"
+            )
+    first = np.cumsum([0, *(len(piece.points) for piece in pieces)])
+    points = np.vstack([piece.points for piece in pieces]).astype(np.float32)
+    faces = np.vstack([piece.faces + n for piece, n in zip(pieces, first, strict=False)]).astype(np.int64)
+    if not np.isfinite(points[faces]).all():
+        raise InputError(f"{path}: has vertices that are not finite numbers; export it again")
+    pieces = [_coloured(piece, reading) for piece in pieces]
+    paints = tuple(dict.fromkeys(piece.paint for piece in pieces))
+    paint = np.repeat([paints.index(p.paint) for p in pieces], [len(p.faces) for p in pieces])
+    kept, index = distinct(points)
+    points, faces = points[kept], index[faces]
+    solid = has_area(points, faces)
+    if not solid.any():
+        raise InputError(f"{path}: holds no triangle with an area; export it again, or use a primitive")
+    lost = int(len(faces) - solid.sum())
+    if lost:
+        reading.note(f"{lost} triangles without an area left out")
+    faces, paint = faces[solid], paint[solid]
+    used = np.zeros(len(points), bool)
+    used[faces] = True
+    shown = np.unique(paint)
+    return Mesh(
+        path=path,
+        points=points[used],
+        faces=(np.cumsum(used) - 1)[faces],
+        paints=tuple(paints[i] for i in shown),
+        paint=np.searchsorted(shown, paint),
+        normals=_unit(_at_corners([p.normals for p in pieces], pieces, 3, solid)),
+        uvs=_at_corners([p.uvs for p in pieces], pieces, 2, solid),
+        colours=_at_corners([p.colours for p in pieces], pieces, 3, solid),
+        notes=tuple(reading.notes),
+    )
+
+
+def _coloured(piece: Piece, reading: Reading) -> Piece:
+    """A piece whose colours at corners are its look, where it has no other, or are left out."""
+    if piece.colours is None or (piece.paint is not None and piece.paint.by_vertex):
+        return piece
+    if piece.paint is None:
+        return replace(piece, paint=Paint("vertex_colours", by_vertex=True))
+    reading.lose("colours of vertices are left out where a material covers them")
+    return replace(piece, colours=None)
+
+
+def _at_corners(
+    values: Sequence[NDArray | None], pieces: Sequence[Piece], width: int, kept: NDArray
+) -> NDArray | None:
+    """Values at the corners of all pieces, nan where one has none; none where all have none."""
+    if all(value is None for value in values):
+        return None
+    filled = [
+        np.full((len(piece.faces), 3, width), np.nan) if value is None else value
+        for value, piece in zip(values, pieces, strict=True)
+    ]
+    return np.vstack(filled).astype(np.float32)[kept]
+
+
+def _unit(normals: NDArray | None) -> NDArray | None:
+    """Normals of length 1; nan at those that have no direction."""
+    if normals is None:
+        return None
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(length > 1e-12, normals / length, np.nan).astype(np.float32)
+
+
+def has_area(points: NDArray, faces: NDArray) -> NDArray[np.bool_]:
+    """Whether each triangle has an area, against the square of its longest edge."""
+    x, y, z = points.astype(float).T
+    a, b, c = faces.T
+    u, v, w = ((p[b] - p[a], p[c] - p[a], p[c] - p[b]) for p in (x, y, z))
+    uu, vv, ww = (u[i] ** 2 + v[i] ** 2 + w[i] ** 2 for i in range(3))
+    nx, ny, nz = v[0] * w[1] - w[0] * v[1], w[0] * u[1] - u[0] * w[1], u[0] * v[1] - v[0] * u[1]
+    return nx**2 + ny**2 + nz**2 > (1e-9 * np.maximum(uu, np.maximum(vv, ww))) ** 2
+
+
+def bounds(points: NDArray) -> tuple[NDArray, NDArray]:
+    """Least and greatest corner of the box around points (N, 3); columns are quicker to go through."""
+    columns = np.ascontiguousarray(points.T)
+    return columns.min(1), columns.max(1)
+
+
+def distinct(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The distinct rows of an array of floats, in the order in which they first appear.
+
+    One sort of a 64-bit word a row, its hash above its index, is many times quicker than sorting rows;
+    should two rows that differ have one hash, rows are sorted after all.
+
+    Args:
+        rows: Taken in single precision, shape (N, K).
+
+    Returns:
+        Index of the first row of each kind, shape (D,), and which kind each row is, shape (N,).
+    """
+    words = np.ascontiguousarray(rows + np.float32(0), np.float32).view(np.uint32)  # + 0 makes -0 into 0
+    hashed, here = np.zeros(len(words), np.uint64), np.arange(len(words))
+    for column in words.T:
+        hashed = (hashed ^ column) * np.uint64(0x9E3779B97F4A7C15)
+        hashed ^= hashed >> np.uint64(32)
+    low = np.uint64(len(words).bit_length())
+    keys = np.sort(hashed >> low << low | here.astype(np.uint64))
+    row, hashed = (keys & ~(~np.uint64(0) << low)).astype(np.int64), keys >> low
+    starts = np.append(True, hashed[1:] != hashed[:-1])[: len(row)]  # of rows of one hash, the first is first
+    first = np.empty_like(here)
+    first[row] = row[starts][np.cumsum(starts) - 1]
+    if not np.array_equal(words[first], words):
+        _, least, kind = np.unique(words, axis=0, return_index=True, return_inverse=True)
+        first = least[kind.reshape(-1)]
+    is_first = first == here
+    return here[is_first], (np.cumsum(is_first) - 1)[first]
+
+
+def face_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
+    """Unit normals of triangles, shape (F, 3); args as for `corner_normals`."""
+    a, b, c = (points[faces[:, i]].astype(float) for i in range(3))
+    area = np.cross(b - a, c - a)
+    return area / np.linalg.norm(area, axis=1, keepdims=True)
+
+
+def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float32]:
+    """Unit normals of each triangle's corners: smooth across shallow edges, sharp across creases.
+
+    A corner's normal is the mean, weighted by area, of the faces around its point that turn from its
+    own by less than CREASE; where more than FAN faces meet it is its own face's.
+
+    Args:
+        points: Vertices [m], shape (V, 3).
+        faces: Corners of the triangles, counter-clockwise from outside, shape (F, 3).
+
+    Returns:
+        Normals, shape (F, 3, 3).
+    """
+    a, b, c = (points[faces[:, i]].astype(float) for i in range(3))
+    area = np.cross(b - a, c - a)
+    size = np.linalg.norm(area, axis=1, keepdims=True)
+    area = (area / size.mean()).astype(np.float32)
+    unit = area / np.linalg.norm(area, axis=1, keepdims=True)
+    flat = faces.ravel().astype(np.int32)
+    by_point = np.argsort(flat, kind="stable")  # corners of one point stand together
+    count = np.bincount(flat, minlength=len(points))
+    first = np.cumsum(count) - count
+    corner = by_point[count[flat[by_point]] <= FAN]
+    around = count[flat[corner]]  # each corner is paired with each corner of its point
+    mine = np.repeat(np.arange(len(corner)), around)
+    start = np.repeat(first[flat[corner]] - np.cumsum(around) + around, around)
+    theirs = (by_point // 3)[start + np.arange(len(mine))]
+    near = np.einsum("ij,ij->i", np.repeat(unit[corner // 3], around, axis=0), unit[theirs]) >= np.cos(CREASE)
+    mine, theirs = mine[near], theirs[near]
+    normals = np.repeat(unit, 3, axis=0)
+    for axis in range(3):
+        normals[corner, axis] = np.bincount(mine, area[theirs, axis], len(corner))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return (normals / length).reshape(-1, 3, 3)

@@ -1,0 +1,299 @@
+"""Meshes: the big arrays of a robot, each mesh file once, in a layer of its own (.usdc).
+
+The readable root layer references them; arrays of more than 64 elements do not belong in text.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
+
+from magtwin.errors import InputError
+from magtwin.urdf.description.description import Description
+from magtwin.urdf.description.model import Mesh as UrdfMesh
+from magtwin.urdf.material import GREY
+from magtwin.urdf.meshes.collider import Solid, solids_of
+from magtwin.urdf.meshes.mesh import SUFFIXES, Mesh, Paint, distinct, face_normals, read_mesh
+from magtwin.urdf.meshes.texture import Textures
+from magtwin.urdf.options import DEFAULTS, Collision, Options
+from magtwin.urdf.source.source import MissingFileError
+from magtwin.usd.geometry import linear_from_srgb
+from magtwin.usd.layers import describe_stage
+
+T = TypeVar("T")
+
+ROOT = Sdf.Path("/Meshes")
+
+MESH = "mesh"
+"""Name of the mesh below a visual's prim."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A visual of the layer: an Xform with one mesh below it."""
+
+    path: Sdf.Path
+
+    paints: tuple[Paint | None, ...]
+    """Looks that the file gives; none stands for triangles to which it gives no look."""
+
+    subsets: tuple[str, ...]
+    """Names of the GeomSubsets below the mesh, one a paint; none where one paint covers all."""
+
+    textured: bool
+    """Whether the mesh has texture coordinates."""
+
+
+class MeshLayer:
+    """A layer of meshes, shared by every visual and collider that shows the same file at the same scale."""
+
+    def __init__(
+        self, description: Description, options: Options = DEFAULTS, textures: str = "./textures"
+    ) -> None:
+        """Start without a mesh.
+
+        Args:
+            description: Whose meshes they are; takes notes.
+            options: What meshes collide as, and what is done about missing ones.
+            textures: Asset path of the folder for textures, as the robot's layer sees it.
+        """
+        self.textures = Textures(textures)
+        self._description, self._options = description, options
+        self._stage = Usd.Stage.CreateInMemory()
+        describe_stage(self._stage, f"{description.name}: triangles of its meshes.")
+        self._stage.SetDefaultPrim(UsdGeom.Scope.Define(self._stage, ROOT).GetPrim())
+        self._names: set[str] = set()
+        self._found: dict[str, Path] = {}
+        self._files: dict[Path, Mesh] = {}
+        self._visuals: dict[tuple[Path, tuple[float, ...]], Entry] = {}
+        self._colliders: dict[tuple[Path, tuple[float, ...]], tuple[Sdf.Path, ...]] = {}
+        self._solids: dict[Path, tuple[Solid, ...]] = {}
+
+    @property
+    def collision(self) -> Collision:
+        """What meshes collide as."""
+        return self._options.collision
+
+    def __len__(self) -> int:
+        return len(self._visuals) + len(self._colliders)
+
+    def visual(self, mesh: UrdfMesh) -> Entry:
+        """The prim that shows a URDF `<mesh>`.
+
+        Args:
+            mesh: As the URDF names it.
+
+        Raises:
+            MissingFileError: The file is not there.
+            InputError: It is out of bounds, unreadable or empty, or the scale is none.
+        """
+        path, scale = self._file(mesh)
+        key = (path, scale)
+        if key not in self._visuals:
+            self._visuals[key] = self._define_visual(self._read(path), np.array(scale))
+        return self._visuals[key]
+
+    def collider(self, mesh: UrdfMesh) -> tuple[Sdf.Path, ...]:
+        """The mesh prims that a URDF `<mesh>` collides as: one, or several of a convex decomposition.
+
+        Args and refusals as for `visual`.
+        """
+        path, scale = self._file(mesh)
+        key = (path, scale)
+        if key not in self._colliders:
+            if path not in self._solids:
+                self._solids[path] = solids_of(self._read(path), self._options.collision)
+            self._colliders[key] = tuple(
+                self._define_solid(solid, np.array(scale), f"{path.stem}_{_form(self._options.collision)}")
+                for solid in self._solids[path]
+            )
+        return self._colliders[key]
+
+    def try_add(self, mesh: UrdfMesh, add: Callable[[UrdfMesh], T], label: str = "") -> T | None:
+        """What `visual` or `collider` gives; none, with a note, where the file is missing and that will do.
+
+        Args:
+            mesh: As the URDF names it.
+            add: `visual` or `collider`.
+            label: Whose mesh it is, for the note; "" makes none.
+        """
+        try:
+            return add(mesh)
+        except MissingFileError:
+            if self._options.missing_meshes != "note":
+                raise
+            if label:
+                text = f"{label} is left out: its mesh {mesh.filename!r} is missing"
+                self._description.note(text, lost=True)
+            return None
+
+    def vertices(self, mesh: UrdfMesh) -> NDArray[np.float64]:
+        """Vertices of a URDF `<mesh>` that was added, as its file has them, scaled [m], shape (V, 3)."""
+        path, scale = self._file(mesh)
+        return self._files[path].points.astype(float) * scale
+
+    def export(self, path: Path) -> None:
+        """Write the layer."""
+        self._stage.GetRootLayer().Export(str(path))
+
+    def _file(self, mesh: UrdfMesh) -> tuple[Path, tuple[float, ...]]:
+        """File and scale of a URDF `<mesh>`."""
+        name, urdf = mesh.filename, self._description.path
+        if Path(name).suffix.lower() not in SUFFIXES:
+            raise InputError(f"{urdf}: mesh {name!r} is of no known format ({', '.join(SUFFIXES)})")
+        if name not in self._found:
+            self._found[name] = self._description.find_file(name, "mesh")
+        if not mesh.scale.all():
+            raise InputError(
+                f"{urdf}: mesh {name!r} has scale {mesh.scale.tolist()}; give three numbers but 0"
+            )
+        return self._found[name], tuple(float(f) for f in np.broadcast_to(mesh.scale, 3))
+
+    def _read(self, path: Path) -> Mesh:
+        if path not in self._files:
+            self._files[path] = read_mesh(path, self._description.source.packages.holds)
+            for note in self._files[path].notes:
+                self._description.note(note.text, lost=note.lost)
+        return self._files[path]
+
+    def _define_visual(self, file: Mesh, scale: NDArray) -> Entry:
+        xform = UsdGeom.Xform.Define(self._stage, self._free(file.path.stem))
+        points, faces = _scaled(file.points, file.faces, scale)
+        corners = slice(None, None, -1) if np.prod(scale) < 0 else slice(None)
+        normals = file.shaded()[:, corners] / scale
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        mesh = self._define_mesh(xform.GetPath().AppendChild(MESH), points, faces)
+        _primvar(mesh, "normals", Sdf.ValueTypeNames.Normal3fArray, np.round(normals, 4))
+        if any(paint is not None and paint.double_sided for paint in file.paints):
+            mesh.CreateDoubleSidedAttr(True)
+        if file.uvs is not None:
+            _primvar(mesh, "st", Sdf.ValueTypeNames.TexCoord2fArray, np.nan_to_num(file.uvs[:, corners]))
+        subsets: list[str] = []
+        if len(file.paints) > 1:
+            subsets = _subsets(mesh, file)
+        self._define_colours(mesh, file, corners)
+        return Entry(xform.GetPath(), file.paints, tuple(subsets), file.uvs is not None)
+
+    def _define_colours(self, mesh: UsdGeom.Mesh, file: Mesh, corners: slice) -> None:
+        """Colours for viewers without materials, and those of corners, which materials show too.
+
+        A mesh of one colour has none: its visual says it.
+        """
+        kind, tokens = Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens
+        by_paint = np.array([display_colour(paint) for paint in file.paints], np.float32)
+        if file.colours is not None:
+            colours = np.where(np.isfinite(file.colours), file.colours, by_paint[file.paint][:, None])
+            _primvar(mesh, "displayColor", kind, np.round(colours[:, corners], 4))
+        elif len(file.paints) > 1:
+            primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("displayColor", kind, tokens.uniform)
+            primvar.Set(Vt.Vec3fArray.FromNumpy(by_paint))
+            primvar.SetIndices(Vt.IntArray.FromNumpy(file.paint.astype(np.int32)))
+
+    def _define_solid(self, solid: Solid, scale: NDArray, name: str) -> Sdf.Path:
+        points, faces = _scaled(solid.points, solid.faces, scale)
+        mesh = self._define_mesh(self._free(name), points, faces)
+        normals = np.round(face_normals(points, faces), 4)
+        _primvar(mesh, "normals", Sdf.ValueTypeNames.Normal3fArray, normals, UsdGeom.Tokens.uniform)
+        return mesh.GetPath()
+
+    def _define_mesh(self, path: Sdf.Path, points: NDArray, faces: NDArray) -> UsdGeom.Mesh:
+        mesh = UsdGeom.Mesh.Define(self._stage, path)
+        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+        mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+        mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.ravel().astype(np.int32)))
+        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.array([points.min(0), points.max(0)])))
+        return mesh
+
+    def _free(self, name: str) -> Sdf.Path:
+        """Path of a prim that is not there yet, called `name` if that is free."""
+        return ROOT.AppendChild(free_name(Tf.MakeValidIdentifier(name), self._names))
+
+
+def gather(description: Description, options: Options, textures: str) -> MeshLayer:
+    """Every mesh that a link shows or touches with; other args as for `MeshLayer`.
+
+    Raises:
+        InputError: One cannot be read; or is missing, and `options` do not say that a note will do.
+    """
+    meshes = MeshLayer(description, options, textures)
+    colliding = False
+    for name, link in description.links.items():
+        for visual in link.visuals:
+            if visual.geometry.mesh is not None:
+                meshes.try_add(visual.geometry.mesh, meshes.visual, f"link {name!r}: visual")
+        for collision in link.collisions:
+            if collision.geometry.mesh is not None:
+                meshes.try_add(collision.geometry.mesh, meshes.collider, f"link {name!r}: collision")
+                colliding = True
+    if options.collision == "mesh" and colliding:
+        description.note(
+            "meshes collide as they are; PhysX allows that for bodies that stand still, and takes the convex "
+            "hulls of those that move"
+        )
+    return meshes
+
+
+def _form(collision: Collision) -> str:
+    """What a collider's prim is called after its file."""
+    return {"hull": "hull", "decomposition": "part", "mesh": "exact"}[collision]
+
+
+def free_name(name: str, taken: set[str]) -> str:
+    """A name that is not taken, and is from now on: `name`, or `name_2` and so on."""
+    unique, number = name, 1
+    while unique in taken:
+        number += 1
+        unique = f"{name}_{number}"
+    taken.add(unique)
+    return unique
+
+
+def display_colour(paint: Paint | None) -> tuple[float, float, float]:
+    """Linear colour by which a viewer without materials shows a paint."""
+    if paint is None:
+        r, g, b = linear_from_srgb(GREY[:3])
+    else:
+        mean = (1.0, 1.0, 1.0) if paint.image is None else paint.image.mean
+        r, g, b = linear_from_srgb(paint.rgba[:3]) * linear_from_srgb(mean)
+    return (round(float(r), 5), round(float(g), 5), round(float(b), 5))
+
+
+def _scaled(points: NDArray, faces: NDArray, scale: NDArray) -> tuple[NDArray[np.float32], NDArray]:
+    """Points and faces at a scale, facing outwards still where that mirrors."""
+    scaled = (points * scale).astype(np.float32)
+    return scaled, faces[:, ::-1] if np.prod(scale) < 0 else faces
+
+
+def _primvar(
+    mesh: UsdGeom.Mesh,
+    name: str,
+    kind: Sdf.ValueTypeName,
+    values: NDArray,
+    interpolation: str = UsdGeom.Tokens.faceVarying,
+) -> None:
+    """A primvar of values at corners, shape (F, 3, K), or of another interpolation; each value once."""
+    rows = values.reshape(-1, values.shape[-1]).astype(np.float32) + np.float32(0)
+    first, index = distinct(rows)
+    arrays = {2: Vt.Vec2fArray, 3: Vt.Vec3fArray}
+    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(name, kind, interpolation)
+    primvar.Set(arrays[rows.shape[1]].FromNumpy(np.ascontiguousarray(rows[first])))
+    primvar.SetIndices(Vt.IntArray.FromNumpy(index.astype(np.int32)))
+
+
+def _subsets(mesh: UsdGeom.Mesh, file: Mesh) -> list[str]:
+    """A GeomSubset a paint, named after it."""
+    api = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
+    taken: set[str] = set()
+    names: list[str] = []
+    for i, paint in enumerate(file.paints):
+        name = free_name(Tf.MakeValidIdentifier((paint.name if paint else "") or "plain"), taken)
+        faces = Vt.IntArray.FromNumpy(np.flatnonzero(file.paint == i).astype(np.int32))
+        api.CreateMaterialBindSubset(name, faces)
+        names.append(name)
+    api.SetMaterialBindSubsetsFamilyType(UsdGeom.Tokens.partition)
+    return names

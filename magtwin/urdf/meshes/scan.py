@@ -1,0 +1,78 @@
+"""Scan: STL and PLY, triangles without materials, read by trimesh."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.urdf.meshes.mesh import Piece
+from magtwin.urdf.meshes.reading import Reading
+from magtwin.usd.geometry import linear_from_srgb
+
+
+def read_scan(file: Reading) -> list[Piece]:
+    """The triangles of an STL or PLY file, as `read_mesh` has it.
+
+    An STL's normals are not read: they are its faces' own, and smooth ones are made from those. A PLY's
+    texture coordinates are not either: the format names no picture that they could belong to.
+    """
+    with file.path.open("rb") as stream:
+        if file.path.suffix.lower() == ".stl":
+            from trimesh.exchange.stl import load_stl
+
+            read = load_stl(stream)
+        else:
+            from trimesh.exchange.ply import load_ply
+
+            read = load_ply(stream)
+    parts = _parts(read)
+    if not parts and file.path.suffix.lower() == ".stl":
+        raise InputError(f"{file.path}: {_why_empty(file.path)}; export it again, or use a primitive")
+    return [_piece(part) for part in parts]
+
+
+def _why_empty(path: Path) -> str:
+    """Why an STL gave no triangle: a binary one has a header of 84 bytes, and 50 for each."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        head = stream.read(84)
+    if head.lstrip()[:5].lower() == b"solid" or len(head) < 84:
+        return "holds no triangle, or is cut short"
+    count = int.from_bytes(head[80:], "little")
+    return (
+        f"is of {size} bytes, though its {count} triangles need {84 + 50 * count}"
+        if count
+        else "holds no triangle"
+    )
+
+
+def _parts(read: dict[str, Any]) -> list[dict[str, Any]]:
+    """What trimesh's readers return: one mesh, or several by name, as an ASCII STL of several solids is."""
+    parts = list(read["geometry"].values()) if "geometry" in read else [read]
+    return [part for part in parts if part.get("faces") is not None and len(part["faces"])]
+
+
+def _piece(part: dict[str, Any]) -> Piece:
+    faces = np.asarray(part["faces"], np.int64)
+    normals, by_vertex, by_face = (
+        part.get(key) for key in ("vertex_normals", "vertex_colors", "face_colors")
+    )
+    colours = None
+    if by_vertex is not None:
+        colours = _linear(by_vertex)[faces]
+    elif by_face is not None:
+        colours = np.repeat(_linear(by_face)[:, None], 3, axis=1)
+    return Piece(
+        points=np.asarray(part["vertices"], float),
+        faces=faces,
+        normals=None if normals is None else np.asarray(normals)[faces],
+        colours=colours,
+    )
+
+
+def _linear(colours: NDArray) -> NDArray:
+    """Linear red, green, blue of colours in bytes or in 0 to 1, shape (N, 3)."""
+    colours = np.asarray(colours)
+    return linear_from_srgb(colours[:, :3] / (255 if colours.dtype.kind in "iu" else 1))

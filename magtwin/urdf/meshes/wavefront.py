@@ -1,0 +1,221 @@
+"""Wavefront: triangles of an .obj with the materials of its .mtl."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.urdf.meshes.mesh import Paint, Piece
+from magtwin.urdf.meshes.polygon import cut_polygons
+from magtwin.urdf.meshes.reading import Reading, numbers
+from magtwin.urdf.meshes.texture import read_image
+from magtwin.usd.geometry import linear_from_srgb
+
+UNREAD = ("curv", "curv2", "surf", "l", "p")
+"""Statements that draw something which is no polygon."""
+
+MAP_ARGUMENTS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
+"""Numbers that may follow an option of a texture; every other option has one word."""
+
+
+@dataclass
+class _Group:
+    """Polygons of one material."""
+
+    material: str
+    words: list[str] = field(default_factory=list)
+    """Corners of all polygons as the file has them: `v`, `v/vt`, `v//vn` or `v/vt/vn`, from 1."""
+    counts: list[int] = field(default_factory=list)
+    """Number of corners of each polygon."""
+    lines: list[int] = field(default_factory=list)
+    """Line of each polygon."""
+
+
+def read_wavefront(reading: Reading) -> list[Piece]:
+    """The triangles of a Wavefront OBJ, as `read_mesh` has it.
+
+    A colour after a vertex's coordinates is read (as MeshLab writes it).
+    """
+    path = reading.path
+    rows: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}
+    paints: dict[str, Paint] = {}
+    unread: set[str] = set()
+    group = _Group("")
+    groups = [group]
+    for number, kind, rest in _statements(path):
+        if kind in rows:
+            rows[kind].append(rest)
+        elif kind == "f":
+            words = rest.split()
+            if "-" in rest:
+                words = [_absolute(word, rows) for word in words]
+            if len(words) >= 3:
+                group.words += words
+                group.counts.append(len(words))
+                group.lines.append(number)
+        elif kind == "usemtl":
+            group = _Group(rest)
+            groups.append(group)
+        elif kind == "mtllib":
+            paints |= _read_library(rest, reading)
+        elif kind in UNREAD:
+            unread.add(kind)
+    if unread:
+        reading.lose(f"lines, points and curves ({', '.join(sorted(unread))}) are left out")
+    v, vt, vn = (_table(rows[kind], kind, least, path) for kind, least in (("v", 3), ("vt", 2), ("vn", 3)))
+    groups = [g for g in groups if g.counts]
+    for missing in dict.fromkeys(g.material for g in groups if g.material and g.material not in paints):
+        reading.lose(f"material {missing!r} is in none of its libraries; shown without it")
+    return [_piece(g, paints.get(g.material), v, vt, vn, path) for g in groups]
+
+
+def _statements(path: Path) -> Iterator[tuple[int, str, str]]:
+    """Line, keyword and the rest of each statement; a backslash at the end of a line joins the next."""
+    held = ""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for number, text in enumerate(file, 1):
+            line = held + text if held else text
+            if line.endswith("\\\n"):
+                held = line[:-2] + " "
+                continue
+            held = ""
+            parts = (line.partition("#")[0] if "#" in line else line).split(None, 1)
+            if len(parts) == 2:
+                yield number, parts[0], parts[1].rstrip()
+
+
+def _absolute(word: str, rows: dict[str, list[str]]) -> str:
+    """A corner whose negative numbers, which count back from the newest, count from the first."""
+    parts = word.split("/")
+    for i, (part, kind) in enumerate(zip(parts, ("v", "vt", "vn"), strict=False)):
+        if part.startswith("-") and part[1:].isdecimal():
+            parts[i] = str(len(rows[kind]) + 1 - int(part[1:]))
+    return "/".join(parts)
+
+
+def _corners(group: _Group, path: Path) -> NDArray[np.int64]:
+    """Vertex, texture coordinate and normal of each corner, from 0; -1 is none; shape (N, 3)."""
+    words = group.words
+    corners = np.zeros((len(words), 3), np.int64)
+    slashes = {word.count("/") for word in words}
+    doubled = sum("//" in word for word in words)
+    if slashes in ({0}, {1}, {2}) and doubled in (0, len(words)):
+        columns = [0, 2] if doubled else list(range(max(slashes) + 1))
+        values = numbers(" ".join(words).replace("/", " "), np.int64)
+        if len(values) == len(words) * len(columns):
+            corners[:, columns] = values.reshape(len(words), len(columns))
+            if (corners[:, columns] > 0).all():
+                return corners - 1
+    first = 0  # corners of several kinds, or malformed ones: one by one
+    for number, count in zip(group.lines, group.counts, strict=True):
+        for i in range(first, first + count):
+            parts = words[i].split("/")
+            try:
+                corners[i, : len(parts)] = [int(part or 0) for part in parts]
+            except ValueError:
+                corners[i, 0] = 0
+            if corners[i, 0] < 1 or corners[i].min() < 0:
+                polygon = " ".join(words[first : first + count])
+                raise InputError(f"{path}:{number}: face {polygon!r} is malformed; export it again")
+        first += count
+    return corners - 1
+
+
+def _table(rows: list[str], kind: str, least: int, path: Path) -> NDArray:
+    """Numbers of all `v`, `vt` or `vn`, one row each: as many as the first has, or the least."""
+    if not rows:
+        return np.empty((0, least))
+    width = len(rows[0].split())
+    values = numbers(" ".join(rows), float)
+    if width >= least and len(values) == len(rows) * width:
+        return values.reshape(len(rows), width)
+    try:
+        return np.array([row.split()[:least] for row in rows], float).reshape(len(rows), least)
+    except ValueError as error:
+        raise InputError(f"{path}: its {kind} are not {least} numbers each; export it again") from error
+
+
+def _piece(group: _Group, paint: Paint | None, v: NDArray, vt: NDArray, vn: NDArray, path: Path) -> Piece:
+    corners, counts = _corners(group, path), np.array(group.counts)
+    for column, table, name in ((0, v, "vertex"), (1, vt, "texture coordinate"), (2, vn, "normal")):
+        if corners[:, column].max() >= len(table):
+            raise InputError(
+                f"{path}: a face names {name} {corners[:, column].max() + 1} of {len(table)}; export it again"
+            )
+    index = corners[cut_polygons(v[:, :3], corners[:, 0], counts)]
+    faces = index[:, :, 0]
+    return Piece(
+        points=v[:, :3],
+        faces=faces,
+        paint=paint,
+        normals=_picked(vn, index[:, :, 2]),
+        uvs=_picked(vt[:, :2], index[:, :, 1]),
+        colours=linear_from_srgb(v[faces, 3:6]) if v.shape[1] >= 6 else None,
+    )
+
+
+def _picked(table: NDArray, index: NDArray) -> NDArray | None:
+    """Rows of a table; nan at corners that name none (-1), none where all do."""
+    if (index < 0).all():
+        return None
+    return np.where((index < 0)[..., None], np.nan, table[index])
+
+
+def _read_library(name: str, reading: Reading) -> dict[str, Paint]:
+    """Materials of an .mtl by name; none, with a note, where it cannot be read.
+
+    `Kd` is the colour and `d` (or 1 - `Tr`) the opacity; of a surface with `map_Kd` the picture is the
+    colour, since exporters write any `Kd` beside one.
+    """
+    library = reading.path.parent / name.replace("\\", "/")
+    if not reading.may_read(library):
+        reading.lose(f"material library {name!r} lies outside the robot's packages and is left out")
+        return {}
+    if not library.is_file():
+        reading.lose(f"material library {name!r} is missing; shown without it")
+        return {}
+    tables: dict[str, dict[str, list[str]]] = {}
+    table: dict[str, list[str]] = {}
+    for _, kind, rest in _statements(library):
+        if kind == "newmtl":
+            table = tables.setdefault(rest, {})
+        else:
+            table[kind.lower()] = rest.split()
+    return {material: _paint(material, table, library.parent, reading) for material, table in tables.items()}
+
+
+def _paint(name: str, table: dict[str, list[str]], folder: Path, reading: Reading) -> Paint:
+    try:
+        r, g, b = (
+            float(np.clip(float(word), 0, 1)) for word in (table.get("kd") or ["0.5", "0.5", "0.5"])[:3]
+        )
+        if "d" in table:
+            opacity = float(table["d"][-1])
+        else:
+            opacity = 1 - float(table["tr"][-1]) if "tr" in table else 1.0
+    except (ValueError, IndexError):
+        reading.note(f"material {name!r} has a malformed colour; taken as grey")
+        r, g, b, opacity = 0.5, 0.5, 0.5, 1.0
+    if not opacity > 0:
+        reading.note(f"material {name!r} would be invisible; taken as opaque")
+    opacity = min(opacity, 1.0) if opacity > 0 else 1.0
+    image = read_image(_file_of(table["map_kd"]), reading, folder) if table.get("map_kd") else None
+    return Paint(name, (r, g, b, opacity) if image is None else (1.0, 1.0, 1.0, opacity), image)
+
+
+def _file_of(words: list[str]) -> str:
+    """The file name after a texture's options; it may hold spaces."""
+    at = 0
+    while at < len(words) and re.fullmatch(r"-[a-z]+", words[at]):
+        numbers = MAP_ARGUMENTS.get(words[at], 1)
+        at += 1
+        taken = 0
+        while (
+            taken < numbers and at < len(words) - 1 and (taken == 0 or re.fullmatch(r"[-+.\deE]+", words[at]))
+        ):
+            at, taken = at + 1, taken + 1
+    return " ".join(words[at:])

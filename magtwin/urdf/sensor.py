@@ -1,0 +1,437 @@
+"""Sensor: `<sensor>` elements of `<gazebo>` tags as prims on their links, with their figures.
+
+Figures and their meaning after SDFormat's specification of `<sensor>` (sdformat.org/spec). Gazebo's
+sensors look along x, z up; USD's cameras along -z, y up.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdRender, Vt
+
+from magtwin.errors import InputError, hint
+from magtwin.frames import matrix_from_quat, quat_from_rpy
+from magtwin.spec.scene import ZERO3, ImuSpec, LidarSpec, MagnetometerSpec
+from magtwin.urdf.description.tag import Element, Tags
+from magtwin.urdf.shape import pose_of
+from magtwin.usd.schema import prims_with
+from magtwin.usd.sensors import (
+    EMITTER_API,
+    define_imu,
+    define_isaac_imu,
+    define_lidar,
+    define_magnetometer,
+    define_omni_lidar,
+    write_pose,
+)
+
+FACTS = "magtwin:sensor"
+"""Key of a sensor's customData: figures that no schema has, by name with their unit."""
+
+CONTACT_TYPE, CONTACT_API = "IsaacContactSensor", "PhysxContactReportAPI"
+"""NVIDIA's types, by name: their plugins live in Omniverse, not here."""
+
+SCANNER = np.pi
+"""View from which on a LiDAR is one that spins [rad]; below, it is a range finder."""
+
+APERTURE_MM = 20.955
+"""Width of a camera's aperture, UsdGeom's own default [mm]; the field of view is what counts."""
+
+RAYS, PIXELS = 2_000_000, 65_536
+"""Most rays of a LiDAR, and most pixels along a side of a camera's image."""
+
+X_FORWARD: NDArray[np.float64] = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Axes of USD's camera in Gazebo's sensor, as columns."""
+
+NT_PER_T = 1e9
+
+
+@dataclass(frozen=True)
+class Fan:
+    """Rays of a LiDAR in one plane, at even angles."""
+
+    least: float
+    """Angle of the first [rad]."""
+
+    most: float
+    """Angle of the last [rad]."""
+
+    count: int
+
+    @property
+    def angles(self) -> NDArray[np.float64]:
+        """Angle of each ray [rad], shape (count,); a single one looks along the middle."""
+        if self.count == 1:
+            return np.array([(self.least + self.most) / 2])
+        return np.linspace(self.least, self.most, self.count)
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where a sensor goes."""
+
+    stage: Usd.Stage
+    path: Sdf.Path
+    """Path of its prim, below its link's."""
+
+    pose: NDArray[np.float64]
+    """In its link, shape (4, 4)."""
+
+    @property
+    def mount(self) -> dict[str, Any]:
+        """Its place as fields of a MountSpec."""
+        p, q = pose_of(self.pose)
+        turn = {} if q is None else {"q_link_sensor_xyzw": q}
+        return {"link": self.path.GetParentPath().name, "p_link_sensor": p, **turn}
+
+    def define(self) -> Usd.Prim:
+        """An Xform there."""
+        prim = UsdGeom.Xform.Define(self.stage, self.path).GetPrim()
+        write_pose(prim, *pose_of(self.pose))
+        return prim
+
+
+def define_sensors(tags: Tags, robot: Usd.Prim, prim_of: Callable[[str], Usd.Prim]) -> list[Usd.Prim]:
+    """Author every `<sensor>` of `<gazebo reference="LINK">` that has a counterpart, on its link's prim.
+
+    IMU, magnetometer and the first LiDAR that spins get magtwin's schemas, so that magtwin simulates
+    them; there is one of each on a robot. All others are NVIDIA's types and USD's cameras alone. Sensors
+    without a counterpart are kept as text, with a note.
+
+    Args:
+        tags: Read.
+        robot: The robot's prim.
+        prim_of: Gives the prim of a link by its name.
+
+    Raises:
+        InputError: A figure of a sensor is not a number, or out of range; the text gives the line.
+    """
+    made, description = list[Usd.Prim](), tags.description
+    for block in tags.blocks("gazebo"):
+        link = block.get("reference", "")
+        for sensor in block.findall("sensor"):
+            name, kind = sensor.get("name") or "sensor", (sensor.get("type") or "").lower()
+            start = f"sensor {name!r} of link {link!r}"
+            if link not in description.links:
+                description.note(f"{start}: {hint(link, description.links)}; it is kept as text", lost=True)
+                continue
+            if kind not in KINDS:
+                description.note(f"{start} is of type {kind!r}, which has no counterpart: kept as text")
+                continue
+            tags.read(sensor)
+            prim = prim_of(link)
+            site = Site(prim.GetStage(), _free(prim, name), _pose(tags, sensor))
+            try:
+                made.append(KINDS[kind](tags, sensor, site, robot))
+            except InputError as error:
+                if str(error).startswith(str(description.path)):
+                    raise
+                raise InputError(f"{description.where(sensor)}: {start}: {error}") from error
+    return made
+
+
+def _define_imu(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd.Prim:
+    rate = _rate(tags, sensor, ImuSpec.rate_hz)
+    spec = ImuSpec(
+        **site.mount,
+        rate_hz=rate,
+        tilt=(0.0, 0.0),  # Gazebo gives the true orientation, and shakes nothing
+        level_error=(0.0, 0.0),
+        tilt_std=0.0,
+        orientation_noise_std=0.0,
+        gyro_bias_walk=0.0,
+        gyro_vibration=ZERO3,
+        accel_vibration=ZERO3,
+        gyro_noise_std=_noise(tags, tags.find(sensor, "imu/angular_velocity", "imu/noise/rate")),
+        accel_noise_std=_noise(tags, tags.find(sensor, "imu/linear_acceleration", "imu/noise/accel")),
+    )
+    if not prims_with(robot, "imu"):
+        return define_imu(site.stage, site.path, spec)
+    prim = _facts(
+        site.define(), rateHz=rate, gyroNoiseStd=spec.gyro_noise_std, accelNoiseStd=spec.accel_noise_std
+    )
+    define_isaac_imu(prim, rate)
+    tags.description.note(f"{_say(sensor)} is an IMU more than magtwin simulates; others see it")
+    return prim
+
+
+def _define_magnetometer(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd.Prim:
+    rate = _rate(tags, sensor, MagnetometerSpec.rate_hz)
+    noise = NT_PER_T * _noise(tags, tags.find(sensor, "magnetometer"))
+    if noise:
+        tags.description.note(f"{_say(sensor)}: its noise is taken as tesla, {noise:.6g} nT")
+    if prims_with(robot, "magnetometer"):
+        tags.description.note(f"{_say(sensor)} is a magnetometer more than magtwin simulates")
+        return _facts(site.define(), rateHz=rate, noiseStdNt=noise)
+    density = noise / math.sqrt(rate / 2)
+    spec = MagnetometerSpec(**site.mount, rate_hz=rate, noise_density_nt=density, resolution_nt=0.0)
+    return define_magnetometer(site.stage, site.path, spec)
+
+
+def _define_lidar(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd.Prim:
+    scan = tags.find(sensor, "lidar", "ray")
+    if scan is None:
+        raise InputError("has no <lidar> or <ray>")
+    across, up = (_fan(tags, tags.find(scan, f"scan/{axis}")) for axis in ("horizontal", "vertical"))
+    near = tags.number(scan, "range/min", least=0.0) or 0.0
+    far = tags.number(scan, "range/max", above=0.0)
+    if far is None or not far > near:
+        raise InputError(f"its farthest range {far} m is not above its nearest {near:g} m; give both")
+    if across.count * up.count > RAYS:
+        raise InputError(f"it has {across.count} x {up.count} rays, over {RAYS}")
+    rate = _rate(tags, sensor, LidarSpec.scan_rate_hz)
+    noise, step = _noise(tags, scan), tags.number(scan, "range/resolution", least=0.0) or 0.0
+    spins = across.most - across.least >= SCANNER
+    if spins and not prims_with(robot, "lidar"):
+        spec = LidarSpec(
+            **site.mount,
+            scan_rate_hz=rate,
+            rays=across.count,
+            range_min_m=near,
+            range_max_m=far,
+            range_noise_std_m=noise,
+            off_s=0.0,
+        )
+        prim = define_lidar(site.stage, site.path, spec)
+    else:
+        prim = site.define()
+        if spins:
+            tags.description.note(f"{_say(sensor)} is a LiDAR more than magtwin simulates; others see it")
+    lidar = define_omni_lidar(prim, rate, (near, far), rotary=spins)
+    if spins:
+        _define_turning(lidar, across, up, rate)
+    else:
+        _define_fixed(lidar, across, up)
+    _write(lidar, "rangeResolutionM", Sdf.ValueTypeNames.Float, step)
+    _write(lidar, "rangeAccuracyM", Sdf.ValueTypeNames.Float, noise)
+    _facts(
+        prim,
+        rateHz=rate,
+        noiseStdM=noise,
+        horizontalSamples=across.count,
+        horizontalMinRad=across.least,
+        horizontalMaxRad=across.most,
+        verticalSamples=up.count,
+        verticalMinRad=up.least,
+        verticalMaxRad=up.most,
+    )
+    return prim
+
+
+def _define_turning(lidar: Usd.Prim, across: Fan, up: Fan, rate_hz: float) -> None:
+    """A column of emitters that fires at even angles and keeps what lies between two azimuths."""
+    span = across.most - across.least
+    full = np.isclose(span, 2 * np.pi, atol=1e-3)
+    start, end = (0.0, 360.0) if full else (np.degrees(a) % 360 for a in (across.least, across.most))
+    firings = max(1, across.count - 1) * 2 * np.pi / span * rate_hz
+    names = Sdf.ValueTypeNames
+    _write(lidar, "validStartAzimuthDeg", names.Float, start)
+    _write(lidar, "validEndAzimuthDeg", names.Float, end)
+    _write(lidar, "patternFiringRateHz", names.UInt, max(1, round(float(firings))))
+    _define_emitters(lidar, np.zeros(up.count), up.angles)
+
+
+def _define_fixed(lidar: Usd.Prim, across: Fan, up: Fan) -> None:
+    """A grid of emitters that all fire at once, line by line."""
+    names = Sdf.ValueTypeNames
+    _write(lidar, "numLines", names.UInt, up.count)
+    _write(lidar, "numRaysPerLine", names.UIntArray, Vt.UIntArray([across.count] * up.count))
+    azimuth, elevation = np.meshgrid(across.angles, up.angles)
+    _define_emitters(lidar, azimuth.ravel(), elevation.ravel())
+
+
+def _define_emitters(lidar: Usd.Prim, azimuth: NDArray, elevation: NDArray) -> None:
+    """Directions of the emitters [rad], shape (E,)."""
+    names, state, count = Sdf.ValueTypeNames, "emitterState:s001:", len(azimuth)
+    if EMITTER_API not in lidar.GetPrimTypeInfo().GetAppliedAPISchemas():
+        lidar.AddAppliedSchema(EMITTER_API)
+    _write(lidar, "numberOfEmitters", names.UInt, count)
+    _write(lidar, "numberOfChannels", names.UInt, count)
+    for name, angle in (("azimuthDeg", azimuth), ("elevationDeg", elevation)):
+        degrees = np.round(np.degrees(angle), 6) + 0.0
+        _write(lidar, state + name, names.FloatArray, Vt.FloatArray(list(map(float, degrees))))
+    _write(lidar, state + "fireTimeNs", names.UIntArray, Vt.UIntArray([0] * count))
+    _write(lidar, state + "channelId", names.UIntArray, Vt.UIntArray(range(1, count + 1)))
+
+
+def _define_camera(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd.Prim:
+    lens = tags.find(sensor, "camera")
+    if lens is None:
+        raise InputError("has no <camera>")
+    if tags.find(lens, "pose") is not None:
+        site = Site(site.stage, site.path, site.pose @ _pose(tags, lens))
+    fov = tags.number(lens, "horizontal_fov", above=0.0)
+    fov = 1.047 if fov is None else fov  # SDFormat's own default
+    if not fov < np.pi:
+        raise InputError(f"its horizontal_fov of {fov:g} rad is no perspective's; give one below pi")
+    size = [tags.number(lens, f"image/{side}", above=0.0) for side in ("width", "height")]
+    width, height = (int(n or default) for n, default in zip(size, (320, 240), strict=True))
+    if not 1 <= min(width, height) <= max(width, height) <= PIXELS:
+        raise InputError(f"its image of {width:g} x {height:g} is none; give sides from 1 to {PIXELS}")
+    near = tags.number(lens, "clip/near", "depth_camera/clip/near", above=0.0) or 0.1
+    far = tags.number(lens, "clip/far", "depth_camera/clip/far", above=0.0) or 100.0
+    if not far > near:
+        raise InputError(f"its clip has far {far:g} m not beyond near {near:g} m")
+    prim = site.define()
+    camera = UsdGeom.Camera.Define(site.stage, site.path.AppendChild("camera"))
+    turn = np.eye(4)
+    turn[:3, :3] = X_FORWARD
+    write_pose(camera.GetPrim(), *pose_of(turn))
+    camera.CreateProjectionAttr(UsdGeom.Tokens.perspective)
+    camera.CreateHorizontalApertureAttr(APERTURE_MM)
+    camera.CreateVerticalApertureAttr(APERTURE_MM * height / width)
+    camera.CreateFocalLengthAttr(APERTURE_MM / 2 / np.tan(fov / 2))
+    camera.CreateClippingRangeAttr(Gf.Vec2f(near, far))
+    kind = (sensor.get("type") or "").lower()
+    _define_image(prim, camera, (width, height), depth=kind != "camera", colour=not kind.startswith("depth"))
+    return _facts(
+        prim,
+        type=kind,
+        rateHz=_rate(tags, sensor, 30.0),
+        width=width,
+        height=height,
+        horizontalFovRad=fov,
+        noiseStd=_noise(tags, lens),
+    )
+
+
+def _define_image(
+    prim: Usd.Prim, camera: UsdGeom.Camera, size: tuple[int, int], *, depth: bool, colour: bool
+) -> None:
+    """What a camera gives: a render product of its resolution with its channels."""
+    stage = prim.GetStage()
+    product = UsdRender.Product.Define(stage, prim.GetPath().AppendChild("image"))
+    product.CreateResolutionAttr(Gf.Vec2i(*size))
+    product.CreateCameraRel().SetTargets([camera.GetPath()])
+    made = []
+    for name, source, wanted in (
+        ("colour", "LdrColor", colour),
+        ("depth", "DistanceToImagePlaneSD", depth),
+    ):
+        if wanted:
+            var = UsdRender.Var.Define(stage, product.GetPath().AppendChild(name))
+            var.CreateSourceNameAttr(source)
+            made.append(var.GetPath())
+    product.CreateOrderedVarsRel().SetTargets(made)
+
+
+def _define_contact(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd.Prim:
+    rate = _rate(tags, sensor, 0.0)
+    link = site.stage.GetPrimAtPath(site.path.GetParentPath())
+    prim = site.stage.DefinePrim(site.path, CONTACT_TYPE)  # NVIDIA's wants the body as its parent
+    names = Sdf.ValueTypeNames
+    prim.CreateAttribute("enabled", names.Bool, custom=False).Set(True)
+    prim.CreateAttribute("sensorPeriod", names.Float, custom=False).Set(1 / rate if rate else 0.0)
+    link.AddAppliedSchema(CONTACT_API)
+    return prim
+
+
+KINDS: Mapping[str, Callable[[Tags, Element, Site, Usd.Prim], Usd.Prim]] = {
+    "imu": _define_imu,
+    "imu_sensor": _define_imu,
+    "magnetometer": _define_magnetometer,
+    **dict.fromkeys(("ray", "gpu_ray", "lidar", "gpu_lidar"), _define_lidar),
+    **dict.fromkeys(("camera", "depth", "depth_camera", "rgbd", "rgbd_camera"), _define_camera),
+    "contact": _define_contact,
+}
+"""Types of sensors that have a counterpart."""
+
+
+def _say(sensor: Element) -> str:
+    return f"sensor {sensor.get('name') or 'sensor'!r}"
+
+
+def _rate(tags: Tags, sensor: Element, default: float) -> float:
+    """Readings a second [Hz]; Gazebo's 0 and nothing mean each step of its own."""
+    rate = tags.number(sensor, "update_rate", least=0.0)
+    if tags.flag(sensor, "always_on") is False:
+        tags.description.note(f"{_say(sensor)} is off until asked in Gazebo; here it is on")
+    if not rate and default:
+        tags.description.note(f"{_say(sensor)} gives no rate: {default:g} Hz")
+    return rate or default
+
+
+def _noise(tags: Tags, element: Element | None) -> float:
+    """Standard deviation of a sensor's white noise: of the axes' the root mean square; 0 for none."""
+    if element is None:
+        return 0.0
+    if element.tag in ("rate", "accel"):
+        places: tuple[str, ...] = ("",)
+    else:
+        places = ("noise/", *(f"{axis}/noise/" for axis in "xyz"))
+    found = []
+    for place in places:
+        tags.nothing(element, *(f"{place}{tag}" for tag in ("mean", "bias_mean", "bias_stddev")))
+        if place:
+            tags.find(element, f"{place}type")
+        value = tags.number(element, f"{place}stddev", least=0.0)
+        if value is not None:
+            found.append(value)
+    if len(set(found)) > 1:
+        words = ", ".join(f"{value:g}" for value in found)
+        tags.description.note(
+            f"{tags.description.where(element)}: noise {words} of the axes becomes their RMS"
+        )
+    return found[0] if len(set(found)) == 1 else float(np.sqrt(np.mean(np.square(found or [0.0]))))
+
+
+def _fan(tags: Tags, element: Element | None) -> Fan:
+    """The rays of a LiDAR's `<horizontal>` or `<vertical>`; one where there is none."""
+    samples = tags.number(element, "samples", least=1)
+    density = tags.number(element, "resolution", above=0.0)
+    count = max(1, round((samples or 1) * (1.0 if density is None else density)))
+    least = tags.number(element, "min_angle") or 0.0
+    most = tags.number(element, "max_angle") or 0.0
+    if most < least or most - least > 2 * np.pi + 1e-6:
+        raise InputError(f"its angles go from {least:g} to {most:g} rad; give them in order, a turn at most")
+    return Fan(least, most, count)
+
+
+def _pose(tags: Tags, element: Element) -> NDArray[np.float64]:
+    """A `<pose>` x y z roll pitch yaw, shape (4, 4).
+
+    Raises:
+        InputError: It is not six finite numbers, or is given in another frame than the link's.
+    """
+    found, T = tags.find(element, "pose"), np.eye(4)
+    if found is None or not (found.text or "").strip():
+        return T
+    where = tags.description.where(found)
+    frame = found.get("relative_to") or found.get("frame")
+    if frame:
+        raise InputError(
+            f"{where}: a pose relative to {frame!r} is not followed; give it in the link's frame"
+        )
+    try:
+        values = [float(word) for word in (found.text or "").split()]
+    except ValueError:
+        values = []
+    if len(values) != 6 or not np.isfinite(values).all():
+        raise InputError(f"{where}: a pose is x y z roll pitch yaw, got {(found.text or '').strip()!r}")
+    angles = np.radians(values[3:]) if found.get("degrees", "").lower() in ("true", "1") else values[3:]
+    T[:3, :3], T[:3, 3] = matrix_from_quat(quat_from_rpy(angles)), values[:3]
+    return T
+
+
+def _facts(prim: Usd.Prim, **facts: object) -> Usd.Prim:
+    """Keep figures that no schema has on a sensor's prim."""
+    for name, value in facts.items():
+        prim.SetCustomDataByKey(f"{FACTS}:{name}", value)
+    return prim
+
+
+def _write(lidar: Usd.Prim, name: str, kind: Sdf.ValueTypeName, value: object) -> None:
+    """Set an attribute of NVIDIA's LiDAR, whose schema is not here."""
+    lidar.CreateAttribute(f"omni:sensor:Core:{name}", kind, custom=False).Set(value)
+
+
+def _free(prim: Usd.Prim, name: str) -> Sdf.Path:
+    """Path of a child of a link's prim that is not there yet, called `name` if that is free."""
+    name = Tf.MakeValidIdentifier(name)
+    taken = {child.GetName() for child in prim.GetChildren()}
+    unique = next(n for n in (name, *(f"{name}_{i}" for i in range(2, 10_000))) if n not in taken)
+    return prim.GetPath().AppendChild(unique)

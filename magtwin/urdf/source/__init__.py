@@ -1,0 +1,1 @@
+"""The text of a robot description: XML, xacro, packages and settings."""

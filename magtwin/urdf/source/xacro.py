@@ -1,0 +1,401 @@
+"""Xacro: macros expanded to plain URDF, by the xacro library with every reach to the outside replaced.
+
+The library's own `${...}` and `$(eval ...)` run Python with ways around their guard, `load_yaml` and
+`<xacro:include>` read any file and `$(env)` any variable. Here texts are evaluated by `expression`; files
+are read from the description's folder and from packages only; environment variables are not read (what
+`$(env)` and `$(optenv)` ask for is given as an argument). The library keeps macros, scopes, blocks,
+conditions and lazy properties.
+"""
+
+import glob
+import importlib.util
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from xml.dom import minidom
+from xml.etree import ElementTree
+
+from magtwin.errors import InputError, hint
+from magtwin.urdf.source.expression import GLOBALS, LARGEST, Budget, ExpressionError, check_size, evaluate
+from magtwin.urdf.source.markup import parse_markup
+from magtwin.urdf.source.package import Packages
+
+UNITS, ELEMENT = 20_000_000, 100
+"""What an expansion may cost, see `Budget`, and the part of it that each element costs."""
+
+PLACE = "magtwin.place"
+"""Key of the file and line that a node carries, through copies too."""
+
+_PIECES = re.compile(
+    r"(?P<escaped>\$\$+[{(])|\$\{(?P<expression>[^}]*)\}|\$\((?P<command>[^)]*)\)|(?P<text>[^$]+|\$[^{($]+|\$$)"
+)
+"""Lexemes of a text, as xacro has them."""
+
+Place = tuple[Path, int]
+
+
+def expand(
+    path: Path, packages: Packages, arguments: Mapping[str, str]
+) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place], tuple[str, ...]]:
+    """The URDF that a xacro stands for.
+
+    Args:
+        path: The xacro.
+        packages: Where `$(find)` leads, and what may be included.
+        arguments: Values of `<xacro:arg>`, before their defaults.
+
+    Returns:
+        `<robot>`; file and line of each element; and what the user ought to know, one line each.
+
+    Raises:
+        InputError: It is not XML, reaches out of the packages, has an expression that is not of the
+            language, or does not end; file and line are given.
+    """
+    return _Expansion(path, packages, arguments).run()
+
+
+class _Expansion:
+    """One expansion, on an instance of the library's module of its own: it keeps its state in globals."""
+
+    def __init__(self, path: Path, packages: Packages, arguments: Mapping[str, str]) -> None:
+        self._path = path
+        self._packages = packages
+        self._arguments = dict(arguments)
+        self._asked: set[str] = set()
+        self._budget = Budget(UNITS)
+        self._at: Place = (path, 1)
+        self._notes: list[str] = []
+        self._library = _library()
+        self._replace_reaches()
+
+    def run(self) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place], tuple[str, ...]]:
+        library = self._library
+        try:
+            library.init_stacks(str(self._path))
+            document = self._parse(None, str(self._path))
+            library.process_doc(document, mappings=dict(self._arguments), verbosity=0)
+        except RecursionError as error:
+            raise self._refused("expands without end: a macro or an include leads to itself") from error
+        except ExpressionError as error:
+            raise self._refused(str(error)) from error
+        except library.XacroException as error:
+            raise self._refused(" ".join(str(error.args[0] or error).split())) from error
+        except InputError:
+            raise
+        except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+            raise self._refused(f"cannot be expanded: {error}") from error  # the library's way to say no
+        unknown = [name for name in self._arguments if name not in self._asked]
+        if unknown:
+            known = hint(unknown[0], self._asked) if self._asked else "it has none"
+            raise InputError(f"{self._path}: no xacro argument {unknown[0]!r}; {known}")
+        assert document.documentElement is not None  # it was parsed
+        root, places = _to_tree(document.documentElement, (self._path, 1))
+        return root, places, tuple(self._notes)
+
+    def _refused(self, text: str) -> InputError:
+        file, line = self._at
+        return InputError(f"{file}:{line}: {text}")
+
+    def _replace_reaches(self) -> None:
+        """Put our own in place of whatever of the library evaluates, reads, or prints."""
+        library = self._library
+        ours: dict[str, Callable[..., Any]] = {
+            "eval_text": self._text,
+            "safe_eval": _forbidden,
+            "eval_extension": _forbidden,
+            "load_yaml": _forbidden,
+            "parse": self._parse,
+            "get_include_files": self._included,
+            "print_location": lambda: None,
+            "warning": self._note,
+            "message": self._note,
+            "error": self._note,
+        }
+        for name in ("check_attrs", "eval_all", "handle_macro_call", "reqd_attrs"):
+            ours[name] = self._followed(getattr(library, name))
+        for name, replacement in ours.items():
+            if not hasattr(library, name):
+                raise InputError(f"xacro: this version has no {name}; install xacro 2.1")
+            setattr(library, name, replacement)
+        xacro = {
+            "abs_filename": library.abs_filename_spec,
+            "arg": self._argument,
+            "dotify": dict,
+            "error": self._note,
+            "fatal": self._fatal,
+            "load_yaml": self._yaml,
+            "message": self._note,
+            "tokenize": _tokenize,
+            "warning": self._note,
+        }
+        shown = {name: xacro[name] for name in ("abs_filename", "dotify", "load_yaml")}
+        vars(library)["_global_symbols"] = {**GLOBALS, **shown, "xacro": xacro}
+
+    def _followed(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The library's function, with the node that it works on kept in mind and paid for."""
+
+        def follow(node: minidom.Element, *arguments: Any) -> Any:
+            self._budget.spend(ELEMENT)
+            self._at = node.getUserData(PLACE) or self._at
+            if node.tagName == "xacro:arg":
+                self._asked.add(node.getAttribute("name"))
+            return function(node, *arguments)
+
+        return follow
+
+    def _text(self, text: str, symbols: Mapping[str, Any]) -> Any:
+        """The value of a text: that of its one expression, or all joined to a text."""
+        values: list[Any] = []
+        end = size = 0
+        for piece in _PIECES.finditer(text):
+            if piece.start() != end:
+                break
+            end = piece.end()
+            kind = piece.lastgroup
+            content = piece[kind or 0]
+            if kind == "escaped":
+                content = content[1:]
+            elif kind == "expression":
+                value = evaluate(str(self._text(content, symbols)), symbols, self._budget)
+                content = check_size(value, self._budget, plain=True)
+            elif kind == "command":
+                content = self._command(str(self._text(content, symbols)))
+            values.append(content)
+        if end != len(text):
+            raise ExpressionError(f"not closed: {text[end : end + 40]!r}")
+        if len(values) == 1:
+            return values[0]
+        words = []
+        for value in values:
+            words.append(str(check_size(value, self._budget)))
+            size += len(words[-1])
+            if size > 16 * LARGEST:
+                raise ExpressionError(f"a text of over {16 * LARGEST} characters")
+        return "".join(words)
+
+    def _command(self, text: str) -> str:
+        """The value of `$(...)`."""
+        command, _, rest = text.strip().partition(" ")
+        words = rest.split()
+        if command == "eval":
+            return str(evaluate(rest, _Arguments(self), self._budget))
+        if command in ("find", "arg", "env") and len(words) != 1:
+            raise ExpressionError(f"$({text}): {command} takes one name")
+        if command == "find":
+            return self._find(words[0])
+        if command == "arg":
+            return str(self._argument(words[0]))
+        if command == "env":
+            return self._variable(words[0], None)
+        if command == "optenv" and words:
+            return self._variable(words[0], " ".join(words[1:]))
+        if command == "dirname":
+            return str(Path(self._library.filestack[-1]).resolve().parent)
+        raise ExpressionError(f"$({text}) is not known; known: arg, dirname, env, eval, find, optenv")
+
+    def _find(self, name: str) -> str:
+        try:
+            return str(self._packages.find(name))
+        except InputError as error:
+            raise ExpressionError(f"$(find {name}): {error}") from error
+
+    def _argument(self, name: str) -> Any:
+        self._asked.add(name)
+        table = self._library.substitution_args_context["arg"]
+        if name not in table:
+            raise ExpressionError(f"no argument {name!r}; give --arg {name}=VALUE")
+        return table[name]
+
+    def _variable(self, name: str, default: str | None) -> str:
+        self._asked.add(name)
+        if name in self._arguments:
+            return self._arguments[name]
+        if default is None:
+            raise ExpressionError(f"environment variables are not read; give --arg {name}=VALUE")
+        self._note(f"environment variable {name} is not read, {default!r} is taken; give --arg {name}=VALUE")
+        return default
+
+    def _included(self, filename: str, names: Mapping[str, Any]) -> Iterator[str]:
+        """Files of an `<xacro:include>`."""
+        wanted = self._library.abs_filename_spec(str(self._text(filename, names)))
+        files = [wanted]
+        if pattern := re.search(r"[*?\[]", wanted):
+            self._check_inside(os.path.dirname(wanted[: pattern.start()]), "include")  # noqa: PTH120
+            files = sorted(glob.glob(wanted))  # noqa: PTH207 - the pattern may be absolute
+        if not files:
+            self._note(f"include {filename!r} names no file that is there")
+        for file in files:
+            self._check_inside(file, "include")
+            yield file
+
+    def _check_inside(self, file: str, what: str) -> Path:
+        path = Path(os.path.normpath(file))
+        if not self._packages.holds(path):
+            raise ExpressionError(
+                f"{what} {str(path)!r} lies outside {self._packages.home} and of all packages; "
+                "name its folder by --package NAME=FOLDER"
+            )
+        return path
+
+    def _parse(self, text: None, filename: str) -> minidom.Document:
+        """The DOM of a file; each element carries its place."""
+        path = Path(os.path.normpath(filename))
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            self._library.filestack.pop()
+            raise self._library.XacroException(
+                f"include {str(path)!r} cannot be read: {error.strerror}", exc=error
+            ) from error
+        markup = parse_markup(content, path)
+        document = minidom.parseString(content)
+        elements = document.getElementsByTagName("*")
+        for element, line in zip(elements, markup.lines.values(), strict=True):
+            element.setUserData(PLACE, (path, line), _KEEP)
+        self._budget.spend(ELEMENT * len(elements))
+        return document
+
+    def _yaml(self, filename: str) -> Any:
+        """Data of a YAML file, with angles and lengths in the units that their tags name."""
+        import yaml
+
+        from magtwin.urdf.source.settings import Loader
+
+        path = self._check_inside(self._library.abs_filename_spec(str(filename)), "load_yaml")
+
+        class UnitLoader(Loader):
+            """YAML's safe types, and our units."""
+
+        def number(factor: float) -> Callable[[Any, Any], float]:
+            return lambda loader, node: (
+                factor * float(evaluate(str(loader.construct_scalar(node)), GLOBALS, self._budget))
+            )
+
+        for tag, factor in UNIT_TAGS.items():
+            UnitLoader.add_constructor(tag, number(factor))
+        try:
+            content = path.read_bytes()
+            self._budget.spend(len(content))
+            return check_size(yaml.load(content, UnitLoader), self._budget)
+        except OSError as error:
+            raise ExpressionError(f"load_yaml: {path} cannot be read ({error.strerror})") from error
+        except yaml.YAMLError as error:
+            raise ExpressionError(f"load_yaml: {path} is not YAML: {' '.join(str(error).split())}") from error
+        except RecursionError as error:
+            raise ExpressionError(f"load_yaml: {path} nests too deep") from error
+
+    def _note(self, *words: Any, **_: Any) -> str:
+        text = f"{self._at[0].name}:{self._at[1]}: " + " ".join(map(str, words))
+        if text not in self._notes:
+            self._notes.append(text)
+        return ""
+
+    def _fatal(self, *words: Any) -> None:
+        raise ExpressionError(" ".join(map(str, words)))
+
+
+UNIT_TAGS: Mapping[str, float] = {
+    "!radians": 1.0,
+    "!degrees": 0.017453292519943295,
+    "!meters": 1.0,
+    "!millimeters": 0.001,
+    "!foot": 0.3048,
+    "!inches": 0.0254,
+}
+"""Factors to radians and metres of YAML's tags, as xacro names them."""
+
+
+class _Arguments(Mapping[str, Any]):
+    """Names of `$(eval ...)`: arguments as numbers where they are numbers, and a few functions."""
+
+    def __init__(self, expansion: _Expansion) -> None:
+        self._functions = {
+            **GLOBALS,
+            "true": True,
+            "false": False,
+            "arg": lambda name: _typed(str(expansion._argument(name))),
+            "find": expansion._find,
+            "env": lambda name: expansion._variable(name, None),
+            "optenv": lambda name, default="": expansion._variable(name, default),
+            "dirname": lambda: expansion._command("dirname"),
+        }
+        self._expansion = expansion
+
+    def __getitem__(self, name: str) -> Any:
+        if name in self._functions:
+            return self._functions[name]
+        if name in self._expansion._library.substitution_args_context["arg"]:
+            return _typed(str(self._expansion._argument(name)))
+        raise KeyError(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([*self._functions, *self._expansion._library.substitution_args_context["arg"]])
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+class _Keep:
+    """Carries a node's place over to its copies (DOM level 3, UserDataHandler)."""
+
+    def handle(self, operation: int, key: str, data: Any, src: Any, dst: Any) -> None:
+        if dst is not None:
+            dst.setUserData(key, data, self)
+
+
+_KEEP = _Keep()
+
+
+def _library() -> ModuleType:
+    """A fresh instance of the xacro library's module."""
+    spec = importlib.util.find_spec("xacro")
+    if spec is None or spec.loader is None:
+        raise InputError("xacro files are read with the package xacro; install it: pip install xacro")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _forbidden(*_: Any, **__: Any) -> Any:
+    raise ExpressionError("this version of xacro evaluates in a way that is not guarded; install xacro 2.1")
+
+
+def _tokenize(text: str, sep: str = ",; ", skip_empty: bool = True) -> list[str]:
+    """Words of a text, split at any of the characters `sep`."""
+    words = re.split(f"[{re.escape(sep)}]", text)
+    return [word for word in words if word or not skip_empty]
+
+
+def _typed(text: str) -> Any:
+    """An argument as a number or truth value where it reads as one."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return {"true": True, "false": False}.get(text.lower(), text)
+
+
+def _to_tree(
+    node: minidom.Element, place: Place
+) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place]]:
+    """A DOM element as ElementTree's, and the places of all in it."""
+    places: dict[ElementTree.Element, Place] = {}
+    builder = ElementTree.TreeBuilder()
+
+    def add(node: minidom.Element, place: Place) -> None:
+        place = node.getUserData(PLACE) or place
+        attributes = {name: value for name, value in node.attributes.items() if name != "xmlns:xacro"}
+        places[builder.start(node.tagName, attributes)] = place
+        for child in node.childNodes:
+            if child.nodeType == child.ELEMENT_NODE:
+                add(child, place)
+            elif child.nodeType in (child.TEXT_NODE, child.CDATA_SECTION_NODE):
+                builder.data(child.data)
+        builder.end(node.tagName)
+
+    add(node, place)
+    return builder.close(), places

@@ -1,0 +1,161 @@
+"""Between plain data and a prim: fields of a spec as attributes, a pose as a transform, a link as a target.
+
+What is written is read back to the bit. A value is authored even where it equals the schema's fallback,
+which a reader without the schema does not see; over a layer that gives it already, it is not said again.
+"""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+from magtwin.errors import InputError
+from magtwin.frames import wxyz_from_xyzw, xyzw_from_wxyz
+from magtwin.spec.scene import Quat, Vec3
+from magtwin.usd.layers import relative_asset
+from magtwin.usd.schema import attribute_name, place, require_api
+
+S = TypeVar("S")
+
+
+def write_figures(prim: Usd.Prim, noun: str, spec: Any, *, skip: Any = ()) -> Usd.Prim:
+    """Write each field of a spec, but those in `skip`, to the attribute that stands for it.
+
+    None, "" and () are left to the fallback, unless a weaker layer gives another value.
+    """
+    for field in fields(spec):
+        if field.name in skip:
+            continue
+        attribute = prim.GetAttribute(attribute_name(noun, field.name))
+        value = getattr(spec, field.name)
+        unsaid = value not in (None, "", ()) and not attribute.HasAuthoredValue()
+        if unsaid or plain_value(attribute) != (value.resolve() if isinstance(value, Path) else value):
+            attribute.Set(_usd_value(attribute, value))
+    return prim
+
+
+def read_figures(cls: type[S], prim: Usd.Prim, noun: str, **known: Any) -> S:
+    """A spec from the attributes of `prim`, for those fields that are not in `known`.
+
+    Raises:
+        InputError: The prim has not the schema, or a value is missing, of another type or out of range.
+    """
+    require_api(prim, noun)
+    values = dict(known)
+    for field in fields(cls):  # type: ignore[arg-type]
+        if field.name not in known:
+            values[field.name] = plain_value(prim.GetAttribute(attribute_name(noun, field.name)))
+    try:
+        return cls(**values)
+    except InputError as error:
+        raise InputError(f"{place(prim)}: {error}") from error
+
+
+def write_pose(prim: Usd.Prim, p: Vec3, q_xyzw: Quat | None = None) -> None:
+    """Place an Xform in its parent: a position [m] and, unless none, a turn, both in double precision.
+
+    Other transform ops are dropped from the order.
+    """
+    want = [("xformOp:translate", Sdf.ValueTypeNames.Double3, Gf.Vec3d(p))]
+    if q_xyzw is not None:
+        want.append(
+            ("xformOp:orient", Sdf.ValueTypeNames.Quatd, Gf.Quatd(*map(float, wxyz_from_xyzw(q_xyzw))))
+        )
+    for name, kind, value in want:
+        attribute = prim.GetAttribute(name) or prim.CreateAttribute(name, kind, custom=False)
+        if attribute.GetTypeName() != kind:
+            raise InputError(f"{place(prim)}: {name} is a {attribute.GetTypeName()}, magtwin writes {kind}")
+        if attribute.Get() != value:
+            attribute.Set(value)
+    order = Vt.TokenArray([name for name, _, _ in want])
+    if UsdGeom.Xformable(prim).GetXformOpOrderAttr().Get() != order:
+        UsdGeom.Xformable(prim).GetXformOpOrderAttr().Set(order)
+
+
+def read_pose(prim: Usd.Prim) -> tuple[Vec3, Quat]:
+    """Position [m] and turn (xyzw) of an Xform in its parent.
+
+    What `write_pose` wrote comes back to the bit; any other rigid transform comes back as it composes,
+    its turn brought to unit length where it is in less than double precision.
+    """
+    xformable = UsdGeom.Xformable(prim)
+    ops = {op.GetOpName(): op.Get() for op in xformable.GetOrderedXformOps()}
+    if list(ops) in (["xformOp:translate"], ["xformOp:translate", "xformOp:orient"]):
+        translate, orient = ops["xformOp:translate"], ops.get("xformOp:orient", Gf.Quatd(1))
+        if not isinstance(orient, Gf.Quatd):
+            orient = Gf.Quatd(orient).GetNormalized()
+    else:
+        local = xformable.GetLocalTransformation()
+        translate, orient = local.ExtractTranslation(), local.RemoveScaleShear().ExtractRotationQuat()
+    q = xyzw_from_wxyz((orient.GetReal(), *orient.GetImaginary()))
+    return tuple(map(float, translate)), tuple(map(float, q))  # type: ignore[return-value]
+
+
+def target(prim: Usd.Prim, relationship: str) -> Usd.Prim:
+    """The one prim that a relationship of `prim` points to.
+
+    Raises:
+        InputError: It points to no prim of the stage, or to several.
+    """
+    found = prim.GetRelationship(relationship)
+    paths = found.GetForwardedTargets() if found else []
+    there = prim.GetStage().GetPrimAtPath(paths[0]) if len(paths) == 1 else None
+    if not there:
+        seen = ", ".join(map(str, paths)) or "none"
+        raise InputError(f"{place(prim)}: {relationship} must point to one prim of the stage, found {seen}")
+    return there
+
+
+def check_prim_name(name: str, what: str) -> str:
+    """`name` if a prim can have it.
+
+    Raises:
+        InputError: It has signs other than letters, digits and _, or begins with a digit.
+    """
+    if not Sdf.Path.IsValidIdentifier(name):
+        raise InputError(f"{what} {name!r} cannot name a prim; use letters, digits and _, no digit first")
+    return name
+
+
+def _usd_value(attribute: Usd.Attribute, value: Any) -> Any:
+    """A field's value as the attribute's type."""
+    kind = attribute.GetTypeName()
+    if kind == Sdf.ValueTypeNames.Asset:
+        layer = attribute.GetStage().GetEditTarget().GetLayer()
+        return Sdf.AssetPath(relative_asset(layer, value) if value is not None else "")
+    if kind == Sdf.ValueTypeNames.Matrix3d:
+        return Gf.Matrix3d(*value)
+    if kind == Sdf.ValueTypeNames.StringArray:
+        return Vt.StringArray(value)
+    if kind == Sdf.ValueTypeNames.DoubleArray:
+        return Vt.DoubleArray(value)
+    return tuple(value) if isinstance(value, tuple) else value
+
+
+def plain_value(attribute: Usd.Attribute) -> Any:
+    """An attribute's value as plain Python: numbers, text, tuples, a Path (which need not exist) or None.
+
+    Raises:
+        InputError: The layers give a value of another type than the schema does.
+    """
+    value, kind = attribute.Get(), attribute.GetTypeName()
+    if not isinstance(value, kind.type.pythonClass or type(kind.defaultValue)):
+        raise InputError(
+            f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}, got {value!r}"
+        )
+    if isinstance(value, Sdf.AssetPath):
+        return _anchored(attribute, value) if value.path else None
+    if isinstance(value, Gf.Matrix3d):
+        return tuple(float(x) for row in value for x in row)
+    if isinstance(value, Gf.Vec3d | Gf.Vec2d):
+        return tuple(map(float, value))
+    return tuple(value) if isinstance(value, Vt.StringArray | Vt.DoubleArray) else value
+
+
+def _anchored(attribute: Usd.Attribute, value: Sdf.AssetPath) -> Path:
+    """The file that an asset path names, whether it is there or not."""
+    if value.resolvedPath:
+        return Path(value.resolvedPath).resolve()
+    layer = attribute.GetPropertyStack()[0].layer
+    return Path(Sdf.ComputeAssetPathRelativeToLayer(layer, value.path)).resolve()

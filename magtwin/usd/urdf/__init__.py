@@ -1,5 +1,0 @@
-"""URDF to a USD articulation: `convert_urdf` is the door, one noun a module behind it."""
-
-from magtwin.usd.urdf.convert import convert_urdf, read_notes
-
-__all__ = ["convert_urdf", "read_notes"]

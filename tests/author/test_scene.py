@@ -1,0 +1,895 @@
+"""A Scene through its layers and back; what cannot be a scene is refused by file and prim."""
+
+import importlib.util
+import math
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade
+from validators import assert_valid
+
+import magtwin
+from magtwin.author.lab import LAB, define_lab, read_lab
+from magtwin.author.scene import author_scene, open_alone, read_scene, robots_in, scene_from_toml
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.sources.earth import earth_field_nt
+from magtwin.files import sha256, shipped
+from magtwin.frames import IDENTITY_XYZW, quat_from_rpy, quat_multiply
+from magtwin.spec.scene import (
+    BatterySpec,
+    DriveSpec,
+    EarthFieldSpec,
+    ImuSpec,
+    LabSpec,
+    LidarSpec,
+    MagnetometerSpec,
+    PlatformFieldSpec,
+    Scene,
+    SourceSpec,
+)
+from magtwin.twin import open_twin, simulate
+from magtwin.usd import sensors
+from magtwin.usd.attributes import write_pose
+from magtwin.usd.layers import new_stage
+from magtwin.usd.maps import MAP, save_map
+
+EARTH = EarthFieldSpec(
+    b_world_nt=(-2_000.5, 23_000.25, -39_000.125),
+    latitude_deg=29.6,
+    longitude_deg=-82.3,
+    height_m=20.0,
+    date="2026-01-01",
+)
+SOURCES = (
+    SourceSpec(name="beam", p_world=(1.0, 0.5, -0.4), m_world=(0.0, 3.0, -8.0)),
+    SourceSpec(name="anchor", p_world=(-1.5, -0.25, -0.3), m_world=(0.5, 0.0, 2.0)),
+)
+LINKS = {
+    "base_link": (0.0, 0.0, 0.05),
+    "magnetometer_link": (0.03, 0.0, 0.35),
+    "imu_link": (0.0, 0.0, 0.1),
+    "rplidar_link": (0.0, 0.0, 0.2),
+}
+TOML = """
+name = "small"
+map = "map.usdc"
+
+[robot]
+asset = "robot/bot.usda"
+"""
+
+
+def define_robot_asset(path: Path) -> None:
+    """A robot with every part that magtwin reads, and nothing to look at."""
+    with new_stage(path, "a robot of the tests") as stage:
+        root = UsdGeom.Xform.Define(stage, "/bot").GetPrim()
+        stage.SetDefaultPrim(root)
+        stage.RemovePrim("/World")
+        for link, p in LINKS.items():
+            write_pose(UsdGeom.Xform.Define(stage, f"/bot/{link}").GetPrim(), p)
+        UsdPhysics.RigidBodyAPI.Apply(stage.GetPrimAtPath("/bot/base_link"))
+        for joint in ("left_wheel_joint", "right_wheel_joint"):
+            UsdPhysics.RevoluteJoint.Define(stage, f"/bot/{joint}").CreateBody0Rel().SetTargets(
+                ["/bot/base_link"]
+            )
+        sensors.define_footprint(root, 0.2)
+        sensors.define_drive(root, DriveSpec(v_max=0.4))
+        sensors.define_platform(root, PlatformFieldSpec(hard_iron_nt=(1.0, 2.0, 3.0)))
+        sensors.define_battery(stage, "/bot/battery", BatterySpec(load_w=12.0))
+        mount = MagnetometerSpec(p_link_sensor=(0.0, 0.0, 0.01))
+        sensors.define_magnetometer(stage, "/bot/magnetometer_link/magnetometer", mount)
+        sensors.define_imu(stage, "/bot/imu_link/imu", ImuSpec())
+        sensors.define_lidar(stage, "/bot/rplidar_link/lidar", LidarSpec())
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory) -> Path:
+    """A folder with a map, a robot, weights and a TOML that names the first two; not to be changed."""
+    folder = tmp_path_factory.mktemp("parts")
+    define_robot_asset(folder / "robot" / "bot.usda")
+    save_map(small_map(), folder / "map.usdc")
+    (folder / "net.pth").write_bytes(b"weights")
+    (folder / "scene.toml").write_text(TOML)
+    return folder
+
+
+@pytest.fixture
+def own_parts(parts, tmp_path) -> Path:
+    """The same, to be changed."""
+    return Path(shutil.copytree(parts, tmp_path / "parts"))
+
+
+def small_map() -> AnomalyMap:
+    rng = np.random.default_rng(0)
+    return AnomalyMap(
+        values_nt=rng.normal(41_000, 300, (4, 3, 4)).astype(np.float32),
+        origin_m=(-3.0, -1.75),
+        cell_m=(2.0, 1.75),
+        headings_rad=np.arange(4) * np.pi / 2,
+        name="small",
+    )
+
+
+def full_scene(parts: Path) -> Scene:
+    scene = scene_from_toml(parts / "scene.toml", network=parts / "net.pth")
+    return replace(scene, earth=EARTH, sources=SOURCES, start=(1.0, -0.5, 0.0))
+
+
+def test_a_scene_survives_its_layers(parts, tmp_path, capfd):
+    scene = full_scene(parts)
+    assert scene.robot.magnetometer.network_sha256 == sha256(parts / "net.pth")
+    assert read_scene(author_scene(scene, tmp_path / "s", by_reference=True)) == scene
+    assert capfd.readouterr().err == "", "USD has nothing to warn of"
+
+
+number = st.floats(-1e6, 1e6)
+vec3 = st.tuples(number, number, number)
+above_zero, not_negative = st.floats(1e-6, 1e6), st.floats(0, 1e6)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    lab=st.builds(
+        LabSpec,
+        floor_m=st.tuples(st.floats(0.1, 100), st.floats(0.1, 100)),
+        wall_height_m=st.sampled_from([0.0, 0.1, 1.0]),
+        wall_thickness_m=st.floats(0.01, 1),
+        post_height_m=st.sampled_from([0.0, 1.7, 3.0]),
+    ),
+    earth=st.none() | st.just(EARTH) | st.builds(replace, st.just(EARTH), b_world_nt=vec3),
+    sources=st.lists(vec3, max_size=3).map(
+        lambda m: tuple(
+            SourceSpec(name=f"s{i}", p_world=(float(i), 0.0, 0.0), m_world=v) for i, v in enumerate(m)
+        )
+    ),
+    start=st.tuples(number, number, st.floats(-3.14, 3.14)),
+    magnetometer=st.builds(
+        MagnetometerSpec,
+        p_link_sensor=st.just((0.0, 0.0, 0.01)),
+        rate_hz=above_zero,
+        noise_density_nt=not_negative,
+        resolution_nt=not_negative,
+    ),
+    imu=st.builds(ImuSpec, rate_hz=above_zero, gyro_noise_std=not_negative),
+    lidar=st.builds(LidarSpec, on_s=not_negative, off_s=not_negative),
+    battery=st.builds(BatterySpec, load_w=not_negative, initial_fraction=st.floats(0, 1)),
+    drive=st.builds(DriveSpec, v_max=above_zero, wheel_radius_m=above_zero),
+    platform=st.builds(PlatformFieldSpec, hard_iron_nt=vec3, soft_iron=st.tuples(*[number] * 9)),
+    footprint=above_zero,
+)
+def test_any_scene_of_that_robot_survives_its_layers(
+    parts, tmp_path_factory, lab, earth, sources, start, footprint, **of_robot
+):
+    robot = replace(scene_from_toml(parts / "scene.toml").robot, footprint_radius_m=footprint, **of_robot)
+    scene = Scene(
+        name="any",
+        map_layer=parts / "map.usdc",
+        robot=robot,
+        lab=lab,
+        earth=earth,
+        sources=sources,
+        start=start,
+    )
+    read = read_scene(author_scene(scene, tmp_path_factory.mktemp("any") / "s", by_reference=True))
+    assert read.start == pytest.approx(start, rel=1e-15, abs=1e-15)  # two roundings of a quaternion
+    assert replace(read, start=start) == scene
+
+
+def test_the_magnetometers_place_in_the_base_is_read_through_the_links(parts):
+    robot = scene_from_toml(parts / "scene.toml").robot
+    assert robot.p_base_magnetometer == pytest.approx((0.03, 0.0, 0.31), abs=1e-15)  # .35 + .01 - .05
+
+
+def turned_links(parts: Path) -> None:
+    """Lean the robot's base, in it yaw imu_link by a quarter and lay magnetometer_link on its back."""
+    lean = tuple(quat_from_rpy([0.1, -0.2, 0.3]).tolist())
+    turns = {
+        "base_link": lean,
+        "imu_link": quat_multiply(lean, (0.0, 0.0, 0.5**0.5, 0.5**0.5)),
+        "magnetometer_link": quat_multiply(lean, (1.0, 0.0, 0.0, 0.0)),
+        "rplidar_link": lean,
+    }
+    stage = Usd.Stage.Open(str(parts / "robot" / "bot.usda"))
+    for link, q in turns.items():
+        write_pose(stage.GetPrimAtPath(f"/bot/{link}"), LINKS[link], tuple(map(float, q)))
+    stage.Save()
+
+
+def test_the_axes_of_the_sensors_links_in_the_base_are_read_from_the_stage(own_parts, tmp_path):
+    level = scene_from_toml(own_parts / "scene.toml").robot
+    assert level.q_base_magnetometer_link_xyzw == level.q_base_imu_link_xyzw == IDENTITY_XYZW
+    turned_links(own_parts)
+    scene = scene_from_toml(own_parts / "scene.toml")
+    assert scene.robot.q_base_imu_link_xyzw == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5), abs=1e-15)
+    assert np.abs(scene.robot.q_base_magnetometer_link_xyzw) == pytest.approx((1, 0, 0, 0), abs=1e-15)
+    placed = replace(scene, start=(1.0, -0.5, math.pi / 2))
+    assert read_scene(author_scene(placed, tmp_path / "s", by_reference=True)).robot == scene.robot
+
+
+def test_links_that_lean_with_their_base_are_parallel_to_the_bit(own_parts):
+    turned_links(own_parts)
+    stage = Usd.Stage.Open(str(own_parts / "robot" / "bot.usda"))
+    lean = stage.GetPrimAtPath("/bot/base_link").GetAttribute("xformOp:orient").Get()
+    for link in ("imu_link", "magnetometer_link"):
+        stage.GetPrimAtPath(f"/bot/{link}").GetAttribute("xformOp:orient").Set(lean)
+    stage.Save()
+    robot = scene_from_toml(own_parts / "scene.toml").robot
+    assert robot.q_base_magnetometer_link_xyzw == robot.q_base_imu_link_xyzw == IDENTITY_XYZW
+
+
+def test_a_scenes_folder_can_be_moved_and_needs_nothing_outside_of_it(own_parts, tmp_path):
+    scene = full_scene(own_parts)
+    author_scene(scene, tmp_path / "a" / "s")
+    shutil.rmtree(own_parts)
+    (tmp_path / "a" / "s").rename(tmp_path / "moved")
+    read = read_scene(tmp_path / "moved" / "small.usda")
+    inside = replace(
+        scene,
+        map_layer=tmp_path / "moved" / "map" / "map.usdc",
+        robot=replace(
+            scene.robot,
+            asset=tmp_path / "moved" / "robot" / "bot.usda",
+            magnetometer=replace(
+                scene.robot.magnetometer, network=tmp_path / "moved" / "weights" / "net.pth"
+            ),
+        ),
+    )
+    assert read == inside
+    for layer in (tmp_path / "moved").rglob("*.usda"):
+        assert str(tmp_path) not in layer.read_text()
+
+
+def test_a_robot_of_several_files_is_copied_whole(own_parts, tmp_path):
+    folder = own_parts / "robot"
+    (folder / "base").mkdir()
+    (folder / "bot.usda").rename(folder / "base" / "body.usda")
+    with new_stage(folder / "bot.usda", "a robot in two files") as stage:
+        root = UsdGeom.Xform.Define(stage, "/bot").GetPrim()
+        stage.SetDefaultPrim(root)
+        root.GetPayloads().AddPayload("./base/body.usda")
+    scene = scene_from_toml(own_parts / "scene.toml")
+    read = read_scene(author_scene(scene, tmp_path / "s"))
+    assert (tmp_path / "s" / "robot" / "base" / "body.usda").exists()
+    assert read.robot.asset == tmp_path / "s" / "robot" / "bot.usda"
+
+
+def test_one_scene_gives_the_same_bytes_every_time(parts, tmp_path):
+    for name in "ab":
+        author_scene(full_scene(parts), tmp_path / name)
+    files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file())
+    assert len(files) == 6
+    for file in files:
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
+
+
+def test_the_root_layer_is_short_text_with_units_axes_and_relative_paths(parts, tmp_path):
+    root = author_scene(full_scene(parts), tmp_path / "s")
+    text = root.read_text()
+    assert len(text.splitlines()) < 60
+    stage = Usd.Stage.Open(str(root))
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    assert UsdPhysics.GetStageKilogramsPerUnit(stage) == 1
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert stage.GetDefaultPrim().GetPath() == "/World"
+    assert list(stage.GetRootLayer().subLayerPaths) == ["./room.usda", "./magnetics.usda", "./map/map.usdc"]
+    assert "@./robot/bot.usda@" in text
+    assert "@./weights/net.pth@" in text
+    assert stage.GetRootLayer().documentation
+    assert stage.GetRootLayer().customLayerData["creator"] == "magtwin"
+
+
+def test_the_robot_stands_where_the_scene_starts(parts, tmp_path):
+    scene = replace(full_scene(parts), start=(1.0, -0.5, math.pi / 2))
+    stage = Usd.Stage.Open(str(author_scene(scene, tmp_path / "s")))
+    world = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath("/World/bot"))
+    assert Gf.IsClose(world.Transform(Gf.Vec3d(1, 0, 0)), Gf.Vec3d(1, 0.5, 0), 1e-12)
+
+
+def test_the_magnetometer_points_to_the_map_that_it_reads(parts, tmp_path):
+    stage = Usd.Stage.Open(str(author_scene(full_scene(parts), tmp_path / "s")))
+    magnetometer = stage.GetPrimAtPath("/World/bot/magnetometer_link/magnetometer")
+    assert magnetometer.GetRelationship(sensors.MAP_RELATIONSHIP).GetTargets() == [MAP]
+
+
+def test_a_scene_passes_the_gates(parts, tmp_path):
+    assert_valid(author_scene(full_scene(parts), tmp_path / "s"), tmp_path)
+
+
+# The lab
+
+
+def lab_stage(spec: LabSpec) -> Usd.Stage:
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    define_lab(stage, spec)
+    return stage
+
+
+def box_of(stage: Usd.Stage, path: Sdf.Path) -> Gf.Range3d:
+    return (
+        UsdGeom.BBoxCache(0, ["default"]).ComputeWorldBound(stage.GetPrimAtPath(path)).ComputeAlignedRange()
+    )
+
+
+def test_the_floor_ends_at_zero_and_the_walls_stand_just_outside_of_it():
+    spec = LabSpec(floor_m=(6.0, 3.5), wall_height_m=0.3, wall_thickness_m=0.05)
+    stage = lab_stage(spec)
+    floor = box_of(stage, LAB.AppendChild("Floor"))
+    assert floor.GetMax()[2] == pytest.approx(0)
+    east, south = box_of(stage, LAB.AppendPath("Walls/East")), box_of(stage, LAB.AppendPath("Walls/South"))
+    assert (east.GetMin()[0], east.GetMax()[0], east.GetMax()[2]) == pytest.approx((3.0, 3.05, 0.3))
+    assert (south.GetMax()[1], south.GetMin()[1], south.GetMin()[2]) == pytest.approx((-1.75, -1.8, 0.0))
+
+
+def test_posts_stand_at_the_corners_and_amid_the_long_walls_and_reach_their_height():
+    stage = lab_stage(LabSpec(floor_m=(2.0, 8.0), post_height_m=2.0))
+    frame = stage.GetPrimAtPath(LAB.AppendChild("CaptureFrame"))
+    posts = [p for p in frame.GetChildren() if p.GetName().startswith("Post")]
+    places = {tuple(np.sign(np.round(box_of(stage, p.GetPath()).GetMidpoint(), 6))[:2]) for p in posts}
+    assert places == {(-1, -1), (-1, 1), (1, -1), (1, 1), (-1, 0), (1, 0)}
+    assert all(box_of(stage, p.GetPath()).GetMax()[2] == pytest.approx(2.0) for p in posts)
+
+
+def test_cameras_look_at_the_middle_of_the_floor():
+    stage = lab_stage(LabSpec())
+    cache = UsdGeom.XformCache()
+    frame = stage.GetPrimAtPath(LAB.AppendChild("CaptureFrame"))
+    cameras = [p for p in frame.GetChildren() if p.GetName().startswith("Camera")]
+    assert len(cameras) == 6
+    for camera in cameras:
+        world = cache.GetLocalToWorldTransform(camera)
+        ahead = world.TransformDir(Gf.Vec3d(1, 0, 0))
+        home = -world.ExtractTranslation()
+        assert Gf.IsClose(ahead, home.GetNormalized(), 1e-12)
+
+
+def test_everything_in_the_lab_wears_a_material_and_floor_walls_and_posts_collide():
+    stage = lab_stage(LabSpec())
+    gprims = [p for p in stage.Traverse() if p.IsA(UsdGeom.Gprim)]
+    for prim in gprims:
+        assert UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0], prim
+    solid = {p.GetName() for p in gprims if p.HasAPI(UsdPhysics.CollisionAPI)}
+    assert {"Floor", "North", "South", "East", "West", "Post_0"} <= solid
+    material, _ = UsdShade.MaterialBindingAPI(
+        stage.GetPrimAtPath(LAB.AppendChild("Floor"))
+    ).ComputeBoundMaterial("physics")
+    assert UsdPhysics.MaterialAPI(material.GetPrim()).GetStaticFrictionAttr().Get() == pytest.approx(0.05)
+
+
+def test_the_lab_has_gravity_and_light():
+    stage = lab_stage(LabSpec())
+    scene = UsdPhysics.Scene(stage.GetPrimAtPath("/World/PhysicsScene"))
+    assert scene.GetGravityDirectionAttr().Get() == Gf.Vec3f(0, 0, -1)
+    assert scene.GetGravityMagnitudeAttr().Get() == pytest.approx(9.81)
+    assert any(p.IsA(UsdLux.DomeLight) for p in stage.Traverse())
+    assert sum(p.IsA(UsdLux.RectLight) for p in stage.Traverse()) == 4
+
+
+def test_a_lab_without_walls_and_posts_has_none():
+    spec = LabSpec(wall_height_m=0.0, post_height_m=0.0)
+    stage = lab_stage(spec)
+    assert {p.GetName() for p in stage.GetPrimAtPath(LAB).GetChildren()} == {"Looks", "Floor", "Lights"}
+    assert read_lab(stage.GetPrimAtPath(LAB)) == spec
+
+
+# A scene's TOML
+
+
+def test_a_toml_fills_in_defaults_and_takes_its_files_from_its_folder(parts):
+    scene = scene_from_toml(parts / "scene.toml")
+    assert (scene.name, scene.lab, scene.earth, scene.sources) == ("small", LabSpec(), None, ())
+    assert scene.map_layer == parts / "map.usdc"
+    assert scene.robot.asset == parts / "robot" / "bot.usda"
+    assert scene.robot.footprint_radius_m == 0.2
+    assert scene.robot.magnetometer.network is None
+
+
+def test_a_toml_gives_room_start_earth_and_sources(own_parts):
+    (own_parts / "sources.toml").write_text(
+        '[[source]]\nname = "beam"\np_world = [1, 2, -0.5]\nm_world = [0, 0, 4.5]\n'
+    )
+    (own_parts / "scene.toml").write_text(
+        TOML.replace('"map.usdc"', '"map.usdc"\nstart = [1, 0.5, 0.25]')
+        + "[lab]\nfloor_m = [5, 4]\n[sources]\nfile = 'sources.toml'\n"
+        + "[earth]\nb_world_nt = [0, 20e3, -40e3]\nlatitude_deg = 29\nlongitude_deg = -82\nheight_m = 2\n"
+        + 'date = "2026-01-01"\nmeasured = true\n'
+    )
+    scene = scene_from_toml(own_parts / "scene.toml")
+    assert scene.start == (1.0, 0.5, 0.25)
+    assert scene.lab == LabSpec(floor_m=(5.0, 4.0))
+    assert scene.earth is not None
+    assert scene.earth.b_world_nt == (0.0, 20e3, -40e3)
+    assert scene.sources == (SourceSpec(name="beam", p_world=(1.0, 2.0, -0.5), m_world=(0.0, 0.0, 4.5)),)
+    other = scene_from_toml(own_parts / "scene.toml", map_layer=own_parts / "map.usdc")
+    assert (other.earth, other.sources) == (scene.earth, scene.sources), "a map takes nothing away"
+
+
+def test_a_toml_of_one_robot_can_say_its_start_and_path_beside_it(own_parts, tmp_path):
+    (own_parts / "scene.toml").write_text(TOML + "start = [1, 0, 0.5]\npath = 'sine'\n")
+    scene = scene_from_toml(own_parts / "scene.toml")
+    assert (scene.start, scene.path, scene.others) == ((1.0, 0.0, 0.5), "sine", ())
+    assert read_scene(author_scene(scene, tmp_path / "s")).path == "sine"
+
+
+def test_a_network_brings_its_inputs_and_its_checksum(own_parts):
+    from magtwin.learn.models.predictor import load_predictor
+
+    weights = shipped("weights", "turtlebot4_hybrid.safetensors")
+    (own_parts / "scene.toml").write_text(TOML + f'network = "{weights}"\n')
+    magnetometer = magtwin.scene_from_toml(own_parts / "scene.toml").robot.magnetometer
+    assert magnetometer.inputs == load_predictor(weights).features
+    assert magnetometer.network_sha256 == sha256(weights)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("name =", "nmae =", r"scene\.toml:2: unknown key 'nmae'; did you mean 'name'"),
+        ("asset =", "aset =", r"scene\.toml:6: \[robot\] unknown key 'aset'; did you mean 'asset'"),
+        ("bot.usda", "gone.usda", r"gone\.usda: no such robot asset; did you mean 'bot\.usda'"),
+        ("map.usdc", "mapp.usdc", r"mapp\.usdc: no such map layer; did you mean 'map\.usdc'"),
+        ('map = "map.usdc"', "", r"scene\.toml: names no map; add map = "),
+        ("[robot]", "[lab]\nfloor_m = [6]\n[robot]", r"scene\.toml:6: \[lab\] floor_m must be a list of 2"),
+        (
+            "[robot]",
+            "[lab]\nfloor_m = [6, -1]\n[robot]",
+            r"scene\.toml:6: \[lab\] floor_m of LabSpec must be above",
+        ),
+        ("[robot]", "[robot]\nnetwork = 'net'", r"net: no such weights file"),
+        ("[robot]", "[sources]\nfile = 'gone.toml'\n[robot]", r"gone\.toml: no such TOML file"),
+        ("small", "../small", r"scene '\.\./small' cannot name a file"),
+        ('"small"', '""', "scene '' cannot name a file; use letters, digits, - and _"),
+        ('"small"', '"."', r"scene '\.' cannot name a file"),
+        (
+            "[robot]",
+            "start = [0, inf, 0]\n[robot]",
+            r"scene\.toml:5: start must be a number, got inf",
+        ),
+        (
+            "[robot]",
+            "[earth]\nb_world_nt = [0, 2e4, -4e4]\nlatitude_deg = 95\nlongitude_deg = 0\nheight_m = 0\n"
+            'date = "2026-01-01"\n[robot]',
+            r"scene\.toml:7: \[earth\] latitude_deg of EarthTable must lie in -90\.\.90, got 95",
+        ),
+        (
+            "[robot]",
+            "[earth]\nb_world_nt = [0, 2e4, -4e4]\nlatitude_deg = 9\nlongitude_deg = 0\nheight_m = 0\n"
+            'date = "20260101"\n[robot]',
+            r"scene\.toml:10: \[earth\] date of EarthTable must be a day as YYYY-MM-DD, got '20260101'",
+        ),
+        (
+            'asset = "robot/bot.usda"',
+            'urdf = "bot.urdf"\nfootprint_radius_m = -1',
+            r"scene\.toml:7: \[robot\] footprint_radius_m of RobotTable must be above 0, got -1",
+        ),
+    ],
+)
+def test_a_broken_toml_is_refused_by_line_with_nothing_written(own_parts, tmp_path, old, new, said):
+    (own_parts / "scene.toml").write_text(TOML.replace(old, new))
+    with pytest.raises(InputError, match=said):
+        author_scene(scene_from_toml(own_parts / "scene.toml"), tmp_path / "s")
+    assert not (tmp_path / "s").exists()
+
+
+@pytest.mark.parametrize("name", ["net.safetensors", "net.pth", "net.txt"])
+def test_what_is_no_network_is_refused(own_parts, name):
+    (own_parts / name).write_bytes(b"none")
+    with pytest.raises(InputError, match=name.replace(".", r"\.")):
+        magtwin.scene_from_toml(own_parts / "scene.toml", network=own_parts / name)
+
+
+# Several robots
+
+TWO = """
+name = "two"
+map = "map.usdc"
+
+[[robot]]
+name = "ann"
+asset = "robot/bot.usda"
+start = [-1, 0.5, 0]
+path = "figure8"
+
+[[robot]]
+name = "bob"
+asset = "robot/bot.usda"
+network = "net.pth"
+path = "there.csv"
+
+[[robot]]
+name = "cleo"
+asset = "other/bot.usda"
+start = [0, -1, 0]
+path = "random"
+"""
+
+
+def two_robots(parts: Path) -> Scene:
+    """Three robots of two assets that have one file name."""
+    (parts / "other").mkdir()
+    define_robot_asset(parts / "other" / "bot.usda")
+    (parts / "there.csv").write_text("0,0\n1,0\n")
+    (parts / "scene.toml").write_text(TWO)
+    return scene_from_toml(parts / "scene.toml")
+
+
+def test_a_toml_of_several_robots_gives_each_its_name_start_path_and_network(own_parts):
+    scene = two_robots(own_parts)
+    assert [p.robot.name for p in scene.robots] == ["ann", "bob", "cleo"]
+    assert [p.start for p in scene.robots] == [(-1.0, 0.5, 0.0), (0.0, 0.0, 0.0), (0.0, -1.0, 0.0)]
+    assert [p.path for p in scene.robots] == ["figure8", own_parts / "there.csv", "random"]
+    assert [p.robot.magnetometer.kind for p in scene.robots] == ["physical", "neural", "physical"]
+    assert (scene.robot, scene.start, scene.path) == (scene.robots[0].robot, (-1.0, 0.5, 0.0), "figure8")
+    led = scene.led_by("bob")
+    assert [p.robot.name for p in led.robots] == ["bob", "ann", "cleo"]
+    assert led.led_by("ann") == scene
+    with pytest.raises(InputError, match="no robot 'bobby'; did you mean 'bob'"):
+        scene.led_by("bobby")
+
+
+def test_a_robot_of_several_stands_where_its_path_begins_unless_it_is_said(own_parts):
+    two_robots(own_parts)
+    (own_parts / "there.csv").write_text("0.5,0.25\n0.5,1.25\n")
+    scene = scene_from_toml(own_parts / "scene.toml")
+    assert [placed.start for placed in scene.robots] == [
+        (-1, 0.5, 0),
+        (0.5, 0.25, pytest.approx(np.pi / 2)),
+        (0, -1, 0),
+    ]
+
+
+@pytest.mark.parametrize("by_reference", [True, False])
+def test_several_robots_survive_their_layers_each_a_prim_of_its_own(own_parts, tmp_path, by_reference, capfd):
+    scene = two_robots(own_parts)
+    root = author_scene(scene, tmp_path / "a" / "s", by_reference=by_reference)
+    stage = Usd.Stage.Open(str(root))
+    for name in ("ann", "bob", "cleo"):
+        assert stage.GetPrimAtPath(f"/World/{name}").HasAPI("MagtwinRobotAPI")
+    if by_reference:
+        assert read_scene(root) == scene
+    else:
+        (tmp_path / "a" / "s").rename(tmp_path / "moved")
+        shutil.rmtree(own_parts)
+        read = read_scene(tmp_path / "moved" / "two.usda")
+        files = [p.robot.asset.relative_to(tmp_path / "moved") for p in read.robots]
+        assert list(map(str, files)) == ["robot/bot.usda", "robot/bot.usda", "robot/cleo/bot.usda"]
+        assert read.robots[1].path == tmp_path / "moved" / "paths" / "there.csv"
+        for copy, original in ((read.robots[i], scene.robots[i]) for i in (0, 2)):
+            assert replace(copy.robot, asset=original.robot.asset) == original.robot
+    assert capfd.readouterr().err == ""
+
+
+def test_a_scene_of_several_robots_passes_the_gates(own_parts, tmp_path):
+    assert_valid(author_scene(two_robots(own_parts), tmp_path / "s"), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('name = "bob"', 'name = "ann"', "names of their own, got \"'ann' twice"),
+        ('name = "bob"\n', "", r"scene\.toml: \[\[robot\]\] '' needs name = "),
+        ('name = "bob"', 'name = "Lab"', "'Lab' has the name of a part of the scene"),
+        ('"figure8"', '"figure9"', r"\[\[robot\]\] 'ann' path: no path 'figure9'; did you mean"),
+        ('"there.csv"', '"their.csv"', r"'bob' path: .*their\.csv: no such path file; did you"),
+        ("start = [0, -1, 0]", "start = [0, -1]", r"start must be a list of 3"),
+        ("start = [0, -1, 0]", "strat = [0, -1, 0]", r"unknown key 'strat'; did you mean 'start'"),
+        ("start = [0, -1, 0]", "footprint_radius_m = 1", r"'cleo' footprint_radius_m goes with urdf"),
+    ],
+)
+def test_a_toml_of_several_robots_that_do_not_fit_is_refused(own_parts, tmp_path, old, new, said):
+    two_robots(own_parts)
+    (own_parts / "scene.toml").write_text(TWO.replace(old, new))
+    with pytest.raises(InputError, match=said):
+        author_scene(scene_from_toml(own_parts / "scene.toml"), tmp_path / "s")
+    assert not (tmp_path / "s").exists()
+
+
+def test_robots_that_read_different_maps_are_refused_by_prim(own_parts, tmp_path):
+    root = author_scene(two_robots(own_parts), tmp_path / "s")
+    stage = Usd.Stage.Open(str(root))
+    other = stage.GetPrimAtPath("/World/bob/magnetometer_link/magnetometer")
+    other.GetAttribute(sensors.MAP_CHECKSUM).Set("0" * 64)
+    stage.Save()
+    with pytest.raises(InputError, match="</World/bob/magnetometer_link/magnetometer>: reads another map"):
+        read_scene(root)
+
+
+# What ships
+
+
+def build_lab(folder: Path) -> Path:
+    """`scenes/build.py` run for another folder."""
+    script = importlib.util.spec_from_file_location("build_scenes", shipped("scenes", "build.py"))
+    assert script is not None
+    assert script.loader is not None
+    module = importlib.util.module_from_spec(script)
+    script.loader.exec_module(module)
+    return module.build(folder)
+
+
+def without_ways(layer: Path) -> str:
+    """A layer's text, each relative path without the way up to where the project's folders part."""
+    return re.sub(r"@(\.\./)[^@]*?((maps|robots|weights)/[^@]*)@", r"@\2@", layer.read_text())
+
+
+def test_the_labs_stage_is_what_a_fresh_build_gives(tmp_path):
+    fresh, committed = build_lab(tmp_path / "lab").parent, shipped("scenes", "lab")
+    assert sorted(p.name for p in fresh.iterdir()) == sorted(p.name for p in committed.iterdir())
+    for layer in fresh.iterdir():
+        assert without_ways(layer) == without_ways(committed / layer.name), (
+            f"run scenes/build.py: {layer.name}"
+        )
+
+
+def test_the_labs_stage_holds_what_its_toml_says():
+    toml = shipped("scenes", "lab.toml")
+    assert read_scene(shipped("scenes", "lab", "lab.usda")) == magtwin.scene_from_toml(toml)
+
+
+def test_the_lab_passes_the_gates(tmp_path, lab_scene):
+    assert_valid(shipped("scenes", "lab", "lab.usda"), tmp_path)
+    assert_valid(lab_scene, tmp_path)
+
+
+def test_the_labs_earth_is_the_igrfs_to_a_tenth_of_a_nanotesla():
+    earth = scene_from_toml(shipped("scenes", "lab.toml")).earth
+    assert earth is not None
+    field = earth_field_nt(earth.latitude_deg, earth.longitude_deg, earth.height_m, earth.date)
+    assert earth.b_world_nt == pytest.approx(field, abs=0.06)
+
+
+def test_the_real_lab_asks_for_its_map():
+    with pytest.raises(InputError, match=r"aprilab\.toml: names no map; .*give --map FILE\.usdc"):
+        scene_from_toml(shipped("scenes", "aprilab.toml"))
+
+
+# What cannot be authored
+
+
+def test_a_folder_that_exists_is_refused_and_kept(parts, tmp_path):
+    root = author_scene(full_scene(parts), tmp_path / "s")
+    before = root.read_bytes()
+    with pytest.raises(InputError, match="exists already; give --force"):
+        author_scene(replace(full_scene(parts), start=(0.0, 0.0, 0.0)), tmp_path / "s")
+    assert root.read_bytes() == before
+    author_scene(replace(full_scene(parts), start=(0.0, 0.0, 0.0)), tmp_path / "s", force=True)
+    assert read_scene(root).start == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda s: {"map_layer": s.robot.asset}, r"bot\.usda </>: needs one prim with MagtwinAnomalyMapAPI"),
+        (
+            lambda s: {"robot": replace(s.robot, asset=s.map_layer)},
+            r"needs one prim with MagtwinMagnetometerAPI",
+        ),
+        (lambda s: {"robot": replace(s.robot, name="Lab")}, "'Lab' has the name of a part of the scene"),
+        (lambda s: {"robot": replace(s.robot, name="my bot")}, "'my bot' cannot name a prim"),
+        (lambda s: {"sources": (SOURCES[0], SOURCES[0])}, "two sources are called 'beam'"),
+        (
+            lambda s: {"robot": replace(s.robot, imu=replace(s.robot.imu, link="base_link"))},
+            "sits on 'base_link', so its prim must be a child of it",
+        ),
+    ],
+)
+def test_a_scene_that_does_not_fit_is_refused_with_nothing_written(parts, tmp_path, change, said):
+    scene = full_scene(parts)
+    with pytest.raises(InputError, match=said):
+        author_scene(replace(scene, **change(scene)), tmp_path / "s")
+    assert list(tmp_path.iterdir()) == []
+
+
+# Broken stages
+
+
+def broken(parts: Path, folder: Path, edit) -> Path:
+    """A scene whose root layer `edit` has changed."""
+    root = author_scene(full_scene(parts), folder / "s")
+    text = root.read_text()
+    changed = edit(text)
+    assert changed != text
+    root.write_text(changed)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (
+            lambda t: t.replace("./robot/bot.usda", "./robot/gone.usda"),
+            r"gone\.usda@ for reference.*</World/bot>",
+        ),
+        (lambda t: t.replace("./map/map.usdc", "./map/gone.usdc"), r"Could not load sublayer.*gone\.usdc"),
+        (
+            lambda t: t.replace("@./map/map.usdc@", ""),
+            r"</World/bot/.*/magnetometer>: magtwin:magnetometer:map must",
+        ),
+        (
+            lambda t: t.replace("@./room.usda@,", ""),
+            r"needs one prim with MagtwinLabAPI below it, found none",
+        ),
+        (
+            lambda t: t.replace("./weights/net.pth", "./weights/gone"),
+            r"</.*magnetometer>: .*network names .*gone",
+        ),
+        (
+            lambda t: t.replace("</World/AnomalyMap>", "</World/Lab>"),
+            r"</World/Lab>: has no MagtwinAnomalyMapAPI",
+        ),
+        (
+            lambda t: t.replace("metersPerUnit = 1", "metersPerUnit = 0.01"),
+            "0.01 m a unit and Z up; magtwin reads metres",
+        ),
+        (
+            lambda t: t.replace('upAxis = "Z"', 'upAxis = "Y"'),
+            "1 m a unit and Y up; magtwin reads metres with Z up",
+        ),
+        (lambda t: t.replace("{", "{{{", 1), r"small\.usda: cannot be opened as USD"),
+    ],
+)
+def test_a_broken_stage_is_refused_in_one_line_by_file_and_prim(parts, tmp_path, capfd, edit, said):
+    root = broken(parts, tmp_path, edit)
+    with pytest.raises(InputError, match=said) as refused:
+        read_scene(root)
+    assert "small.usda" in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert capfd.readouterr().err == "", "USD's own warnings stay off the terminal"
+
+
+def test_a_missing_scene_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"gone\.usda: no such USD file"):
+        read_scene(tmp_path / "gone.usda")
+
+
+def test_a_stage_that_is_no_scene_is_refused(parts):
+    with pytest.raises(
+        InputError, match=r"map\.usdc </>: needs one prim with MagtwinLabAPI below it, found none"
+    ):
+        read_scene(parts / "map.usdc")
+
+
+def test_another_map_in_the_place_of_the_scenes_own_is_refused_naming_both(parts, tmp_path):
+    scene = full_scene(parts)
+    assert scene.map_sha256 == sha256(parts / "map.usdc")
+    root = author_scene(scene, tmp_path / "s")
+    own = tmp_path / "s" / "map" / "map.usdc"
+    save_map(replace(small_map(), origin_m=(-2.5, -1.75)), own, force=True)
+    with pytest.raises(InputError, match=r"small\.usda </World/bot/.*/magnetometer>: .*map\.usdc: has") as e:
+        read_scene(root)
+    assert sha256(own) in str(e.value)
+    assert scene.map_sha256 in str(e.value)
+    root.write_text(root.read_text().replace(f'mapSha256 = "{scene.map_sha256}"', 'mapSha256 = ""'))
+    assert read_scene(root).map_sha256 == "", "any map will do where the scene says no checksum"
+
+
+def test_a_scene_is_not_authored_over_another_map_than_it_names(own_parts, tmp_path):
+    scene = full_scene(own_parts)
+    save_map(replace(small_map(), name="other"), own_parts / "map.usdc", force=True)
+    with pytest.raises(InputError, match=r"map\.usdc: has SHA-256 .* but scene 'small' was made with a map"):
+        author_scene(scene, tmp_path / "s")
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_flattened_scene_is_read_though_it_is_its_own_map(parts, tmp_path):
+    scene = full_scene(parts)
+    stage = Usd.Stage.Open(str(author_scene(scene, tmp_path / "s")))
+    stage.Flatten().Export(str(tmp_path / "flat.usdc"))
+    flat = read_scene(tmp_path / "flat.usdc")
+    assert flat.map_layer == tmp_path / "flat.usdc"
+    assert (flat.earth, flat.sources, flat.robot.drive) == (scene.earth, scene.sources, scene.robot.drive)
+
+
+def test_a_scene_whose_weights_are_gone_is_read_when_they_are_not_wanted(parts, tmp_path):
+    root = author_scene(full_scene(parts), tmp_path / "s")
+    weights = tmp_path / "s" / "weights" / "net.pth"
+    weights.unlink()
+    with pytest.raises(InputError, match=r"magnetometer:network names .*net\.pth, which is not there"):
+        read_scene(root)
+    assert read_scene(root, check_network=False).robot.magnetometer.network == weights
+
+
+def test_a_twin_is_opened_with_other_weights_or_none_where_the_scenes_own_are_gone(parts, tmp_path):
+    root = author_scene(full_scene(parts), tmp_path / "s")
+    (tmp_path / "s" / "weights" / "net.pth").unlink()
+    others = shipped("weights", "turtlebot4_hybrid.safetensors")
+    assert open_twin(root, net=others).scene.robot.magnetometer.network == others
+    assert open_twin(root, net="none").magnetometer is None
+    with pytest.raises(InputError, match=r"net\.pth, which is not there"):
+        open_twin(root)
+
+
+def test_a_toml_names_the_kind_of_magnetometer_and_a_network_makes_it_neural(own_parts):
+    def kind(robot: str, **options) -> str:
+        (own_parts / "scene.toml").write_text(TOML + robot)
+        return scene_from_toml(own_parts / "scene.toml", **options).robot.magnetometer.kind
+
+    assert kind("") == "physical"
+    assert kind('network = "net.pth"') == "neural"
+    assert kind('kind = "map-only"') == "map-only"
+    assert kind('network = "net.pth"\nkind = "physical"') == "physical"
+    assert kind('kind = "map-only"', network=own_parts / "net.pth") == "neural"  # weights asked for are used
+    with pytest.raises(InputError, match=r'\[robot\] kind = "neural" needs network = "FILE" beside it'):
+        kind('kind = "neural"')
+    with pytest.raises(InputError, match=r"scene\.toml"):
+        kind('kind = "magnetic"')
+
+
+@pytest.mark.parametrize("kind", ["physical", "neural", "map-only"])
+def test_the_kind_of_a_magnetometer_survives_the_stage(parts, tmp_path, kind):
+    scene = full_scene(parts)
+    magnetometer = replace(scene.robot.magnetometer, kind=kind)
+    scene = replace(scene, robot=replace(scene.robot, magnetometer=magnetometer))
+    assert read_scene(author_scene(scene, tmp_path / "s", by_reference=True)) == scene
+
+
+def test_a_twin_loads_a_network_only_for_a_neural_magnetometer(lab_scene, tmp_path):
+    assert open_twin(lab_scene).magnetometer is not None
+    for kind in ("physical", "map-only"):
+        twin = open_twin(lab_scene, magnetometer=kind)
+        assert twin.magnetometer is None
+        assert twin.scene.robot.magnetometer.kind == kind
+    assert open_twin(lab_scene, net="none").scene.robot.magnetometer.kind == "physical"
+    with pytest.raises(InputError, match="a neural magnetometer that names no network"):
+        open_twin(lab_scene, net="none", magnetometer="neural")
+    with pytest.raises(InputError, match=r"kind of MagnetometerSpec must be a known kind .*'physical'"):
+        open_twin(lab_scene, magnetometer="physicall")  # type: ignore[arg-type]
+    run = simulate(open_twin(lab_scene, magnetometer="map-only"), duration_s=1.0)
+    np.testing.assert_array_equal(run["b_total_nt"], run["b_map_nt"])
+    assert run.facts["magnetometer"] == "map-only"
+    assert "network" not in run.facts
+
+
+def test_a_robot_that_stands_nowhere_is_refused_by_prim(parts, tmp_path):
+    root = broken(parts, tmp_path, lambda text: text.replace("translate = (1,", "translate = (inf,"))
+    with pytest.raises(InputError, match=r"</World/bot>: start of PlacedRobot must be finite, got \(inf"):
+        read_scene(root)
+
+
+def test_a_folder_is_no_stage(tmp_path):
+    with pytest.raises(InputError, match=rf"^{re.escape(str(tmp_path))}: a folder; give a USD file in it$"):
+        read_scene(tmp_path)
+
+
+def test_a_truncated_crate_is_refused_in_words_without_where_usd_keeps_its_sources(parts, tmp_path):
+    whole = (parts / "map.usdc").read_bytes()
+    (tmp_path / "half.usdc").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"half\.usdc: cannot be opened as USD: .*truncated") as refused:
+        read_scene(tmp_path / "half.usdc")
+    assert "pxrInternal" not in str(refused.value)
+    assert "/pxr/" not in str(refused.value)
+    (tmp_path / "text.usda").write_text("#usda 1.0\n{{{")
+    with pytest.raises(InputError, match=r"text\.usda:2:1: parse error") as refused:
+        read_scene(tmp_path / "text.usda")
+    assert "pxrInternal" not in str(refused.value)
+
+
+def test_a_map_that_was_changed_is_refused(parts, tmp_path):
+    root = author_scene(full_scene(parts), tmp_path / "s")
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "s" / "map" / "map.usdc"))
+    layer.GetPrimAtPath(MAP).attributes["magtwin:anomalyMap:values"].default = [4e4] * 48
+    layer.Save()
+    with pytest.raises(InputError, match=r"</World/AnomalyMap>: .*not those that its checksum was taken of"):
+        read_scene(root)
+
+
+def test_a_stage_can_be_opened_with_one_of_its_robots_alone(own_parts, tmp_path):
+    root = author_scene(two_robots(own_parts), tmp_path / "s")
+    before = root.read_bytes()
+    stage = open_alone(root, "bob")
+    active = [name for name in ("ann", "bob", "cleo") if stage.GetPrimAtPath(f"/World/{name}").IsActive()]
+    assert active == ["bob"]
+    assert robots_in(root) == {
+        "ann": "figure8",
+        "bob": tmp_path / "s" / "paths" / "there.csv",
+        "cleo": "random",
+    }
+    assert root.read_bytes() == before

@@ -1,0 +1,175 @@
+"""`magtwin dataset`: recordings of several kinds, labelled on the default lab's map."""
+
+import json
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import csv, parquet
+
+from magtwin.cli import main
+from magtwin.files import sha256, shipped
+from magtwin.io.formats import read_run, write_run
+from magtwin.learn.data.dataset import open_dataset
+from magtwin.learn.data.labels import labels
+from magtwin.usd.maps import load_map
+
+MAP = shipped("maps", "lab", "lab.usdc")
+
+
+def node(path, start, seed):
+    """A recording of the released node: a drive in circles, its field 300 nT over the map's."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(80) / 10
+    x, y, yaw = 1.2 * np.cos(0.3 * t), 0.9 * np.sin(0.3 * t), (0.3 * t + np.pi / 2) % 6
+    on_map = load_map(MAP).lookup(np.column_stack([x, y]), yaw)
+    with open(path, "w", encoding="utf-8") as file:
+        file.write("[\n")
+        for i in range(len(t)):
+            q = [0.0, 0.0, float(np.sin(yaw[i] / 2)), float(np.cos(yaw[i] / 2))]
+            told = {
+                "timestamp": start + t[i],
+                "nn_magnetic_magnitude": on_map[i] + 300 + rng.normal(0, 20),
+                "map_magnetic_magnitude": on_map[i],
+                "pose_data": [x[i], y[i], yaw[i]],
+                "odom": [[0.3, 0.0, 0.0], [0.0, 0.0, float(rng.normal())]],
+                "imu_data": [q, rng.normal(size=3).tolist(), rng.normal(size=3).tolist()],
+                "battery_data": [15.0 + seed, 0.9],
+                "lidar": int(i > 40),
+            }
+            file.write(json.dumps(told) + ",\n")
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("days")
+    for i, (day, name) in enumerate((("monday", "a"), ("monday", "b"), ("tuesday", "a"))):
+        (folder / day).mkdir(exist_ok=True)
+        node(folder / day / f"{name}.json", 1.7e9 + 1000 * i, i)
+    write_run(read_run(folder / "tuesday" / "a.json").with_facts(path="circle"), folder / "c.parquet")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(recorded, tmp_path_factory):
+    out = tmp_path_factory.mktemp("made") / "set"
+    files = [*(recorded / "monday").iterdir(), recorded / "tuesday" / "a.json", recorded / "c.parquet"]
+    main(["dataset", "build", *map(str, sorted(files)), "--map", str(MAP), "--out", str(out)])
+    return out
+
+
+def test_recordings_of_several_kinds_become_one_data_set_with_a_name_each(made, recorded):
+    found = open_dataset(made)
+    assert found.names == ("c", "monday_a", "b", "tuesday_a")
+    assert found.recording("c").path == "circle"
+    assert found.map_sha256 == sha256(MAP)
+    ((_, run),) = found.runs(["tuesday_a"])
+    expected = labels(read_run(recorded / "tuesday" / "a.json"), load_map(MAP))
+    np.testing.assert_array_equal(run["label_nt"], expected.value_nt)
+    assert np.nanmean(run["label_nt"]) == pytest.approx(300, abs=15)
+
+
+def test_sessions_are_told_by_folder_on_request(recorded, tmp_path, capsys):
+    files = [str(recorded / "monday" / "a.json"), str(recorded / "tuesday" / "a.json")]
+    options = ["--map", str(MAP), "--session-by", "folder", "--path-by", "file", "--rate-hz", "5", "--json"]
+    main(["dataset", "build", *files, "--out", str(tmp_path / "set"), *options])
+    told = json.loads(capsys.readouterr().out)
+    assert told["figures"]["sessions"]["value"] == 2
+    found = open_dataset(tmp_path / "set")
+    assert [one.session for one in found.recordings] == ["monday", "tuesday"]
+    assert [one.path for one in found.recordings] == list(found.names)
+    assert {one.rows for one in found.recordings} == {40}
+
+
+@pytest.mark.parametrize("end", [".csv", ".parquet"])
+def test_a_table_of_another_program_is_read_by_its_own_names_of_columns(recorded, tmp_path, end):
+    run = read_run(recorded / "c.parquet")
+    p, yaw = run["p_world_base"], run["yaw"]
+    table = {"time": run["t"], "east": p[:, 0], "north": p[:, 1], "heading": yaw, "B": run["b_measured_nt"]}
+    theirs = tmp_path / f"theirs{end}"
+    (csv.write_csv if end == ".csv" else parquet.write_table)(pa.table(table), theirs)
+    names = ["t=time", "p_world_base_x=east", "p_world_base_y=north", "yaw=heading", "b_measured_nt=B"]
+    words = [word for name in names for word in ("--column", name)]
+    main(["dataset", "build", str(theirs), "--map", str(MAP), "--out", str(tmp_path / "set"), *words])
+    ((_, found),) = open_dataset(tmp_path / "set").runs()
+    np.testing.assert_array_equal(found["b_measured_nt"], run["b_measured_nt"])
+    np.testing.assert_array_equal(found["p_world_base"], p * [1, 1, 0])
+    assert np.isfinite(found["label_nt"]).any()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--column", "t=tim"], "no column 'tim'; did you mean 'time'"),
+        (["--column", "time"], "--column takes NAME=THEIRS, each once, such as yaw=heading, got 'time'"),
+        (["--column", "t=time", "--column", "yaw=time"], "got 'yaw=time'"),
+    ],
+)
+def test_columns_that_a_table_lacks_or_that_are_named_twice_are_refused(tmp_path, capsys, words, said):
+    (tmp_path / "theirs.csv").write_text("time,B\n0,1\n1,2\n")
+    files = [str(tmp_path / "theirs.csv"), "--map", str(MAP), "--out", str(tmp_path / "set")]
+    with pytest.raises(SystemExit):
+        main(["dataset", "build", *files, *words])
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "set").exists()
+
+
+def test_a_folder_of_runs_stands_for_its_runs_and_their_sessions(recorded, tmp_path):
+    (tmp_path / "runs").mkdir()
+    run = read_run(recorded / "c.parquet")
+    for k in range(3):
+        dealt = run.with_facts(session=k % 2, session_seed=5)
+        write_run(dealt, tmp_path / "runs" / f"run_0000{k}.parquet")
+    (tmp_path / "runs" / "runs.csv").write_text("file\n")
+    main(["dataset", "build", str(tmp_path / "runs"), "--map", str(MAP), "--out", str(tmp_path / "set")])
+    found = open_dataset(tmp_path / "set")
+    assert [one.session for one in found.recordings] == ["5-0", "5-1", "5-0"]
+
+
+def test_info_tells_of_every_recording_and_reads_every_shard(made, capsys):
+    main(["dataset", "info", str(made), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert list(told["facts"]["recordings"]) == ["c", "monday_a", "b", "tuesday_a"]
+    assert told["facts"]["feature sets"] == "full, correlated"
+    assert told["figures"]["labels"]["value"] == 320
+
+
+def test_correlate_tells_and_draws(made, tmp_path, capsys):
+    main(["dataset", "correlate", str(made), "--out", str(tmp_path / "f.png"), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert len(told["figures"]) == 20
+    assert told["figures"]["odom_v_x"]["value"] == "never varies"
+    assert told["facts"]["groups"] == 4
+    assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
+    main(["dataset", "correlate", str(made), "--features", "lidar_on, imu_w_x", "--json"])
+    assert list(json.loads(capsys.readouterr().out)["figures"]) == ["lidar_on", "imu_w_x"]
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["build", "DAYS/monday/x.json"], "no such recording"),
+        (["build", "DAYS/monday/a.json", "DAYS/monday/a.json"], "two recordings are called 'monday_a'"),
+        (
+            ["build", "DAYS/c.parquet", "--align", "fit", "--latency", "0.1"],
+            "drop it, or --lever-arm and --latency",
+        ),
+        (["build", "DAYS/c.parquet", "--align", "fit"], "80 readings have a label on the map 'lab', too few"),
+        (
+            ["correlate", "SET", "--features", "gradiant"],
+            "no feature set 'gradiant'; did you mean 'gradient'?",
+        ),
+        (["correlate", "SET", "--features", "vector"], "which its recordings do not all have"),
+        (["info", "DAYS"], "no such manifest of a data set"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_a_line(options, text, made, recorded, tmp_path, capsys):
+    words = [word.replace("DAYS", str(recorded)).replace("SET", str(made)) for word in options]
+    if words[0] == "build":
+        words += ["--map", str(MAP), "--out", str(tmp_path / "new")]
+    with pytest.raises(SystemExit) as ended:
+        main(["dataset", *words])
+    assert ended.value.code == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert text in said
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,155 @@
+"""Manual driving: keys and sticks as commands, a terminal left as it was, a drive that is repeated."""
+
+import os
+import pty
+import struct
+import subprocess
+import sys
+import termios
+import time
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.io.rerun.live import streamed
+from magtwin.io.rerun.viewer import live_viewer
+from magtwin.io.tables import read_parquet
+from magtwin.sim.motion.commands import read_commands
+from magtwin.sim.motion.follow import play
+from magtwin.sim.motion.manual import Gamepad, Keyboard, Recorder, at_start
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.scene import DriveSpec
+from magtwin.twin import open_twin
+
+DRIVE = DriveSpec()
+
+
+def test_keys_change_speeds_by_steps_within_the_drives_limits():
+    keys = Keyboard(DRIVE)
+    keys.feed(b"ww\x1b[A\x1b[Dz")
+    assert_allclose(keys.command, (0.15, 0.25))
+    keys.feed(b"\x1b")  # an arrow that comes in two pieces
+    keys.feed(b"[Cx")
+    assert_allclose(keys.command, (0.15, 0.0))
+    keys.feed(b"w" * 50 + b"d" * 50)
+    assert keys.command == (DRIVE.v_max, -DRIVE.w_max)
+    keys.feed(b" ")
+    assert keys.command == (0.0, 0.0)
+    assert not keys.done
+    keys.feed(b"sq")
+    assert keys.command == (0.0, 0.0)
+    assert keys.done
+
+
+def test_a_line_that_closes_ends_the_drive():
+    for hand in (Keyboard(DRIVE), Gamepad(DRIVE)):
+        hand.feed(b"")
+        assert hand.done
+
+
+def test_a_stick_drives_in_proportion_and_start_ends():
+    pad = Gamepad(DRIVE)
+    events = [(0, 0, 0x82, 1), (1, -32767, 2, 1), (2, 16384, 2, 0), (3, 1, 1, 0), (4, 1000, 2, 3)]
+    data = b"".join(struct.pack("<IhBB", *event) for event in events)
+    pad.feed(data[:11])  # events that come in pieces
+    pad.feed(data[11:])
+    assert_allclose(pad.command, (DRIVE.v_max, -DRIVE.w_max / 2), rtol=1e-4)
+    pad.feed(struct.pack("<IhBB", 5, 1000, 2, 1))
+    assert pad.command[0] == 0.0  # a stick let go is not quite at rest
+    pad.feed(struct.pack("<IhBB", 6, 1, 1, 7))
+    assert pad.done
+    assert pad.command == (0.0, 0.0)
+
+
+def test_commands_of_a_manual_drive_drive_it_again_to_the_last_bit():
+    keys, errors = Keyboard(DRIVE), (0.002, -0.003)
+    wall = Obstacles(("wall",), (np.array([[0.5, -1], [0.6, -1], [0.6, 1], [0.5, 1]]),))
+    chassis = at_start(DRIVE, (0.1, 0.0, 0.3), wall, 0.171, errors, 0.02)
+    recorder = Recorder(chassis, keys, 0.02)
+    for k in range(400):
+        if k % 10 == 0:
+            keys.feed(np.random.default_rng(k).choice([b"w", b"w", b"a", b"d", b"x"]))
+        recorder.step()
+    by_hand = chassis.motion()
+    again = play(
+        recorder.commands("c.csv").rows,
+        DRIVE,
+        start=(0.1, 0.0, 0.3),
+        obstacles=wall,
+        footprint_radius_m=0.171,
+        wheel_errors=errors,
+    )
+    assert by_hand.bump.any()
+    assert_array_equal(again.poses[: len(by_hand.poses)], by_hand.poses)
+    assert again.v[-1] == 0.0
+
+
+@pytest.mark.parametrize("end", [b"q", b"\x03"])
+def test_a_drive_at_a_terminal_is_recorded_and_leaves_the_terminal_as_it_was(tmp_path, lab_scene, end):
+    ours, theirs = pty.openpty()
+    before = termios.tcgetattr(theirs)
+    command = [sys.executable, "-m", "magtwin", "drive", str(lab_scene), "--out", str(tmp_path / "d")]
+    process = subprocess.Popen(
+        [*command, "--net", "none", "--no-view", "--json"],
+        stdin=theirs,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=lambda: (os.setsid(), __import__("fcntl").ioctl(0, termios.TIOCSCTTY, 0)),
+    )
+    said = b""
+    while b"space: stop" not in said:
+        said += process.stderr.read1(1024)
+    assert not termios.tcgetattr(theirs)[3] & termios.ICANON  # keys come one by one
+    for key in (b"w", b"w", b"\x1b[D", end):
+        os.write(ours, key)
+        time.sleep(0.3)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 0, error
+    assert termios.tcgetattr(theirs) == before
+    os.close(ours)
+    os.close(theirs)
+    run = read_parquet(tmp_path / "d" / "run.parquet")
+    assert run["p_world_base"][-1, 0] > 0.01
+    assert np.abs(run["w_cmd"]).max() == 0.25
+    commands, parquet = tmp_path / "d" / "commands.csv", tmp_path / "again.parquet"
+    options = ["--net", "none", "--json", "--commands", str(commands), "--parquet", str(parquet)]
+    main(["run", str(lab_scene), *options])
+    again = read_parquet(tmp_path / "again.parquet")
+    for name in run:
+        assert_array_equal(again[name], run[name], err_msg=name)
+    assert read_commands(tmp_path / "d" / "commands.csv").rows[-1, 1] == 0.0
+
+
+def test_a_gamepad_that_is_not_there_is_refused(tmp_path, lab_scene, capsys):
+    with pytest.raises(SystemExit):
+        main(["drive", str(lab_scene), "--out", str(tmp_path / "d"), "--gamepad", str(tmp_path / "js0")])
+    assert "no such gamepad" in capsys.readouterr().err
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_folder_is_no_gamepad(tmp_path, lab_scene, capsys):
+    with pytest.raises(SystemExit):
+        main(["drive", str(lab_scene), "--gamepad", str(tmp_path), "--out", str(tmp_path / "d"), "--no-view"])
+    assert f"{tmp_path}: a folder; name a gamepad in it" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_viewer_that_listens_shows_the_drive_while_it_goes_on(lab_scene):
+    scene = open_twin(lab_scene, net="none").scene
+    try:
+        with live_viewer(headless=True) as (address, client), streamed(scene, lab_scene, address) as show:
+            for k in range(20):
+                show(k / 50, (k / 100, 0.0, 0.0))
+            end = time.monotonic() + 60
+            while time.monotonic() < end and not any(r.timelines for r in client.get_state().recordings):
+                client.take_screenshot(max_size=64)
+            state = client.get_state()
+            assert [timeline.name for r in state.recordings for timeline in r.timelines if r.timelines]
+            assert [report for seen in state.views for report in seen.reports] == []
+    except InputError as error:
+        if "cannot draw here" not in str(error):
+            raise
+        pytest.skip(str(error))

@@ -1,0 +1,247 @@
+"""`magtwin evaluate`: a report of weights, with pictures, from the command line."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from places import DOCS
+
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.figures.evaluations import read_curve
+from magtwin.files import sha256
+from magtwin.io.formats import write_run
+from magtwin.io.provenance import made_again
+from magtwin.learn.data.dataset import build_dataset
+from magtwin.run.compare import traversals
+from magtwin.run.run import COLUMNS, Run
+from magtwin.twin import in_session_of, open_twin, simulate
+from magtwin.usd.maps import save_map
+
+
+def a_map(name, level):
+    x, y = np.arange(-2, 2.01, 0.2), np.arange(-1.6, 1.61, 0.2)
+    values = level + 1500 * np.sin(3.1 * x[None, :]) * np.cos(2.3 * y[:, None])
+    return AnomalyMap(
+        values_nt=values[None], origin_m=(-2.0, -1.6), cell_m=(0.2, 0.2), headings_rad=np.zeros(1), name=name
+    )
+
+
+HILLS = a_map("hills", 41e3)
+
+
+def a_run(seed, path, rows=400):
+    rng = np.random.default_rng(seed)
+    t = np.arange(rows) / 10
+    columns = {}
+    for name, spec in COLUMNS.items():
+        values = rng.normal(size=(rows,) if spec.width == 1 else (rows, spec.width))
+        columns[name] = values > 9 if spec.unit == "bool" else values
+    columns = {k: v for k, v in columns.items() if not k.startswith(("mocap", "b_truth", "b_vector"))}
+    phase = 0.2 * t + seed
+    p = np.column_stack([1.7 * np.sin(phase), 1.2 * np.cos(2 * phase), 0 * t])
+    yaw = np.arctan2(-2.4 * np.sin(2 * phase), 1.7 * np.cos(phase))
+    field = HILLS.lookup(p[:, :2], yaw)
+    measured = field + 300 + 100 * columns["odom_v"][:, 0] + rng.normal(0, 20, rows)
+    columns |= {"t": t, "p_world_base": p, "yaw": yaw, "b_measured_nt": measured}
+    return Run(columns, {"session": seed % 5, "session_seed": 1, "path": path})
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """A folder with two maps, a training set, weights of it, and runs that nothing has seen."""
+    folder = tmp_path_factory.mktemp("room")
+    save_map(HILLS, folder / "hills.usdc")
+    save_map(a_map("higher", 41.5e3), folder / "higher.usdc")
+    runs = {f"r{k}": a_run(k, ("fast_sine", "figure8")[k % 2]) for k in range(10)}
+    build_dataset(runs, HILLS, folder / "set", map_sha256=sha256(folder / "hills.usdc"))
+    small = ["--layers", "8", "--epochs", "2", "--features", "circular", "--batch", "64", "--json"]
+    main(["train", str(folder / "set"), "--out", str(folder / "net.safetensors"), *small])
+    for k, path in enumerate(("fast_sine", "curvilinear", "spiral")):
+        write_run(a_run(20 + k, path), folder / f"drive{k}.parquet")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def report(room):
+    out = room / "report"
+    drives = [str(room / f"drive{k}.parquet") for k in range(3)]
+    maps = [str(room / name) for name in ("hills.usdc", "higher.usdc")]
+    words = ["evaluate", str(room / "net.safetensors"), "--runs", *drives, "--map", *maps]
+    main([*words, "--train", str(room / "set"), "--against", str(room / "drive2.parquet"), "--out", str(out)])
+    return out
+
+
+def refused(capsys, *words):
+    with pytest.raises(SystemExit) as ended:
+        main(["evaluate", *map(str, words)])
+    assert ended.value.code == 1
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def test_the_report_has_the_table_with_every_model_and_case(report):
+    told = json.loads((report / "evaluation.json").read_text())
+    assert [case["name"] for case in told["cases"]] == ["A", "B", "spiral", "all", "mean"]
+    names = ["naive", "net", "Tolles-Lawson, hills", "Tolles-Lawson and gradient, hills"]
+    names += ["Tolles-Lawson, higher", "Tolles-Lawson and gradient, higher"]
+    assert [one["name"] for one in told["models"]] == names
+    every = told["cases"][3]
+    assert every["rows"] == 1200
+    assert every["models"]["naive"]["ratio"] == 1
+    assert every["models"]["Tolles-Lawson, hills"]["ratio"] < 0.4
+    markdown = (report / "evaluation.md").read_text()
+    assert f"{every['models']['net']['mae_nt']:.1f} ({every['models']['net']['ratio']:.3f})" in markdown
+    assert "| the paper's network | 217.6 (0.966) |" in markdown
+
+
+def test_every_figure_of_the_paper_is_drawn_and_shown_in_markdown_and_html(report):
+    pictures = {path.name for path in (report / "figures").iterdir()}
+    wanted = {
+        "figure_2.svg",
+        "figure_5.svg",
+        "figure_6ab.svg",
+        "figure_6c.svg",
+        "figure_7.png",
+        "figure_8.svg",
+    }
+    assert pictures == wanted
+    linked = set(re.findall(r"\]\(figures/([^)]+)\)", (report / "evaluation.md").read_text()))
+    assert linked == pictures
+    page = (report / "evaluation.html").read_text()
+    assert page.count("<img ") == len(pictures)
+    assert not re.search(r'(src|href)="(?!data:|#)', page)
+
+
+def test_the_same_evaluation_gives_the_same_bytes(room, report):
+    drives = [str(room / f"drive{k}.parquet") for k in range(3)]
+    maps = [str(room / name) for name in ("hills.usdc", "higher.usdc")]
+    words = ["evaluate", str(room / "net.safetensors"), "--runs", *drives, "--map", *maps, "--force"]
+    out = room / "again"
+    main([*words, "--train", str(room / "set"), "--against", str(room / "drive2.parquet"), "--out", str(out)])
+    for path in (path for path in report.rglob("*") if path.is_file()):
+        assert path.read_bytes() == (out / path.relative_to(report)).read_bytes(), path.name
+
+
+def test_of_its_own_data_set_weights_are_judged_by_their_test_recordings(room, capsys):
+    own = ["--dataset", str(room / "set"), "--train", str(room / "set"), "--map", str(room / "hills.usdc")]
+    main(["evaluate", str(room / "net.safetensors"), *own, "--out", str(room / "own"), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    facts = told["models"][1]["facts"]
+    assert told["cases"][-2]["models"]["net"]["mae_nt"] == pytest.approx(facts["test_mae_nt"], rel=1e-4)
+    assert told["cases"][-2]["models"]["naive"]["mae_nt"] == pytest.approx(
+        facts["test_naive_mae_nt"], rel=1e-3
+    )
+
+
+def test_a_recording_that_baselines_learn_from_is_refused_whatever_its_file_is_called(room, tmp_path, capsys):
+    write_run(a_run(3, "figure8"), tmp_path / "new.parquet")
+    own = ["--train", room / "set", "--map", room / "hills.usdc", "--out", room / "x"]
+    said = refused(capsys, room / "net.safetensors", "--runs", tmp_path / "new.parquet", *own)
+    assert "new: is 'r3' of" in said
+    assert said.endswith("which was learned from; judge by others")
+
+
+def test_weights_for_another_map_are_refused_with_both_checksums(room, capsys):
+    said = refused(capsys, room / "net.safetensors", "--runs", room / "drive0.parquet", "--out", room / "x",
+                   "--map", room / "higher.usdc")  # fmt: skip
+    assert sha256(room / "hills.usdc") in said
+    assert sha256(room / "higher.usdc") in said
+    assert not (room / "x").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--map", "hills.usdc"], "judge by --runs or by a --dataset, one of the two"),
+        (["--runs", "drive0.parquet"], "no map: name those that the weights were trained on"),
+        (["--runs", "drive0.parquet", "--map", "hills.usdc", "hills.usdc"], "hills.usdc is named twice"),
+        (["--runs", "drive0.parquet", "--map", "hills.usdc", "--case", "D"], "--case is a row of the table"),
+        (
+            ["--runs", "drive0.parquet", "--map", "hills.usdc", "--scene", "lab.usda"],
+            "--scene adds an error budget",
+        ),
+        (["--runs", "no.parquet", "--map", "hills.usdc"], "no.parquet: no such"),
+    ],
+)
+def test_what_cannot_be_judged_is_refused_in_a_line(room, capsys, words, said):
+    words = [word if word.startswith("--") or "." not in word else room / word for word in words]
+    assert said in refused(capsys, room / "net.safetensors", *words, "--out", room / "x")
+
+
+def test_a_table_that_is_no_learning_curve_is_refused(tmp_path):
+    (tmp_path / "f.csv").write_text("number,val_rmse_nt\n1,many\n")
+    with pytest.raises(InputError, match=r"f\.csv: not a learning curve"):
+        read_curve(tmp_path / "f.safetensors")
+    assert read_curve(tmp_path / "none.safetensors") == ()
+
+
+def test_a_budget_is_made_where_the_scene_is_at_hand(room, lab_scene, tmp_path, capsys):
+    twin = open_twin(lab_scene, magnetometer="physical")
+    for day in range(3):
+        facts = {"session_seed": 1, "session": day}
+        run = simulate(in_session_of(twin, facts), "figure8", seed=day, duration_s=20.0, rate_hz=10.0)
+        write_run(run.with_facts(**facts), tmp_path / f"d{day}.parquet")
+    layer = twin.scene.map_layer
+    drives = [str(tmp_path / f"d{day}.parquet") for day in range(3)]
+    main(["dataset", "build", *drives[:2], "--map", str(layer), "--out", str(tmp_path / "set"), "--json"])
+    capsys.readouterr()
+    words = [
+        "--train",
+        str(tmp_path / "set"),
+        "--scene",
+        str(lab_scene),
+        "--engine",
+        "kinematic",
+        "--any-map",
+    ]
+    main(
+        [
+            "evaluate",
+            str(room / "net.safetensors"),
+            "--runs",
+            drives[2],
+            *words,
+            "--out",
+            str(tmp_path / "out"),
+            "--json",
+        ]
+    )
+    told = json.loads(capsys.readouterr().out)
+    assert [one["model"] for one in told["budget"]["models"]][:2] == ["naive", "net"]
+    for one in told["budget"]["models"]:
+        assert sum(term["bought_nt"] for term in one["terms"]) == pytest.approx(one["mae_nt"])
+    pictures = {path.stem for path in (tmp_path / "out" / "figures").iterdir()}
+    assert {"budget", "steps", "figure_8"} <= pictures
+
+
+def test_the_example_of_the_docs_runs(room, tmp_path, monkeypatch, capsys):
+    page = (DOCS / "evaluate.md").read_text(encoding="utf-8")
+    files = {"map.usdc": "hills.usdc", "set": "set", "f.safetensors": "net.safetensors"}
+    for name, of in (files | {"a.parquet": "drive0.parquet", "b.parquet": "drive1.parquet"}).items():
+        (tmp_path / name).symlink_to(room / of)
+    monkeypatch.chdir(tmp_path)
+    exec(page.split("```python")[1].split("```")[0], {})
+    ratio, low, high = map(float, re.findall(r"[\d.]+", capsys.readouterr().out))
+    assert low <= ratio <= high
+
+
+def test_two_drives_of_one_path_lie_over_each_other_once_they_are_aligned(lab_scene):
+    twin = open_twin(lab_scene, magnetometer="physical")
+    a = simulate(twin, "figure8", seed=0, duration_s=30.0, rate_hz=20.0)
+    faster = simulate(twin, "figure8", seed=1, speed=0.25, duration_s=25.0, rate_hz=20.0)
+    again = made_again(a, lab_scene, engine="kinematic", seed=1)
+    both, speeds = traversals(a, again), traversals(a, faster)
+    field = {how: getattr(both, how).fields["b_truth_nt"] for how in ("recorded", "placed")}
+    apart = {how: np.abs(np.subtract(*pair)).mean() for how, pair in field.items()}
+    assert apart["placed"] < 40  # wheels of another seed, motors and all
+    drift = {how: np.abs(np.subtract(*getattr(speeds, how).fields["b_truth_nt"])).mean()
+             for how in ("recorded", "placed")}  # fmt: skip
+    assert drift["recorded"] > 5 * drift["placed"]  # as in the paper's Figure 8
+
+
+def test_a_run_that_cannot_be_driven_again_is_refused(lab_scene):
+    run = a_run(0, "figure8")
+    with pytest.raises(InputError, match="do not say how it was made"):
+        made_again(run, lab_scene, engine="kinematic", seed=1)

@@ -1,0 +1,593 @@
+"""Exports of what others made: refused with what to do and nothing written, or converted point by point."""
+
+import json
+import shutil
+import signal
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+
+from magtwin.author.scene import read_scene
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.export.package import export_scene
+from magtwin.export.structure import structure
+from magtwin.export.units import to_metres_z_up
+from magtwin.export.usdz import pack, unpack
+from magtwin.files import sha256, shipped
+from magtwin.io.tables import write_parquet
+from magtwin.run.run import Run
+
+LAB = shipped("scenes", "lab", "lab.usda")
+HEAD = '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    upAxis = "Z"\n)\n'
+CUBE = 'def Xform "World"\n{\n    def Cube "box"\n    {\n    }\n}\n'
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of the default lab, to be copied and spoiled."""
+    out = tmp_path_factory.mktemp("lab") / "lab"
+    export_scene(LAB, out, trusted=True)
+    return out
+
+
+def refuse(text: str, stage: Path, tmp_path: Path, out: str = "out", **options) -> None:
+    """The export is refused with a text, one line of it, and leaves nothing behind."""
+    place = tmp_path / "place"
+    place.mkdir()
+    with pytest.raises(InputError, match=text) as refused:
+        export_scene(stage, place / out, **{"trusted": True, **options})
+    assert "\n" not in str(refused.value)
+    assert "/tmp/tmp" not in str(refused.value)  # a folder that is gone helps nobody
+    assert not list(place.iterdir())
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    (tmp_path / "stage.usda").write_text(text)
+    return tmp_path / "stage.usda"
+
+
+# What is missing, spoiled or dangerous
+
+
+def test_a_sublayer_that_is_not_there_is_refused_by_name(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    (own / "room.usda").unlink()
+    refuse(r"lab\.usda: .*room\.usda", own / "lab.usda", tmp_path)
+
+
+def test_a_layer_that_is_no_utf8_is_refused_in_one_line(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    data = (own / "room.usda").read_bytes()
+    (own / "room.usda").write_bytes(data.replace(b"Looks", b"L\xffoks"))
+    refuse(r"lab\.usda: .*room\.usda", own / "lab.usda", tmp_path)
+
+
+def test_a_reference_in_a_variant_that_is_not_chosen_is_refused_too(tmp_path):
+    text = (
+        'def Xform "World" (variants = {string v = "a"}\nprepend variantSets = "v")\n{\n'
+        'variantSet "v" = {\n"a" {\n}\n"b" (references = @./gone.usda@) {\n}\n}\n}\n'
+    )
+    refuse(
+        r"stage\.usda: names .*gone\.usda, which is not there; put it there",
+        write(tmp_path, HEAD + text),
+        tmp_path,
+    )
+
+
+def test_a_folder_is_refused_with_the_stage_that_is_meant(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    refuse(r"lab: a folder; give a USD file in it, such as \S*lab/lab\.usda", own, tmp_path)
+
+
+def test_a_network_that_is_not_there_is_refused_with_the_prim_that_names_it(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    next((own / "weights").glob("*.safetensors")).unlink()
+    refuse(
+        r"<\S*/magnetometer\S*network>: names .*\.safetensors, which is not there",
+        own / "lab.usda",
+        tmp_path,
+    )
+
+
+def test_a_network_that_is_not_the_one_of_its_checksum_is_refused(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    with open(next((own / "weights").glob("*.safetensors")), "ab") as file:
+        file.write(b"x")
+    refuse(
+        r"lab/lab\.usda <\S*/magnetometer>: its network .* has SHA-256 .*put that", own / "lab.usda", tmp_path
+    )
+
+
+def test_a_map_that_is_not_the_one_of_its_checksum_is_refused(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    layer = Sdf.Layer.FindOrOpen(str(own / "lab" / "lab.usdc"))
+    values = layer.GetAttributeAtPath("/World/AnomalyMap.magtwin:anomalyMap:values")
+    values.default = type(values.default)([v + 1 for v in values.default])
+    layer.Save()
+    refuse("<.*AnomalyMap>: the map's values are not those that its checksum", own / "lab.usda", tmp_path)
+
+
+def test_a_texture_that_is_not_there_is_refused_with_the_property_that_names_it(tmp_path):
+    text = 'def Xform "World"\n{\n    asset inputs:file = @./wood.png@\n}\n'
+    refuse(
+        r"</World\.inputs:file>: names .*wood\.png, which is not there",
+        write(tmp_path, HEAD + text),
+        tmp_path,
+    )
+
+
+def test_a_file_that_is_nothing_a_stage_needs_is_not_handed_on(tmp_path):
+    text = 'def Xform "World"\n{\n    asset picture = @/etc/passwd@\n}\n'
+    refuse(r"</World\.picture>: names /etc/passwd, .* not handed on", write(tmp_path, HEAD + text), tmp_path)
+
+
+def test_a_material_that_omniverse_brings_may_be_named(tmp_path):
+    text = 'def Xform "World"\n{\n    asset mdl = @OmniPBR.mdl@\n}\n'
+    made = export_scene(write(tmp_path, HEAD + text), tmp_path / "out", trusted=True)
+    assert "@OmniPBR.mdl@" in made.root.read_text()
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil.usda", "/tmp/evil.usda", "a/../../evil.usda", "..\\evil.usda", "c:evil.usda"]
+)
+def test_an_entry_that_climbs_out_of_its_package_is_refused_before_anything_is_written(name, tmp_path):
+    with zipfile.ZipFile(tmp_path / "slip.usdz", "w") as archive:
+        archive.writestr("a.usda", HEAD + CUBE)
+        archive.writestr(name, "#usda 1.0\n")
+    refuse(r"slip\.usdz: its entry .*evil.* would lie outside", tmp_path / "slip.usdz", tmp_path)
+    assert not list(tmp_path.rglob("evil*"))
+
+
+def test_a_package_that_names_a_layer_outside_of_itself_is_refused(tmp_path):
+    secret = write(tmp_path, HEAD + CUBE)
+    with zipfile.ZipFile(tmp_path / "a.usdz", "w") as archive:
+        text = HEAD.replace("    upAxis", f"    subLayers = [@{secret}@]\n    upAxis")
+        archive.writestr("a.usda", text + CUBE)
+    refuse(r"a\.usdz/a\.usda: names .*stage\.usda, outside of its package", tmp_path / "a.usdz", tmp_path)
+
+
+@pytest.mark.parametrize(
+    "damage", ["cut", "flipped", "empty", "text", "compressed", "twice", "program", "no layer"]
+)
+def test_a_damaged_package_or_one_against_the_format_is_refused(damage, tmp_path):
+    package = tmp_path / "lab.usdz"
+    write(tmp_path, HEAD + CUBE)
+    folder = tmp_path / "stage"
+    folder.mkdir()
+    shutil.move(tmp_path / "stage.usda", folder)
+    pack(folder / "stage.usda", package)
+    data = bytearray(package.read_bytes())
+    if damage == "cut":
+        data = data[:-100]
+    elif damage == "flipped":
+        data[100] ^= 1
+    elif damage == "empty":
+        data = bytearray()
+    elif damage == "text":
+        data = bytearray(b"not a package")
+    package.write_bytes(data)
+    if damage in ("compressed", "twice", "program", "no layer"):
+        how = zipfile.ZIP_DEFLATED if damage == "compressed" else zipfile.ZIP_STORED
+        with zipfile.ZipFile(package, "w", how) as archive:
+            archive.writestr("a.png" if damage == "no layer" else "a.usda", HEAD + CUBE)
+            archive.writestr({"twice": "A.usda", "program": "run.py"}.get(damage, "b.usda"), HEAD)
+    refuse(r"lab\.usdz: ", package, tmp_path)
+
+
+def test_a_package_that_is_packed_and_unpacked_is_the_same_files(lab, tmp_path):
+    shutil.copytree(
+        lab, tmp_path / "lab", ignore=shutil.ignore_patterns("weights", "plugin", "*.md", ".thumbs")
+    )
+    pack(tmp_path / "lab" / "lab.usda", tmp_path / "lab.usdz")
+    (tmp_path / "back").mkdir()
+    assert unpack(tmp_path / "lab.usdz", tmp_path / "back") == tmp_path / "back" / "lab.usda"
+    files = {f.relative_to(tmp_path / "lab") for f in (tmp_path / "lab").rglob("*") if f.is_file()}
+    assert files == {f.relative_to(tmp_path / "back") for f in (tmp_path / "back").rglob("*") if f.is_file()}
+    assert all(sha256(tmp_path / "lab" / f) == sha256(tmp_path / "back" / f) for f in files)
+
+
+def attached(layer: Sdf.Layer, fact: str) -> Sdf.AttributeSpec:
+    """What a layer says of the one file that is attached in it."""
+    (file,) = layer.GetPrimAtPath("/World/Files").nameChildren
+    return layer.GetAttributeAtPath(file.path.AppendProperty(f"magtwin:file:{fact}"))
+
+
+def test_bytes_that_were_changed_in_a_package_are_refused(tmp_path):
+    export_scene(LAB, tmp_path / "lab.usdz", trusted=True)
+    (tmp_path / "open").mkdir()
+    root = unpack(tmp_path / "lab.usdz", tmp_path / "open")
+    layer = Sdf.Layer.FindOrOpen(str(root.with_name("files.usdc")))
+    attached(layer, "sha256").default = "0" * 64
+    layer.Save()
+    pack(root, tmp_path / "changed.usdz")
+    refuse(
+        r"<.*/Files/\w+_safetensors>: the bytes of \w+\.safetensors are not those",
+        tmp_path / "changed.usdz",
+        tmp_path,
+    )
+
+
+def test_a_name_in_a_package_that_would_lie_elsewhere_is_refused(tmp_path):
+    export_scene(LAB, tmp_path / "lab.usdz", trusted=True)
+    (tmp_path / "open").mkdir()
+    root = unpack(tmp_path / "lab.usdz", tmp_path / "open")
+    layer = Sdf.Layer.FindOrOpen(str(root.with_name("files.usdc")))
+    attached(layer, "name").default = "../../evil.csv"
+    layer.Save()
+    pack(root, tmp_path / "changed.usdz")
+    refuse(r"magtwin:file:name '\.\./\.\./evil\.csv' is no name", tmp_path / "changed.usdz", tmp_path)
+
+
+def test_a_layer_that_ends_its_reader_is_refused_in_one_line(lab, tmp_path, monkeypatch):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    seen = {}
+
+    def killed(command, **options):
+        seen["command"] = command
+        return __import__("subprocess").CompletedProcess(command, -signal.SIGSEGV, "", "")
+
+    monkeypatch.setattr("magtwin.export.validation.inspection.subprocess.run", killed)
+    refuse(r"lab\.usda: damaged: USD ends when it reads it", own / "lab.usda", tmp_path, trusted=False)
+    assert "magtwin.export.validation.inspection" in seen["command"]
+
+
+@pytest.mark.parametrize(
+    ("out", "options", "text"),
+    [
+        ("lab.obj", {}, r"an export is a folder \(no suffix\), or ends in \.usdz, \.usd, \.usdc or \.glb"),
+        ("lab.glb", {"profile": "isaac"}, r"\.glb is for viewers; give a folder or a \.usdz"),
+        ("lab", {"profile": "ominverse"}, r"did you mean 'omniverse'"),
+    ],
+)
+def test_what_cannot_be_made_is_refused(out, options, text, tmp_path):
+    refuse(text, LAB, tmp_path, out, **options)
+
+
+def test_a_stage_without_a_robot_has_no_action_graph_to_be_exported_with(tmp_path):
+    refuse(
+        "is no scene of magtwin's, .* take --profile omniverse",
+        write(tmp_path, HEAD + CUBE),
+        tmp_path,
+        profile="isaac",
+    )
+
+
+def test_what_exists_is_replaced_only_when_asked(lab, tmp_path):
+    stage = write(tmp_path, HEAD + CUBE)
+    for name in ("a", "a.usdz", "a.glb", "a.usd"):
+        export_scene(stage, tmp_path / name, trusted=True)
+        before = (tmp_path / name).stat().st_mtime_ns
+        with pytest.raises(InputError, match="exists already; give --force"):
+            export_scene(stage, tmp_path / name, trusted=True)
+        assert (tmp_path / name).stat().st_mtime_ns == before
+        export_scene(stage, tmp_path / name, trusted=True, force=True)
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_an_export_does_not_take_the_place_of_the_stage_that_it_is_made_from(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    for out in (own, own.parent):
+        with pytest.raises(InputError, match="holds the stage that is exported; name another place"):
+            export_scene(own / "lab.usda", out, trusted=True, force=True)
+    assert (own / "room.usda").is_file()
+
+
+def test_a_robot_alone_can_be_handed_on(tmp_path):
+    robot = shipped("robots", "turtlebot4", "turtlebot4.usda")
+    made = export_scene(robot, tmp_path / "robot.usdz", trusted=True)
+    assert Usd.Stage.Open(str(made.root)).GetPrimAtPath("/turtlebot4/left_wheel")
+    assert made.licences == {"turtlebot4.usda": "Apache-2.0"}
+
+
+def test_a_layer_of_the_stages_own_is_not_mistaken_for_the_one_of_attached_files(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    Sdf.Layer.OpenAsAnonymous(str(own / "room.usda")).Export(str(own / "files.usdc"))
+    text = (own / "lab.usda").read_text().replace("room.usda", "files.usdc")
+    (own / "lab.usda").write_text(text)
+    made = export_scene(own / "lab.usda", tmp_path / "lab.usdz", trusted=True)
+    stage = Usd.Stage.Open(str(made.root))
+    assert stage.GetPrimAtPath("/World/Lab/Floor")
+    assert stage.GetPrimAtPath("/World/Files").GetChildren()
+
+
+def test_a_prim_in_the_place_of_attached_files_is_refused(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    text = (
+        (own / "lab.usda")
+        .read_text()
+        .replace('    def Xform "turtlebot4"', '    def "Files"\n    {\n    }\n\n    def Xform "turtlebot4"')
+    )
+    (own / "lab.usda").write_text(text)
+    refuse("</World/Files>: is where files are attached; rename", own / "lab.usda", tmp_path, "lab.usdz")
+
+
+# Units
+
+
+YARD = """#usda 1.0
+(
+    defaultPrim = "World"
+    metersPerUnit = 0.01
+    upAxis = "Y"
+)
+
+def Xform "World"
+{
+    def PhysicsScene "Scene"
+    {
+        vector3f physics:gravityDirection = (0, -1, 0)
+        float physics:gravityMagnitude = 981
+    }
+
+    def Xform "cart" (
+        prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"]
+    )
+    {
+        double3 xformOp:translate = (100, 20, -300)
+        double xformOp:rotateY = 90
+        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateY"]
+        point3f physics:centerOfMass = (10, 0, 0)
+        float physics:density = 0.001
+        float3 physics:diagonalInertia = (10000, 20000, 30000)
+        float physics:mass = 5
+
+        def Mesh "plate"
+        {
+            float3[] extent = [(0, 0, 0), (200, 50, 0)]
+            int[] faceVertexCounts = [3]
+            int[] faceVertexIndices = [0, 1, 2]
+            point3f[] points = [(0, 0, 0), (200, 0, 0), (0, 50, 0)]
+            point3f[] points.timeSamples = {
+                0: [(0, 0, 0), (200, 0, 0), (0, 50, 0)],
+                1: [(0, 0, 0), (400, 0, 0), (0, 50, 0)],
+            }
+        }
+
+        def Xform "free"
+        {
+            double3 xformOp:translate = (0, 100, 0)
+            uniform token[] xformOpOrder = ["!resetXformStack!", "xformOp:translate"]
+        }
+
+        def Camera "eye"
+        {
+            float2 clippingRange = (1, 1000)
+            float focalLength = 50
+            float horizontalAperture = 20
+            matrix4d xformOp:transform = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 30, 0, 1))
+            uniform token[] xformOpOrder = ["xformOp:transform"]
+        }
+    }
+
+    def PhysicsPrismaticJoint "slide" (
+        prepend apiSchemas = ["PhysicsDriveAPI:linear"]
+    )
+    {
+        float drive:linear:physics:maxForce = 500
+        float drive:linear:physics:stiffness = 7
+        float drive:linear:physics:targetPosition = 25
+        point3f physics:localPos0 = (0, 10, 0)
+        point3f physics:localPos1 = (0, 20, 0)
+        rel physics:body1 = </World/cart>
+        float physics:lowerLimit = -50
+        float physics:upperLimit = inf
+    }
+
+    def PhysicsRevoluteJoint "turn" (
+        prepend apiSchemas = ["PhysicsDriveAPI:angular"]
+    )
+    {
+        float drive:angular:physics:damping = 10000
+        float physics:lowerLimit = -90
+        rel physics:body0 = </World/cart>
+        rel physics:body1 = </World/cart>
+    }
+}
+"""
+
+
+def world_points(stage: Usd.Stage, path: str, time: float) -> np.ndarray:
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
+    to_world = np.array(UsdGeom.Xformable(mesh).ComputeLocalToWorldTransform(time))
+    points = np.array(mesh.GetPointsAttr().Get(time))
+    return np.column_stack([points, np.ones(len(points))]) @ to_world[:, :3]
+
+
+def test_a_stage_in_centimetres_with_y_up_is_refused_unless_it_is_to_be_converted(tmp_path):
+    stage = write(tmp_path, YARD)
+    refuse(r"stage\.usda: has 0\.01 m a unit and Y up; .*give --convert-units", stage, tmp_path)
+
+
+def test_a_stage_that_says_no_unit_is_refused_as_what_usd_takes_it_for(tmp_path):
+    refuse("0.01 m a unit and Y up, as it says none", write(tmp_path, "#usda 1.0\n" + CUBE), tmp_path)
+
+
+def test_points_and_transforms_are_converted_to_metres_with_z_up(tmp_path):
+    made = export_scene(write(tmp_path, YARD), tmp_path / "out", convert_units=True, trusted=True)
+    stage = Usd.Stage.Open(str(made.root))
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    # cart's x axis is the yard's -z, which is y of the world with Z up; its y is up
+    assert_allclose(
+        world_points(stage, "/World/cart/plate", 0), [[1, 3, 0.2], [1, 5, 0.2], [1, 3, 0.7]], atol=1e-6
+    )
+    assert_allclose(world_points(stage, "/World/cart/plate", 1)[1], [1, 7, 0.2], atol=1e-6)
+    cache = UsdGeom.XformCache()
+    free, eye = (
+        cache.GetLocalToWorldTransform(stage.GetPrimAtPath(f"/World/cart/{n}")) for n in ("free", "eye")
+    )
+    assert_allclose(free.ExtractTranslation(), [0, 0, 1], atol=1e-9)
+    assert_allclose(eye.ExtractTranslation(), [1, 3, 0.5], atol=1e-9)
+    assert_allclose(free.TransformDir(Gf.Vec3d(0, 1, 0)), [0, 0, 1], atol=1e-9)
+    world = stage.GetPrimAtPath("/World")
+    assert cache.GetLocalToWorldTransform(world) == Gf.Matrix4d(1)
+    assert_allclose(
+        UsdGeom.Mesh(stage.GetPrimAtPath("/World/cart/plate")).GetExtentAttr().Get()[1], [2, 0.5, 0]
+    )
+
+
+def test_every_conversion_agrees_with_the_rule_for_points_of_the_world(tmp_path):
+    before = Usd.Stage.Open(str(write(tmp_path, YARD)))
+    made = export_scene(tmp_path / "stage.usda", tmp_path / "out", convert_units=True, trusted=True)
+    after = Usd.Stage.Open(str(made.root))
+    for time in (0, 1):
+        x, y, z = world_points(before, "/World/cart/plate", time).T / 100
+        assert_allclose(
+            world_points(after, "/World/cart/plate", time), np.column_stack([x, -z, y]), atol=1e-6
+        )
+
+
+def test_figures_of_physics_are_converted_by_their_units(tmp_path):
+    made = export_scene(write(tmp_path, YARD), tmp_path / "out", convert_units=True, trusted=True)
+    stage = Usd.Stage.Open(str(made.root))
+    scene = UsdPhysics.Scene(stage.GetPrimAtPath("/World/Scene"))
+    assert scene.GetGravityMagnitudeAttr().Get() == pytest.approx(9.81)
+    assert_allclose(scene.GetGravityDirectionAttr().Get(), [0, 0, -1])
+    expected = {
+        "/World/cart.physics:mass": 5,
+        "/World/cart.physics:density": 1000,  # kg/cm3 to kg/m3
+        "/World/cart.physics:diagonalInertia": (1, 2, 3),  # kg cm2 to kg m2
+        "/World/cart.physics:centerOfMass": (0.1, 0, 0),
+        "/World/slide.physics:lowerLimit": -0.5,
+        "/World/slide.physics:upperLimit": np.inf,
+        "/World/slide.physics:localPos0": (0, 0, 0.1),  # its first end is the world
+        "/World/slide.physics:localPos1": (0, 0.2, 0),
+        "/World/slide.drive:linear:physics:maxForce": 5,  # kg cm/s2 to N
+        "/World/slide.drive:linear:physics:stiffness": 7,  # N/m, of force and length
+        "/World/slide.drive:linear:physics:targetPosition": 0.25,
+        "/World/turn.physics:lowerLimit": -90,
+        "/World/turn.drive:angular:physics:damping": 1,
+        "/World/cart/eye.focalLength": 0.5,
+        "/World/cart/eye.horizontalAperture": 0.2,
+        "/World/cart/eye.clippingRange": (0.01, 10),
+    }
+    for path, value in expected.items():
+        assert_allclose(stage.GetAttributeAtPath(path).Get(), value, rtol=1e-6, err_msg=path)
+
+
+def test_a_variant_that_is_not_chosen_is_converted_too(tmp_path):
+    (tmp_path / "tall.usda").write_text(
+        '#usda 1.0\n(\n    defaultPrim = "box"\n)\ndef Cube "box"\n{\n    double size = 300\n}\n'
+    )
+    text = (
+        '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 0.01\n    upAxis = "Y"\n)\n'
+        'def Xform "World" (variants = {string v = "low"}\nprepend variantSets = "v")\n{\n'
+        'variantSet "v" = {\n"low" {\ndef Cube "box"\n{\ndouble size = 100\n}\n}\n'
+        '"tall" {\ndef "box" (references = @./tall.usda@)\n{\n}\n}\n}\n}\n'
+    )
+    made = export_scene(write(tmp_path, text), tmp_path / "out", convert_units=True, trusted=True)
+    stage = Usd.Stage.Open(str(made.root))
+    world = stage.GetPrimAtPath("/World")
+    for variant, size in (("low", 1), ("tall", 3)):
+        world.GetVariantSet("v").SetVariantSelection(variant)
+        box = stage.GetPrimAtPath("/World/box")
+        assert box.GetAttribute("size").Get() == pytest.approx(size)
+        up = UsdGeom.XformCache().GetLocalToWorldTransform(box).TransformDir(Gf.Vec3d(0, 1, 0))
+        assert_allclose(up, [0, 0, 1], atol=1e-9)
+
+
+def test_lengths_of_physics_engines_that_are_not_known_are_noted(tmp_path):
+    text = YARD.replace(
+        "        float physics:mass = 5",
+        "        float physxVehicle:wheelBase = 5\n        float physics:mass = 5",
+    )
+    made = export_scene(write(tmp_path, text), tmp_path / "out", convert_units=True, trusted=True)
+    assert "physxVehicle:wheelBase" in made.notes[0]
+
+
+def test_a_scene_that_went_to_centimetres_comes_back_to_the_bit_of_single_precision(lab, tmp_path):
+    own = shutil.copytree(lab, tmp_path / "lab")
+    _to_centimetres(own / "lab.usda")
+    refuse("0.01 m a unit and Z up", own / "lab.usda", tmp_path)
+    made = export_scene(own / "lab.usda", tmp_path / "back", convert_units=True, trusted=True)
+    there, here = (read_scene(file) for file in (lab / "lab.usda", made.root))
+    assert here.lab == there.lab
+    assert here.robot.drive == there.robot.drive
+    assert_allclose(here.robot.magnetometer.p_link_sensor, there.robot.magnetometer.p_link_sensor, rtol=1e-12)
+    before, after = (Usd.Stage.Open(str(file)) for file in (lab / "lab.usda", made.root))
+    caches = UsdGeom.XformCache(), UsdGeom.XformCache()
+    for prim in before.Traverse():
+        places = [
+            c.GetLocalToWorldTransform(s.GetPrimAtPath(prim.GetPath()))
+            for c, s in zip(caches, (before, after), strict=True)
+        ]
+        assert_allclose(np.array(places[1]), np.array(places[0]), atol=1e-7)
+
+
+def _to_centimetres(root: Path) -> None:
+    """The lab in centimetres, as another program's conversion leaves it, its map's checksum taken anew."""
+    stage = Usd.Stage.Open(str(root))
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    layers = [Sdf.Layer.FindOrOpen(layer.identifier) for layer in stage.GetUsedLayers() if layer.realPath]
+    # metres a unit 100, as if one unit were a hundred metres, multiplies all lengths by 100
+    for layer in layers:
+        layer.pseudoRoot.SetInfo("metersPerUnit", 100.0)
+        layer.Save()
+    to_metres_z_up(root)
+    for layer in layers:
+        layer.pseudoRoot.SetInfo("metersPerUnit", 0.01)
+        layer.Save()
+    prim = stage.GetPrimAtPath("/World/turtlebot4/magnetometer_link/magnetometer")
+    prim.GetAttribute("magtwin:magnetometer:mapSha256").Set(sha256(root.parent / "lab" / "lab.usdc"))
+    stage.GetRootLayer().Save()
+
+
+# Structure
+
+
+def test_a_robot_that_is_laid_out_already_stays_as_it_is(tmp_path):
+    export_scene(LAB, tmp_path / "lab", profile="isaac", trusted=True)
+    asset = tmp_path / "lab" / "turtlebot4" / "turtlebot4.usda"
+    before = {f: f.read_bytes() for f in asset.parent.rglob("*") if f.is_file()}
+    structure(asset)
+    assert {f: f.read_bytes() for f in asset.parent.rglob("*") if f.is_file()} == before
+
+
+# The command
+
+
+def test_the_command_exports_a_scene_by_its_name_and_says_what_it_made_as_json(tmp_path, capsys):
+    main(["export", "lab", "--out", str(tmp_path / "lab.glb"), "--json"])
+    said = capsys.readouterr().out
+    assert '"profile"' in said
+    assert struct.unpack("<4s", (tmp_path / "lab.glb").read_bytes()[:4]) == (b"glTF",)
+
+
+def test_the_command_draws_a_thumbnail_and_plays_a_run(tmp_path, capsys):
+    out, run = tmp_path / "lab", tmp_path / "run.parquet"
+    poses = {"p_world_base": np.zeros((2, 3)), "q_world_base_xyzw": np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))}
+    write_parquet(Run({"t": np.array([0.0, 1.0]), **poses}), run)
+    main(["export", str(LAB), "--out", str(out), "--run", str(run), "--no-onnx"])
+    picture = (out / ".thumbs" / "256x256" / "lab.usda.png").read_bytes()
+    assert struct.unpack_from(">II", picture, 16) == (256, 256)
+    assert (out / "lab_run.usdc").is_file()
+    assert "Wrote" in capsys.readouterr().out
+
+
+def test_a_stage_that_shows_nothing_is_exported_without_a_thumbnail_and_says_so(tmp_path, capsys):
+    stage, out = tmp_path / "bare.usda", tmp_path / "out"
+    stage.write_text(
+        '#usda 1.0\n(\n    defaultPrim = "A"\n    metersPerUnit = 1\n    upAxis = "Z"\n)\n'
+        'def Xform "A"\n{\n}\n'
+    )
+    main(["export", str(stage), "--out", str(out), "--json"])
+    (note,) = json.loads(capsys.readouterr().out)["facts"]["notes"]
+    assert note.startswith("no thumbnail was drawn: bare.usda: shows nothing")
+    assert (out / "bare.usda").is_file()
+    assert not (out / ".thumbs").exists()
+
+
+@pytest.mark.parametrize(
+    ("scene", "text"), [("lap", "did you mean 'lab'"), ("lab.toml", "magtwin scene lab.toml --out DIR")]
+)
+def test_the_command_refuses_what_is_no_stage_with_status_1(scene, text, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["export", scene, "--out", str(tmp_path / "lab")])
+    assert ended.value.code == 1
+    assert text in capsys.readouterr().err

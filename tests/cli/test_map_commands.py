@@ -1,0 +1,305 @@
+"""`magtwin map plot`, `info`, `diff`, `continue`, `epochs`, and the card that `info` prints."""
+
+import json
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from magtwin.cli import main
+from magtwin.field.grid import Grid
+from magtwin.field.maps.card import map_card, source_files
+from magtwin.field.maps.epochs import drift
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.sources.harmonic import HarmonicField
+from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
+
+SHA = "0123456789abcdef" * 4
+
+
+def a_field(height_m=0.35) -> HarmonicField:
+    return HarmonicField(
+        p_world_dipole=[[0.5, 0.2, -0.5], [-1.0, 0.0, -0.8]],
+        m_world=[[0, 0, 4.0], [2.0, 0, 0]],
+        b_uniform_nt=(-3_000.0, 24_000.0, -38_000.0),
+        hard_iron_nt=(300.0, 0.0, -400.0),
+        soft_iron=np.diag([0.01, 0.0, 0.02]),
+        p_base_sensor=(0.01, 0.0, height_m),
+    )
+
+
+def a_map(harmonic=None, **more) -> AnomalyMap:
+    """The dipoles' field on 4 headings x 7 x 9 nodes, in numbers that a layer holds."""
+    grid = Grid.over((-2, 2, -1.5, 1.5), 0.5, np.radians([0, 90, 180, 270]))
+    values = a_field().magnitude_nt(*grid.poses()).astype(np.float32).astype(float)
+    given = {
+        "values_nt": values,
+        "variance_nt2": np.full(values.shape, 25.0),
+        "origin_m": grid.origin_m,
+        "cell_m": grid.cell_m,
+        "headings_rad": grid.headings_rad,
+        "name": "hall",
+        "method": "harmonic",
+        "source": f"0_map.csv sha256:{SHA}; 90_map.csv sha256:{SHA[::-1]}",
+        "licence": "MIT",
+        "created": "2026-01-01",
+        "frame": "world",
+        "datum": "the door",
+        "height_m": 0.35,
+        "parameters": {"depth_m": 0.5, "notes": ["a", 1]},
+        "harmonic": harmonic,
+    }
+    return AnomalyMap(**{**given, **more})
+
+
+def on(day: str, rise_nt: float) -> AnomalyMap:
+    """The map of another day, its field higher by so much."""
+    field = a_map()
+    return replace(field, values_nt=field.values_nt + rise_nt, created=day)
+
+
+@pytest.fixture
+def layer(tmp_path):
+    save_map(a_map(a_field()), tmp_path / "m.usdc")
+    return tmp_path / "m.usdc"
+
+
+@pytest.fixture
+def series(tmp_path):
+    save_map_series([on("2026-01-01", 0), on("2026-01-11", 10), on("2026-01-21", 60)], tmp_path / "s.usdc")
+    return tmp_path / "s.usdc"
+
+
+def told(capsys, *arguments):
+    """What a command says as JSON."""
+    main([*map(str, arguments), "--json"])
+    return json.loads(capsys.readouterr().out)
+
+
+def refused(capsys, *arguments):
+    with pytest.raises(SystemExit) as stop:
+        main(list(map(str, arguments)))
+    assert stop.value.code == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    return said
+
+
+def test_info_tells_everything_that_a_map_knows(layer, capsys):
+    said = told(capsys, "map", "info", layer)
+    figures, facts = said["figures"], said["facts"]
+    assert figures["valid share"]["value"] == 100
+    assert figures["standard deviation"]["value"] == 5
+    assert figures["height"] == {"value": 0.35, "unit": "m", "note": "of the sensor above the floor"}
+    assert figures["dipoles"] == {"value": 2, "note": "0.5 to 0.8 m below the floor"}
+    assert figures["hard iron"]["value"] == 500
+    assert figures["hard iron"]["note"] == "(300, 0, -400)"
+    assert figures["soft iron"]["value"] == pytest.approx(0.02)
+    assert figures["extent"]["value"] == "x -2..2, y -1.5..1.5"
+    assert facts["files"] == {"0_map.csv": SHA, "90_map.csv": SHA[::-1]}
+    assert facts["parameters"] == {"depth_m": 0.5, "notes": ["a", 1]}
+    for name, value in (
+        ("method", "harmonic"),
+        ("frame", "world"),
+        ("datum", "the door"),
+        ("created", "2026-01-01"),
+        ("licence", "MIT"),
+        ("headings deg", "0, 90, 180, 270"),
+    ):
+        assert facts[name] == value
+    main(["map", "info", str(layer)])
+    text = capsys.readouterr().out
+    for part in ("the door", "0_map.csv", "dipoles", "(300, 0, -400)", "parameters", "depth_m  0.5"):
+        assert part in text
+
+
+def test_info_says_what_is_unknown():
+    bare = AnomalyMap(
+        values_nt=np.full((1, 2, 2), 4e4),
+        origin_m=(0, 0),
+        cell_m=(1, 1),
+        headings_rad=[0.0],
+        source="by hand",
+    )
+    card = map_card(bare)
+    figures = {f.name: f.value for f in card.figures}
+    assert figures["standard deviation"] == figures["height"] == "unknown"
+    assert [card.facts[n] for n in ("method", "frame", "datum", "created", "licence")] == ["unknown"] * 5
+    assert card.facts["source"] == "by hand"
+    assert "dipoles" not in figures
+    assert map_card(replace(bare, source="")).facts["source"] == "unknown"
+
+
+def test_info_works_on_a_stage_that_holds_a_map(lab_scene, capsys):
+    said = told(capsys, "map", "info", lab_scene)
+    assert said["title"] == "map lab"
+    assert said["figures"]["valid share"]["value"] == 100
+
+
+def test_info_works_on_a_folder_of_csvs_and_tells_their_checksums(real_data, capsys):
+    from magtwin.files import sha256
+
+    folder = real_data / "aprilab" / "maps"
+    said = told(capsys, "map", "info", folder)
+    assert said["facts"]["files"] == {p.name: sha256(p) for p in folder.glob("*_map.csv")}
+    assert said["figures"]["valid share"]["value"] < 97
+
+
+@pytest.mark.parametrize("source", ["", "a.csv", f"a.csv sha256:{SHA[:-1]}", f"a.csv sha256:{SHA}; by hand"])
+def test_a_source_that_is_not_all_files_with_checksums_names_none(source):
+    assert source_files(source) == {}
+
+
+def test_files_of_one_name_that_differ_are_all_told():
+    other = SHA[::-1].replace("a", "b")
+    source = f"lab.usda sha256:{SHA}; room.usda sha256:{SHA}; lab.usda sha256:{other}; room.usda sha256:{SHA}"
+    assert source_files(source) == {"lab.usda": SHA, "room.usda": SHA, "lab.usda (2)": other}
+
+
+def test_the_drift_is_the_slope_of_the_line_through_the_epochs():
+    maps = [on("2026-01-01", 0), on("2026-01-11", 10), on("2026-01-21", 60)]
+    figures = {f.name: f for f in drift(maps).figures}
+    assert figures["span"].value == 20
+    # rises 0, 10, 60 at -10, 0, 10 days about their mean: (600 - 0) / 200
+    assert figures["drift"].value == pytest.approx(3.0)
+    assert figures["drift"].spread == pytest.approx(0.0, abs=1e-6)
+    assert figures["greatest drift"].spread == pytest.approx(5 * np.sqrt(2) / 20)
+
+
+def test_the_greatest_drift_is_told_with_its_place():
+    late = on("2026-01-11", 0)
+    values = late.values_nt.copy()
+    values[1, 2, 3] -= 50.0
+    figure = drift([on("2026-01-01", 0), replace(late, values_nt=values)]).figures[-1]
+    assert figure.value == pytest.approx(-5.0)
+    assert figure.note == "at (-0.5, -0.5) m, heading 90 deg"
+
+
+def test_info_of_a_map_of_several_days_tells_its_drift_and_every_day(series, capsys):
+    said = told(capsys, "map", "info", series)
+    assert said["figures"]["drift"]["value"] == pytest.approx(3.0, abs=1e-3)
+    assert said["figures"]["epochs"]["note"] == "2026-01-01, 2026-01-11, 2026-01-21"
+    assert list(said["facts"]["epochs"]) == ["2026-01-01", "2026-01-11", "2026-01-21"]
+    assert said["facts"]["created"] == "2026-01-21"
+    between = told(capsys, "map", "info", series, "--date", "2026-01-06")
+    mean = on("2026-01-06", 5).values_nt.mean()
+    assert between["figures"]["mean"]["value"] == pytest.approx(mean, abs=0.06)
+    assert "reaches from 2026-01-01 to 2026-01-21" in refused(
+        capsys, "map", "info", series, "--date", "2025-12-31"
+    )
+
+
+def test_epochs_joins_maps_in_any_order_and_series_too(tmp_path, series, capsys):
+    later = on("2026-02-01", 70)
+    save_map(later, tmp_path / "later.usdc")
+    said = told(capsys, "map", "epochs", tmp_path / "later.usdc", series, "--out", tmp_path / "all.usdc")
+    assert said["figures"]["epochs"]["value"] == 4
+    assert load_epochs(tmp_path / "all.usdc") == (*load_epochs(series), load_map(tmp_path / "later.usdc"))
+
+
+def test_what_is_no_series_is_refused_and_nothing_is_written(tmp_path, layer, series, capsys):
+    out = tmp_path / "out.usdc"
+    assert "two at least, got 1" in refused(capsys, "map", "epochs", layer, "--out", out)
+    assert "are both of 2026-01-01" in refused(capsys, "map", "epochs", layer, layer, "--out", out)
+    assert "exists already" in refused(capsys, "map", "epochs", layer, layer, "--out", series)
+    assert not out.exists()
+
+
+def test_continue_writes_the_map_of_another_height(tmp_path, layer, capsys):
+    said = told(capsys, "map", "continue", layer, "--height", "1.0", "--out", tmp_path / "up.usdc")
+    assert said["figures"]["height"]["value"] == 1.0
+    up = load_map(tmp_path / "up.usdc")
+    exact = a_field().magnitude_nt(*up.grid.poses(), height_m=1.0)
+    assert np.abs(up.values_nt - exact).max() < 0.004
+    assert up.method.endswith("continued from 0.35 to 1 m by its harmonic field")
+    assert "height_m is a height above the floor, 0 m or more, got -1.0" in refused(
+        capsys, "map", "continue", layer, "--height", "-1", "--out", tmp_path / "down.usdc"
+    )
+    assert not (tmp_path / "down.usdc").exists()
+
+
+def test_diff_tells_and_draws_what_changed(tmp_path, layer, capsys):
+    changed = a_map()
+    values = changed.values_nt + 30.0
+    values[:, 2, 3] += 400.0
+    save_map(replace(changed, values_nt=values, created="2026-02-01"), tmp_path / "b.usdc")
+    said = told(capsys, "map", "diff", layer, tmp_path / "b.usdc", "--out", tmp_path / "d.svg")
+    assert said["figures"]["common bias"]["value"] == pytest.approx(30, abs=0.01)
+    assert said["figures"]["changed nodes"]["value"] == 4
+    (region,) = said["facts"]["regions"]
+    assert region["centre_m"] == [-0.5, -0.5]
+    assert region["peak_nt"] == pytest.approx(400, abs=0.01)
+    assert (
+        said["figures"]["region 1"]["note"]
+        == "z 56.6, about (-0.50, -0.50) m, x -0.5..-0.5, y -0.5..-0.5 m, 1 node"
+    )
+    words = "".join(ElementTree.parse(tmp_path / "d.svg").getroot().itertext())
+    assert "hall 2026-01-01 to hall 2026-02-01" in words
+    assert "exists already" in refused(
+        capsys, "map", "diff", layer, tmp_path / "b.usdc", "--out", tmp_path / "d.svg"
+    )
+
+
+@pytest.mark.parametrize("what", ["field", "gradient", "variance", "mask", "headings"])
+def test_plot_draws_each_quantity_as_png_and_svg(tmp_path, layer, capsys, what):
+    for suffix, head in (("png", b"\x89PNG"), ("svg", b"<?xml")):
+        out = tmp_path / f"a.{suffix}"
+        main(["map", "plot", str(layer), "--out", str(out), "--what", what])
+        assert out.read_bytes().startswith(head)
+
+
+def test_plot_shows_the_headings_and_the_day_that_are_asked_for(tmp_path, series):
+    main(
+        [
+            "map",
+            "plot",
+            str(series),
+            "--out",
+            str(tmp_path / "a.svg"),
+            "--headings",
+            "45",
+            "--date",
+            "2026-01-06",
+        ]
+    )
+    words = " ".join(ElementTree.parse(tmp_path / "a.svg").getroot().itertext())
+    assert "heading 45°" in words
+    assert "heading 0°" not in words
+    assert "2026-01-06" in words
+
+
+def test_a_map_in_many_headings_is_drawn_in_four_unless_asked(tmp_path):
+    from magtwin.figures.plots import plot_map
+
+    headings = np.radians(np.arange(0, 360, 15.0))
+    values = np.repeat(a_map().values_nt[:1], 24, axis=0)
+    field = AnomalyMap(values_nt=values, origin_m=(-2, -1.5), cell_m=(0.5, 0.5), headings_rad=headings)
+    plot_map(field, tmp_path / "a.svg")
+    words = " ".join(ElementTree.parse(tmp_path / "a.svg").getroot().itertext())
+    assert [h for h in range(0, 360, 15) if f"heading {h}°" in words] == [0, 90, 180, 270]
+
+
+def test_a_picture_of_another_kind_is_refused_before_anything_is_read(tmp_path, capsys):
+    said = refused(capsys, "map", "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.jpg")
+    assert "a picture ends in .png or .svg" in said
+    assert "no such USD file" in refused(
+        capsys, "map", "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.png"
+    )
+
+
+def test_info_fits_80_columns_with_each_checksum_whole_on_a_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    save_map(a_map(), tmp_path / "m.usdc")
+    main(["map", "info", str(tmp_path / "m.usdc")])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert all(any(checksum in line for line in lines) for checksum in (SHA, SHA[::-1]))
+
+
+def test_a_maps_own_texts_do_not_steer_the_terminal(tmp_path, capsys):
+    save_map(a_map(datum="the \x1b[31mdoor"), tmp_path / "m.usdc")
+    main(["map", "info", str(tmp_path / "m.usdc")])
+    told = capsys.readouterr().out
+    assert "\x1b" not in told
+    assert "the \\x1b[31mdoor" in told

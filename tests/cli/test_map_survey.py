@@ -1,0 +1,111 @@
+"""`magtwin map survey`: the twin surveyed as it stands, from the command line."""
+
+import json
+
+import numpy as np
+import pytest
+
+from magtwin.cli import main
+from magtwin.files import sha256
+from magtwin.io.surveys.readings import load_readings
+from magtwin.usd.maps import load_map
+
+
+def run(*arguments):
+    main(["map", "survey", *map(str, arguments)])
+
+
+def test_a_survey_becomes_a_map_that_knows_where_it_comes_from(lab_scene, tmp_path, capsys):
+    out = tmp_path / "coarse.usdc"
+    run(lab_scene, "--out", out, "--spacing", 0.5, "--headings", "0,120,240", "--seed", 3, "--json")
+    field = load_map(out)
+    assert field.values_nt.shape == (3, 8, 13)
+    assert np.degrees(field.headings_rad) == pytest.approx([0, 120, 240])
+    assert f"lab.usda sha256:{sha256(lab_scene)}" in field.source
+    assert f"furniture.usda sha256:{sha256(lab_scene.parent / 'furniture.usda')}" in field.source
+    assert "lab.usdc" not in field.source, "the map that the scene had before has no part in it"
+    assert (field.name, field.created) == ("coarse", "2026-11-21")
+    assert field.parameters["seed"] == 3
+    assert field.parameters["readings"] == 135
+    assert field.frame == "world: x east, y north, z up"
+    assert field.height_m == pytest.approx(0.405, abs=0.002)
+    assert json.loads(capsys.readouterr().out)["figures"]["nodes"]["value"] == 104
+
+
+def test_a_survey_of_the_shipped_scene_finds_the_shipped_map_but_for_its_error(lab_scene, tmp_path):
+    out = tmp_path / "again.usdc"
+    run(lab_scene, "--out", out, "--position-error", 0, "--heading-error", 0)
+    again, shipped = load_map(out), load_map(lab_scene.parent / "map" / "lab.usdc")
+    _, rows, columns = again.values_nt.shape
+    x, y = (again.origin_m[k] + again.cell_m[k] * np.arange(count) for k, count in ((0, columns), (1, rows)))
+    yaw, y, x = np.meshgrid(again.headings_rad, y, x, indexing="ij")
+    off = shipped.lookup(np.stack([x, y], axis=-1), yaw, outside="clamp") - again.values_nt
+    # the shipped map is fitted to a survey of which each node is read 1.5 cm and 7 deg off
+    assert 5 < np.sqrt(np.mean(off**2)) < 80
+
+
+def test_one_seed_gives_one_file_and_another_another(lab_scene, tmp_path):
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        folder = tmp_path / name
+        folder.mkdir()
+        run(lab_scene, "--out", folder / "m.usdc", "--spacing", 1, "--readings", 1, "--seed", seed)
+    a, b, c = ((tmp_path / name / "m.usdc").read_bytes() for name in "abc")
+    assert a == b
+    assert a != c
+
+
+def test_a_survey_becomes_readings_whose_headings_deviate(lab_scene, tmp_path):
+    out = tmp_path / "survey.parquet"
+    run(
+        lab_scene,
+        "--out",
+        out,
+        "--spacing",
+        0.5,
+        "--heading-error",
+        7,
+        "--position-error",
+        0.01,
+        "--height",
+        0.2,
+    )
+    read = load_readings(out)
+    off = np.degrees(read.yaw - np.asarray(read.grid.headings_rad)[read.node[:, 0]])
+    assert off.std() == pytest.approx(7, rel=0.15)
+    assert (len(read), read.height_m, read.name) == (416, 0.2, "survey")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--spacing", "0"], "spacing_m must be above 0 m"),
+        (["--spacing", "9"], "spacing_m 9 leaves no cell on 6 x 3.5 m"),
+        (["--headings", "north"], "headings are degrees with commas between"),
+        (["--readings", "0"], "readings must be at least 1"),
+        (["--seed", "-1"], "seed must be a whole number from 0 up"),
+        (["--height", "nan"], "height_m is a height above the floor, 0 m or more"),
+        (["--position-error", "-1"], "position_error_m must not be below 0"),
+    ],
+)
+def test_a_survey_that_cannot_be_made_is_refused_in_one_line_and_nothing_is_written(
+    lab_scene, tmp_path, capsys, options, said
+):
+    with pytest.raises(SystemExit) as end:
+        run(lab_scene, "--out", tmp_path / "m.usdc", *options)
+    assert end.value.code == 1
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert line.startswith("magtwin: ")
+    assert said in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_outputs_are_kept_and_other_suffixes_refused(lab_scene, tmp_path, capsys):
+    (tmp_path / "m.usdc").write_text("mine")
+    for out, said in (
+        (tmp_path / "m.usdc", "exists already; give --force"),
+        (tmp_path / "m.csv", "ends in .usdc"),
+    ):
+        with pytest.raises(SystemExit):
+            run(lab_scene, "--out", out)
+        assert said in capsys.readouterr().err
+    assert (tmp_path / "m.usdc").read_text() == "mine"

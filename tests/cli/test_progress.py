@@ -1,0 +1,331 @@
+"""Progress of commands: when lines come, what they say, and that no output is broken into lines of 80."""
+
+import io
+import json
+import os
+import pty
+import re
+import subprocess
+import sys
+import threading
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+import magtwin
+from magtwin.cli import main
+from magtwin.cli.progress import EVERY_S, FIRST_S, Step, Watch, in_words, progress, step, watched
+
+ROOT = Path(magtwin.__file__).parents[1]
+
+
+class Clock:
+    """A clock that is set by hand."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def stream():
+    return io.StringIO()
+
+
+@pytest.fixture
+def watch(clock, stream):
+    return Watch(stream=stream, clock=clock)
+
+
+def times_of_lines(watch, clock, stream, until, every=0.1):
+    """When lines came, while a thread looks every tenth of a second."""
+    found, before = [], len(stream.getvalue())
+    while clock.now < until:
+        clock.now += every
+        watch.tick()
+        if len(stream.getvalue()) > before:
+            found.append(clock.now)
+            before = len(stream.getvalue())
+    return found
+
+
+def test_the_first_line_comes_within_2_s_and_the_next_ones_every_10_s(watch, clock, stream):
+    times = times_of_lines(watch, clock, stream, 60.0)
+    assert times == pytest.approx([1.5, 11.5, 21.5, 31.5, 41.5, 51.5], abs=0.11)
+    assert FIRST_S < 2
+    assert EVERY_S == 10
+    assert stream.getvalue().splitlines()[0] == "  Starting: 2 s so far"
+
+
+def test_lines_come_at_most_every_10_s_however_many_steps_and_reports_there_are(watch, clock, stream):
+    times = []
+    for k in range(1000):  # 100 s
+        clock.now += 0.1
+        before = stream.getvalue()
+        if k % 30 == 0:
+            watch.step(f"Step {k}", quiet=True)
+        with watch.progress("Driving", "runs") as advance:
+            advance(k, 1000)
+        if stream.getvalue() != before:
+            times.append(clock.now)
+    assert len(times) == 10
+    assert min(b - a for a, b in pairwise(times)) >= 10
+
+
+def test_a_command_of_less_than_2_s_prints_no_progress(watch, clock, stream):
+    with watch.progress("Driving", "runs") as advance:
+        for k in range(14):
+            clock.now += 0.1
+            advance(k, 14)
+    assert stream.getvalue() == ""
+
+
+def test_a_line_tells_counts_rate_and_time_left(watch, clock, stream):
+    with watch.progress("Training", "rows") as advance:
+        for k in range(17):
+            clock.now = 0.1 * k + 0.01
+            advance(1000 * k, 100_000, "epoch 1 of 12")
+    assert stream.getvalue() == "  Training: 15,000 of 100,000 rows, 10,000 rows/s, 8 s left, epoch 1 of 12\n"
+
+
+@pytest.mark.parametrize(
+    ("per_s", "said"),
+    [(0.05, "0.05 runs/s, 29 min 56 s left"), (2, "2 runs/s, 41 s left"), (250, "250 runs/s")],
+)
+def test_rates_and_times_left_are_those_of_the_loop(clock, per_s, said):
+    one = Step("Driving", "runs", 0.0)
+    total = 100 if per_s < 100 else 100_000
+    for k in range(11):
+        one.advance(k / per_s, k, total)
+    assert said in one.line(10 / per_s + 4)  # 4 s after the last report
+
+
+def test_a_loop_that_stands_still_has_no_time_left():
+    one = Step("Driving", "runs", 0.0)
+    for k in range(11):
+        one.advance(k, k, 100)
+    assert one.line(14.0) == "Driving: 10 of 100 runs, 1 runs/s, 1 min 26 s left"
+    assert one.line(16.0) == "Driving: 10 of 100 runs, 16 s so far"
+
+
+def test_a_rate_forgets_what_is_long_ago(clock):
+    one = Step("Driving", "runs", 0.0)
+    for k in range(100):
+        one.advance(0.1 * k, k, 10_000)  # 10/s for 10 s
+    for k in range(100):
+        one.advance(10 + k, 100 + k, 10_000)  # then 1/s for 100 s
+    assert one.rate(109.0) == pytest.approx(1.0, rel=0.05)
+
+
+def test_a_rate_does_not_count_what_was_done_before_a_resume():
+    one = Step("Training", "rows", 0.0)
+    for k in range(5):
+        one.advance(k, 50_000 + 100 * k, 100_000)
+    assert one.rate(4.0) == pytest.approx(100)
+
+
+def test_a_loop_that_begins_anew_has_a_rate_of_its_own():
+    one = Step("Fitting", "", 0.0)
+    one.advance(1.0, 0, 10)
+    one.advance(2.0, 10, 10)
+    one.advance(3.0, 0, 40)
+    assert one.rate(3.0) is None
+    one.advance(5.0, 4, 40)
+    assert one.line(5.0) == "Fitting: 4 of 40, 2/s, 18 s left"
+
+
+def test_an_unknown_length_tells_the_time_that_has_gone(watch, clock, stream):
+    clock.now = 5.0
+    watch.step("Drawing the stage")
+    clock.now = 7.0
+    watch.tick()
+    with watch.progress("Recording", "messages") as advance:
+        advance(0, None)
+        clock.now = 17.5
+        advance(2100, None)
+    assert stream.getvalue().splitlines() == [
+        "  Drawing the stage ...",
+        "  Drawing the stage: 2 s so far",
+        "  Recording: 2,100 messages, 200 messages/s, 10 s so far",
+    ]
+
+
+def test_seconds_are_told_as_a_share_of_real_time():
+    one = Step("Simulating", "s", 0.0)
+    for k in range(11):
+        one.advance(k, 0.5 * k, 60)
+    assert one.line(10.0) == "Simulating: 5 of 60 s, 0.5 x real time, 1 min 50 s left"
+
+
+def test_times_are_in_words():
+    assert [in_words(s) for s in (0.4, 59.4, 59.6, 80, 3599.7, 7500)] == [
+        "0 s",
+        "59 s",
+        "1 min 0 s",
+        "1 min 20 s",
+        "1 h 0 min",
+        "2 h 5 min",
+    ]
+
+
+def test_nothing_is_printed_while_a_viewer_is_shown(watch, clock, stream):
+    with watch.silence():
+        clock.now = 100.0
+        watch.tick()
+    assert stream.getvalue() == ""
+    clock.now = 101.0
+    watch.tick()
+    assert stream.getvalue() == ""
+    clock.now = 102.0
+    watch.tick()
+    assert stream.getvalue().startswith("  Starting")
+
+
+def test_a_thread_prints_what_a_library_without_a_hook_takes_long_for(capsys):
+    with watched():
+        step("Waiting for a library")
+        begin, said = time.monotonic(), ""
+        while not said and time.monotonic() - begin < 20:
+            time.sleep(0.02)
+            said = capsys.readouterr().err
+    assert re.fullmatch(r"  Waiting for a library: \d+ s so far\n", said)
+    assert not [t for t in threading.enumerate() if t.name == "magtwin-progress"]
+
+
+def test_without_a_command_progress_can_be_reported_too(capsys):
+    with progress("Driving", "runs") as advance:
+        advance(1, 2)
+    assert capsys.readouterr().err == ""
+
+
+def piped(*arguments, cwd=None):
+    """A command with nothing but pipes, in an environment that says no width."""
+    env = {k: v for k, v in os.environ.items() if k not in ("COLUMNS", "LINES")} | {"PYTHONPATH": str(ROOT)}
+    code = "from magtwin.cli import main; main()"
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        env=env,
+        cwd=cwd,
+        check=False,
+        stdin=subprocess.DEVNULL,
+    )
+
+
+@pytest.fixture(scope="module")
+def long_run(tmp_path_factory):
+    """A run whose name and facts are longer than a line of 80."""
+    import numpy as np
+
+    from magtwin.io.tables import write_parquet
+    from magtwin.run.run import Run
+
+    folder = tmp_path_factory.mktemp("a-folder-with-a-name-that-is-long" * 2)
+    run = Run({"t": np.arange(5.0), "b_total_nt": np.full(5, 4e4)}, {"scene_file": "word " * 40 + "end"})
+    write_parquet(run, folder / f"{'a-long-name-' * 8}.parquet")
+    return folder / f"{'a-long-name-' * 8}.parquet"
+
+
+def test_piped_reports_are_not_broken_and_have_no_spaces_at_the_end(long_run):
+    out = piped("info", long_run)
+    assert out.returncode == 0
+    assert out.stdout.splitlines()[0] == str(long_run)
+    assert len(str(long_run)) > 150
+    assert any(line.endswith("word word end") for line in out.stdout.splitlines())
+    assert not re.search(r" +$", out.stdout, re.M)
+    assert any(re.match(r"  b_total_nt  nT  .*$", line) for line in out.stdout.splitlines())
+
+
+def test_columns_says_how_wide_piped_reports_are(long_run, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "50")
+    main(["info", str(long_run)])
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 50
+
+
+def test_piped_messages_of_wrong_usage_are_one_line(tmp_path):
+    out = piped(
+        "run", tmp_path, "--engine", "a-word-that-is-so-long-that-a-box-of-80-columns-would-break-it" * 2
+    )
+    assert out.returncode == 2
+    said = [line for line in out.stderr.splitlines() if not line.startswith("  ")]
+    assert len(said) == 1
+    assert said[0].startswith("magtwin: Invalid value")
+    assert "newton" in said[0]
+    out = piped("run", tmp_path / ("far-away-" * 20))
+    assert out.returncode == 1
+    assert out.stderr.splitlines()[-1] == f"magtwin: {tmp_path / ('far-away-' * 20)}: no such scene"
+
+
+def test_piped_help_has_a_line_an_option(tmp_path):
+    out = piped("run", "--help")
+    assert out.returncode == 0
+    options = [line for line in out.stdout.splitlines() if line.startswith("  --path")]
+    assert len(options) == 1
+    assert options[0].count("curvilinear_2") == 1
+    assert max(map(len, out.stdout.splitlines())) > 200
+    assert not re.search(r" +$", out.stdout, re.M)
+    assert "─" not in out.stdout
+    for words in (["--help"], [], ["map", "--help"], ["ros"]):
+        assert "─" not in piped(*words).stdout, words
+
+
+def test_json_stays_json_while_progress_goes_to_stderr(tmp_path):
+    slow = f"""
+import sys, time
+from magtwin.cli import main
+from magtwin.cli import file
+whole = file._info_of_run
+file._info_of_run = lambda path: time.sleep(2.2) or whole(path)
+main(["info", {str(tmp_path / "run.parquet")!r}, "--json"])
+"""
+    import numpy as np
+
+    from magtwin.io.tables import write_parquet
+    from magtwin.run.run import Run
+
+    write_parquet(Run({"t": np.arange(3.0)}), tmp_path / "run.parquet")
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    out = subprocess.run([sys.executable, "-c", slow], capture_output=True, text=True, env=env, check=True)
+    assert json.loads(out.stdout)["figures"]
+    assert re.match(r"  Reading run.parquet( \.\.\.|: [1-9] s so far)\n", out.stderr)
+
+
+def test_on_a_terminal_there_is_a_bar_with_rate_and_time_left(tmp_path):
+    code = """
+import time
+from magtwin.cli.progress import watched, progress
+with watched():
+    with progress("Driving", "runs") as advance:
+        for k in range(41):
+            advance(k, 40, "lap")
+            time.sleep(0.02)
+print("the end")
+"""
+    parent, child = pty.openpty()
+    env = os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "100"}
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=child, env=env)
+    os.close(child)
+    shown = b""
+    while True:
+        try:
+            block = os.read(parent, 4096)
+        except OSError:
+            break
+        if not block:
+            break
+        shown += block
+    assert process.communicate()[0] == b"the end\n"
+    os.close(parent)
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.decode())
+    assert re.search(r"  Driving ━.* 40/40 .*runs/s 0:00:00 lap", text)
+    assert "so far" not in text

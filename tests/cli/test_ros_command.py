@@ -1,0 +1,101 @@
+"""`magtwin ros`: nodes from the command line, and one line where they cannot be."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from nodes import DOMAINS
+
+from magtwin.cli import main
+from magtwin.files import shipped
+from magtwin.io.formats import write_run
+from magtwin.run.run import Run
+
+pytest.importorskip("cyclonedds", reason="extra ros is not installed")
+
+SCENE = str(shipped("scenes", "lab", "lab.usda"))
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A domain of the test's own, on loopback only."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(next(DOMAINS)))
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """What is said in one line where an input is refused."""
+    with pytest.raises(SystemExit) as ended:
+        main(["ros", *arguments])
+    assert ended.value.code == 1
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("  ")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_a_robot_is_simulated_for_a_while(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["ros", "sim", SCENE, "--net", "none", "--duration", "0.3", "--speed", "2", "--units", "nT"])
+    said = capsys.readouterr().err
+    assert "simulating by cyclonedds at 2 x real time" in said
+    assert "published in nT" in said
+
+
+def test_the_profile_of_the_release_publishes_nt_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    quickly = ["--net", "none", "--duration", "0.1", "--speed", "4", "--profile", "aprilab"]
+    main(["ros", "sim", SCENE, *quickly])
+    assert "published in nT" in capsys.readouterr().err
+    main(["ros", "sim", SCENE, *quickly, "--units", "T"])
+    assert "published in nT" not in capsys.readouterr().err
+    main(["ros", "magnetometer", SCENE, "--profile", "aprilab", "--duration", "0.1"])
+    assert "published in nT" in capsys.readouterr().err
+
+
+def test_the_magnetometer_waits_for_a_robot(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["ros", "magnetometer", SCENE, "rate_hz:=50", "--duration", "0.3"])
+    assert "reading by cyclonedds" in capsys.readouterr().err
+
+
+def test_a_run_is_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    t = np.arange(20) / 135
+    write_run(Run({"t": t, "b_measured_nt": 4e4 + t}, {}), tmp_path / "run.parquet")
+    main(["ros", "replay", str(tmp_path / "run.parquet")])
+    # The field in two units, the whole reading and /clock for each, and once what columns there are.
+    assert capsys.readouterr().out == f"{4 * 20 + 1} messages\n"
+
+
+def test_a_recording_of_nothing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = refused(["record", str(tmp_path / "bag"), "--duration", "0.1"], capsys)
+    assert "nothing was recorded" in said
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["sim", "nowhere.usda"], "nowhere.usda"),
+        (["sim", SCENE, "--speed", "-1"], "speed must be above 0"),
+        (["sim", SCENE, "--domain", "300"], "a domain of ROS must be from 0 to 232, got 300"),
+        (["sim", SCENE, "--remap", "odom=x"], "a remap is a name:=another"),
+        (["sim", SCENE, "--namespace", "my robot"], "namespace 'my robot' is none of ROS"),
+        (["sim", SCENE, "--duration", "nan"], "duration must be above 0 s, got nan"),
+        (["sim", SCENE, "--rate-hz", "1e9"], "rate_hz must be at most 1000 Hz live"),
+        (["magnetometer", SCENE, "--duration", "-1"], "duration must be above 0 s, got -1"),
+        (["magnetometer", SCENE, "rate_hz:=0"], "parameter rate_hz must be from 1 to 1000"),
+        (["magnetometer", SCENE, "--net", "none"], "is physical, which needs the lab itself"),
+        (["follow", "figur8"], "did you mean 'figure8'"),
+        (["follow", "figure8", "--speed", "3"], "speed must be above 0"),
+        (["replay", "nothing.parquet"], "nothing.parquet"),
+        (["teleop", "--gamepad", "/dev/input/nojs"], "/dev/input/nojs"),
+    ],
+)
+def test_what_cannot_be_is_one_line(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert said in refused(arguments, capsys)
+
+
+def test_what_exists_is_not_recorded_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "bag").mkdir()
+    said = refused(["record", str(tmp_path / "bag"), "--duration", "0.1"], capsys)
+    assert "--force" in said

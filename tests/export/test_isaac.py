@@ -1,0 +1,403 @@
+"""Isaac Sim: the Action Graph has what its nodes' definitions have, and what magtwin's ROS 2 topics are."""
+
+import json
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from pxr import Sdf, Usd, UsdPhysics, UsdShade
+
+from magtwin.author.scene import author_scene, read_scene
+from magtwin.errors import InputError
+from magtwin.export.isaac import GRAPHS, author_graph
+from magtwin.export.ogn import Graph, faults, fits, message_fields, node_types
+from magtwin.io.bags.messages import SCAN, TOPICS, TYPES, sender_of
+from magtwin.ros.magnetometer import INPUTS
+from magtwin.spec.scene import PlacedRobot
+from magtwin.usd.layers import open_stage
+from magtwin.usd.schema import only_prim_with
+
+USD_TYPES = {
+    "execution": "uint",
+    "vectord[3]": "vector3d",
+    "quatd[4]": "quatd",
+}
+"""OmniGraph's types that USD calls otherwise."""
+
+
+@pytest.fixture(scope="module")
+def authored(lab_scene):
+    stage, scene = open_stage(lab_scene), read_scene(lab_scene)
+    stage.SetEditTarget(stage.GetSessionLayer())
+    (graph,) = author_graph(stage, scene)
+    return stage, scene, graph
+
+
+def kind_of(attribute):
+    """The kind of an authored input or output by its node's definition, and the fields of its message."""
+    prim = attribute.GetPrim()
+    known = node_types()[prim.GetAttribute("node:type").Get()]
+    namespace, name = attribute.GetName().split(":", 1)
+    kinds = dict(getattr(known, namespace))
+    if prim.GetAttribute("inputs:messageName"):
+        package, folder, short = (
+            prim.GetAttribute(f"inputs:message{part}").Get() for part in ("Package", "Subfolder", "Name")
+        )
+        kinds |= message_fields(f"{package}/{folder}/{short}")
+    assert name in kinds, f"{prim.GetPath()}: {known.name} has no {attribute.GetName()}"
+    return kinds[name]
+
+
+def ports(prim):
+    return [
+        prop
+        for prop in prim.GetAuthoredProperties()
+        if prop.GetName().split(":")[0] in ("inputs", "outputs") and prop.GetName() != "node:type"
+    ]
+
+
+def test_every_node_input_and_output_is_one_of_its_definition_and_of_its_type(authored):
+    _, _, graph = authored
+    assert graph.GetTypeName() == "OmniGraph"
+    assert graph.GetAttribute("evaluator:type").Get() == "execution"
+    for prim in graph.GetChildren():
+        assert prim.GetTypeName() == "OmniGraphNode"
+        known = node_types()[prim.GetAttribute("node:type").Get()]
+        assert prim.GetAttribute("node:typeVersion").Get() == known.version
+        assert known.source
+        for prop in ports(prim):
+            kind = kind_of(prop)
+            if kind == "target":
+                assert isinstance(prop, Usd.Relationship)
+                continue
+            wanted = USD_TYPES.get(kind, kind) if isinstance(kind, str) else "token"
+            assert str(prop.GetTypeName()) == wanted, prop.GetPath()
+            assert bool(prop.GetCustomDataByKey("isExecution")) == (kind == "execution")
+
+
+def test_every_connection_goes_from_an_output_to_an_input_that_takes_it(authored):
+    stage, _, graph = authored
+    count = 0
+    for prim in graph.GetChildren():
+        for attribute in prim.GetAttributes():
+            for path in attribute.GetConnections():
+                source = stage.GetAttributeAtPath(path)
+                assert source, path
+                assert source.GetName().startswith("outputs:")
+                assert attribute.GetName().startswith("inputs:")
+                assert fits(kind_of(source), kind_of(attribute)), (path, attribute.GetPath())
+                count += 1
+    assert count > 60
+
+
+def test_each_frame_comes_to_every_node_that_something_must_run(authored):
+    _, _, graph = authored
+    reached, seen = {graph.GetPath().AppendChild("tick")}, set()
+    while reached - seen:
+        seen |= (now := reached - seen)
+        for prim in graph.GetChildren():
+            attribute = prim.GetAttribute("inputs:execIn")
+            if attribute and any(path.GetPrimPath() in now for path in attribute.GetConnections()):
+                reached.add(prim.GetPath())
+    for prim in graph.GetChildren():
+        known = node_types()[prim.GetAttribute("node:type").Get()]
+        assert ("execIn" in known.inputs) <= (prim.GetPath() in reached), prim.GetPath()
+
+
+def test_topics_messages_and_qos_are_those_of_magtwins_own_robot(authored):
+    stage, _, graph = authored
+    seen = {}
+    for prim in graph.GetChildren():
+        topic = prim.GetAttribute("inputs:topicName")
+        if not topic:
+            continue
+        name, short = topic.Get(), prim.GetAttribute("node:type").Get().split("ROS2")[1]
+        known = TOPICS[name]
+        message = prim.GetAttribute("inputs:messageName")
+        said = message.Get() if message else short.removeprefix("Publish").removeprefix("Subscribe")
+        said = {"Odometry": "Odometry", "RtxLidarHelper": "LaserScan"}.get(said, said)
+        assert known.kind.endswith(f"/{said}")
+        qos = stage.GetPrimAtPath(prim.GetAttribute("inputs:qosProfile").GetConnections()[0].GetPrimPath())
+        assert qos.GetAttribute("inputs:depth").Get() == known.qos.depth
+        assert (qos.GetAttribute("inputs:reliability").Get() == "reliable") == known.qos.reliable
+        seen[name] = short
+    assert set(seen) == {
+        *("/clock", "/robot/odom", "/robot/imu", "/robot/enu/pose"),
+        *("/robot/battery_state", "/robot/joint_states", "/robot/scan", "/robot/cmd_vel"),
+    }
+    assert seen["/robot/cmd_vel"].startswith("Subscribe")
+
+
+def test_the_magnetometers_node_finds_in_isaac_every_topic_that_it_can_read(authored):
+    _, _, graph = authored
+    topics = {a.Get() for prim in graph.GetChildren() if (a := prim.GetAttribute("inputs:topicName"))}
+    assert {topic.name for topic in (*INPUTS, SCAN)} <= topics
+
+
+@pytest.mark.parametrize("node", ["publish_pose", "publish_battery"])
+def test_a_message_has_every_field_that_its_publisher_makes_so_that_isaac_keeps_the_connections(
+    authored, node
+):
+    _, _, graph = authored
+    prim = graph.GetChild(node)
+    package, folder, short = (
+        prim.GetAttribute(f"inputs:message{part}").Get() for part in ("Package", "Subfolder", "Name")
+    )
+    own = set(node_types()["isaacsim.ros2.bridge.ROS2Publisher"].inputs)
+    made = {prop.GetName().removeprefix("inputs:") for prop in ports(prim)} - own
+    assert made == set(message_fields(f"{package}/{folder}/{short}"))
+
+
+@pytest.mark.parametrize("message", ["geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/BatteryState"])
+def test_fields_of_messages_are_the_leaves_that_magtwin_itself_writes(message):
+    basic = {"text": "token", "f8": "double", "f4": "float", "u1": "uint", "f4[]": "float[]"}
+    parts = {"f8[3]": "xyz", "f8[4]": "xyzw"}
+    want = {}
+    for leaf in TYPES[message].split(", "):
+        kind, name = leaf.split()
+        name = name.replace(".", ":")
+        if kind == "time":
+            want |= {f"{name}:sec": "int", f"{name}:nanosec": "uint"}
+        elif kind in parts:
+            want |= {f"{name}:{part}": "double" for part in parts[kind]}
+        else:
+            want[name] = "bool" if name == "present" else basic[kind]
+    assert message_fields(message) == want
+
+
+def test_pose_and_battery_are_put_together_as_the_robot_has_them(authored):
+    _, scene, graph = authored
+    pose, battery = graph.GetChild("publish_pose"), graph.GetChild("publish_battery")
+    for group, parts in (("position", "xyz"), ("orientation", "xyzw")):
+        for axis in parts:
+            (path,) = pose.GetAttribute(f"inputs:pose:{group}:{axis}").GetConnections()
+            assert path.name == f"outputs:{axis}"
+    pack = scene.robot.battery
+    volts, amperes = (battery.GetAttribute(f"inputs:{name}").Get() for name in ("voltage", "current"))
+    assert volts * -amperes == pytest.approx(pack.load_w, rel=1e-5)
+    assert pack.voltage_empty_v < volts < pack.voltage_full_v
+    assert battery.GetAttribute("inputs:percentage").Get() == pack.initial_fraction
+    assert graph.GetChild("seldom").GetAttribute("inputs:step").Get() == 60 / pack.rate_hz
+
+
+def test_frames_of_messages_are_those_that_a_bag_of_the_robot_names(authored):
+    _, scene, graph = authored
+    who = sender_of(scene.robot)
+    assert graph.GetChild("publish_imu").GetAttribute("inputs:frameId").Get() == who.imu_frame
+    assert graph.GetChild("publish_scan").GetAttribute("inputs:frameId").Get() == who.lidar_frame
+    assert graph.GetChild("publish_pose").GetAttribute("inputs:header:frame_id").Get() == who.map_frame
+    assert graph.GetChild("publish_battery").GetAttribute("inputs:header:frame_id").Get() == who.base_frame
+    odometry = graph.GetChild("publish_odometry")
+    assert odometry.GetAttribute("inputs:odomFrameId").Get() == who.odom_frame
+    assert odometry.GetAttribute("inputs:chassisFrameId").Get() == who.base_frame
+    assert graph.GetChild("wheels").GetAttribute("inputs:jointNames").Get() == list(who.wheel_joints)
+
+
+def test_the_drive_of_the_robot_limits_its_wheels(authored):
+    _, scene, graph = authored
+    drive, controller = scene.robot.drive, graph.GetChild("controller")
+    for name, want in {
+        "wheelRadius": drive.wheel_radius_m,
+        "wheelDistance": drive.wheel_separation_m,
+        "maxLinearSpeed": drive.v_max,
+        "maxAngularSpeed": drive.w_max,
+        "maxAcceleration": drive.a_max,
+        "maxDeceleration": drive.a_max,
+        "maxAngularAcceleration": drive.alpha_max,
+        "maxWheelSpeed": drive.wheel_rate_max,
+    }.items():
+        assert controller.GetAttribute(f"inputs:{name}").Get() == want
+
+
+def test_prims_that_nodes_name_are_what_isaac_looks_for(authored):
+    stage, _, graph = authored
+
+    def target(node, name):
+        (path,) = graph.GetChild(node).GetRelationship(f"inputs:{name}").GetTargets()
+        return stage.GetPrimAtPath(path)
+
+    assert target("odometry", "chassisPrim").HasAPI(UsdPhysics.RigidBodyAPI)
+    assert target("pose", "prim") == target("odometry", "chassisPrim")
+    assert target("wheels", "targetPrim").HasAPI(UsdPhysics.ArticulationRootAPI)
+    assert target("joints", "prim") == target("wheels", "targetPrim")
+    imu, lidar = target("imu", "imuPrim"), target("beams", "cameraPrim")
+    assert imu.GetTypeName() == "IsaacImuSensor"
+    assert imu.GetParent().GetParent().HasAPI(UsdPhysics.RigidBodyAPI)
+    assert lidar.GetTypeName() == "OmniLidar"
+    names = [joint.GetName() for joint in target("wheels", "targetPrim").GetChild("joints").GetChildren()]
+    assert set(graph.GetChild("wheels").GetAttribute("inputs:jointNames").Get()) <= set(names)
+
+
+def test_a_lidar_scans_a_plane_with_as_many_rays_as_its_figures_say(authored):
+    stage, scene, graph = authored
+    (path,) = graph.GetChild("beams").GetRelationship("inputs:cameraPrim").GetTargets()
+    lidar, core = stage.GetPrimAtPath(path), "omni:sensor:Core:"
+    turns = lidar.GetAttribute(f"{core}scanRateBaseHz").Get()
+    for name in ("patternFiringRateHz", "reportRateBaseHz"):
+        assert lidar.GetAttribute(core + name).Get() == scene.robot.lidar.rays * turns
+    count = lidar.GetAttribute(f"{core}numberOfEmitters").Get()
+    assert count == 1
+    for name in ("azimuthDeg", "elevationDeg", "fireTimeNs", "channelId"):
+        assert len(lidar.GetAttribute(f"{core}emitterState:s001:{name}").Get()) == count
+
+
+def test_the_robot_lists_its_links_and_joints_from_the_base_on(authored):
+    stage, _, _ = authored
+    root = only_prim_with(stage.GetPseudoRoot(), "robot")
+    links = root.GetRelationship("isaac:physics:robotLinks").GetForwardedTargets()
+    joints = root.GetRelationship("isaac:physics:robotJoints").GetForwardedTargets()
+    bodies = [p.GetPath() for p in Usd.PrimRange(root) if p.HasAPI(UsdPhysics.RigidBodyAPI)]
+    assert sorted(links) == sorted(bodies)
+    assert sorted(joints) == sorted(p.GetPath() for p in Usd.PrimRange(root) if p.IsA(UsdPhysics.Joint))
+    assert links[0].name == "base_link"
+    known = {links[0]}
+    for path in joints:  # each hangs on what came before, and brings the link of its own place
+        joint = UsdPhysics.Joint(stage.GetPrimAtPath(path))
+        (parent,), (child,) = (
+            rel.GetForwardedTargets() for rel in (joint.GetBody0Rel(), joint.GetBody1Rel())
+        )
+        assert parent in known
+        known.add(child)
+        assert links[len(known) - 1] == child
+
+
+def test_every_collider_has_a_physics_material(authored):
+    stage, _, _ = authored
+    colliders = [p for p in stage.Traverse() if p.HasAPI(UsdPhysics.CollisionAPI)]
+    assert len(colliders) > 10
+    for prim in colliders:
+        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")
+        assert material, prim.GetPath()
+        assert material.GetPrim().HasAPI(UsdPhysics.MaterialAPI), prim.GetPath()
+
+
+def test_robots_that_share_a_lab_have_topics_of_their_own_and_one_clock(lab_scene, tmp_path):
+    scene = read_scene(lab_scene)
+    second = PlacedRobot(robot=replace(scene.robot, name="second"), start=(1.0, 1.0, 0.0))
+    file = author_scene(replace(scene, others=(second,)), tmp_path / "two", by_reference=True)
+    stage = open_stage(file)
+    graphs = author_graph(stage, read_scene(file))
+    assert [g.GetPath().name for g in graphs] == [scene.robot.name, "second"]
+    topics = [
+        prim.GetAttribute("inputs:topicName").Get()
+        for graph in graphs
+        for prim in graph.GetChildren()
+        if prim.GetAttribute("inputs:topicName")
+    ]
+    assert len(topics) == len(set(topics)) == 15
+    assert {"/clock", "/second/odom", f"/{scene.robot.name}/odom"} <= set(topics)
+
+
+def test_what_is_no_robot_to_isaac_is_refused_with_what_to_do(lab_scene):
+    scene = read_scene(lab_scene)
+    stage = open_stage(lab_scene)
+    stage.SetEditTarget(stage.GetSessionLayer())
+    root = only_prim_with(stage.GetPseudoRoot(), "robot")
+    with pytest.raises(InputError, match="the stage has no robot 'nobody'; it has turtlebot4"):
+        author_graph(stage, replace(scene, robot=replace(scene.robot, name="nobody")))
+    imu = only_prim_with(root, "imu").GetChildren()[0]
+    imu.SetActive(False)
+    with pytest.raises(InputError, match="has 0 children of type IsaacImuSensor"):
+        author_graph(stage, scene)
+    imu.SetActive(True)
+    root.GetRelationship("isaac:physics:robotLinks").SetTargets([])
+    with pytest.raises(InputError, match="robotLinks lists none"):
+        author_graph(stage, scene)
+    assert not stage.GetPrimAtPath(GRAPHS)
+
+
+@pytest.mark.parametrize(
+    ("given", "taken", "yes"),
+    [
+        ("vectord[3]", ("double[3]", "float[3]"), True),
+        ("quatd[4]", ("double[4]",), True),
+        (("double", "double[]"), "double", True),
+        ("double", "double[]", False),
+        ("vectord[3]", "vectorf[3]", False),
+        ("int", "uint", False),
+        ("quatd[4]", "vectord[3]", False),
+        ("execution", "uint", False),
+    ],
+)
+def test_types_go_together_where_base_tuple_and_array_are_the_same(given, taken, yes):
+    assert fits(given, taken) is yes
+
+
+@pytest.mark.skipif(
+    "MAGTWIN_ISAACSIM" not in os.environ, reason="MAGTWIN_ISAACSIM names no checkout of isaac-sim/IsaacSim"
+)
+def test_the_table_is_what_a_checkout_of_isaac_sim_says():
+    count = 0
+    for known in node_types().values():
+        file = Path(os.environ["MAGTWIN_ISAACSIM"], known.source.split(": ")[-1])
+        if file.suffix != ".ogn":
+            continue
+        ((name, said),) = json.loads(file.read_text()).items()
+        assert known.name in (name, f"{file.parts[file.parts.index('extensions') + 1]}.{name}")
+        assert known.version == said["version"]
+        for mine, its in ((known.inputs, said.get("inputs", {})), (known.outputs, said.get("outputs", {}))):
+            kinds = {key: value["type"] for key, value in its.items()}
+            assert mine == {k: v if isinstance(v, str) else tuple(v) for k, v in kinds.items()}, known.name
+        for key, values in known.tokens.items():
+            assert set(values) == set(said["inputs"][key]["metadata"]["allowedTokens"].values())
+        count += 1
+    assert count == 20
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("int node:typeVersion = 7", "is of version 7 of isaacsim.ros2.bridge.ROS2PublishClock, known is 1"),
+        ('string inputs:topic = "/clock"', "has no inputs:topic; did you mean 'inputs:topicName'?"),
+        ("float inputs:timeStamp = 0", "inputs:timeStamp is a float, .* has a double"),
+        ("uint inputs:execIn.connect = </G/tick.outputs:time>", "execIn takes execution, .* is double"),
+        ("uint inputs:execIn.connect = </G/tick.inputs:tick>", "which is no output"),
+        ("uint inputs:execIn.connect = </G/tock.outputs:tick>", "which is no node's"),
+    ],
+)
+def test_a_graph_that_others_edited_is_held_against_the_definitions_too(text, what):
+    version = "" if "typeVersion" in text else "int node:typeVersion = 1"
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.ImportFromString(
+        '#usda 1.0\ndef OmniGraph "G" {\n'
+        'def OmniGraphNode "tick" { token node:type = "omni.graph.action.OnPlaybackTick"\n'
+        "int node:typeVersion = 2\n }\n"
+        'def OmniGraphNode "clock" { token node:type = "isaacsim.ros2.bridge.ROS2PublishClock"\n'
+        f"{version}\n{text}\n }}\n}}\n"
+    )
+    stage = Usd.Stage.Open(layer)
+    assert not faults(stage.GetPrimAtPath("/G/tick"))
+    (said,) = faults(stage.GetPrimAtPath("/G/clock"))
+    assert re.search(what, said)
+
+
+def test_no_node_of_the_authored_graph_has_a_fault(authored):
+    _, _, graph = authored
+    assert not [text for prim in graph.GetChildren() for text in faults(prim)]
+
+
+def test_what_a_definition_does_not_have_is_refused_when_it_is_authored():
+    graph = Graph(Usd.Stage.CreateInMemory(), Sdf.Path("/Graph"))
+    clock = "isaacsim.ros2.bridge.ROS2PublishClock"
+    with pytest.raises(InputError, match=r"did you mean 'isaacsim\.ros2\.bridge\.ROS2PublishClock'"):
+        graph.node("a", "isaacsim.ros2.bridge.ROS2PublishClocks")
+    with pytest.raises(InputError, match="no input 'topic'"):
+        graph.node("a", clock, topic="/clock")
+    with pytest.raises(InputError, match="type 'laserscan' is none; did you mean 'laser_scan'"):
+        graph.node("a", "isaacsim.ros2.bridge.ROS2RtxLidarHelper", type="laserscan")
+    with pytest.raises(InputError, match="no message 'geometry_msgs/msg/Pose'"):
+        graph.node("a", "isaacsim.ros2.bridge.ROS2Publisher", message="geometry_msgs/msg/Pose")
+    graph.node("tick", "omni.graph.action.OnPlaybackTick")
+    graph.node("clock", clock)
+    with pytest.raises(InputError, match=r"tick\.tick is execution, clock\.timeStamp takes double"):
+        graph.connect("tick.tick", "clock.timeStamp")
+    with pytest.raises(InputError, match=r"clock\.exec: no such attribute"):
+        graph.connect("tick.tick", "clock.exec")
+    with pytest.raises(InputError, match="no node 'tock'"):
+        graph.connect("tock.tick", "clock.execIn")
+    stage = Usd.Stage.CreateInMemory()
+    stage.DefinePrim("/Graph", "Xform")
+    with pytest.raises(InputError, match="is taken by a Xform"):
+        Graph(stage, Sdf.Path("/Graph"))

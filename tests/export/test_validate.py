@@ -1,0 +1,574 @@
+"""Validators in one answer: a few lines break each rule, damaged files end nothing, mends mend."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from places import DOCS
+from pxr import Sdf, Usd, UsdUtils
+
+import magtwin.export.validation.validators as others
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.export.package import export_scene
+from magtwin.export.usdz import pack
+from magtwin.export.validation.findings import Check, Finding, Findings, check_from
+from magtwin.export.validation.fix import ASKED, SAFE, mend
+from magtwin.export.validation.isaac_rules import ISAAC_RULES
+from magtwin.export.validation.rule import Subject, climbs, is_absolute
+from magtwin.export.validation.rules import RULES, robot_assets
+from magtwin.export.validation.validate import SAFE as NAMES
+from magtwin.export.validation.validate import validate
+from magtwin.learn.data.features import FEATURES
+
+EVERY = {**RULES, **ISAAC_RULES}
+
+HEAD = """#usda 1.0
+(
+    defaultPrim = "World"
+    kilogramsPerUnit = 1
+    metersPerUnit = 1
+    subLayers = [@./lab.usda@]
+    upAxis = "Z"
+)
+"""
+
+ORDER, MOVE, SCALE = "uniform token[] xformOpOrder", '"xformOp:translate"', '"xformOp:scale"'
+MAGNETOMETER = "turtlebot4/magnetometer_link/magnetometer"
+IMU = "turtlebot4/imu_link/imu/imu_sensor"
+LIDAR = "turtlebot4/rplidar_link/lidar/omni_lidar"
+
+
+@pytest.fixture(scope="module")
+def lab(lab_scene, tmp_path_factory):
+    """The default lab in a folder of this module's own, where broken stages are put beside it."""
+    folder = tmp_path_factory.mktemp("validate") / "lab"
+    shutil.copytree(lab_scene.parent, folder)
+    return folder / lab_scene.name
+
+
+def over(path, text="", head=""):
+    """Text that says something at a prim below /World."""
+    names = ["World", *filter(None, path.split("/"))]
+    opened = "".join(f'over "{name}"\n{{\n' for name in names[:-1])
+    return f'{opened}over "{names[-1]}" {head}\n{{\n{text}\n}}\n' + "}\n" * (len(names) - 1)
+
+
+def beside(lab, name, text):
+    """A stage beside the lab; `text` follows the head, or takes its place where it begins as a layer does."""
+    file = lab.with_name(f"{name}.usda")
+    file.write_text(text if text.startswith("#usda") else HEAD + text)
+    return file
+
+
+def subject(file, **known):
+    heard = UsdUtils.CoalescingDiagnosticDelegate()
+    stage = Usd.Stage.Open(str(file))
+    heard.TakeUncoalescedDiagnostics()
+    return Subject(stage, Path(file), inputs=frozenset(FEATURES), **known)
+
+
+def broken(file, *names, **known):
+    """Those of the named rules, or of all, that a stage breaks, with what they found."""
+    heard = UsdUtils.CoalescingDiagnosticDelegate()
+    held = subject(file, **known)
+    found = {name: EVERY[name].findings(held) for name in names or EVERY}
+    heard.TakeUncoalescedDiagnostics()
+    return {name: findings for name, findings in found.items() if findings}
+
+
+def test_a_lab_that_magtwin_authored_breaks_no_rule(lab):
+    assert not broken(lab)
+
+
+def test_every_rule_says_in_a_sentence_what_holds_and_what_to_do():
+    assert len(EVERY) == len(RULES) + len(ISAAC_RULES), "a name is there twice"
+    for name, rule in EVERY.items():
+        assert rule.sentence.endswith("."), name
+        assert rule.advice, name
+
+
+BROKEN = {
+    "references": (
+        over("thing", head="(prepend references = @./gone.usda@</A>)"),
+        "gone.usda",
+        "error",
+    ),
+    "absolute-paths": (over("", "asset a = @/somewhere/else.png@"), "names /somewhere/else.png", "error"),
+    "climbing-paths": (over("", "asset a = @../else.png@"), "names ../else.png, outside", "warning"),
+    "units": (HEAD.replace("metersPerUnit = 1", "metersPerUnit = 0.01"), "in units of 0.01 m", "error"),
+    "default-prim": (
+        HEAD.replace('defaultPrim = "World"', 'defaultPrim = "Wrld"'),
+        "'Wrld' is not there",
+        "error",
+    ),
+    "schema-names": (over("turtlebot4", "double magtwin:drive:vMx = 1"), "magtwin:drive:vMx, which", "error"),
+    "targets": (over("turtlebot4", "rel magtwin:drive:leftWheelJoint = </World/x>"), "</World/x>", "error"),
+    "map-complete": (over("AnomalyMap", "double[] magtwin:anomalyMap:headings = None"), "headings", "error"),
+    "map-checksum": (
+        over("AnomalyMap", f'string magtwin:anomalyMap:checksum = "{"0" * 64}"'),
+        "its checksum says 000000000000",
+        "error",
+    ),
+    "map-grid": (
+        over("AnomalyMap", "double2 magtwin:anomalyMap:origin = (-2.9, -1.7)"),
+        "its grid spans x -2.9",
+        "error",
+    ),
+    "map-file": (
+        over(MAGNETOMETER, f'string magtwin:magnetometer:mapSha256 = "{"0" * 64}"'),
+        "lab.usdc has SHA-256",
+        "error",
+    ),
+    "magnetometer-map": (
+        over(MAGNETOMETER, "rel magtwin:magnetometer:map = </World/Lab>"),
+        "is no map",
+        "error",
+    ),
+    "network-file": (
+        over(MAGNETOMETER, f'string magtwin:magnetometer:networkSha256 = "{"0" * 64}"'),
+        "turtlebot4_hybrid.safetensors has SHA-256",
+        "error",
+    ),
+    "network-inputs": (
+        over(MAGNETOMETER, 'string[] magtwin:magnetometer:inputs = ["warp"]'),
+        "warp",
+        "error",
+    ),
+    "frames": (
+        over("AnomalyMap", f"double3 xformOp:translate = (1, 0, 0)\n{ORDER} = [{MOVE}]"),
+        "is moved",
+        "error",
+    ),
+    "robot-inside": (
+        over("turtlebot4", "double3 xformOp:translate = (9, 0, 0)"),
+        "it is off the floor",
+        "error",
+    ),
+    "robot-clear": (
+        over("turtlebot4", "double3 xformOp:translate = (2.9, 0, 0)"),
+        "m from /World/Lab/Walls/East, and needs",
+        "error",
+    ),
+    "figures": (over("turtlebot4", "double magtwin:drive:wheelRadiusM = -1"), "wheel_radius_m", "error"),
+    "sensor-types": (over(IMU, "float sensorPeriod = 1"), "has a period of 1.0 s", "error"),
+    "robot-schema": (
+        'def Xform "Extra" (prepend apiSchemas = ["PhysicsArticulationRootAPI"]) {}\n',
+        "without IsaacRobotAPI",
+        "error",
+    ),
+    "robot-lists": (
+        over("turtlebot4", "rel isaac:physics:robotLinks = </World/turtlebot4/bumper>"),
+        "lacks",
+        "error",
+    ),
+    "joint-bodies": (
+        over("turtlebot4/joints/bumper_joint", "rel physics:body1 = </World/Lab>"),
+        "no rigid body",
+        "error",
+    ),
+    "joint-drives": (
+        over("turtlebot4/joints/left_wheel_joint", "float drive:angular:physics:maxForce = inf"),
+        "a drive of force inf",
+        "error",
+    ),
+    "rigid-scale": (
+        over("turtlebot4/bumper", f"float3 xformOp:scale = (1, 2, 1)\n{ORDER} = [{MOVE}, {SCALE}]"),
+        "is scaled by 1, 2, 1",
+        "error",
+    ),
+    "sensor-mounts": (
+        over(LIDAR, "float[] omni:sensor:Core:emitterState:s001:azimuthDeg = [0, 1]"),
+        "1 emitters and 2",
+        "error",
+    ),
+    "physics-scene": ('def PhysicsScene "Second" {}\n', "has 2 physics scenes", "error"),
+    "materials": ('def Sphere "Bare" {}\n', "wears no material", "warning"),
+    "action-graph": (
+        'def OmniGraph "G" {\ndef OmniGraphNode "N" {\ntoken node:type = "omni.nothing"\n}\n}\n',
+        "'omni.nothing', of which nothing is known",
+        "warning",
+    ),
+    "collider-shapes": (
+        over(
+            "turtlebot4/bumper",
+            'def Mesh "m" (prepend apiSchemas = ["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"])\n'
+            '{\nuniform token physics:approximation = "none"\n}',
+        ),
+        "a triangle mesh that moves",
+        "error",
+    ),
+}
+
+
+def test_every_rule_is_broken_by_a_test():
+    assert BROKEN.keys() == EVERY.keys()
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_few_lines_break_a_rule_and_it_says_so(lab, name):
+    text, said, severity = BROKEN[name]
+    found = broken(beside(lab, name, text), name)
+    assert found
+    told = [finding for finding in found[name] if said in finding.text]
+    assert told, found[name]
+    assert told[0].severity == severity
+    assert told[0].advice
+    if severity == "error":
+        assert told[0].where or name in ("references", "units", "default-prim", "physics-scene"), told[0]
+
+
+def test_a_path_that_climbs_out_is_an_error_in_a_package(lab):
+    file = beside(lab, "climbs", over("", "asset a = @../else.png@"))
+    assert broken(file, "climbing-paths", packed=lab.parent)["climbing-paths"][0].severity == "error"
+
+
+def test_paths_of_one_machine_or_of_a_network_are_told_from_relative_ones(tmp_path):
+    for path in ("/a/b.usd", "C:\\a.usd", "C:/a.usd", "\\\\host\\a", "file:/a", "omniverse://host/a.usd"):
+        assert is_absolute(path), path
+    for path in ("./a.usd", "a.usd", "../a.usd", "OmniPBR.mdl", "a/b c.usd"):
+        assert not is_absolute(path), path
+    layer = Sdf.Layer.CreateNew(str(tmp_path / "a" / "b" / "l.usda"))
+    assert not climbs("../c.usda", layer, tmp_path / "a")
+    assert climbs("../../c.usda", layer, tmp_path / "a")
+
+
+def test_a_map_off_the_floor_is_told_by_how_far(lab):
+    text = over("Lab", "double2 magtwin:lab:floorM = (4, 3.5)")
+    (finding,) = broken(beside(lab, "small", text), "frames")["frames"]
+    assert "reaches 1 m beyond the floor of 4 x 3.5 m" in finding.text
+
+
+def test_a_robot_that_floats_or_leans_is_told(lab):
+    text = "double3 xformOp:translate = (0, 0, 0.5)\nquatd xformOp:orient = (0.8, 0.6, 0, 0)"
+    file = beside(lab, "leans", over("turtlebot4", text))
+    texts = [finding.text for finding in broken(file, "robot-inside")["robot-inside"]]
+    assert any("0.5 m above the floor" in t for t in texts)
+    assert any("does not stand upright" in t for t in texts)
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "rule"),
+    [
+        ("AnomalyMap", 'token magtwin:anomalyMap:shape = "x"', "map-grid"),
+        (MAGNETOMETER, "double3 magtwin:magnetometer:map = (1, 2, 3)", "targets"),
+    ],
+)
+def test_a_value_of_another_kind_breaks_the_rule_that_reads_it_and_ends_nothing(lab, path, text, rule):
+    found = broken(beside(lab, f"kind_{rule.replace('-', '_')}", over(path, text)), rule)
+    assert "a value is not of its kind" in found[rule][0].text
+
+
+def test_the_docs_list_every_rule_and_every_mend_with_its_sentence():
+    text = (DOCS / "validate.md").read_text()
+    for rule in EVERY.values():
+        assert f"| `{rule.name}` | {rule.sentence} | {rule.advice} |" in text
+    for fix in (*SAFE.values(), *ASKED.values()):
+        assert f"| `{fix.name}` | {fix.sentence} |" in text
+
+
+def test_a_robots_asset_is_found_for_the_profiles_that_are_for_it(lab, tmp_path):
+    (asset,) = robot_assets(subject(lab)).values()
+    assert asset.name == "turtlebot4.usda"
+    assert robot_assets(subject(asset)) == {"/turtlebot4": asset}
+    flat = tmp_path / "flat.usdc"
+    Usd.Stage.Open(str(lab)).Export(str(flat))
+    assert robot_assets(subject(flat)) == {"/World/turtlebot4": None}
+
+
+# --- the answer -----------------------------------------------------------------------------------
+
+
+def test_what_was_not_run_is_never_passed():
+    missing = Check("nvidia", not_run="is not installed")
+    assert missing.result == "not run"
+    failed = Check("core", (Finding("a", "b"), Finding("c", "d", severity="note")))
+    assert (failed.result, Check("x", (Finding("a", "b", severity="warning"),)).result) == (
+        "failed",
+        "passed",
+    )
+    found = Findings(Path("a.usda"), (missing, failed))
+    assert not found.clean
+    table = json.loads(found.to_json())
+    assert [check["result"] for check in table["checks"]] == ["not run", "failed"]
+    assert tuple(check_from(check) for check in table["checks"]) == found.checks
+
+
+def test_the_command_says_clean_by_its_exit_status_and_in_json(lab, tmp_path, capfd):
+    out = tmp_path / "r.json"
+    main(["validate", str(lab), "--against", "core", "isaac", "magtwin", "--json", "--out", str(out)])
+    printed = json.loads(capfd.readouterr().out)
+    assert printed == json.loads(out.read_text())
+    assert [c["validator"] for c in printed[0]["checks"]] == ["core", "isaac", "magtwin"]
+    assert printed[0]["clean"]
+    assert all(c["result"] == "passed" for c in printed[0]["checks"])
+
+
+def test_the_command_shows_rule_prim_and_what_to_do_and_exits_1(lab, capfd, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    text, _, _ = BROKEN["robot-inside"]
+    file = beside(lab, "off", text)
+    with pytest.raises(SystemExit) as e:
+        main(["validate", str(file), "--against", "magtwin"])
+    assert e.value.code == 1
+    printed = capfd.readouterr().out
+    assert "error magtwin robot-inside /World/turtlebot4: stands at (9, 0) m" in printed
+    assert "start it on the floor" in printed
+
+
+def test_validators_that_are_not_installed_say_how_to_get_them(lab, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(others, "_programs", lambda: str(tmp_path))
+    monkeypatch.setattr(others.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv(others.SIMREADY, raising=False)
+    checks = [others.nvidia(lab), *others.simready({"/a": lab}), others.newton(lab, 1)]
+    assert {check.result for check in checks} == {"not run"}
+    for check, get in zip(checks, ["[validate]", *["make simready"] * 3, "[physics]"], strict=True):
+        assert get in check.not_run
+    with pytest.raises(SystemExit) as e:
+        main(["validate", str(lab), "--against", "nvidia"])
+    assert e.value.code == 1
+    assert "asked for and not run: nvidia" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("said", "result"),
+    [("Profile 'Sensor-IMU' is not registered", "not run"), ("it broke", "failed")],
+)
+def test_an_empty_report_of_simreadys_counts_as_passed_for_no_profile(
+    lab, tmp_path, monkeypatch, said, result
+):
+    program = tmp_path / "simready-validate"
+    program.write_text(
+        f"#!{sys.executable}\nimport sys\nopen(sys.argv[6], 'w').write('{{}}')\n"
+        f"print({said!r})\nsys.exit(1)\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv(others.SIMREADY, str(program))
+    checks = others.simready({"/a": lab})
+    assert {check.result for check in checks} == {result}
+    for check in checks:
+        assert "make simready" in check.not_run if check.not_run else said in check.findings[0].text
+
+
+def test_a_layer_that_holds_its_network_is_sound_until_its_bytes_are_others(lab, tmp_path):
+    layer = tmp_path / "lab.usdc"
+    export_scene(lab, layer, trusted=True)
+    (check,) = validate(layer, ["magtwin"]).checks
+    assert not check.findings
+    stage = Usd.Stage.Open(str(layer))
+    (file,) = stage.GetPrimAtPath("/World/Files").GetChildren()
+    file.GetAttribute("magtwin:file:bytes").Set([1, 2, 3])
+    stage.Save()
+    (check,) = validate(layer, ["magtwin"]).checks
+    assert [(f.rule, f.severity) for f in check.findings] == [("network-file", "error")]
+    assert "attached network has SHA-256 039058c6f2c0" in check.findings[0].text
+    stage.RemovePrim("/World/Files")
+    stage.Save()
+    (check,) = validate(layer, ["magtwin"]).checks
+    assert [(f.rule, f.severity) for f in check.findings] == [("network-file", "warning")]
+
+
+def test_nvidias_validator_names_rule_and_prim(lab):
+    (clean,) = validate(lab, ["nvidia"]).checks
+    assert (clean.result, clean.count("warning")) == ("passed", 0)
+    file = beside(lab, "nv", 'def Sphere "S" {\nrel material:binding = </World/gone>\n}\n')
+    (check,) = validate(file, ["nvidia"]).checks
+    assert ("UsdDanglingMaterialBinding", "/S") in {(f.rule, f.where) for f in check.findings}
+
+
+def test_core_is_every_validator_of_usds(lab):
+    (check,) = validate(
+        beside(lab, "core", over("", head="(prepend references = @./gone.usda@)")), ["core"]
+    ).checks
+    assert int(check.scope.split()[0]) >= 30
+    assert "UnresolvableDependency" in {finding.rule for finding in check.findings}
+
+
+@pytest.mark.physics
+def test_newton_loads_every_body_of_the_lab(lab):
+    pytest.importorskip("newton", reason="Newton is in the extra physics; make physics installs it")
+    (check,) = validate(lab, ["newton"]).checks
+    assert check.result == "passed"
+    assert "20 bodies" in check.scope
+
+
+@pytest.mark.skipif(
+    not os.environ.get(others.SIMREADY), reason=f"{others.SIMREADY} names no simready-validate"
+)
+def test_the_labs_robot_is_simready_and_one_without_emitters_is_told(lab, tmp_path):
+    assert all(check.result == "passed" for check in validate(lab, ["simready"]).checks)
+    shutil.copytree(lab.parent, tmp_path / "lab")
+    asset = tmp_path / "lab" / "robot" / "turtlebot4.usda"
+    asset.write_text(asset.read_text().replace("numberOfEmitters", "numberOfNothing"))
+    (*others_, lidar) = validate(tmp_path / "lab" / lab.name, ["simready"]).checks
+    assert [check.result for check in others_] == ["passed", "passed"]
+    assert "LI.002" in lidar.findings[0].rule
+
+
+# --- files that are damaged or made to harm -------------------------------------------------------
+
+
+def test_a_damaged_crate_is_refused_in_one_line_and_ends_nothing(lab, tmp_path):
+    shutil.copytree(lab.parent, tmp_path / "lab")
+    crate = next((tmp_path / "lab").rglob("*.usdc"))
+    data = bytearray(crate.read_bytes())
+    rng = np.random.default_rng(0)
+    ended = 0
+    for _ in range(2):
+        spoilt = bytearray(data)
+        for at in rng.integers(len(data) // 2, len(data), 300):
+            spoilt[at] = int(rng.integers(256))
+        crate.write_bytes(spoilt)
+        command = [sys.executable, "-m", "magtwin", "validate", str(crate), "--against", "magtwin"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 1, "it ended otherwise than by refusing"
+        assert "Traceback" not in done.stderr
+        ended += "damaged" in done.stderr
+    assert ended, "none of them was damaged"
+
+
+@pytest.mark.parametrize("content", [b"PXR-USDC", b"#usda 1.0\n((("])
+def test_what_is_no_stage_is_refused(tmp_path, content):
+    file = tmp_path / "a.usda"
+    file.write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.usda: cannot be opened as USD"):
+        validate(file, ["magtwin"])
+
+
+@pytest.mark.parametrize("entry", ["../evil.usda", "/evil.usda", "a/../../evil.usda", "C:\\evil.usda"])
+def test_a_package_with_an_entry_that_climbs_out_is_refused_with_nothing_written(tmp_path, entry):
+    package = tmp_path / "inner" / "a.usdz"
+    package.parent.mkdir()
+    with zipfile.ZipFile(package, "w") as archive:
+        archive.writestr("root.usda", "#usda 1.0\n")
+        archive.writestr(entry, "#usda 1.0\n")
+    with pytest.raises(InputError, match="would lie outside"):
+        validate(package)
+    assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == ["a.usdz"]
+
+
+def test_a_package_is_looked_at_whole(lab, tmp_path):
+    package = tmp_path / "a.usdz"
+    folder = tmp_path / "in"
+    shutil.copytree(lab.parent / "robot", folder, ignore=shutil.ignore_patterns("*.urdf"))
+    root = folder / "turtlebot4.usda"
+    pack(root, package)
+    found = validate(package, ["core", "isaac", "magtwin"])
+    assert found.clean, found.to_json()
+    layer = Sdf.Layer.FindOrOpen(str(root))
+    layer.customLayerData = {}
+    root.write_text(
+        root.read_text().replace(
+            'def Xform "turtlebot4" (',
+            'def Xform "o" (references = @../o.usda@) {}\ndef Xform "turtlebot4" (',
+            1,
+        )
+    )
+    package.unlink()
+    pack(root, package)
+    (check,) = validate(package, ["magtwin"]).checks
+    assert "climbing-paths" in {finding.rule for finding in check.findings if finding.severity == "error"}
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("gone.usda", "no such USD file"), (".", "a folder; give the root layer"), ("a.txt", "no USD file")],
+)
+def test_what_cannot_be_validated_is_refused(tmp_path, name, said):
+    (tmp_path / "a.txt").write_text("x")
+    with pytest.raises(InputError, match=said):
+        validate(tmp_path / name)
+
+
+def test_a_validator_that_there_is_not_is_refused_by_the_near_one(tmp_path):
+    (tmp_path / "a.usda").write_text(HEAD)
+    with pytest.raises(InputError, match="no validator 'isac'; did you mean 'isaac'"):
+        validate(tmp_path / "a.usda", ["isac"])
+
+
+# --- mending --------------------------------------------------------------------------------------
+
+UNSAID = '#usda 1.0\n(\n    subLayers = [@./lab.usda@]\n)\nover "World"\n{\n}\n'
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "rule"),
+    [
+        ("default-prim", UNSAID, "default-prim"),
+        ("units", UNSAID, "units"),
+        ("relative-paths", HEAD + over("", "asset a = @HERE/map/lab.usdc@"), "absolute-paths"),
+        ("relative-paths", HEAD + over("", "asset a = @/home/else/lab/map/lab.usdc@"), "absolute-paths"),
+        ("map-checksum", BROKEN["map-checksum"][0], "map-checksum"),
+        ("map-file", BROKEN["map-file"][0], "map-file"),
+        ("network-file", BROKEN["network-file"][0], "network-file"),
+    ],
+)
+def test_a_mend_mends_what_the_rule_found_and_is_done_once(lab, name, text, rule):
+    file = beside(lab, f"mend_{name.replace('-', '_')}", text.replace("HERE", lab.parent.as_posix()))
+    assert broken(file, rule)
+    assert mend(file, [name])
+    assert not broken(file, rule)
+    before = file.read_bytes()
+    assert mend(file, [name]) == []
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["extents", "material-bindings"])
+def test_a_mend_of_shapes_is_what_the_validators_asked_for(lab, name):
+    text = HEAD + 'def Cube "C" {\nrel material:binding = </World/Lab/Looks/wall>\n}\n'
+    file = beside(lab, f"shape_{name.replace('-', '_')}", text)
+    assert mend(file, [name])
+    stage = Usd.Stage.Open(str(file))  # held in a name: a prim does not keep its stage alive
+    prim = stage.GetPrimAtPath("/C")
+    if name == "extents":
+        assert np.array_equal(prim.GetAttribute("extent").Get(), [(-1, -1, -1), (1, 1, 1)])
+    else:
+        assert "MaterialBindingAPI" in prim.GetAppliedSchemas()
+
+
+def test_the_units_of_a_strangers_stage_are_not_guessed(tmp_path):
+    file = tmp_path / "a.usda"
+    file.write_text('#usda 1.0\ndef Xform "A" {}\n')
+    assert mend(file, ["units"]) == []
+
+
+def test_a_layer_outside_of_the_folder_is_left_alone(lab, tmp_path):
+    (tmp_path / "in").mkdir()
+    outside = tmp_path / "else.usda"
+    outside.write_text('#usda 1.0\n(defaultPrim = "A")\ndef Cube "A" {}\n')
+    file = tmp_path / "in" / "a.usda"
+    file.write_text('#usda 1.0\n(\n    defaultPrim = "A"\n    subLayers = [@../else.usda@]\n)\n')
+    before = outside.read_bytes()
+    assert mend(file, list(SAFE)) == []
+    assert outside.read_bytes() == before
+
+
+def test_the_command_mends_says_what_it_did_and_leaves_checksums_unless_asked(lab, capfd, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    assert tuple(SAFE) == NAMES
+    assert not set(SAFE) & set(ASKED)
+    text = UNSAID.replace('over "World"\n{\n}\n', "") + over(
+        "AnomalyMap", f'string magtwin:anomalyMap:checksum = "{"0" * 64}"'
+    )
+    file = beside(lab, "command", text)
+    with pytest.raises(SystemExit):
+        main(["validate", str(file), "--against", "magtwin", "--fix"])
+    printed = capfd.readouterr().out
+    assert "mended command.usda: its default prim is World" in printed
+    assert "map-checksum" in printed
+    assert not broken(file, "units")
+    main(["validate", str(file), "--against", "magtwin", "--fix-also", "map-checksum"])
+    assert "passed" in capfd.readouterr().out
+
+
+def test_a_package_is_not_mended(tmp_path, lab):
+    (tmp_path / "a.usdz").write_bytes(b"")
+    with pytest.raises(InputError, match="a package is not mended"):
+        validate(tmp_path / "a.usdz", fix=["units"])

@@ -1,0 +1,156 @@
+"""The front door of all methods, and the maps that come out of it."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from test_gp import survey, truth
+
+from magtwin.errors import InputError
+from magtwin.field.fit.fit import METHODS, fit, grid_report, raster
+from magtwin.field.survey.readings import Readings
+
+QUICK = ("trilinear", "cubic", "gp")
+
+
+def drive(count=700, seed=0):
+    rng = np.random.default_rng(seed)
+    p = rng.uniform((-1.0, -0.8), (1.0, 0.8), (count, 2))
+    yaw = rng.uniform(0, 2 * np.pi, count)
+    return Readings(
+        p_xy=p, yaw=yaw, b_nt=truth(p, yaw) + rng.normal(0, 10, count), name="drive", height_m=0.35
+    )
+
+
+def test_a_trilinear_raster_of_a_grid_is_the_survey_to_the_last_digit():
+    good = np.ones(224, bool)
+    good[[5, 60, 61]] = False
+    readings = survey().with_(
+        good=good, source="a.csv sha256:0", licence="MIT", created="2026-01-02", height_m=0.3
+    )
+    field = raster(fit(readings, "trilinear"), readings)
+    assert field.grid == readings.grid
+    assert_array_equal(field.values_nt[tuple(readings.node[good].T)], readings.b_nt[good])
+    assert_array_equal(field.valid[tuple(readings.node.T)], good)
+    assert (field.method, field.name, field.source) == ("trilinear", "made", "a.csv sha256:0")
+    assert (field.licence, field.created, field.height_m) == ("MIT", "2026-01-02", 0.3)
+    assert field.variance_nt2 is not None
+
+
+@pytest.mark.parametrize("method", ["cubic", "gp"])
+def test_a_smooth_raster_is_as_fine_as_its_fit_needs(method):
+    readings = survey()
+    model = fit(readings, method)
+    field = raster(model, readings)
+    assert 0.05 <= field.cell_m[0] <= 0.15
+    assert 4 <= len(field.headings_rad) <= 24
+    assert_allclose(np.diff(field.headings_rad), 2 * np.pi / len(field.headings_rad))
+    assert_allclose(field.extent, readings.grid.extent, rtol=1e-12)
+    p, yaw = field.grid.poses()
+    known = field.valid
+    assert known.mean() > 0.95
+    assert np.sqrt(np.mean((field.values_nt[known] - truth(p, yaw)[known]) ** 2)) < 60
+    figures = {f.name: f for f in grid_report(field).figures}
+    assert figures["node spacing"].value == pytest.approx(max(field.cell_m), abs=1e-4)
+    assert "errs by" in figures["headings apart"].note
+
+
+def test_a_harmonic_raster_is_the_fit_at_its_nodes_and_on_fine_grids_nearly_its_sd():
+    readings = drive()
+    model = fit(readings, "harmonic")
+    ratio = []
+    for spacing in (0.075, 0.05):
+        field = raster(model, readings, spacing_m=spacing, headings_rad=[0.0, 1.0])
+        p, yaw = field.grid.poses()
+        value, variance = model.predict(p, yaw)
+        assert_allclose(field.values_nt, value, rtol=1e-9)
+        ratio.append(np.sqrt(field.variance_nt2 / variance)[field.valid])
+    assert_allclose(ratio[0], 1, rtol=1e-6)  # a difference of sums: prior less what is known
+    # scattered readings 6 cm apart: as rough a variance as there is; between means of a drive it is smoother
+    assert np.all(np.quantile(ratio[1], (0.1, 0.01)) > (0.95, 0.9))
+    assert np.all(np.quantile(ratio[1], (0.9, 0.99)) < (1.07, 1.2))
+
+
+@pytest.mark.parametrize("method", QUICK)
+def test_a_drive_becomes_a_map_that_ends_where_the_readings_do(method):
+    readings = drive()
+    field = raster(
+        fit(readings, method), readings, spacing_m=0.1, headings_rad=[0.0, np.pi], extent=(-3, 3, -3, 3)
+    )
+    p, yaw = field.grid.poses()
+    assert field.values_nt.shape[0] == 2
+    assert not field.valid[np.abs(p).max(axis=-1).repeat(1, 0) > 1.5].any()
+    middle = np.broadcast_to(np.abs(p).max(axis=-1) < 0.7, field.valid.shape)
+    assert field.valid[middle].all()
+    assert np.sqrt(np.mean((field.values_nt[middle] - truth(p, yaw)[middle]) ** 2)) < 60
+
+
+def test_a_survey_of_one_heading_makes_a_map_of_one_layer():
+    readings = drive().with_(yaw=np.full(700, 0.5))
+    field = raster(fit(readings, "cubic"), readings, spacing_m=0.2)
+    assert_allclose(field.headings_rad, [0.5])
+
+
+def test_progress_counts_up_to_its_total():
+    said = []
+    readings = survey(rows=4, columns=4)
+    model = fit(readings, "gp", progress=lambda *step: said.append(step))
+    assert said[0][0] == 0
+    assert said[-1][0] == said[-1][1]
+    assert [s[0] for s in said] == sorted(s[0] for s in said)
+    said.clear()
+    raster(model, readings, progress=lambda *step: said.append(step))
+    assert said[-1][0] == said[-1][1]
+    assert said[-1][2] == "headings"
+
+
+def test_an_unknown_method_or_option_is_refused_with_the_near_one():
+    readings = survey(rows=4, columns=4)
+    with pytest.raises(InputError, match="no method 'cubik'; did you mean 'cubic'"):
+        fit(readings, "cubik")
+    with pytest.raises(InputError, match="no option 'fil'; did you mean 'fill'"):
+        fit(readings, "trilinear", fil=True)
+
+
+def test_a_raster_off_the_readings_is_refused():
+    readings = survey(rows=4, columns=4)
+    with pytest.raises(InputError, match="keep the extent within the readings"):
+        raster(fit(readings, "cubic"), readings, extent=(50, 52, 50, 52))
+
+
+def test_readings_on_one_line_are_refused_by_the_harmonic_fit_too():
+    x = np.linspace(0, 5, 60)
+    line = Readings(p_xy=np.column_stack([x, 0 * x]), yaw=0 * x, b_nt=41_000 + 500 * np.sin(x), name="line")
+    with pytest.raises(InputError, match=r"readings of 'line' lie on one line, x 0\.\.5, y 0\.\.0 m"):
+        raster(fit(line, "harmonic"), line)
+
+
+def test_every_method_has_its_own_name():
+    readings = survey(rows=4, columns=4)
+    for method in QUICK:
+        assert fit(readings, method).method == method
+    assert set(QUICK) < set(METHODS)
+
+
+def test_a_map_has_its_surveys_frame_and_datum_and_a_height_only_where_the_survey_has_one():
+    given = drive(400).with_(frame="world: x east", datum="the door", height_m=None)
+    for method in ("trilinear", "harmonic"):
+        field = raster(fit(given, method), given, spacing_m=1.0, headings_rad=[0.0])
+        assert (field.frame, field.datum, field.height_m) == ("world: x east", "the door", None)
+
+
+def test_a_latched_hole_is_masked_at_every_heading_and_a_node_read_at_one_is_not():
+    readings = survey()
+    node = readings.node
+    hole = (node[:, 1] >= 2) & (node[:, 1] <= 4) & (node[:, 2] >= 3) & (node[:, 2] <= 5)
+    latched = hole | ((node[:, 0] > 0) & (node[:, 1] == 5) & (node[:, 2] == 1))
+    readings = readings.with_(good=~latched)
+    field = raster(
+        fit(readings, "gp"), readings, spacing_m=0.125, headings_rad=np.radians(np.arange(0, 360, 15))
+    )
+    assert field.values_nt.shape == (24, 13, 15)
+    masked = np.zeros((13, 15), bool)
+    masked[4:9, 6:11] = True  # half a spacing around its nodes, where these are the nearest
+    known = field.valid
+    assert not known[:, masked].any()
+    assert known[:, 10, 2].all()
+    assert known[:, ~masked].mean() > 0.9

@@ -1,0 +1,262 @@
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from magtwin.errors import InputError
+from magtwin.learn.data.features import FULL
+from magtwin.learn.models.checkpoint import read_checkpoint
+from magtwin.learn.models.network import FieldNet, convert, load_net
+
+RELEASED = "aprilab/models/nn_magnetometer_model_v0.0.1.pth"
+
+
+def a_net(features=FULL, hidden=(8, 4), seed=0, **options):
+    """A small network with weights, scalers and ranges that are all different."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        net = FieldNet(features, hidden, **options)
+    rng = np.random.default_rng(seed)
+    net.set_scalers(rng.normal(3, 2, (100, len(net.features))), rng.normal(300, 500, 100))
+    return net.eval()
+
+
+@pytest.mark.parametrize("hidden", [(512, 512, 512, 512), (512, 512, 512, 128), (3,)])
+def test_the_file_alone_tells_the_architecture(tmp_path, hidden):
+    net = a_net(hidden=hidden)
+    net.save(tmp_path / "n.safetensors")
+    again = load_net(tmp_path / "n.safetensors")
+    assert again.hidden == hidden
+    for name, value in net.state_dict().items():
+        assert_array_equal(again.state_dict()[name], value)
+
+
+def test_the_papers_network_has_799233_parameters():
+    assert FieldNet().parameters_count == 799_233
+
+
+def test_what_is_known_of_a_network_survives_the_file(tmp_path):
+    net = a_net(
+        ["yaw_deg", "odom_v_x"], dropout=0.1, residual_sd_nt=12.5, facts={"source": "here", "rows": 7}
+    )
+    net.save(tmp_path / "n.safetensors")
+    again = load_net(tmp_path / "n.safetensors")
+    assert again.features == ("yaw_deg", "odom_v_x")
+    assert (again.dropout, again.residual_sd_nt, again.facts) == (0.1, 12.5, {"source": "here", "rows": 7})
+    assert not again.training
+
+
+def test_one_network_gives_one_file_byte_for_byte(tmp_path):
+    for name in ("a", "b"):
+        a_net(facts={"z": 1, "a": 2}).save(tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_a_weights_file_has_the_rights_of_any_new_file(tmp_path):
+    a_net().save(tmp_path / "n.safetensors")
+    (tmp_path / "plain").write_bytes(b"")
+    assert (tmp_path / "n.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_the_metadata_name_features_with_their_units(tmp_path):
+    a_net().save(tmp_path / "n.safetensors")
+    with safe_open(tmp_path / "n.safetensors", framework="np") as file:
+        about = json.loads(file.metadata()["magtwin"])
+    assert about["features"] == list(FULL)
+    assert about["units"][:4] == ["deg", "m/s", "m/s", "m/s"]
+    assert about["residual_sd_nt"] is None
+    assert about["output_unit"] == "nT"
+
+
+def test_scalers_make_training_rows_standard_and_leave_constant_ones_alone():
+    rng = np.random.default_rng(1)
+    x = rng.normal(5, 3, (1000, 2))
+    x[:, 1] = 7.1
+    net = FieldNet(["yaw_deg", "battery_v"], (4,))
+    net.set_scalers(x, rng.normal(size=1000))
+    z = (x - net.x_mean.numpy()) / net.x_scale.numpy()
+    assert_allclose(z.mean(axis=0), 0, atol=1e-12)
+    assert_allclose(z[:, 0].std(), 1)
+    assert net.x_scale[1] == 1
+    assert_array_equal(net.x_max, x.max(axis=0))
+
+
+def test_forward_is_the_textbook_perceptron():
+    net = a_net()
+    x = np.random.default_rng(2).normal(3, 2, (30, 20))
+    h = (x - net.x_mean.numpy()) / net.x_scale.numpy()
+    for i, layer in enumerate(net.linears):
+        h = h @ layer.weight.detach().double().numpy().T + layer.bias.detach().double().numpy()
+        h = np.maximum(h, 0) if i < 2 else h
+    with torch.inference_mode():
+        ours = net(torch.from_numpy(x)).numpy()
+    assert_allclose(ours, float(net.y_mean) + float(net.y_scale) * h[:, 0], atol=1e-3)  # float32 products
+
+
+def test_the_released_network_converts_once_and_stays_itself(real_data, tmp_path):
+    out = tmp_path / "released.safetensors"
+    converted = convert(real_data / RELEASED, out)
+    net, checkpoint = load_net(out), read_checkpoint(real_data / RELEASED)
+    assert net.hidden == (512, 512, 512, 128)
+    assert net.features == FULL
+    for layer, (weight, bias) in zip(net.linears, checkpoint.layers, strict=True):
+        assert_array_equal(layer.weight.detach(), weight)
+        assert_array_equal(layer.bias.detach(), bias)
+    assert net.facts == converted.facts
+    assert net.facts["source_sha256"] == "2418abc80cb0eab578e1e8af35f53566db2efa84b1cfa5257710d15273a07cf0"
+    assert math.isnan(net.residual_sd_nt)
+    assert torch.isnan(net.x_min).all()
+
+
+def test_a_pth_loads_without_conversion(real_data, tmp_path):
+    convert(real_data / RELEASED, tmp_path / "n.safetensors")
+    a, b = load_net(real_data / RELEASED), load_net(tmp_path / "n.safetensors")
+    assert all(
+        torch.equal(a.state_dict()[n].nan_to_num(), b.state_dict()[n].nan_to_num()) for n in a.state_dict()
+    )
+
+
+def test_an_output_that_exists_is_refused_unless_forced(real_data, tmp_path):
+    out = tmp_path / "n.safetensors"
+    out.write_bytes(b"precious")
+    with pytest.raises(InputError, match="exists already; give --force"):
+        convert(real_data / RELEASED, out)
+    assert out.read_bytes() == b"precious"
+    convert(real_data / RELEASED, out, force=True)
+    assert load_net(out).hidden == (512, 512, 512, 128)
+
+
+# Files that are refused
+
+
+def changed(tmp_path, *, about=None, drop=(), metadata=None, **tensors):
+    """A file of a small network with tensors, or what it says of itself, changed."""
+    path = tmp_path / "n.safetensors"
+    a_net(["yaw_deg", "odom_v_x"]).save(path, force=True)
+    with safe_open(path, framework="np") as file:
+        said = json.loads(file.metadata()["magtwin"])
+    held = {k: v for k, v in load_file(path).items() if k not in drop}
+    held |= {k.replace("__", "."): torch.as_tensor(v) for k, v in tensors.items()}
+    metadata = {"magtwin": json.dumps(said | (about or {}))} if metadata is None else metadata
+    save_file(held, path, metadata=metadata)
+    return path
+
+
+F8 = torch.float64
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (
+            {"drop": ["x_mean"]},
+            "tensor 'x_mean' is missing; train or convert the network again",
+        ),
+        (
+            {"drop": ["layers.1.bias"]},
+            "tensor 'layers.1.bias' is missing; train or convert the network again",
+        ),
+        (
+            {"drop": ["layers.1.weight", "layers.2.weight"]},
+            "tensor 'layers.1.weight' is missing; train or convert the network again",
+        ),
+        (
+            {"layers__0__weight": torch.ones(8, 3)},
+            "tensor 'layers.0.weight' is float32 (8, 3), the 2 features and the other layers ask for "
+            "float32 (8, 2)",
+        ),
+        (
+            {"layers__1__weight": torch.ones(4, 9)},
+            "tensor 'layers.1.weight' is float32 (4, 9), the 2 features and the other layers ask for "
+            "float32 (4, 8)",
+        ),
+        (
+            {"x_mean": torch.zeros(2)},
+            "tensor 'x_mean' is float32 (2,), the 2 features and the other layers ask for float64 (2,)",
+        ),
+        (
+            {"layers__2__bias": torch.tensor([math.nan])},
+            "tensor 'layers.2.bias' has numbers that are nan or infinite",
+        ),
+        (
+            {"x_scale": torch.tensor([1.0, 0.0], dtype=F8)},
+            "a scale of its scalers is not above 0",
+        ),
+        ({"spare": torch.zeros(1)}, "tensor 'spare' belongs to no layer of a FieldNet"),
+        (
+            {"about": {"features": ["yaw_deg", "odom_vx"]}},
+            "no feature 'odom_vx'; did you mean 'odom_v_x'?",
+        ),
+        (
+            {"about": {"units": ["rad", "m/s"]}},
+            "reads yaw_deg in 'rad', magtwin gives it in 'deg'",
+        ),
+        ({"about": {"dropout": "much"}}, "'dropout' of its metadata is missing or of the wrong type"),
+        ({"about": {"features": [1, 2]}}, "'features' of its metadata must be names, one at least"),
+        ({"about": {"features": []}}, "'features' of its metadata must be names, one at least"),
+        ({"about": {"features": 5}}, "'features' of its metadata is missing or of the wrong type"),
+        ({"metadata": {"magtwin": '{"a": 5}'}}, "format version None, this magtwin reads 1; update magtwin"),
+        ({"metadata": {"magtwin": "5"}}, "format version None, this magtwin reads 1; update magtwin"),
+        (
+            {"about": {"residual_sd_nt": math.inf}},
+            "'residual_sd_nt' of its metadata must be from 0 nT up and finite, got inf",
+        ),
+        ({"about": {"facts": {"a": [1]}}}, "fact 'a' of its metadata must be text, a number, true or false"),
+        (
+            {"layers__0__weight": torch.tensor(1.0)},
+            "tensor 'layers.0.weight' is float32 (); a layer's have shape (out, in)",
+        ),
+        (
+            {"layers__2__weight": torch.ones(4)},
+            "tensor 'layers.2.weight' is float32 (4,); a layer's have shape (out, in)",
+        ),
+        ({"about": {"format_version": 2}}, "format version 2, this magtwin reads 1; update magtwin"),
+        ({"metadata": {"magtwin": "{"}}, "its metadata is not JSON (Expecting property name enclosed in "
+                                         "double quotes: line 1 column 2 (char 1))"),
+        (
+            {"metadata": {"magtwin": "[" * 100_000}},
+            "its metadata is not JSON (maximum recursion depth exceeded while decoding a JSON array from a "
+            "unicode string)",
+        ),
+        (
+            {"metadata": {"format": "pt"}},
+            "safetensors without magtwin's metadata; not a network of magtwin's",
+        ),
+    ],
+)  # fmt: skip
+def test_a_weights_file_that_does_not_hold_together_is_refused(tmp_path, change, text):
+    path = changed(tmp_path, **change)
+    with pytest.raises(InputError) as refused:
+        load_net(path)
+    assert str(refused.value) == f"{path}: {text}"
+
+
+def test_a_truncated_weights_file_is_refused(tmp_path):
+    path = changed(tmp_path)
+    path.write_bytes(path.read_bytes()[:-10])
+    with pytest.raises(InputError, match=r"damaged safetensors \(.*\); get the file again"):
+        load_net(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"weights", b"\x89PNG\r\n\x1a\n" + bytes(20)])
+def test_a_file_of_another_kind_is_refused(tmp_path, content):
+    path = tmp_path / "n.bin"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="no weights: neither safetensors nor a PyTorch checkpoint"):
+        load_net(path)
+
+
+def test_a_folder_is_refused(tmp_path):
+    with pytest.raises(InputError, match="a folder; give a weights file"):
+        load_net(tmp_path)
+
+
+@pytest.mark.parametrize(("hidden", "dropout"), [((), 0.3), ((4, 0), 0.3), ((4,), 1.0)])
+def test_a_network_without_width_or_with_all_units_dropped_is_refused(hidden, dropout):
+    with pytest.raises(InputError, match="a network needs hidden layers"):
+        FieldNet(FULL, hidden, dropout=dropout)

@@ -1,0 +1,277 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.interpolate import RegularGridInterpolator
+
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+
+FOUR = np.radians([0.0, 90.0, 180.0, 270.0])
+SCIPY_NT = 1e-9
+"""Two roundings of 8 products of 41,000 nT lie below 1e-10 nT; FACTS' bound on ours is 1e-9 nT."""
+
+
+def field_map(*, headings=FOUR, shape=(15, 25), seed=0, **more):
+    rng = np.random.default_rng(seed)
+    values = 41_000 + 3_000 * rng.standard_normal((len(headings), *shape))
+    return AnomalyMap(
+        values_nt=values, origin_m=(-3.0, -1.75), cell_m=(0.25, 0.25), headings_rad=headings, **more
+    )
+
+
+def poses(field, count, seed=1):
+    rng = np.random.default_rng(seed)
+    x0, x1, y0, y1 = field.extent
+    return rng.uniform((x0, y0), (x1, y1), (count, 2)), rng.uniform(-20, 20, count)
+
+
+def by_scipy(field, p, yaw):
+    """The heading axis closed by a copy of the first layer 360 degrees on, then scipy's interpolator."""
+    first = field.headings_rad[0]
+    axes = (np.append(field.headings_rad, first + 2 * np.pi), field.y_m, field.x_m)
+    values = np.concatenate([field.values_nt, field.values_nt[:1]])
+    turned = first + np.mod(yaw - first, 2 * np.pi)
+    return RegularGridInterpolator(axes, values)(np.column_stack([turned, p[:, 1], p[:, 0]]))
+
+
+@pytest.mark.parametrize("degrees", [(0, 90, 180, 270), (15, 100, 110, 300), (0, 180), (0, 45, 350)])
+def test_lookup_equals_scipys_interpolator_with_the_heading_axis_closed(degrees):
+    field = field_map(headings=np.radians(degrees))
+    p, yaw = poses(field, 20_000)  # more than two blocks
+    assert_allclose(field.lookup(p, yaw), by_scipy(field, p, yaw), rtol=0, atol=SCIPY_NT)
+
+
+def test_lookup_equals_scipys_interpolator_on_the_real_survey(real_data):
+    tables = [np.loadtxt(real_data / f"aprilab/maps/{d}_map.csv", delimiter=",") for d in (0, 90, 180, 270)]
+    field = AnomalyMap(
+        values_nt=np.stack([t[:, 3].reshape(15, 25) for t in tables]),
+        origin_m=(-3.0, -1.75),
+        cell_m=(0.25, 0.25),
+        headings_rad=FOUR,
+    )
+    p, yaw = poses(field, 5_000)
+    assert_allclose(field.lookup(p, yaw), by_scipy(field, p, yaw), rtol=0, atol=SCIPY_NT)
+
+
+def test_nodes_give_their_values_whatever_the_number_of_turns():
+    field = field_map()
+    x, y = np.meshgrid(field.x_m, field.y_m)
+    p = np.stack([x, y], axis=-1)
+    for turns in (-3, 0, 1):
+        for layer, heading in enumerate(field.headings_rad):
+            got = field.lookup(p, heading + 2 * np.pi * turns)
+            assert_allclose(got, field.values_nt[layer], rtol=0, atol=1e-9)
+
+
+def test_lookup_is_continuous_across_cell_borders_and_across_north():
+    field = field_map()
+    step = 1e-9
+    for p, yaw, dp, dyaw in [
+        ((0.5, 0.3), 1.0, (step, 0), 0),
+        ((0.1, 0.25), 1.0, (0, step), 0),
+        ((0.1, 0.3), np.pi / 2, (0, 0), step),
+        ((0.1, 0.3), 0.0, (0, 0), step),
+        ((0.1, 0.3), 2 * np.pi, (0, 0), step),
+    ]:
+        below = field.lookup(np.subtract(p, dp), yaw - dyaw)
+        above = field.lookup(np.add(p, dp), yaw + dyaw)
+        assert_allclose(below, above, rtol=0, atol=1e-3)  # gradients stay below 1e5 nT a metre or rad
+
+
+def test_a_field_linear_in_x_and_y_is_given_back_exactly():
+    x, y = np.meshgrid(np.arange(7) * 0.1 - 0.3, np.arange(5) * 0.2 + 1.0)
+    field = AnomalyMap(
+        values_nt=np.stack([40_000 + 300 * x - 200 * y]),
+        origin_m=(-0.3, 1.0),
+        cell_m=(0.1, 0.2),
+        headings_rad=[0.0],
+    )
+    p, yaw = poses(field, 500)
+    assert_allclose(field.lookup(p, yaw), 40_000 + p @ (300, -200), rtol=0, atol=1e-9)
+
+
+def test_one_layer_serves_every_heading():
+    field = field_map(headings=np.array([1.2]))
+    p, yaw = poses(field, 100)
+    assert_array_equal(field.lookup(p, yaw), field.lookup(p, 0.0))
+
+
+@given(st.floats(-3, 3), st.floats(-1.75, 1.75), st.floats(-50, 50), st.integers(-4, 4), st.integers(0, 3))
+@settings(max_examples=60, deadline=None)
+def test_turning_the_layers_turns_the_lookup(x, y, yaw, turns, quarter):
+    field = field_map()
+    turned = AnomalyMap(
+        values_nt=np.roll(field.values_nt, quarter, axis=0),
+        origin_m=field.origin_m,
+        cell_m=field.cell_m,
+        headings_rad=FOUR,
+    )
+    want = field.lookup((x, y), yaw)
+    got = turned.lookup((x, y), yaw + quarter * np.pi / 2 + 2 * np.pi * turns)
+    assert_allclose(got, want, rtol=0, atol=1e-8)  # 100 rad carries 1e-14 rad of rounding, times 1e4 nT/rad
+
+
+@given(st.floats(-3, 3), st.floats(-1.75, 1.75), st.floats(allow_nan=False, allow_infinity=False))
+@settings(max_examples=60, deadline=None)
+def test_lookup_lies_between_the_least_and_the_greatest_node(x, y, yaw):
+    field = field_map()
+    value = field.lookup((x, y), yaw)
+    assert field.values_nt.min() - 1e-9 <= value <= field.values_nt.max() + 1e-9
+
+
+def test_mirroring_the_map_mirrors_the_lookup():
+    field = field_map()
+    mirrored = AnomalyMap(
+        values_nt=field.values_nt[:, ::-1, ::-1],
+        origin_m=(-3.0, -1.75),
+        cell_m=(0.25, 0.25),
+        headings_rad=FOUR,
+    )
+    p, yaw = poses(field, 300)
+    assert_allclose(mirrored.lookup(-p, yaw), field.lookup(p, yaw), rtol=0, atol=SCIPY_NT)
+
+
+def test_shapes_are_broadcast_and_kept():
+    field = field_map()
+    assert field.lookup((0.0, 0.0), 0.0).shape == ()
+    assert field.lookup(np.zeros((2, 3, 2)), 0.0).shape == (2, 3)
+    assert field.lookup((0.0, 0.0), np.zeros((5, 1))).shape == (5, 1)
+    assert field.lookup(np.zeros((4, 1, 2)), np.zeros(7)).shape == (4, 7)
+    assert field.lookup(np.zeros((0, 2)), 0.0).shape == (0,)
+    with pytest.raises(InputError, match=r"shape \(\.\.\., 2\), got \(3,\)"):
+        field.lookup((0, 0, 0), 0.0)
+
+
+def test_outside_the_map_gives_nan_the_border_or_a_refusal():
+    field = field_map(name="lab")
+    p = np.array([[3.2, 0.0], [0.0, -9.0], [1.0, 1.0]])
+    assert_array_equal(np.isnan(field.lookup(p, 0.0)), [True, True, False])
+    border = field.lookup([[3.0, 0.0], [0.0, -1.75], [1.0, 1.0]], 0.0)
+    assert_array_equal(field.lookup(p, 0.0, outside="clamp"), border)
+    with pytest.raises(
+        InputError, match=r"^2 of 3 points lie off the map 'lab' \(x -3\.\.3, y -1\.75\.\.1\.75"
+    ):
+        field.lookup(p, 0.0, outside="raise")
+    with pytest.raises(InputError, match="outside must be"):
+        field.lookup(p, 0.0, outside="zero")
+
+
+@pytest.mark.parametrize("outside", ["nan", "clamp", "raise"])
+def test_nan_in_gives_nan_out_whatever_is_asked_for_outside(outside):
+    field = field_map()
+    p = np.array([[np.nan, 0], [0, np.nan], [0, 0], [0, 0], [0, 0]])
+    yaw = np.array([0, 0, np.nan, np.inf, 0])
+    got = field.lookup(p, yaw, outside=outside)
+    assert_array_equal(np.isnan(got), [True, True, True, True, False])
+
+
+def test_the_border_belongs_to_the_map_and_rounding_does_not_lose_it():
+    field = field_map()
+    corners = np.array([[-3, -1.75], [3, -1.75], [3, 1.75], [-3, 1.75]])
+    assert field.contains(corners).all()
+    assert field.contains(corners * (1 + 1e-16)).all()
+    assert not field.contains(corners * 1.001).any()
+    assert not field.contains([np.nan, 0.0])
+    tenths = AnomalyMap(
+        values_nt=np.ones((1, 4, 4)), origin_m=(0.0, 0.0), cell_m=(0.1, 0.1), headings_rad=[0.0]
+    )
+    assert tenths.contains([0.3, 0.3])  # 0.1 * 3 = 0.30000000000000004
+    assert tenths.lookup([0.3, 0.3], 0.0) == 1.0
+
+
+def test_a_masked_node_gives_nan_where_it_has_weight_and_only_there():
+    valid = np.ones((4, 15, 25), bool)
+    valid[1, 7, 12] = False  # x = 0, y = 0, heading 90
+    field = field_map(valid=valid)
+    unknown = np.array([[0.0, 0.0], [0.1, 0.1], [-0.2, 0.24]])
+    known = np.array([[0.25, 0.0], [0.25, 0.25], [-0.25, -0.1], [0.3, 0.0]])
+    assert np.isnan(field.lookup(unknown, np.pi / 2)).all()
+    assert np.isnan(field.lookup(unknown, 0.1)).all()
+    assert_array_equal(field.lookup(unknown, 0.0), field_map().lookup(unknown, 0.0))
+    assert np.isnan(field.lookup(unknown, np.pi - 1e-3)).all()
+    assert np.isfinite(field.lookup(known, np.pi / 2)).all()
+    assert field.contains(unknown).all()
+
+
+def test_masked_nodes_may_hold_anything():
+    values = np.full((1, 3, 3), 40_000.0)
+    values[0, 0, 0] = np.nan
+    field = AnomalyMap(
+        values_nt=values,
+        origin_m=(0.0, 0.0),
+        cell_m=(1.0, 1.0),
+        headings_rad=[0.0],
+        valid=np.isfinite(values),
+    )
+    assert field.lookup((1.5, 1.5), 0.0) == 40_000
+    assert field == field
+
+
+def test_maps_are_equal_when_every_field_is():
+    field = field_map(variance_nt2=np.ones((4, 15, 25)), name="lab")
+    assert field == field_map(variance_nt2=np.ones((4, 15, 25)), name="lab")
+    assert field != field_map(name="lab")
+    assert field != field_map(variance_nt2=np.ones((4, 15, 25)), name="hall")
+    assert field != field_map(seed=1, variance_nt2=np.ones((4, 15, 25)), name="lab")
+    assert field != "lab"
+
+
+def test_a_map_keeps_its_own_arrays_and_nobody_writes_to_them():
+    values = np.full((1, 3, 3), 40_000.0)
+    field = AnomalyMap(values_nt=values, origin_m=(0.0, 0.0), cell_m=(1.0, 1.0), headings_rad=[0.0])
+    values[:] = 0
+    assert field.lookup((1.0, 1.0), 0.0) == 40_000
+    with pytest.raises(ValueError, match="read-only"):
+        field.values_nt[0, 0, 0] = 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"values_nt": np.ones((3, 3))}, r"shape \(H, Y, X\).*got \(3, 3\)"),
+        ({"values_nt": np.ones((1, 1, 3))}, "2 x 2 nodes"),
+        ({"headings_rad": [0.0, 1.0]}, r"headings_rad of AnomalyMap must have shape \(1,\), got \(2,\)"),
+        ({"headings_rad": [7.0]}, r"ascend in \[0, 2 pi\), got \[7.0\]"),
+        ({"headings_rad": [-0.1]}, "ascend"),
+        ({"cell_m": (0.25, 0.0)}, "cell_m of AnomalyMap must be two lengths above 0"),
+        ({"origin_m": (0.0, np.nan)}, "origin_m of AnomalyMap must be two lengths"),
+        ({"valid": np.ones((1, 3, 4), bool)}, "valid of AnomalyMap must have shape"),
+        ({"variance_nt2": -np.ones((1, 3, 3))}, "variance_nt2 of AnomalyMap must not be below 0"),
+        ({"values_nt": np.full((1, 3, 3), np.nan)}, "finite at valid nodes.*heading 0, row 0, column 0"),
+    ],
+)
+def test_a_map_is_checked_at_birth(change, message):
+    good = {
+        "values_nt": np.full((1, 3, 3), 4e4),
+        "origin_m": (0.0, 0.0),
+        "cell_m": (1.0, 1.0),
+        "headings_rad": [0.0],
+    }
+    AnomalyMap(**good)
+    with pytest.raises(InputError, match=message):
+        AnomalyMap(**{**good, **change})
+
+
+def test_headings_that_do_not_ascend_are_refused():
+    with pytest.raises(InputError, match="ascend"):
+        field_map(headings=np.radians([90, 0, 180, 270]))
+
+
+def test_the_figures_of_a_known_field_are_its_slope_and_its_heading_wave():
+    x, y = np.meshgrid(np.arange(6) * 0.25, np.arange(5) * 0.25)
+    wave = 300 * np.cos(FOUR) - 400 * np.sin(FOUR) + 70 * np.cos(2 * FOUR)
+    values = 41_000 + 3_000 * x + 4_000 * y + wave[:, None, None]
+    valid = np.ones(values.shape, bool)
+    valid[2, 4, 5] = False
+    values[2, 4, 5] = np.nan
+    field = AnomalyMap(
+        values_nt=values, origin_m=(0.0, 0.0), cell_m=(0.25, 0.25), headings_rad=FOUR, valid=valid
+    )
+    got = {f.name: f.value for f in field.report().figures}
+    assert got["masked nodes"] == 1
+    for name in ("median gradient", "mean gradient", "greatest gradient"):
+        assert got[name] == pytest.approx(5, abs=1e-3)
+    assert got["heading amplitude"] == pytest.approx(500, abs=0.1)
+    assert got["greatest"] == pytest.approx(np.nanmax(values), abs=0.1)

@@ -1,0 +1,119 @@
+"""Compiled sums over dipoles, and gradients made of them: laws, peers, and who adds up changes nothing."""
+
+import magpylib as magpy
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.errors import InputError
+from magtwin.field.sources import dipole_sums as dipoles
+from magtwin.field.sources import point_dipoles as sources
+from magtwin.field.sources.dipole_sums import dipole_field_and_gradient_nt, dipole_field_nt
+from magtwin.field.sources.harmonic import HarmonicField
+
+
+def below(count, seed=0):
+    rng = np.random.default_rng(seed)
+    place = np.column_stack([rng.uniform(-2, 2, (count, 2)), rng.uniform(-1, -0.3, count)])
+    return place, rng.normal(0, 3, (count, 3))
+
+
+def above(shape, seed=1):
+    rng = np.random.default_rng(seed)
+    return np.concatenate([rng.uniform(-2, 2, (*shape, 2)), rng.uniform(0.1, 1, (*shape, 1))], axis=-1)
+
+
+def apart(got, want):
+    """Greatest length of a difference of vectors, over that of the longest."""
+    return np.linalg.norm(got - want, axis=-1).max() / np.linalg.norm(want, axis=-1).max()
+
+
+@given(st.integers(0, 300), st.integers(1, 600), st.integers(0, 99))
+@settings(max_examples=30, deadline=None)
+def test_the_compiled_sum_is_the_plain_one_to_1e_12(count, points, seed):
+    place, moment = below(count, seed)
+    p = above((points,), seed)
+    want = sources.dipole_field_nt(p, place, moment)
+    assert_allclose(dipole_field_nt(p, place, moment), want, rtol=0, atol=1e-12 * (np.abs(want).max() + 1))
+
+
+def test_the_compiled_sum_agrees_with_magpylib():
+    place, moment = below(20)
+    p = above((50,))
+    tesla = sum(magpy.misc.Dipole(moment=m, position=at).getB(p) for at, m in zip(place, moment, strict=True))
+    assert apart(dipole_field_nt(p, place, moment), tesla * 1e9) < 1e-9
+
+
+def test_how_many_points_and_threads_there_are_changes_no_byte(monkeypatch):
+    place, moment = below(30)
+    p = above((1_000,))
+    field, gradient = dipole_field_and_gradient_nt(p, place, moment)
+    assert_array_equal(dipole_field_nt(p, place, moment), field)
+    assert_array_equal(dipole_field_nt(p[300:701], place, moment), field[300:701])
+    assert_array_equal(dipole_field_nt(p[7], place, moment), field[7])
+    monkeypatch.setattr(dipoles, "SHARE", 3_000)
+    for processors in (1, 2, 3, 8, None):
+        monkeypatch.setattr(dipoles.os, "cpu_count", lambda processors=processors: processors)
+        again = dipole_field_and_gradient_nt(p, place, moment)
+        assert_array_equal(again[0], field)
+        assert_array_equal(again[1], gradient)
+
+
+def test_the_gradient_is_what_the_field_changes_by_along_each_axis():
+    place, moment = below(30)
+    p = above((4, 5))
+    _, gradient = dipole_field_and_gradient_nt(p, place, moment)
+    assert gradient.shape == (4, 5, 3, 3)
+    for axis in range(3):
+        v = np.broadcast_to(np.eye(3)[axis], p.shape)
+        _, rate = sources.dipole_field_and_rate_nt(p, v, place, moment)
+        assert apart(gradient[..., axis], rate) < 1e-11
+    assert_array_equal(gradient, np.swapaxes(gradient, -1, -2))
+    assert_array_equal(np.trace(gradient, axis1=-2, axis2=-1), 0.0)
+    step = np.array([0, 0, 1e-5])
+    pair = [dipole_field_nt(p + sign * step, place, moment) for sign in (-1, 1)]
+    assert_allclose((pair[1] - pair[0])[..., 2] / 2e-5, gradient[..., 2, 2], rtol=1e-5, atol=1e-2)
+
+
+def test_no_dipoles_make_no_field_and_a_dipole_is_not_finite_where_it_is():
+    none = np.empty((0, 3))
+    field, gradient = dipole_field_and_gradient_nt(above((2, 3)), none, none)
+    assert_array_equal(field, np.zeros((2, 3, 3)))
+    assert_array_equal(gradient, np.zeros((2, 3, 3, 3)))
+    assert not np.isfinite(dipole_field_nt((1.0, 2.0, 3.0), [(1.0, 2.0, 3.0)], [(0.0, 0.0, 1.0)])).any()
+
+
+def test_shapes_that_are_no_points_or_dipoles_are_refused():
+    place, moment = below(2)
+    with pytest.raises(InputError, match=r"p_world must have shape \(\.\.\., 3\), got \(2,\)"):
+        dipole_field_nt((0.0, 1.0), place, moment)
+    with pytest.raises(InputError, match=r"one shape \(D, 3\), got \(2, 3\) and \(1, 3\)"):
+        dipole_field_nt((0.0, 1.0, 2.0), place, moment[:1])
+
+
+@pytest.mark.parametrize("height_m", [None, 0.9])
+def test_the_gradient_of_what_a_robot_reads_is_its_change_over_a_small_step(height_m):
+    place, moment = below(40)
+    field = HarmonicField(
+        p_world_dipole=place,
+        m_world=moment,
+        b_uniform_nt=(500.0, 20_000.0, -36_000.0),
+        hard_iron_nt=(300.0, -500.0, 800.0),
+        soft_iron=0.02 * np.random.default_rng(2).standard_normal((3, 3)),
+        p_base_sensor=(0.1, -0.05, 0.4),
+    )
+    rng = np.random.default_rng(3)
+    p, yaw = rng.uniform(-2, 2, (20, 2)), rng.uniform(-4, 4, 20)
+    b, slopes = field.magnitude_with_gradient(p, yaw, height_m=height_m)
+    assert_allclose(b, field.magnitude_nt(p, yaw, height_m=height_m), rtol=1e-12)
+    step = 1e-5
+    for axis, (dx, dy, dyaw) in enumerate(step * np.eye(3)):
+        pair = [
+            field.magnitude_nt(p + s * np.array([dx, dy]), yaw + s * dyaw, height_m=height_m) for s in (-1, 1)
+        ]
+        assert_allclose((pair[1] - pair[0]) / (2 * step), slopes[:, axis], rtol=1e-5, atol=0.05)
+    one, slope = field.magnitude_with_gradient((0.3, 0.2), 1.0)
+    assert one.shape == ()
+    assert slope.shape == (3,)

@@ -1,0 +1,84 @@
+"""A harmonic field and the robot in it, held against closed forms and finite differences."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from magtwin.errors import InputError
+from magtwin.field.sources.harmonic import HarmonicField
+from magtwin.field.sources.point_dipoles import dipole_field_nt
+
+
+def field(**parts):
+    rng = np.random.default_rng(0)
+    given = {
+        "p_world_dipole": rng.uniform((-2, -2, -1), (2, 2, -0.3), (12, 3)),
+        "m_world": rng.normal(scale=3.0, size=(12, 3)),
+        "b_uniform_nt": (-2_745.6, 24_067.1, -38_418.4),
+        "hard_iron_nt": (400.0, -250.0, 900.0),
+        "soft_iron": [[0.01, 0.002, 0], [-0.003, 0.02, 0.001], [0, 0.004, -0.01]],
+        "p_base_sensor": (0.05, -0.02, 0.4),
+    }
+    return HarmonicField(**{**given, **parts})
+
+
+def test_without_dipoles_and_platform_every_pose_reads_the_uniform_field():
+    none = np.zeros((0, 3))
+    plain = field(p_world_dipole=none, m_world=none, hard_iron_nt=np.zeros(3), soft_iron=np.zeros((3, 3)))
+    assert_allclose(plain.magnitude_nt([[0, 0], [1, 2]], [0.0, 2.0]), np.linalg.norm(plain.b_uniform_nt))
+
+
+def test_hard_iron_and_lever_arm_turn_with_the_robot():
+    some = field(soft_iron=np.zeros((3, 3)))
+    quarter = dipole_field_nt([0.02, 0.05, 0.4], some.p_world_dipole, some.m_world) + some.b_uniform_nt
+    want = np.linalg.norm(quarter + np.array([250.0, 400.0, 900.0]))
+    assert_allclose(some.magnitude_nt([0.0, 0.0], np.pi / 2), want, rtol=1e-12)
+
+
+@given(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.1, 1.0))
+@settings(max_examples=40, deadline=None)
+def test_the_gradient_is_symmetric_of_trace_zero_and_that_of_the_field(x, y, z):
+    p, some = np.array([x, y, z]), field()
+    b, gradient = some.field_and_gradient_nt(p)
+    assert_allclose(b, some.field_nt(p), rtol=1e-12)
+    size = np.abs(gradient).max()
+    assert abs(np.trace(gradient)) < 1e-9 * size
+    assert np.abs(gradient - gradient.T).max() < 1e-9 * size
+    move = 1e-4 * np.eye(3)
+    slope = (some.field_nt(p + move) - some.field_nt(p - move)).T / 2e-4
+    # second order: (step / distance)^2 = (1e-4 / 0.4)^2; rounding of 4e4 nT / 1e-4 m
+    assert_allclose(gradient, slope, rtol=0, atol=1e-6 * size + 1e-6)
+
+
+@given(st.floats(-2, 2), st.floats(-2, 2), st.floats(-4, 4))
+@settings(max_examples=40, deadline=None)
+def test_the_magnitudes_slopes_are_those_by_finite_differences(x, y, yaw):
+    some, step = field(), 1e-5
+    size, slope = some.magnitude_with_gradient([x, y], yaw)
+    assert_allclose(size, some.magnitude_nt([x, y], yaw), rtol=1e-12)
+    for k, (dx, dy, turn) in enumerate(step * np.eye(3)):
+        ahead = some.magnitude_nt([x + dx, y + dy], yaw + turn)
+        behind = some.magnitude_nt([x - dx, y - dy], yaw - turn)
+        assert_allclose(slope[k], (ahead - behind) / (2 * step), rtol=1e-5, atol=1e-3)
+
+
+def test_a_field_is_equal_to_its_like_and_cannot_be_written_to():
+    assert field() == field()
+    assert field() != field(hard_iron_nt=np.zeros(3))
+    with pytest.raises(ValueError, match="read-only"):
+        field().m_world[0] = 0
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"m_world": np.zeros((3, 3))}, "12 dipoles of HarmonicField have 3 moments"),
+        ({"b_uniform_nt": np.zeros(2)}, r"b_uniform_nt of HarmonicField must be finite, of shape \(3,\)"),
+        ({"hard_iron_nt": [np.nan, 0, 0]}, "hard_iron_nt of HarmonicField must be finite"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(parts, message):
+    with pytest.raises(InputError, match=message):
+        field(**parts)

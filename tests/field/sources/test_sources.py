@@ -1,0 +1,139 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.errors import InputError
+from magtwin.field.sources import point_dipoles as sources
+from magtwin.field.sources.point_dipoles import dipole_field_and_rate_nt, dipole_field_nt
+
+ORIGIN = np.zeros((1, 3))
+
+
+def some_dipoles(count, seed=0):
+    rng = np.random.default_rng(seed)
+    place = rng.uniform((-3, -2, -1), (3, 2, -0.3), (count, 3))
+    return place, rng.normal(scale=3, size=(count, 3))
+
+
+def some_points(count, seed=1):
+    return np.random.default_rng(seed).uniform((-3, -2, 0.2), (3, 2, 1), (count, 3))
+
+
+def test_a_dipole_of_1_a_m2_makes_200_nt_at_1_m_on_its_axis_and_100_against_it_beside():
+    got = dipole_field_nt([[0, 0, 1], [0, 0, -1], [1, 0, 0]], ORIGIN, [[0, 0, 1]])
+    assert_allclose(got, [[0, 0, 200], [0, 0, 200], [0, 0, -100]], rtol=1e-9)
+
+
+def test_dipoles_agree_with_magpylib_which_works_in_tesla():
+    magpy = pytest.importorskip("magpylib")
+    place, moment = some_dipoles(20)
+    p = some_points(200)
+    peer = magpy.getB(
+        [magpy.misc.Dipole(moment=m, position=q) for q, m in zip(place, moment, strict=True)], p
+    )
+    got = dipole_field_nt(p, place, moment)
+    scale = np.abs(got).max()
+    assert_allclose(
+        got, peer.sum(axis=0) * 1e9, rtol=0, atol=2e-9 * scale
+    )  # mu_0 of 2018 against 2022: 7e-10
+
+
+def gradient(p, place, moment, step=1e-3):
+    """dB_j / dp_i by central differences of fourth order [nT/m], shape (N, i, j)."""
+    move = step * np.eye(3)[:, None, :]
+    near = dipole_field_nt(p + move, place, moment) - dipole_field_nt(p - move, place, moment)
+    far = dipole_field_nt(p + 2 * move, place, moment) - dipole_field_nt(p - 2 * move, place, moment)
+    return np.moveaxis((8 * near - far) / (12 * step), 0, 1)
+
+
+def test_the_rate_at_a_moving_point_is_the_gradient_along_its_velocity():
+    p, dipoles = some_points(400), some_dipoles(80)
+    v = np.random.default_rng(3).normal(size=(400, 3))
+    field, rate = dipole_field_and_rate_nt(p, v, *dipoles)
+    assert_array_equal(field, dipole_field_nt(p, *dipoles))
+    slope = gradient(p, *dipoles)
+    assert_allclose(rate, np.einsum("ni,nij->nj", v, slope), rtol=0, atol=1e-8 * np.abs(rate).max())
+
+
+def test_the_rate_on_a_dipoles_axis_is_minus_three_times_the_field_over_the_distance():
+    # B = 200 nT / z^3 along the axis, so dB/dz = -3 B / z
+    field, rate = dipole_field_and_rate_nt([0, 0, 2.0], [0, 0, 0.5], ORIGIN, [[0, 0, 1]])
+    assert_allclose(field, [0, 0, 25], rtol=1e-9)
+    assert_allclose(rate, [0, 0, -3 * 25 / 2 * 0.5], rtol=1e-9)
+
+
+def test_a_standing_point_sees_no_rate_and_no_dipoles_make_none():
+    p, dipoles = some_points(5), some_dipoles(3)
+    assert_array_equal(dipole_field_and_rate_nt(p, 0 * p, *dipoles)[1], 0 * p)
+    assert_array_equal(dipole_field_and_rate_nt(p, p, ORIGIN[:0], ORIGIN[:0])[1], 0 * p)
+
+
+def test_velocities_of_another_shape_are_refused():
+    with pytest.raises(InputError, match=r"v_world must have the shape of p_world, \(3,\), got \(2, 3\)"):
+        dipole_field_and_rate_nt(np.zeros(3), np.zeros((2, 3)), ORIGIN, ORIGIN)
+
+
+def test_the_field_has_neither_divergence_nor_curl():
+    p, dipoles = some_points(100), some_dipoles(30)
+    slope = gradient(p, *dipoles)
+    size = np.linalg.norm(slope, axis=(1, 2))
+    divergence = np.trace(slope, axis1=1, axis2=2)
+    curl = slope - np.swapaxes(slope, 1, 2)
+    # the fourth-order error is (step / distance)^4 = (1e-3 / 0.5)^4 of the gradient, below rounding of 1e-9
+    assert np.all(np.abs(divergence) < 1e-8 * size)
+    assert np.all(np.abs(curl).max(axis=(1, 2)) < 1e-8 * size)
+    assert size.min() > 1  # the bounds above mean something
+
+
+@given(st.floats(0.5, 20), st.floats(0, 2 * np.pi), st.floats(-1, 1))
+@settings(max_examples=50, deadline=None)
+def test_the_field_falls_with_the_cube_of_the_distance(scale, turn, height):
+    p = np.array([np.cos(turn), np.sin(turn), height])
+    near, far = dipole_field_nt([p, scale * p], ORIGIN, [[0.3, -0.2, 1.1]])
+    assert_allclose(far * scale**3, near, rtol=1e-9, atol=1e-9)
+
+
+def test_fields_add_and_turn_with_their_moments():
+    place, moment = some_dipoles(7)
+    p = some_points(40)
+    parts = [dipole_field_nt(p, place[k : k + 1], moment[k : k + 1]) for k in range(7)]
+    assert_allclose(dipole_field_nt(p, place, moment), np.sum(parts, axis=0), rtol=1e-9, atol=1e-9)
+    assert_array_equal(dipole_field_nt(p, place, -moment), -dipole_field_nt(p, place, moment))
+
+
+def test_blocks_do_not_show(monkeypatch):
+    place, moment = some_dipoles(9)
+    p = some_points(101)
+    whole = dipole_field_nt(p, place, moment)
+    monkeypatch.setattr(sources, "PAIRS", 50)
+    assert_allclose(dipole_field_nt(p, place, moment), whole, rtol=1e-13, atol=1e-13 * np.abs(whole).max())
+
+
+def test_the_field_keeps_its_digits_a_millimetre_from_a_dipole_far_from_the_origin():
+    far = np.array([300.0, -200.0, 50.0])
+    place, p = np.array([far, far + 1]), far + np.array([0.0, 0.0, 1e-3])
+    moments = [[0, 0, 1e-3], [1, 0, 0]]
+    near = sum(dipole_field_nt(p - q, ORIGIN, [m]) for q, m in zip(place, moments, strict=True))
+    off = dipole_field_nt(p, place, moments) - near
+    assert np.abs(off).max() < 1e-9 * np.linalg.norm(near)  # at 300 m a millimetre is known to 4e-11
+
+
+def test_shapes_are_kept_and_no_dipole_makes_no_field():
+    place, moment = some_dipoles(3)
+    assert dipole_field_nt(np.ones(3), place, moment).shape == (3,)
+    assert dipole_field_nt(np.ones((2, 5, 3)), place, moment).shape == (2, 5, 3)
+    assert dipole_field_nt(np.ones((0, 3)), place, moment).shape == (0, 3)
+    assert_array_equal(dipole_field_nt(np.ones((4, 3)), np.zeros((0, 3)), np.zeros((0, 3))), np.zeros((4, 3)))
+
+
+def test_at_a_dipole_itself_the_field_is_not_finite_and_no_warning_is_raised():
+    assert not np.isfinite(dipole_field_nt(np.zeros(3), ORIGIN, [[0, 0, 1.0]])).any()
+
+
+def test_wrong_shapes_are_refused():
+    with pytest.raises(InputError, match=r"p_world must have shape \(\.\.\., 3\), got \(2,\)"):
+        dipole_field_nt(np.zeros(2), ORIGIN, ORIGIN)
+    with pytest.raises(InputError, match=r"one shape \(D, 3\), got \(1, 3\) and \(2, 3\)"):
+        dipole_field_nt(np.zeros(3), ORIGIN, np.zeros((2, 3)))

@@ -1,0 +1,204 @@
+import ctypes
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pxr import Sdf, Usd, UsdGeom, UsdShade
+
+from magtwin.errors import InputError
+from magtwin.figures.cutaway import VEIL
+from magtwin.figures.pictures import BACKGROUND, BAR_SHARE, Camera, picture_of_stage, view_distance
+from magtwin.files import shipped
+from magtwin.usd.geometry import srgb_from_linear
+
+SIZE = (240, 160)
+BEHIND = np.array([int(BACKGROUND[i : i + 2], 16) for i in (1, 3, 5)])
+
+
+def pixels(path):
+    """Red, green, blue of a PNG, shape (height, width, 3)."""
+    import matplotlib.image
+
+    return np.round(255 * matplotlib.image.imread(path)[..., :3]).astype(int)
+
+
+def drawn(image):
+    """Where a picture differs from its background, shape (height, width)."""
+    return (np.abs(image - BEHIND) > 8).any(axis=-1)
+
+
+@pytest.fixture
+def stage(tmp_path):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "stage.usda"))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    return stage
+
+
+def draw(stage, tmp_path, **options):
+    stage.Save()
+    return pixels(
+        picture_of_stage(tmp_path / "stage.usda", tmp_path / "a.png", size=SIZE, force=True, **options)
+    )
+
+
+def cube(stage, path, colour, place=(0.0, 0.0, 0.0)):
+    made = UsdGeom.Cube.Define(stage, path)
+    made.CreateSizeAttr(1.0)
+    made.CreateDisplayColorAttr([colour])
+    made.AddTranslateOp().Set(place)
+
+
+def test_a_thing_fills_the_picture_without_touching_its_edges(stage, tmp_path):
+    cube(stage, "/cube", (1, 0, 0))
+    there = drawn(draw(stage, tmp_path))
+    rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
+    assert there.shape == SIZE[::-1]
+    assert 0 < rows[0] < 0.15 * SIZE[1]
+    assert 0.85 * SIZE[1] < rows[-1] < SIZE[1] - 1
+    assert abs(columns.mean() - SIZE[0] / 2) < 0.05 * SIZE[0]
+
+
+def test_colours_arrive_and_y_is_on_the_right_to_who_looks_at_the_front(stage, tmp_path):
+    cube(stage, "/red", (1, 0, 0), (0, -1, 0))
+    cube(stage, "/blue", (0, 0, 1), (0, 1, 0))
+    image = draw(stage, tmp_path, camera=Camera(azimuth_deg=0, elevation_deg=0))
+    red = (image[..., 0] > 80) & (image[..., 2] < 60)
+    blue = (image[..., 2] > 80) & (image[..., 0] < 60)
+    assert min(red.sum(), blue.sum()) > 1000
+    assert np.flatnonzero(red.any(axis=0)).max() < np.flatnonzero(blue.any(axis=0)).min()
+
+
+def heat_map(stage, values):
+    """A square whose left half and right half have two colours, with a scale in its customData."""
+    mesh = UsdGeom.Mesh.Define(stage, "/World/AnomalyMap/HeatMap")
+    mesh.CreatePointsAttr([(x, y, 0) for y in (-1, 1) for x in (-1, 0, 1)])
+    mesh.CreateFaceVertexCountsAttr([4, 4])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 4, 3, 1, 2, 5, 4])
+    mesh.CreateDisplayColorPrimvar("uniform").Set(values)
+    scale = {"colourMap": "viridis", "least": 36000.0, "greatest": 52000.0, "unit": "nT"}
+    mesh.GetPrim().SetCustomData({"magtwin": scale})
+    material = UsdShade.Material.Define(stage, "/World/look")
+    surface = UsdShade.Shader.Define(stage, "/World/look/surface")
+    surface.CreateIdAttr("UsdPreviewSurface")
+    reader = UsdShade.Shader.Define(stage, "/World/look/reader")
+    reader.CreateIdAttr("UsdPrimvarReader_float3")
+    kinds = Sdf.ValueTypeNames
+    surface.CreateInput("diffuseColor", kinds.Color3f).ConnectToSource(
+        reader.CreateOutput("result", kinds.Float3)
+    )
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", kinds.Token))
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+
+
+def test_a_maps_colours_reach_the_screen_unchanged_by_light(stage, tmp_path):
+    heat_map(stage, [(0.5, 0.1, 0.0), (0.0, 0.1, 0.5)])
+    image = draw(stage, tmp_path, camera=Camera(azimuth_deg=-90, elevation_deg=90), legend=False)
+    quarter, middle = SIZE[0] // 4, SIZE[1] // 2
+    left, right = image[middle, SIZE[0] // 2 - quarter // 2], image[middle, SIZE[0] // 2 + quarter // 2]
+    screen = [188, 89, 0]  # sRGB of linear 0.5, 0.1, 0
+    assert np.abs(left - screen).max() <= 2
+    assert np.abs(right - screen[::-1]).max() <= 2
+
+
+@pytest.mark.parametrize("azimuth_deg", [-90, 40, 160])
+@pytest.mark.parametrize("elevation_deg", [15, 36])
+def test_no_wall_or_column_hides_the_map_from_any_side(
+    stage, tmp_path, azimuth_deg, elevation_deg, monkeypatch
+):
+    heat_map(stage, [(0.9, 0.05, 0.0), (0.0, 0.05, 0.9)])
+    camera = Camera(azimuth_deg, elevation_deg, distance_m=9, target=(0, 0, 0))
+    bare = draw(stage, tmp_path, camera=camera, legend=False)
+    for k, (x, y) in enumerate(((0, -2), (2, 0), (0, 2), (-2, 0), (0.5, 0.5), (-0.5, -0.3))):
+        wall = UsdGeom.Cube.Define(stage, f"/wall_{k}")
+        wall.CreateSizeAttr(1.0)
+        wall.AddTranslateOp().Set((x, y, 1.25))
+        wall.AddScaleOp().Set((0.2 + 3 * (abs(y) == 2), 0.2 + 3 * (abs(x) == 2), 2.5))
+    veiled = draw(stage, tmp_path, camera=camera, legend=False)
+    monkeypatch.setattr("magtwin.figures.cutaway.VEIL", 1.0)
+    solid = draw(stage, tmp_path, camera=camera, legend=False)
+    inks = 255 * srgb_from_linear([(0.9, 0.05, 0.0), (0.0, 0.05, 0.9)])  # edges are mixed with what is beside
+    on_map = np.any([np.abs(bare - ink).max(axis=-1) <= 2 for ink in inks], axis=0)
+    assert on_map.sum() > 500
+    changed = np.abs(veiled - bare)[on_map].max(axis=-1), np.abs(solid - bare)[on_map].max(axis=-1)
+    assert np.mean(changed[1] > 100) > 0.2  # without the cutaway, they do
+    assert changed[0].max() <= VEIL * 255 + 3
+    there = ~drawn(bare)
+    np.testing.assert_allclose(veiled[there], solid[there], atol=8)  # solid elsewhere; drawn() sees from 8 on
+
+
+def test_a_camera_that_fits_a_map_keeps_it_clear_of_the_colour_bar(stage, tmp_path):
+    heat_map(stage, [(0.9, 0.05, 0.0), (0.0, 0.05, 0.9)])
+    barred = draw(stage, tmp_path, camera=Camera(azimuth_deg=-90, elevation_deg=90))
+    blue = (barred[..., 2] > 200) & (barred[..., 0] < 60)  # no colour of viridis
+    columns = np.flatnonzero(blue.any(axis=0))
+    assert columns.size
+    assert columns.max() < (1 - BAR_SHARE) * SIZE[0]
+
+
+def test_a_stage_with_a_map_gets_its_colour_bar(stage, tmp_path):
+    heat_map(stage, [(0.5, 0.1, 0.0), (0.0, 0.1, 0.5)])
+    camera = Camera(azimuth_deg=-90, elevation_deg=90)
+    plain = drawn(draw(stage, tmp_path, camera=camera, legend=False))
+    barred = drawn(draw(stage, tmp_path, camera=camera))
+    right = slice(int(0.9 * SIZE[0]), None)
+    assert not plain[:, right].any()
+    assert barred[:, right].sum() > 100
+
+
+def test_the_turtlebot_is_drawn(tmp_path):
+    out = picture_of_stage(shipped("robots", "turtlebot4", "turtlebot4.usda"), tmp_path / "r.png", size=SIZE)
+    image = pixels(out)
+    blue = (image[..., 2] > image[..., 0] + 60) & (image[..., 2] > 90)
+    assert blue.sum() > 20  # the magnetometer's head
+    assert 0.1 < drawn(image).mean() < 0.6
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(-2, 2)] * 3), min_size=1, max_size=8),
+    st.tuples(st.floats(0.1, 0.8), st.floats(0.1, 0.8)),
+)
+def test_at_the_view_distance_all_points_are_within_the_angles_and_one_is_on_the_edge(points, half):
+    D = view_distance(points, [0, 0, 0], np.eye(3), half)
+    r, u, b = np.array(points).T
+    outside = np.maximum(np.abs(r) - (D - b) * np.tan(half[0]), np.abs(u) - (D - b) * np.tan(half[1]))
+    np.testing.assert_allclose(outside.max(), 0, atol=1e-9)
+
+
+def test_what_cannot_be_drawn_is_refused(stage, tmp_path):
+    stage.Save()
+    source, out = tmp_path / "stage.usda", tmp_path / "a.png"
+    with pytest.raises(InputError, match=r"stage\.usda: shows nothing; a picture needs at least one"):
+        picture_of_stage(source, out)
+    with pytest.raises(InputError, match=r"a\.jpg: pictures are PNG; give it the suffix \.png"):
+        picture_of_stage(source, tmp_path / "a.jpg")
+    with pytest.raises(InputError, match=r"size must lie in 16\.\.16384 pixels each way, got 0 x 5"):
+        picture_of_stage(source, out, size=(0, 5))
+    with pytest.raises(InputError, match=r"elevation_deg of Camera must lie in -90\.\.90, got 91"):
+        Camera(elevation_deg=91)
+    with pytest.raises(InputError, match=r"distance_m of Camera must be above 0, got 0"):
+        Camera(distance_m=0)
+    with pytest.raises(InputError, match=r"view_angle_deg of Camera must lie in 1\.\.120"):
+        Camera(view_angle_deg=0)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("lacks", ["libX11", "libOSMesa"])
+def test_a_machine_without_opengl_is_told_the_packages(lacks, stage, tmp_path, monkeypatch):
+    if lacks == "libX11" and sys.platform != "linux":
+        pytest.skip("only on Linux VTK loads libX11, and dies without it")
+    cube(stage, "/cube", (1, 0, 0))
+    stage.Save()
+
+    def load(name, *_, of=ctypes.CDLL, **__):
+        if name.startswith(lacks):
+            raise OSError(name)
+        return of(name)
+
+    monkeypatch.setenv("VTK_DEFAULT_OPENGL_WINDOW", "vtkOSOpenGLRenderWindow")
+    monkeypatch.setattr(ctypes, "CDLL", load)
+    with pytest.raises(InputError, match=r"no OpenGL here, .*: apt-get install libegl1 libgl1-mesa-dri"):
+        picture_of_stage(tmp_path / "stage.usda", tmp_path / "a.png")
+    assert not (tmp_path / "a.png").exists()

@@ -1,0 +1,366 @@
+import dataclasses
+import struct
+import subprocess
+import sys
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from magtwin.errors import InputError
+from magtwin.field.maps.difference import difference
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.figures.plots import plot_difference, plot_map
+from magtwin.figures.plotting import plot_run
+from magtwin.run.run import Run
+
+FOUR = np.radians([0.0, 90.0, 180.0, 270.0])
+
+
+def field_map(**more):
+    x, y = np.meshgrid(np.linspace(-3, 3, 9), np.linspace(-1.75, 1.75, 6))
+    values = 41_000 + 800 * x - 500 * y * x + 300 * np.cos(FOUR)[:, None, None]
+    return AnomalyMap(
+        values_nt=values, origin_m=(-3.0, -1.75), cell_m=(0.75, 0.7), headings_rad=FOUR, name="hall", **more
+    )
+
+
+def a_run(rows=400, **changed):
+    t = np.arange(rows) / 10
+    p = np.column_stack([2 * np.sin(t / 5), np.sin(t / 2.5), 0 * t])
+    columns = {
+        "t": t,
+        "p_world_base": p,
+        "v_base": np.tile([0.2, 0, 0], (rows, 1)),
+        "battery_v": 16 - t / 1000,
+        "lidar_on": (t % 20) > 12,
+        "b_map_nt": 41_000 + 800 * p[:, 0],
+        "b_disturbance_nt": 300 * np.cos(t),
+        "b_total_nt": 41_000 + 800 * p[:, 0] + 300 * np.cos(t),
+    }
+    return Run({**columns, **changed}, {"scene": "hall", "path": "figure8"})
+
+
+def pixels(file):
+    """Width, height and colours (H, W, 4) of a PNG that matplotlib reads back."""
+    from matplotlib.image import imread
+
+    return imread(file)
+
+
+def test_a_map_is_drawn_with_a_panel_a_heading(tmp_path):
+    plot_map(field_map(), tmp_path / "four.png")
+    plot_map(field_map(), tmp_path / "one.png", headings=[0.3])
+    four, one = pixels(tmp_path / "four.png"), pixels(tmp_path / "one.png")
+    assert four.shape[0] > one.shape[0]
+    assert four.shape[1] > 1.5 * one.shape[1]
+    assert len(np.unique(four.reshape(-1, 4), axis=0)) > 100  # colours of a field, not an empty frame
+
+
+def test_three_headings_leave_the_fourth_panel_empty(tmp_path):
+    plot_map(field_map(), tmp_path / "three.png", headings=FOUR[:3])
+    picture = pixels(tmp_path / "three.png")
+    height, width = picture.shape[:2]
+    corner = picture[int(0.6 * height) : int(0.85 * height), int(0.5 * width) : int(0.8 * width), :3]
+    assert np.all(corner == 1)
+
+
+def test_turning_the_layers_by_a_quarter_turns_the_panels(tmp_path):
+    field = field_map()
+    turned = AnomalyMap(
+        values_nt=np.roll(field.values_nt, 1, axis=0),
+        origin_m=field.origin_m,
+        cell_m=field.cell_m,
+        headings_rad=FOUR,
+        name="hall",
+    )
+    plot_map(field, tmp_path / "a.png", headings=[0.0])
+    plot_map(turned, tmp_path / "b.png", headings=[np.pi / 2])
+    a, b = pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png")
+    below_the_title = slice(len(a) // 3, None)
+    assert np.array_equal(a[below_the_title], b[below_the_title])
+
+
+def test_masked_nodes_look_unlike_any_field(tmp_path):
+    valid = np.ones((4, 6, 9), bool)
+    valid[:, 2:4, 3:6] = False
+    plot_map(field_map(valid=valid), tmp_path / "masked.png", headings=[0.0])
+    picture = pixels(tmp_path / "masked.png")[..., :3]
+    ground = np.all(np.abs(picture - 0.85) < 0.01, axis=-1)
+    plot_map(field_map(), tmp_path / "whole.png", headings=[0.0])
+    whole = np.all(np.abs(pixels(tmp_path / "whole.png")[..., :3] - 0.85) < 0.01, axis=-1)
+    assert ground.mean() > 0.01 > whole.mean()
+
+
+def test_one_map_gives_one_file_to_the_byte_without_date_or_version(tmp_path):
+    plot_map(field_map(), tmp_path / "a.png")
+    plot_map(field_map(), tmp_path / "b.png")
+    data = (tmp_path / "a.png").read_bytes()
+    assert data == (tmp_path / "b.png").read_bytes()
+    assert set(chunks(data)) <= {b"IHDR", b"pHYs", b"IDAT", b"IEND"}
+
+
+def chunks(data):
+    """Names of a PNG's chunks: length, name, content and checksum follow one another after 8 bytes."""
+    at, names = 8, []
+    while at < len(data):
+        (length,) = struct.unpack(">I", data[at : at + 4])
+        names.append(data[at + 4 : at + 8])
+        at += 12 + length
+    return names
+
+
+def texts(file):
+    """Texts of an SVG, joined."""
+    root = ElementTree.parse(file).getroot()
+    return " | ".join("".join(e.itertext()).strip() for e in root.iter("{http://www.w3.org/2000/svg}text"))
+
+
+def a_peak(**more):
+    """One heading with a peak of 50 uT at (1.5, 0.7), on 42 uT."""
+    x, y = np.meshgrid(np.linspace(-3, 3, 25), np.linspace(-1.75, 1.75, 15))
+    values = 42_000 + 8_000 * np.exp(-((x - 1.5) ** 2 + (y - 0.7) ** 2))
+    return AnomalyMap(
+        values_nt=values[None], origin_m=(-3.0, -1.75), cell_m=(0.25, 0.25), headings_rad=[0.0], **more
+    )
+
+
+def pixel_at(picture, x, y):
+    """Colour of the panel at a point of a floor of 6 x 3.5 m; the panel is what most of the picture is."""
+    ink = np.any(picture[..., :3] < 0.99, axis=-1)
+    rows, columns = np.flatnonzero(ink.mean(axis=1) > 0.5), np.flatnonzero(ink.mean(axis=0) > 0.5)
+    columns = columns[: np.flatnonzero(np.diff(columns, append=1e6) > 1)[0] + 1]  # without the bar's
+    j = rows[-1] + (rows[0] - rows[-1]) * (y + 1.75) / 3.5
+    i = columns[0] + (columns[-1] - columns[0]) * (x + 3) / 6
+    return picture[round(j), round(i), :3]
+
+
+def test_the_peak_is_bright_where_it_lies_and_the_rest_dark(tmp_path):
+    from matplotlib import colormaps
+
+    plot_map(a_peak(), tmp_path / "a.png")
+    picture = pixels(tmp_path / "a.png")
+    assert np.allclose(pixel_at(picture, 1.5, 0.7), colormaps["viridis"](1.0)[:3], atol=0.12)
+    for x, y in ((-2.9, -1.6), (-1.5, 0.7), (1.5, -1.7)):
+        assert np.allclose(pixel_at(picture, x, y), colormaps["viridis"](0.0)[:3], atol=0.06)
+
+
+def test_the_slope_of_a_peak_is_a_ring_about_it(tmp_path):
+    plot_map(a_peak(), tmp_path / "a.png", what="gradient")
+    picture = pixels(tmp_path / "a.png")
+    side, top, far = (pixel_at(picture, *p).sum() for p in ((0.8, 0.7), (1.5, 0.7), (-2.5, 0.0)))
+    assert side > 2 * top
+    assert side > 2 * far
+
+
+def test_a_masked_node_is_grey_over_its_cell_and_no_farther(tmp_path):
+    valid = np.ones((1, 15, 25), bool)
+    valid[0, 4:7, 5:8] = False  # x from -1.75 to -1.25, y from -0.75 to -0.25, and half a cell about it
+    plot_map(a_peak(valid=valid), tmp_path / "a.png")
+    picture = pixels(tmp_path / "a.png")
+
+    def grey(x, y):
+        red, green, blue = pixel_at(picture, x, y)
+        return abs(red - green) < 0.02 and abs(red - blue) < 0.02
+
+    assert all(grey(x, y) for x in (-1.8, -1.5, -1.2) for y in (-0.8, -0.5, -0.2))
+    assert not any(grey(x, -0.5) for x in (-2.0, -1.0))
+    assert not any(grey(-1.5, y) for y in (-1.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("field", "total field [µT]"),
+        ("gradient", "gradient along the floor [µT/m]"),
+        ("variance", "standard deviation [nT]"),
+        ("headings", "difference from the mean over headings [nT]"),
+    ],
+)
+def test_a_drawing_says_what_where_and_in_which_unit(tmp_path, what, said):
+    field = field_map(variance_nt2=np.full((4, 6, 9), 25.0), height_m=0.35, created="2026-01-02")
+    plot_map(field, tmp_path / "a.svg", what=what)
+    words = texts(tmp_path / "a.svg")
+    for part in (
+        said,
+        "hall",
+        "heading 0°",
+        "heading 270°",
+        "x [m]",
+        "y [m]",
+        "sensor at 0.35 m",
+        "2026-01-02",
+    ):
+        assert part in words
+    assert "masked" not in words
+
+
+def test_the_legend_says_what_hatched_nodes_are(tmp_path):
+    valid = np.ones((4, 6, 9), bool)
+    valid[1, 2, 3] = False
+    for what, said in (
+        ("field", "masked: no field is known there"),
+        ("gradient", "masked, or beside a masked node"),
+        ("headings", "masked in some heading"),
+        ("mask", "masked: no field is known there"),
+    ):
+        plot_map(field_map(valid=valid), tmp_path / f"{what}.svg", what=what)
+        assert said in texts(tmp_path / f"{what}.svg")
+    words = texts(tmp_path / "mask.svg")
+    assert "holds field" in words
+    assert "heading 90°, 1 masked" in words
+    assert "heading 0°, 0 masked" in words
+
+
+def test_the_bar_of_the_standard_deviation_is_about_its_value(tmp_path):
+    plot_map(a_peak(variance_nt2=np.full((1, 15, 25), 25.0)), tmp_path / "a.svg", what="variance")
+    ticks = [float(w) for w in texts(tmp_path / "a.svg").split(" | ") if w.replace(".", "").isdigit()]
+    assert {4.5, 5.0, 5.5} <= set(ticks)
+
+
+def test_one_map_gives_one_svg_to_the_byte_without_a_date(tmp_path):
+    valid = np.ones((4, 6, 9), bool)
+    valid[:, 2, 3] = False
+    for name in ("a.svg", "b.svg"):
+        plot_map(field_map(valid=valid), tmp_path / name)
+    data = (tmp_path / "a.svg").read_bytes()
+    assert data == (tmp_path / "b.svg").read_bytes()
+    assert b"<dc:date>" not in data
+    assert b"Matplotlib v" not in data
+
+
+def test_a_map_of_millions_of_nodes_gives_a_small_drawing(tmp_path):
+    values = 42_000 + np.add.outer(np.arange(1500.0), np.arange(1500.0))[None]
+    field = AnomalyMap(values_nt=values, origin_m=(0, 0), cell_m=(0.01, 0.01), headings_rad=[0.0])
+    plot_map(field, tmp_path / "a.svg")
+    assert (tmp_path / "a.svg").stat().st_size < 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("variance", "nothing is known of the variance of map ''"),
+        ("headings", "map '' has one heading only"),
+        ("feild", "no quantity 'feild'; did you mean 'field'"),
+    ],
+)
+def test_what_a_map_does_not_know_is_not_drawn(tmp_path, what, said):
+    with pytest.raises(InputError, match=said):
+        plot_map(a_peak(), tmp_path / "a.png", what=what)
+    with pytest.raises(InputError, match=r"a\.jpg: a picture ends in \.png or \.svg"):
+        plot_map(a_peak(), tmp_path / "a.jpg")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_real_survey_shows_its_peak_and_its_latched_band(tmp_path, real_data):
+    from magtwin.field.survey.gridded import import_survey
+
+    plot_map(import_survey(real_data / "aprilab" / "maps"), tmp_path / "a.png", headings=[0.0])
+    picture = pixels(tmp_path / "a.png")
+    red, green, blue = pixel_at(picture, 0.0, 0.75)
+    assert red > 0.8 > 0.3 > blue  # yellow
+    assert green > 0.8
+    for y in (1.25, 0.75, -0.25):  # hatched, so of grey
+        assert np.ptp(pixel_at(picture, -1.25, y)) < 0.02
+
+
+def a_difference(**more):
+    changed = a_peak().values_nt.copy()
+    changed[0, 10, 6] += 500.0  # at (-1.5, 0.75)
+    noise = np.random.default_rng(1).normal(0, 5, changed.shape)
+    after = a_peak(name="after", created="2026-02-01", **more)
+    after = dataclasses.replace(after, values_nt=changed + 80.0 + noise)
+    return difference(a_peak(name="before", created="2026-01-01", **more), after)
+
+
+def test_a_difference_is_red_where_the_field_rose_and_says_how_much_and_when(tmp_path):
+    found = a_difference(variance_nt2=np.full((1, 15, 25), 12.5))
+    plot_difference(found, tmp_path / "a.svg")
+    plot_difference(found, tmp_path / "b.svg")
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+    words = texts(tmp_path / "a.svg")
+    for part in (
+        "before 2026-01-01 to after 2026-02-01",
+        "common bias +79.7 nT",
+        "1 of 375 nodes changed, in 1 region,",
+        "local change [nT]",
+        "changed region",
+    ):
+        assert part in words
+    assert "robust spread" not in words
+    plot_difference(found, tmp_path / "a.png")
+    picture = pixels(tmp_path / "a.png")[:, : 1240 // 2]
+    reds = (picture[..., 0] > 0.3) & (picture[..., 1] < 0.1) & (picture[..., 2] < 0.2)
+    assert reds.any()
+
+
+def test_a_difference_without_variance_says_so_and_hatches_what_is_not_known_to_both(tmp_path):
+    valid = np.ones((1, 15, 25), bool)
+    valid[0, 3, 4] = False
+    plot_difference(a_difference(valid=valid), tmp_path / "a.svg")
+    words = texts(tmp_path / "a.svg").replace(" | ", " ")  # its lines may break anywhere
+    assert "no variance is known: z by the robust spread" in words
+    assert "not known to both surveys" in words
+
+
+@pytest.mark.parametrize("field", [field_map(), None], ids=["map", "bare floor"])
+def test_a_run_is_drawn_with_and_without_its_map_and_plan(tmp_path, field):
+    planned = np.array([[0, 0], [2, 1], [2, -1]])
+    plot_run(a_run(), field, tmp_path / "a.png", planned)
+    plot_run(a_run(), field, tmp_path / "b.png", planned)
+    plot_run(a_run(), field, tmp_path / "c.png")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert (tmp_path / "a.png").read_bytes() != (tmp_path / "c.png").read_bytes()
+
+
+def test_a_run_off_the_map_is_drawn_with_gaps(tmp_path):
+    total = np.array(a_run()["b_total_nt"])
+    total[100:] = np.nan
+    plot_run(a_run(b_total_nt=total, b_map_nt=total), field_map(), tmp_path / "half.png")
+    plot_run(a_run(b_total_nt=total * np.nan), field_map(), tmp_path / "none.png")
+    plot_run(a_run(rows=1), None, tmp_path / "one.png")
+
+
+def test_a_name_with_dollars_is_a_name_and_no_formula(tmp_path):
+    field = dataclasses.replace(field_map(), name=r"a $\frac{ b$")
+    plot_map(field, tmp_path / "a.svg", what="mask")
+    assert r"a $\frac{ b$" in (tmp_path / "a.svg").read_text()
+
+
+def test_more_headings_than_a_picture_has_room_for_are_refused(tmp_path):
+    with pytest.raises(InputError, match="headings to show are 36 at most, a panel each, got 37"):
+        plot_map(field_map(), tmp_path / "a.png", headings=np.linspace(0, 6, 37))
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_to_draw_is_refused_and_nothing_is_written(tmp_path):
+    out = tmp_path / "a.png"
+    with pytest.raises(InputError, match="headings must name one heading at least"):
+        plot_map(field_map(), out, headings=[])
+    with pytest.raises(InputError, match="map 'hall' has no valid node to draw"):
+        plot_map(field_map(valid=np.zeros((4, 6, 9), bool)), out)
+    with pytest.raises(InputError, match="the run has no rows"):
+        plot_run(a_run(rows=0), None, out)
+    with pytest.raises(InputError, match="neither positions nor columns of numbers to draw"):
+        plot_run(Run({"t": a_run()["t"]}), None, out)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_picture_that_exists_is_kept_unless_force_is_given(tmp_path):
+    out = tmp_path / "a.png"
+    out.write_text("mine")
+    with pytest.raises(InputError, match=r"a\.png: exists already"):
+        plot_map(field_map(), out)
+    assert out.read_text() == "mine"
+    plot_map(field_map(), out, force=True)
+    assert out.read_bytes().startswith(b"\x89PNG")
+
+
+def test_plotting_leaves_pyplot_alone(tmp_path):
+    code = (
+        "import sys; from magtwin.io import plots; assert 'matplotlib' not in sys.modules;"
+        "from magtwin.field.maps.map import AnomalyMap; import numpy as np;"
+        "m = AnomalyMap(values_nt=np.full((1, 2, 2), 4e4), origin_m=(0, 0), cell_m=(1, 1), headings_rad=[0]);"
+        f"plots.plot_map(m, {str(tmp_path / 'a.png')!r}); sys.exit('matplotlib.pyplot' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

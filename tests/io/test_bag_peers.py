@@ -1,0 +1,406 @@
+"""Every bag that magtwin writes or reads, held to the libraries `mcap` and `rosbags`."""
+
+import struct
+from collections import Counter, defaultdict
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import NonSeekingReader, SeekingReader
+from mcap.records import Channel, Chunk, Message, MessageIndex, Schema, Statistics
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, IndexType
+from mcap.writer import Writer as PeerWriter
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+import magtwin
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.io.bags import mcap as ours
+from magtwin.io.bags.cdr import encode, leaves
+from magtwin.io.bags.db3 import Db3Reader
+from magtwin.io.bags.mcap import McapReader
+from magtwin.io.bags.messages import MAGNITUDE, SCAN, TYPES, Qos
+from magtwin.io.bags.raw import RawBagWriter
+from magtwin.io.bags.rosbag import BagWriter, read_bag, write_bag
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+LASER = "sensor_msgs/msg/LaserScan"
+TEXT = "std_msgs/msg/String"
+FORMS = {LASER: "ranges", "sensor_msgs/msg/JointState": "position", TEXT: "data"}
+"""Types whose messages differ in size, and the field that does it."""
+
+
+def message(kind, size, t_ns=0):
+    """A message in CDR of one of `FORMS`."""
+    values = "x" * size if kind == TEXT else np.arange(float(size))[None] + t_ns % 97
+    fields = {"header.stamp": np.array([t_ns]), "header.frame_id": "laser", FORMS[kind]: values}
+    return encode(leaves(TYPES[kind]), fields, 1)[0].tobytes()
+
+
+def by_magtwin(file):
+    """By topic the times and bytes of messages that our reader finds, and how many the index lacks."""
+    reader = (McapReader if file.suffix == ".mcap" else Db3Reader)(file)
+    names = {heard.id: heard.topic for heard in reader.topics}
+    found = defaultdict(list)
+    for number, messages in reader.messages(names).items():
+        for t, at, size in zip(messages.received, messages.start, messages.size, strict=True):
+            found[names[number]].append((int(t), messages.buffer[at : at + size].tobytes()))
+    reader.close()
+    return dict(found), sum(getattr(reader, "unindexed", {}).values())
+
+
+def by_rosbags(path):
+    """The same by rosbags; its counts are those that it finds."""
+    found = defaultdict(list)
+    with Reader(path) as reader:
+        for connection, t, data in reader.messages():
+            found[connection.topic].append((t, bytes(data)))
+        assert reader.message_count == sum(map(len, found.values()))
+        assert {c.topic: c.msgcount for c in reader.connections if c.msgcount} == counts(found)
+    return dict(found)
+
+
+def by_mcap(file, kind):
+    """The same by mcap's own readers: SeekingReader goes by the summary, NonSeekingReader by the data."""
+    found = defaultdict(list)
+    with open(file, "rb") as stream:
+        for _, channel, m in kind(stream, validate_crcs=True).iter_messages():
+            assert m.publish_time == m.log_time
+            found[channel.topic].append((m.log_time, m.data))
+    return dict(found)
+
+
+def counts(found):
+    return {topic: len(messages) for topic, messages in found.items()}
+
+
+def storage_file(path):
+    """The storage file of a bag, which may be a folder."""
+    return next(p for p in path.iterdir() if p.suffix != ".yaml") if path.is_dir() else path
+
+
+def assert_everyone_reads(path, expected):
+    """Ours, rosbags' and mcap's readers give exactly these messages, each topic in order."""
+    file = storage_file(path)
+    found, unindexed = by_magtwin(file)
+    assert {topic: m for topic, m in found.items() if m} == expected
+    assert unindexed == 0
+    assert by_rosbags(path) == expected
+    if file.suffix == ".mcap":
+        assert by_mcap(file, SeekingReader) == expected
+        assert by_mcap(file, NonSeekingReader) == expected
+        assert_as_specified(file)
+
+
+def assert_as_specified(file):
+    """Statistics, chunk indexes and message indexes are those of https://mcap.dev/spec."""
+    content = file.read_bytes()
+    with open(file, "rb") as stream:
+        records = list(StreamReader(stream, emit_chunks=True, validate_crcs=True).records)
+    with open(file, "rb") as stream:
+        summary = SeekingReader(stream, validate_crcs=True).get_summary()
+    chunks = [r for r in records if isinstance(r, Chunk)]
+    messages = [[m for m in breakup_chunk(c, True) if isinstance(m, Message)] for c in chunks]
+    every = [m for part in messages for m in part]
+    statistics = summary.statistics
+    assert [r for r in records if isinstance(r, Statistics)] == [statistics]
+    assert statistics.message_count == len(every)
+    told = {k: n for k, n in statistics.channel_message_counts.items() if n}
+    assert told == Counter(m.channel_id for m in every)
+    assert statistics.chunk_count == len(chunks) == len(summary.chunk_indexes)
+    assert statistics.channel_count == len(summary.channels)
+    assert statistics.schema_count == len(summary.schemas)
+    times = [m.log_time for m in every] or [0]
+    assert (statistics.message_start_time, statistics.message_end_time) == (min(times), max(times))
+    data = records[: next(k for k, r in enumerate(records) if type(r).__name__ == "DataEnd")]
+    inside = [r for c in chunks for r in breakup_chunk(c, True)] + data
+    assert {c.id for c in inside if isinstance(c, Channel)} == set(summary.channels)
+    assert {s.id for s in inside if isinstance(s, Schema)} == set(summary.schemas)
+    for index, chunk, held in zip(summary.chunk_indexes, chunks, messages, strict=True):
+        opcode, length = struct.unpack_from("<BQ", content, index.chunk_start_offset)
+        assert opcode == 6
+        assert length + 9 == index.chunk_length
+        times = [m.log_time for m in held]
+        assert times == sorted(times)
+        assert (index.message_start_time, index.message_end_time) == (times[0], times[-1])
+        assert (chunk.message_start_time, chunk.message_end_time) == (times[0], times[-1])
+        assert index.compressed_size == len(chunk.data)
+        plain = zstandard.ZstdDecompressor().decompress(chunk.data, index.uncompressed_size)
+        assert len(plain) == index.uncompressed_size
+        assert set(index.message_index_offsets) == {m.channel_id for m in held}
+        end = index.chunk_start_offset + index.chunk_length + index.message_index_length
+        for channel, at in index.message_index_offsets.items():
+            opcode, length, about, size = struct.unpack_from("<BQHI", content, at)
+            assert (opcode, about, length) == (7, channel, size + 6)
+            assert at + 9 + length <= end
+            entries = list(struct.iter_unpack("<QQ", content[at + 15 : at + 15 + size]))
+            assert [t for t, _ in entries] == [m.log_time for m in held if m.channel_id == channel]
+            for t, offset in entries:
+                kind, _, number, _, log, publish = struct.unpack_from("<BQHIQQ", plain, offset)
+                assert (kind, number, log, publish) == (5, channel, t, t)
+    assert sum(isinstance(r, MessageIndex) for r in records) == sum(
+        len(index.message_index_offsets) for index in summary.chunk_indexes
+    )
+
+
+@pytest.mark.parametrize("name", ["scans.mcap", "scans.db3", "scans"])
+def test_a_thousand_scans_of_700_to_722_ranges_are_read_back_by_everyone(tmp_path, name):
+    writer = RawBagWriter(tmp_path / name)
+    writer.add("/scan", LASER, Qos())
+    sent = []
+    for k, n in enumerate(np.random.default_rng(0).integers(700, 723, 1000)):
+        sent.append((k * 10**8, message(LASER, int(n), k * 10**8)))
+        writer.write("/scan", *sent[-1])
+        if k % 8 == 7:
+            writer.flush()
+    writer.close()
+    assert len({len(data) for _, data in sent}) == 23
+    assert_everyone_reads(tmp_path / name, {"/scan": sent})
+    with Reader(tmp_path / name) as reader:
+        lengths = [len(STORE.deserialize_cdr(d, c.msgtype).ranges) for c, _, d in reader.messages()]
+    assert set(lengths) == set(range(700, 723))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32), st.sampled_from([".mcap", ".db3"]), st.booleans(), st.booleans())
+def test_any_messages_of_any_sizes_are_read_back_by_everyone(tmp_path_factory, seed, ending, late, small):
+    """Several topics, equal times, times that go back, flushes anywhere, several chunks."""
+    rng = np.random.default_rng(seed)
+    path = tmp_path_factory.mktemp("any") / f"bag{ending}"
+    topics = [(f"/{kind.rpartition('/')[2]}{k}", kind) for k in range(2) for kind in FORMS]
+    writer = RawBagWriter(path)
+    sent, t = defaultdict(list), 10**18
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ours, "CHUNK", 2000 if small else ours.CHUNK)
+        for topic, kind in topics:
+            writer.add(topic, kind, Qos())
+        for _ in range(rng.integers(1, 300)):
+            t += int(rng.choice([0, 1, 10**6])) - (int(rng.integers(3)) * 10**6 if late else 0)
+            topic, kind = topics[rng.integers(len(topics) - 1)]  # the last one stays empty
+            sent[topic].append((t, message(kind, int(rng.integers(40)), t)))
+            writer.write(topic, *sent[topic][-1])
+            if rng.random() < 0.05:
+                writer.flush()
+        writer.close()
+    if not late:
+        assert_everyone_reads(path, dict(sent))
+        return
+    found, unindexed = by_magtwin(path)
+    in_time = {topic: sorted(m, key=lambda one: one[0]) for topic, m in sent.items()}
+    assert unindexed == 0
+    assert {topic: m for topic, m in found.items() if m} == in_time
+    assert {topic: sorted(m) for topic, m in by_rosbags(path).items()} == {
+        k: sorted(m) for k, m in sent.items()
+    }
+    if ending == ".mcap":
+        assert_as_specified(path)
+        assert {k: sorted(m) for k, m in by_mcap(path, SeekingReader).items()} == {
+            k: sorted(m) for k, m in sent.items()
+        }
+
+
+def test_messages_of_one_moment_keep_the_order_of_their_arrival_over_topics_and_sizes(tmp_path):
+    order = [("/b", 3), ("/a", 900), ("/b", 2), ("/b", 700), ("/a", 1), ("/b", 3), ("/a", 900)]
+    for name in ("bag.mcap", "bag.db3"):
+        writer = RawBagWriter(tmp_path / name)
+        for topic in ("/a", "/b"):
+            writer.add(topic, LASER, Qos())
+        for topic, size in order:
+            writer.write(topic, 5, message(LASER, size))
+        writer.close()
+        with Reader(tmp_path / name) as reader:
+            found = [
+                (c.topic, len(STORE.deserialize_cdr(d, c.msgtype).ranges)) for c, _, d in reader.messages()
+            ]
+        assert found == order
+
+
+@pytest.fixture(scope="module")
+def made(lab_scene, tmp_path_factory):
+    """A run of 20 s with its LiDAR on, as a bag by every writer of ours; the messages of its bag."""
+    from magtwin.twin import scan
+
+    folder = tmp_path_factory.mktemp("made")
+    twin = magtwin.open_twin(lab_scene)
+    run = magtwin.simulate(twin, "figure8", seed=3, duration_s=20.0, lidar="on")
+    write_bag(run, folder / "whole.mcap", twin, scans=scan(twin, run))
+    write_bag(run, folder / "whole.db3", twin, scans=scan(twin, run))
+    for ending in ("mcap", "db3"):
+        with BagWriter(folder / f"blocks.{ending}", twin, scans=scan(twin, run)) as writer:
+            for first in range(0, run.rows, 500):
+                writer.append(run.take(slice(first, first + 500)))
+    with Reader(folder / "whole.db3") as reader:
+        said = [(c.topic, c.msgtype, t, bytes(data)) for c, t, data in reader.messages()]
+    for ending in ("mcap", "db3"):
+        raw = RawBagWriter(folder / f"raw.{ending}")
+        for k, (topic, kind, t, data) in enumerate(said):
+            raw.add(topic, kind, Qos())
+            raw.write(topic, t, data)
+            if k % 1500 == 0:
+                raw.flush()
+        raw.close()
+    expected = defaultdict(list)
+    for topic, _, t, data in said:
+        expected[topic].append((t, data))
+    return folder, run, dict(expected)
+
+
+@pytest.mark.parametrize(
+    "name", [f"{way}.{end}" for way in ("whole", "blocks", "raw") for end in ("mcap", "db3")]
+)
+def test_every_writer_says_the_same_and_everyone_reads_all_of_it(made, name):
+    folder, _, expected = made
+    assert len(expected) >= 12  # every topic of a run of the lab's robot, scans among them
+    assert len(expected[SCAN.name]) > 100
+    assert_everyone_reads(folder / name, expected)
+    if name.endswith("mcap"):
+        with open(folder / name, "rb") as stream:
+            assert SeekingReader(stream).get_summary().statistics.chunk_count > 3
+
+
+@pytest.mark.parametrize("name", ["whole.mcap", "blocks.mcap", "raw.mcap", "raw.db3"])
+def test_info_convert_and_the_file_itself_agree_in_counts(made, tmp_path, capsys, name):
+    folder, run, expected = made
+    main(["convert", str(folder / name), str(tmp_path / "run.parquet")])
+    main(["convert", str(folder / name), str(tmp_path / "again.mcap")])
+    capsys.readouterr()
+    main(["info", str(tmp_path / "run.parquet"), "--json"])
+    table = capsys.readouterr().out
+    main(["info", str(folder / name), "--json"])
+    assert capsys.readouterr().out.replace(str(folder / name), "") == table.replace(
+        str(tmp_path / "run.parquet"), ""
+    )
+    assert read_bag(folder / name).rows == run.rows == len(expected["/magtwin/reading"])
+    assert counts(by_rosbags(tmp_path / "again.mcap"))[MAGNITUDE.name] == len(expected[MAGNITUDE.name])
+
+
+def shuffled(rng, count=900):
+    """Messages of two topics, whose times are out of order and whose sizes differ."""
+    times = 10**18 + rng.permutation(count) * 10**6
+    kinds = [LASER, TEXT]
+    return [
+        (f"/{kinds[k % 2].rpartition('/')[2]}", kinds[k % 2], int(t), message(kinds[k % 2], int(n), int(t)))
+        for k, (t, n) in enumerate(zip(times, rng.integers(0, 200, count), strict=True))
+    ]
+
+
+def in_time(said):
+    found = defaultdict(list)
+    for topic, _, t, data in sorted(said, key=lambda m: m[2]):
+        found[topic].append((t, data))
+    return dict(found)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("index", [IndexType.ALL, IndexType.NONE])
+@pytest.mark.parametrize("chunked", [True, False])
+def test_what_mcaps_own_writer_wrote_out_of_order_is_read_in_order(tmp_path, compression, index, chunked):
+    said = shuffled(np.random.default_rng(1))
+    with open(tmp_path / "bag.mcap", "wb") as stream:
+        writer = PeerWriter(stream, 20_000, compression, index, use_chunking=chunked)
+        writer.start("ros2")
+        numbers = {}
+        for topic, kind, t, data in said:
+            if topic not in numbers:
+                schema = writer.register_schema(kind, "ros2msg", b"")
+                numbers[topic] = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(numbers[topic], t, data, t - 5)
+        writer.finish()
+    assert by_magtwin(tmp_path / "bag.mcap") == (in_time(said), 0)
+
+
+WAYS = [
+    (StoragePlugin.SQLITE3, None),
+    (StoragePlugin.MCAP, None),
+    (StoragePlugin.MCAP, CompressionMode.STORAGE),
+]
+
+
+@pytest.mark.parametrize(("plugin", "mode"), WAYS)
+def test_what_rosbags_wrote_out_of_order_is_read_in_order(tmp_path, plugin, mode):
+    said = shuffled(np.random.default_rng(2))
+    writer = Writer(tmp_path / "bag", version=8, storage_plugin=plugin)
+    if mode is not None:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        links = {}
+        for topic, kind, t, data in said:
+            if topic not in links:
+                links[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(links[topic], t, data)
+    assert by_magtwin(storage_file(tmp_path / "bag")) == (in_time(said), 0)
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_what_rosbags_compressed_as_a_whole_is_refused_in_a_line(tmp_path, mode):
+    writer = Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        writer.write(writer.add_connection("/a", TEXT, typestore=STORE), 5, message(TEXT, 3))
+    with pytest.raises(InputError, match=f"compressed by {mode.name.lower()}; unpack it"):
+        read_bag(tmp_path / "bag")
+
+
+def test_messages_that_an_index_lacks_are_read_and_counted(tmp_path, monkeypatch):
+    """As recordings had it whose index kept only one size of a topic's messages."""
+    entries_of = ours._sorted
+    monkeypatch.setattr(ours, "_sorted", lambda entries: entries_of(entries)[5:9])
+    monkeypatch.setattr(ours, "CHUNK", 50_000)
+    writer = RawBagWriter(tmp_path / "old.mcap")
+    kind = MAGNITUDE.kind
+    writer.add(MAGNITUDE.name, kind, Qos())
+    writer.add("/scan", LASER, Qos())
+    sent = defaultdict(list)
+    rows = 800
+    for k in range(rows):
+        fields = {
+            "header.stamp": np.array([k * 10**7]),
+            "header.frame_id": "m",
+            "magnetic_field": [[5e-5, 0, 0]],
+        }
+        for topic, data in (
+            (MAGNITUDE.name, encode(leaves(TYPES[kind]), fields, 1)[0].tobytes()),
+            ("/scan", message(LASER, k % 7, k)),
+        ):
+            sent[topic].append((k * 10**7, data))
+            writer.write(topic, k * 10**7, data)
+    writer.close()
+    with open(tmp_path / "old.mcap", "rb") as stream:
+        indexed = SeekingReader(stream).get_summary().statistics.message_count
+    assert 0 < indexed < rows
+    found, lacking = by_magtwin(tmp_path / "old.mcap")
+    assert found == sent
+    assert lacking == 2 * rows - indexed
+    run = read_bag(tmp_path / "old.mcap")
+    assert run.rows == rows
+    assert run.facts["messages_not_indexed"] == rows - indexed // 2
+
+
+def test_a_chunk_of_blank_images_is_read(tmp_path):
+    blank = message(TEXT, 0)[:4] + bytes(8_000_000)
+    with open(tmp_path / "bag.mcap", "wb") as stream:
+        writer = PeerWriter(stream, compression=CompressionType.ZSTD)
+        writer.start("ros2")
+        channel = writer.register_channel(
+            "/image", "cdr", writer.register_schema("x/msg/Image", "ros2msg", b"")
+        )
+        for t in range(3):
+            writer.add_message(channel, t, blank, t)
+        writer.finish()
+    assert (tmp_path / "bag.mcap").stat().st_size < 10_000
+    assert by_magtwin(tmp_path / "bag.mcap")[0] == {"/image": [(t, blank) for t in range(3)]}
+
+
+def test_times_of_chunks_overlap_only_where_messages_came_late(made):
+    folder, _, _ = made
+    with open(folder / "raw.mcap", "rb") as stream:
+        spans = [
+            (c.message_start_time, c.message_end_time)
+            for c in SeekingReader(stream).get_summary().chunk_indexes
+        ]
+    assert all(a[1] <= b[0] for a, b in pairwise(spans))

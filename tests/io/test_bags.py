@@ -1,0 +1,622 @@
+"""Runs as bags and back; rosbags and MCAP's own reader are the judges."""
+
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from numpy.testing import assert_allclose, assert_array_equal
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+import magtwin
+from magtwin.errors import InputError
+from magtwin.io.bags.bag import yaml_of
+from magtwin.io.bags.cdr import encode, leaves
+from magtwin.io.bags.messages import TOPICS
+from magtwin.io.bags.rosbag import BagWriter, read_bag, read_bag_readings, write_bag
+from magtwin.io.recorder import partial_of
+from magtwin.run.run import COLUMNS, Column, Run
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+BATTERY = ("battery_v", "battery_a", "battery_fraction")
+FIELDS = ("b_measured_nt", "b_vector_measured_nt")
+KINDS = ("bag", "bag3", "run.mcap", "run.db3")
+
+
+@pytest.fixture(scope="module")
+def twin(lab_scene):
+    return magtwin.open_twin(lab_scene)
+
+
+@pytest.fixture(scope="module")
+def made(twin):
+    """A run of 8 s, its LiDAR on, with a column of a user's own and readings that are missing; its scans."""
+    run = magtwin.simulate(twin, "figure8", seed=3, duration_s=8.0, lidar="on")
+    measured = run["b_measured_nt"].copy()
+    measured[[0, 70, 71]] = np.nan
+    vector = run["b_vector_measured_nt"].copy()
+    vector[:5, 1], vector[2] = np.nan, np.nan
+    run = run.with_columns(
+        b_measured_nt=measured,
+        b_vector_measured_nt=vector,
+        est_p=np.arange(2.0 * run.rows).reshape(-1, 2),
+        est_count=np.arange(run.rows),
+        est_one=np.ones((run.rows, 1), np.float32),
+    )
+    from magtwin.twin import scan
+
+    run = run.with_specs(est_p=Column("m", "world", "an estimate", 2, ("x", "y"), interpolation="hold"))
+    return run.with_facts(note='quoted "text", ä', share=0.1, yes=True), scan(twin, run)
+
+
+@pytest.fixture(scope="module")
+def bags(made, twin, tmp_path_factory):
+    """The run in every form of a bag."""
+    folder = tmp_path_factory.mktemp("bags")
+    for name in KINDS:
+        storage = "sqlite3" if name == "bag3" else None
+        write_bag(made[0], folder / name, twin, scans=made[1], storage=storage)
+    write_bag(made[0], folder / "nt.mcap", twin, units="nT")
+    return folder
+
+
+def assert_same(back, run, *, unit="T"):
+    """Columns and facts are equal to the precision that bags promise."""
+    assert list(back) == list(run)
+    assert dict(back.facts) == dict(run.facts)
+    assert dict(back.specs) == dict(run.specs)
+    for name in run:
+        assert back[name].dtype == run[name].dtype, name
+        if name in BATTERY:
+            assert_allclose(back[name], run[name], rtol=6e-8, err_msg=name)
+        elif name in FIELDS and unit == "T":
+            assert_allclose(back[name], run[name], rtol=5e-16, err_msg=name)
+        else:
+            assert_array_equal(back[name], run[name], err_msg=name)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_run_comes_back_from_a_bag(bags, made, name):
+    assert_same(read_bag(bags / name), made[0])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32), st.integers(0, 60), st.integers(1, 60), st.sampled_from([".mcap", ".db3"]))
+def test_any_run_in_blocks_of_any_size_comes_back_to_the_last_bit(
+    tmp_path_factory, seed, rows, block, ending
+):
+    rng = np.random.default_rng(seed)
+    columns = {"t": np.cumsum(rng.uniform(1e-3, 0.2, rows))}
+    for name in rng.permutation(sorted(COLUMNS.keys() - {"t", *BATTERY}))[: rng.integers(30)]:
+        spec = COLUMNS[name]
+        values = rng.choice([0.0, -0.0, 1.0, np.nan, np.inf, -np.inf, 40e3, 5e-324], (rows, spec.width))
+        held = np.maximum.accumulate(np.where(rng.random(rows) < 0.4, np.arange(rows), 0))
+        values = values[held] if rng.random() < 0.7 else rng.normal(size=(rows, spec.width))
+        values = values if spec.width > 1 else values[:, 0]
+        columns[str(name)] = values != 0 if spec.unit == "bool" else values
+    run = Run(columns, {"seed": seed})
+    path = tmp_path_factory.mktemp("any") / f"run{ending}"
+    with BagWriter(path, units="nT") as writer:
+        for part in blocks(run, block) or [run]:
+            writer.append(part)
+    back = read_bag(path)
+    assert list(back) == list(run)
+    for name in run:
+        a, b = back[name], run[name]
+        gone = np.zeros(rows, bool)
+        if name in FIELDS:  # a reading that is no number is no message; any nan is as another
+            gone = ~np.isfinite(b) if b.ndim == 1 else ~np.isfinite(b).any(axis=1)
+            assert np.isnan(a[gone]).all()
+        assert a[~gone].tobytes() == b[~gone].tobytes(), name
+
+
+def test_a_unit_for_a_bag_that_says_its_own_is_refused(bags):
+    with pytest.raises(InputError, match="says its unit itself; drop 'uT'"):
+        read_bag(bags / "run.mcap", unit="uT")
+
+
+def test_fields_in_nt_come_back_to_the_last_bit(bags, made):
+    assert_same(read_bag(bags / "nt.mcap"), made[0], unit="nT")
+
+
+def messages(path):
+    """By topic the times and messages that rosbags reads."""
+    found = {}
+    with Reader(path) as reader:
+        for connection, t, data in reader.messages():
+            found.setdefault(connection.topic, []).append(
+                (t, STORE.deserialize_cdr(data, connection.msgtype))
+            )
+    return found
+
+
+def raw(path):
+    """By topic the times and bytes of the messages that rosbags finds."""
+    found = {}
+    with Reader(path) as reader:
+        for connection, t, data in reader.messages():
+            found.setdefault(connection.topic, []).append((t, bytes(data)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def heard(bags):
+    return messages(bags / "bag")
+
+
+@pytest.mark.parametrize("name", KINDS[1:])
+def test_rosbags_finds_the_same_messages_in_both_storages(bags, name):
+    assert raw(bags / name) == raw(bags / "bag")
+
+
+def test_mcaps_own_reader_reads_every_message_and_checks_every_checksum(bags, heard):
+    with open(bags / "run.mcap", "rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        counts = {c.topic: summary.statistics.channel_message_counts[k] for k, c in summary.channels.items()}
+        assert counts == {topic: len(said) for topic, said in heard.items()}
+        seen, before = {}, 0
+        for schema, channel, message in reader.iter_messages():
+            assert message.log_time >= before
+            before = message.log_time
+            seen.setdefault(channel.topic, []).append((message.log_time, message.data, schema.name))
+        notes = {m.name: m.metadata for m in reader.iter_metadata()}
+    with Reader(bags / "bag3") as rosbags:
+        peer = {}
+        for connection, t, data in rosbags.messages():
+            peer.setdefault(connection.topic, []).append((t, bytes(data), connection.msgtype))
+    assert seen == peer
+    assert json.loads(notes["magtwin"]["seed"]) == 3
+    told = yaml.safe_load(notes["rosbag2"]["serialized_metadata"])
+    assert told["message_count"] == sum(counts.values())
+
+
+def test_mcap_read_without_its_summary_as_a_stream_gives_the_same_in_order_of_time(bags, heard):
+    from mcap.records import Message
+    from mcap.stream_reader import StreamReader
+
+    with open(bags / "run.mcap", "rb") as file:
+        times = [r.log_time for r in StreamReader(file, validate_crcs=True).records if isinstance(r, Message)]
+    assert len(times) == sum(map(len, heard.values()))
+    assert times == sorted(times)
+
+
+@pytest.mark.parametrize("way", ["NONE", "LZ4", "ZSTD", "unchunked"])
+def test_a_bag_that_mcaps_own_writer_wrote_anew_is_read(bags, made, tmp_path, way):
+    from mcap.writer import CompressionType, Writer
+
+    compression = CompressionType.NONE if way == "unchunked" else CompressionType[way]
+    with open(bags / "run.mcap", "rb") as old, open(tmp_path / "run.mcap", "wb") as new:
+        reader, writer = (
+            make_reader(old),
+            Writer(new, compression=compression, use_chunking=way != "unchunked"),
+        )
+        writer.start("ros2")
+        schemas, channels = {}, {}
+        for schema, channel, message in reader.iter_messages():
+            if schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", schemas[schema.id])
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        for note in reader.iter_metadata():
+            writer.add_metadata(note.name, note.metadata)
+        writer.finish()
+    assert_same(read_bag(tmp_path / "run.mcap"), made[0])
+
+
+def shape_of(content):
+    """The keys of metadata, and the types of what they hold."""
+    if isinstance(content, dict):
+        return {k: shape_of(v) for k, v in content.items() if k != "custom_data"}
+    if isinstance(content, list):
+        return [shape_of(content[0])] if content else []
+    return type(content)
+
+
+@pytest.mark.parametrize(("name", "storage"), [("bag", "mcap"), ("bag3", "sqlite3")])
+def test_metadata_is_laid_out_as_rosbags_lays_it_out(bags, tmp_path, name, storage):
+    with Writer(tmp_path / "peer", version=8, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+        connection = writer.add_connection("/a", "std_msgs/msg/Float64", typestore=STORE)
+        writer.write(connection, 5, b"\0" * 12)
+    ours = yaml.safe_load((bags / name / "metadata.yaml").read_text())
+    peer = yaml.safe_load((tmp_path / "peer" / "metadata.yaml").read_text())
+    assert shape_of(ours) == shape_of(peer)
+    about = ours["rosbag2_bagfile_information"]
+    assert about["storage_identifier"] == storage
+    assert about["relative_file_paths"] == [p.name for p in (bags / name).iterdir() if p.suffix != ".yaml"]
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.recursive(
+        st.none()
+        | st.booleans()
+        | st.integers()
+        | st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"])),
+        lambda inner: st.lists(inner) | st.dictionaries(st.text("ab:- #'\"", min_size=1), inner),
+    )
+)
+def test_metadata_is_yaml_whatever_it_says(content):
+    assert yaml.safe_load(yaml_of({"all": content, "list": [content, {"deep": content, "b": 1}]})) == {
+        "all": content,
+        "list": [content, {"deep": content, "b": 1}],
+    }
+
+
+def test_qualities_of_service_are_read_by_rosbags_as_they_are_meant(bags):
+    with Reader(bags / "bag3") as reader:
+        qos = {c.topic: c.ext.offered_qos_profiles[0] for c in reader.connections}
+    assert qos.keys() <= TOPICS.keys()
+    for topic, said in qos.items():
+        meant = TOPICS[topic].qos
+        assert said.depth == meant.depth
+        assert said.reliability.name == ("RELIABLE" if meant.reliable else "BEST_EFFORT")
+        assert said.durability.name == ("TRANSIENT_LOCAL" if meant.latched else "VOLATILE")
+        assert said.deadline.sec == 9223372036
+
+
+def test_the_same_run_gives_the_same_bytes(bags, made, twin, tmp_path):
+    for name in KINDS:
+        storage = "sqlite3" if name == "bag3" else None
+        write_bag(made[0], tmp_path / name, twin, scans=made[1], storage=storage)
+        files = [tmp_path / name] if Path(name).suffix else sorted((tmp_path / name).iterdir())
+        for file in files:
+            assert file.read_bytes() == (bags / file.relative_to(tmp_path)).read_bytes()
+
+
+def test_fields_are_in_tesla_with_the_predicted_variance_or_in_nt(bags, made, heard):
+    run = made[0]
+    known = np.isfinite(run["b_measured_nt"])
+    said = [m for _, m in heard["/robot/qtfm/magnitude"]]
+    assert_allclose([m.magnetic_field.x for m in said], run["b_measured_nt"][known] * 1e-9, rtol=1e-15)
+    assert all(m.magnetic_field.y == m.magnetic_field.z == 0 for m in said)
+    variance = [m.magnetic_field_covariance[0] for m in said]
+    assert_allclose(variance, (run["b_sd_nt"][known] * 1e-9) ** 2, rtol=1e-12)
+    nt = messages(bags / "nt.mcap")["/robot/qtfm/magnitude"]
+    assert_array_equal([m.magnetic_field.x for _, m in nt], run["b_measured_nt"][known])
+
+
+def test_stamps_are_sim_time_and_a_reading_that_is_missing_is_no_message(made, heard):
+    run = made[0]
+    ns = np.rint(run["t"] * 1e9).astype(int)[np.isfinite(run["b_measured_nt"])]
+    said = heard["/robot/qtfm/magnitude"]
+    assert_array_equal([t for t, _ in said], ns)
+    assert_array_equal([m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in said], ns)
+
+
+def test_slower_signals_come_at_their_own_rates(heard, twin):
+    robot, seconds = twin.scene.robot, 8.0
+    rates = {
+        "/robot/odom": robot.drive.odometry_rate_hz,
+        "/robot/imu": robot.imu.rate_hz,
+        "/robot/enu/pose": robot.mocap.rate_hz,
+        "/robot/scan": robot.lidar.scan_rate_hz,
+        "/clock": 40.0,
+        "/robot/joint_states": 62.0,
+        "/tf": 62.0,
+    }
+    for topic, rate in rates.items():
+        assert len(heard[topic]) / seconds == pytest.approx(rate, rel=0.12), topic
+    assert 4 <= len(heard["/robot/battery_state"]) <= 7
+
+
+def test_commands_are_sent_again_before_the_robot_would_stop_for_want_of_one(made, heard):
+    times = np.array([t for t, _ in heard["/robot/cmd_vel"]]) / 1e9
+    assert np.diff(times).max() < 0.12
+    run = made[0]
+    at = np.searchsorted(times, run["t"] + 1e-9) - 1
+    assert_array_equal([heard["/robot/cmd_vel"][k][1].linear.x for k in at], run["v_cmd"])
+
+
+def test_frames_make_one_tree_that_puts_base_link_where_it_is(made, heard, twin):
+    run = made[0]
+    static = {t.child_frame_id: t.header.frame_id for t in heard["/tf_static"][0][1].transforms}
+    t, message = heard["/tf"][-1]
+    moving = {m.child_frame_id: m for m in message.transforms}
+    assert [(m.header.frame_id, m.child_frame_id) for m in message.transforms[:2]] == [
+        ("map", "odom"),
+        ("odom", "base_link"),
+    ]
+    parents = static | {child: m.header.frame_id for child, m in moving.items()}
+    frames = {
+        m[0][1].header.frame_id
+        for topic, m in heard.items()
+        if topic.startswith("/robot/q") or "imu" in topic
+    }
+    for frame in frames | {"left_wheel", "rplidar_link"}:
+        while frame != "map":
+            frame = parents[frame]
+    row = np.searchsorted(np.rint(run["t"] * 1e9), t)
+    from magtwin.frames import rotate
+
+    def parts(m):
+        p, q = m.transform.translation, m.transform.rotation
+        return np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
+
+    p0, q0 = parts(moving["odom"])
+    p1, _ = parts(moving["base_link"])
+    assert_allclose(p0 + rotate(q0, p1), run["p_world_base"][row], atol=1e-12)
+    _, wheel = parts(moving["left_wheel"])
+    assert np.linalg.norm(wheel) == pytest.approx(1)
+
+
+def test_scans_are_stamped_when_they_were_taken_and_received_when_they_came(made, heard):
+    scans = made[1]
+    said = heard["/robot/scan"]
+    assert_array_equal([t for t, _ in said], np.rint(scans.arrival * 1e9).astype(int))
+    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in said]
+    assert_array_equal(stamps, np.rint(scans.t * 1e9).astype(int))
+    assert_array_equal([m.ranges for _, m in said], scans.ranges_m)
+    one = said[0][1]
+    assert one.angle_max == pytest.approx(
+        one.angle_min + one.angle_increment * (len(one.ranges) - 1), rel=1e-6
+    )
+
+
+def test_covariances_are_those_of_the_robots_specs(heard, twin):
+    drive = twin.scene.robot.drive
+    odometry = heard["/robot/odom"][-1][1]
+    spread = np.sqrt(np.diag(odometry.twist.covariance.reshape(6, 6)))
+    assert_allclose(spread, (*drive.odometry_v_noise_std, *drive.odometry_w_noise_std))
+    imu, spec = heard["/robot/imu"][-1][1], twin.scene.robot.imu
+    speed = odometry.twist.twist.linear.x
+    wanted = np.hypot(spec.accel_noise_std, speed * np.array(spec.accel_vibration))
+    assert_allclose(np.sqrt(np.diag(imu.linear_acceleration_covariance.reshape(3, 3))), wanted, rtol=0.1)
+
+
+def test_a_robot_with_its_urdf_beside_it_is_described(made, tmp_path):
+    from magtwin.files import shipped
+
+    twin = magtwin.open_twin(shipped("scenes", "lab", "lab.usda"))
+    write_bag(made[0], tmp_path / "run.mcap", twin)
+    said = messages(tmp_path / "run.mcap")["/robot/robot_description"]
+    urdf = ElementTree.parse(shipped("robots", "turtlebot4", "turtlebot4.urdf")).getroot()
+    told = ElementTree.fromstring(said[0][1].data)
+    assert [link.get("name") for link in told.iter("link")] == [
+        link.get("name") for link in urdf.iter("link")
+    ]
+    parents = {j.find("child").get("link"): j.find("parent").get("link") for j in told.iter("joint")}
+    assert "base_link" not in parents  # /tf puts it below odom
+    assert parents["base_footprint"] == "base_link"
+
+
+def test_a_run_of_few_columns_is_written_without_a_twin(made, tmp_path):
+    few = Run({name: made[0][name] for name in ("t", "odom_p", "b_measured_nt", "yaw")}, {"seed": 1})
+    write_bag(few, tmp_path / "bag", storage="sqlite3")
+    assert_same(read_bag(tmp_path / "bag"), few)
+    assert messages(tmp_path / "bag").keys() == {
+        *("/robot/qtfm/magnitude", "/clock", "/magtwin/columns", "/magtwin/reading")
+    }
+
+
+def test_a_run_without_rows_comes_back_without(made, tmp_path):
+    none = made[0].take(slice(0))
+    write_bag(none, tmp_path / "run.mcap")
+    assert_same(read_bag(tmp_path / "run.mcap"), none)
+
+
+def test_what_no_bag_can_hold_is_refused_and_what_was_there_stays(made, tmp_path):
+    run, target = made[0], tmp_path / "run.mcap"
+    target.write_bytes(b"earlier")
+    t = run["t"].copy()
+    t[9] = t[7]
+    refused = {
+        "exists already": (run, {}),
+        "the run to write: ": (run.with_columns(t=t), {"force": True}),
+        "begin at 0": (run.with_columns(t=run["t"] - 1), {"force": True}),
+        "column 'name' cannot stand in a bag": (
+            run.with_columns(name=np.full(run.rows, "a")),
+            {"force": True},
+        ),
+        'units of a bag must be "T" or "nT"': (run, {"force": True, "units": "uT"}),
+        "drop storage 'sqlite3'": (run, {"force": True, "storage": "sqlite3"}),
+        "no storage 'mcpa' of bags; did you mean 'mcap'": (run, {"force": True, "storage": "mcpa"}),
+        "not a Run: column 't' is missing": (Run({"yaw": run["yaw"]}), {"force": True}),
+    }
+    for text, (bad, options) in refused.items():
+        with pytest.raises(InputError) as refusal:
+            write_bag(bad, target, **options)
+        assert text in str(refusal.value)
+        assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
+        assert target.read_bytes() == b"earlier"
+    with pytest.raises(InputError, match=r"a bag is a folder, .* or a file that ends in \.mcap"):
+        write_bag(run, tmp_path / "run.bag")
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_disk_that_is_full_is_refused_in_a_line_and_leaves_nothing(made, tmp_path, monkeypatch, name):
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        with pytest.raises(InputError, match="cannot be written") as refusal:
+            write_bag(made[0], tmp_path / name, storage="sqlite3" if name == "bag3" else None)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert "\n" not in str(refusal.value)
+    assert not list(tmp_path.iterdir())
+
+
+def blocks(run, rows):
+    return [run.take(slice(k, k + rows)) for k in range(0, run.rows, rows)]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_run_in_blocks_says_what_the_whole_run_says(made, twin, bags, tmp_path, name):
+    storage = "sqlite3" if name == "bag3" else None
+    with BagWriter(tmp_path / name, twin, storage=storage, scans=made[1]) as writer:
+        for block in blocks(made[0], 101):
+            writer.append(block)
+            assert writer.partial.exists()
+            assert not (tmp_path / name).exists()
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert_same(read_bag(tmp_path / name), made[0])
+    assert raw(tmp_path / name) == raw(bags / name)
+
+
+KILLED = """
+    import os, pickle, signal, sys, time
+    from magtwin.io.bags.rosbag import BagWriter
+    from magtwin.run.run import Run
+    columns = pickle.load(open(sys.argv[1], "rb"))
+    writer = BagWriter(sys.argv[2], storage=sys.argv[3] or None)
+    for k in range(0, len(columns["t"]), 135):
+        writer.append(Run({name: v[k : k + 135] for name, v in columns.items()}, {"seed": 3}))
+        print(k + 135, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_recording_that_is_killed_leaves_every_block_that_was_appended(made, tmp_path, name):
+    import pickle
+
+    run = made[0]
+    (tmp_path / "columns").write_bytes(pickle.dumps(dict(run.columns)))
+    target = tmp_path / name
+    storage = "sqlite3" if name == "bag3" else ""
+    command = [sys.executable, "-c", textwrap.dedent(KILLED), tmp_path / "columns", target, storage]
+    killed = subprocess.run(command, capture_output=True, check=False, text=True)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert not target.exists()
+    assert_same(read_bag(partial_of(target)), Run(run.columns, {"seed": 3}))
+    with pytest.raises(InputError, match="left by a recording that did not end"):
+        BagWriter(target)
+    if name == "bag3":  # and what it wrote is in the database itself, not in a log that others pass over
+        found = raw(partial_of(target))
+        assert len(found["/magtwin/reading"]) == run.rows
+        told = yaml.safe_load((partial_of(target) / "metadata.yaml").read_text())
+        assert told["rosbag2_bagfile_information"]["message_count"] == sum(map(len, found.values()))
+
+
+@pytest.mark.parametrize("keep", [0.3, 0.5, 0.97])
+def test_of_an_mcap_that_was_cut_anywhere_what_is_whole_is_read(made, tmp_path, monkeypatch, keep):
+    monkeypatch.setattr("magtwin.io.bags.mcap.CHUNK", 1 << 16)
+    cut = tmp_path / "run.mcap"
+    write_bag(made[0], cut)
+    content = cut.read_bytes()
+    cut.write_bytes(content[: int(keep * len(content))])
+    with pytest.raises(
+        InputError, match=r"cut short: its end is missing; .* name such as run\.partial\.mcap"
+    ):
+        read_bag(cut)
+    back = read_bag(cut, recover=True)
+    rows = back.rows
+    assert rows > 0.8 * keep * made[0].rows
+    assert_same(back, made[0].take(slice(rows)))
+    cut.write_bytes(content[:1000])
+    with pytest.raises(InputError, match="no topic /robot/qtfm/magnitude; topics in it: none"):
+        read_bag(cut, recover=True)
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "run.db3"])
+def test_a_file_that_is_cut_or_has_a_wrong_byte_anywhere_gives_a_run_or_one_line(bags, tmp_path, name):
+    content = bytearray((bags / name).read_bytes())
+    rng, said = np.random.default_rng(0), []
+    for _ in range(25):
+        wrong = content.copy()
+        for place in rng.integers(0, len(wrong), 3):
+            wrong[place] = rng.integers(256)
+        if rng.integers(2):
+            wrong = wrong[: rng.integers(len(wrong))]
+        (tmp_path / name).write_bytes(wrong)
+        try:
+            read_bag(tmp_path / name, recover=True)
+        except InputError as refusal:
+            said.append(str(refusal))
+    assert all(name in text and "\n" not in text for text in said)
+
+
+def test_what_is_no_bag_is_refused_in_a_line(tmp_path):
+    (tmp_path / "a.mcap").write_bytes(b"not mcap at all")
+    (tmp_path / "a.db3").write_bytes(b"not a database at all, but longer than its header" * 40)
+    (tmp_path / "empty.db3").write_bytes(b"")
+    (tmp_path / "a.txt").write_text("hello")
+    (tmp_path / "folder").mkdir()
+    said = {
+        "a.mcap": "damaged bag, or none .it does not begin as MCAP does",
+        "a.db3": "damaged bag, or none .file is not a database",
+        "empty.db3": "a database without the tables of a bag",
+        "a.txt": "no bag: a folder with metadata.yaml is one",
+        "folder": "no bag: metadata.yaml is missing",
+        "nothing": "no such bag",
+    }
+    for name, text in said.items():
+        with pytest.raises(InputError, match=text) as refusal:
+            read_bag(tmp_path / name)
+        assert "\n" not in str(refusal.value)
+
+
+def test_a_table_of_columns_that_lies_is_refused(bags, made, tmp_path):
+    path = tmp_path / "run.db3"
+    source = sqlite3.connect(bags / "run.db3")
+    (number,) = source.execute("SELECT id FROM topics WHERE name = '/magtwin/columns'").fetchone()
+    (data,) = source.execute("SELECT data FROM messages WHERE topic_id = ?", (number,)).fetchone()
+    table = json.loads(data[8:-1])
+    source.close()
+    lies = {
+        "is not in the readings": {"first": 10_000},
+        "unknown kind": {"dtype": "object"},
+        "no topic '/nowhere'": {"topic": "/nowhere"},
+        "damaged bag": {"width": -5},
+    }
+    for text, lie in lies.items():
+        told = json.loads(json.dumps(table))
+        told["columns"][-1].update(lie)
+        path.write_bytes((bags / "run.db3").read_bytes())
+        database = sqlite3.connect(path)
+        row = encode(leaves("text data"), {"data": json.dumps(told)}, 1)[0].tobytes()
+        database.execute("UPDATE messages SET data = ? WHERE topic_id = ?", (row, number))
+        database.commit()
+        database.close()
+        with pytest.raises(InputError, match=text) as refusal:
+            read_bag(path)
+        assert "\n" not in str(refusal.value)
+
+
+def test_a_database_that_computes_what_is_read_is_refused(bags, tmp_path):
+    path = tmp_path / "run.db3"
+    for statement in (
+        "CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id, 0 AS timestamp, zeroblob(1000000) AS data",
+        "CREATE TABLE messages(id, topic_id, timestamp, data AS (zeroblob(1000000000)))",
+        "CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)",
+    ):
+        path.write_bytes((bags / "run.db3").read_bytes())
+        database = sqlite3.connect(path)
+        database.execute("DROP TABLE messages")
+        database.execute(statement)
+        database.commit()
+        database.close()
+        with pytest.raises(InputError, match=r"without the tables of a bag|not one of plain columns"):
+            read_bag(path)
+
+
+def test_a_chunk_that_says_it_is_a_thousand_times_its_size_is_refused_unread(bags, tmp_path):
+    content = bytearray((bags / "run.mcap").read_bytes())
+    chunk = content.index(b"zstd") - 4 - 4 - 8  # its size stands before checksum and codec
+    content[chunk : chunk + 8] = (1 << 29).to_bytes(8, "little")
+    (tmp_path / "run.mcap").write_bytes(content)
+    with pytest.raises(InputError, match=r"a chunk of 536870912 bytes, zstd compressed to .* cannot be"):
+        read_bag(tmp_path / "run.mcap")
+
+
+def test_readings_for_a_map_are_read_from_our_own_bags(bags, made):
+    readings = read_bag_readings(bags / "bag", field_topic="/robot/qtfm/magnitude")
+    assert "(poses /robot/enu/pose, field /robot/qtfm/magnitude" in readings.source
+    assert len(readings) > 0.9 * made[0].rows
+    assert "in T, told by its size" in readings.source

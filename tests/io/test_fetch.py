@@ -1,0 +1,106 @@
+"""`magtwin fetch` against a web server of our own on loopback."""
+
+import hashlib
+import threading
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from magtwin.errors import InputError
+from magtwin.fetch import SOURCES, Source, fetch
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *args):
+        pass
+
+
+@pytest.fixture
+def mirror(tmp_path):
+    """A folder served on loopback: (folder, base URL)."""
+    folder = tmp_path / "mirror"
+    folder.mkdir()
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder)) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield folder, f"http://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def table(monkeypatch):
+    """Make `fetch` know one source, named tiny, with the given files."""
+
+    def define(**contents):
+        files = [(name, hashlib.sha256(data).hexdigest(), f"data/{name}") for name, data in contents.items()]
+        monkeypatch.setattr(Source, "files", lambda self: files)
+        monkeypatch.setitem(SOURCES, "tiny", (Source("tiny.txt", "http://127.0.0.1:9", "MIT"),))
+
+    return define
+
+
+def test_files_come_whole_from_the_base_url(mirror, table, tmp_path):
+    folder, url = mirror
+    (folder / "data").mkdir()
+    (folder / "data" / "a").write_bytes(b"alpha")
+    (folder / "data" / "b").write_bytes(b"beta")
+    table(a=b"alpha", b=b"beta")
+    seen = []
+    files = fetch("tiny", tmp_path / "out", base_url=url, progress=lambda *step: seen.append(step))
+    assert [f.read_bytes() for f in files] == [b"alpha", b"beta"]
+    assert seen == [(0, 2, "a"), (1, 2, "b"), (2, 2, "")]
+
+
+def test_a_changed_file_is_refused_and_nothing_is_left(mirror, table, tmp_path):
+    folder, url = mirror
+    (folder / "data").mkdir()
+    (folder / "data" / "a").write_bytes(b"alpha")
+    (folder / "data" / "b").write_bytes(b"something else")
+    table(a=b"alpha", b=b"beta")
+    with pytest.raises(InputError, match=r"data/b: its SHA-256 is not .*nothing was kept"):
+        fetch("tiny", tmp_path / "out", base_url=url)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["mirror"]
+
+
+def test_a_missing_file_is_refused_and_nothing_is_left(mirror, table, tmp_path):
+    _, url = mirror
+    table(a=b"alpha")
+    with pytest.raises(InputError, match=r"data/a: could not be fetched \(404"):
+        fetch("tiny", tmp_path / "out", base_url=url)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["mirror"]
+
+
+def test_a_folder_that_exists_is_not_overwritten_unasked(table, tmp_path):
+    table(a=b"alpha")
+    with pytest.raises(InputError, match="exists already"):
+        fetch("tiny", tmp_path)
+
+
+def test_a_misspelt_source_is_refused_by_the_near_name(tmp_path):
+    with pytest.raises(InputError, match="did you mean 'aprilab'"):
+        fetch("april", tmp_path / "out")
+
+
+def test_only_web_addresses_are_fetched_from(tmp_path):
+    with pytest.raises(InputError, match="must begin with http"):
+        fetch("aprilab", tmp_path / "out", base_url="file:///etc")
+
+
+def test_the_tables_agree_with_the_real_files(real_data):
+    folders = {"map": "maps", "models": "models", "paths": "paths"}
+    checked = 0
+    for file, checksum, _ in SOURCES["aprilab"][0].files():
+        top, _, name = file.partition("/")
+        real = real_data / "aprilab" / folders.get(top, top) / name
+        if real.is_file():
+            assert hashlib.sha256(real.read_bytes()).hexdigest() == checksum
+            checked += 1
+    for source in SOURCES["turtlebot4"]:
+        for file, checksum, _ in source.files():
+            real = real_data / "turtlebot4" / "xacro" / file
+            if real.is_file():
+                assert hashlib.sha256(real.read_bytes()).hexdigest() == checksum
+                checked += 1
+    assert checked > 40

@@ -1,0 +1,294 @@
+"""One run through every format that holds it, and the commands that read and write them all."""
+
+import json
+
+import numpy as np
+import pytest
+from test_cli import refused
+from test_run import assert_same, every_column
+from test_tables import few_bytes
+
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.io.bags.rosbag import BagWriter
+from magtwin.io.formats import FORMATS, read_run, write_run
+from magtwin.io.tables import ParquetParts
+from magtwin.run.run import Column, Run
+from magtwin.twin import Twin, open_twin, simulate
+
+EXACT = ("run.parquet", "run.csv", "run.npz", "run.rrd", "run.usd", "run.usda", "run.usdc")
+BAGS = {"run.mcap": {}, "run.db3": {}, "mcap": {"storage": "mcap"}, "sqlite3": {"storage": "sqlite3"}}
+
+WITHIN = {
+    "battery_v": {"rtol": 1e-7},
+    "battery_a": {"rtol": 1e-7},
+    "battery_fraction": {"rtol": 1e-7},
+    "b_vector_measured_nt": {"rtol": 1e-15},
+}
+"""What a bag's messages are coarser in: the battery's are float32, the vector is published in tesla."""
+
+
+@pytest.fixture(scope="module")
+def twin(lab_scene) -> Twin:
+    return open_twin(lab_scene, magnetometer="physical")
+
+
+@pytest.fixture(scope="module")
+def run(twin) -> Run:
+    """Four seconds along the figure of eight, with every column, true facts, and flags that change."""
+    run = simulate(twin, "figure8", seed=11, duration_s=4.0)
+    flag = np.zeros(run.rows, bool)
+    flag[200:203] = True
+    return run.with_columns(flag_bump=flag).with_facts(title="größe", big=2**60, quick=True)
+
+
+@pytest.fixture(scope="module")
+def written(run, twin, tmp_path_factory):
+    """A folder with the run in every format."""
+    folder = tmp_path_factory.mktemp("formats")
+    for name in EXACT:
+        write_run(run, folder / name, twin)
+    for name, options in BAGS.items():
+        write_run(run, folder / name, twin, **options)
+    return folder
+
+
+def assert_carried(run, again):
+    assert list(again) == list(run)
+    assert dict(again.facts) == dict(run.facts)
+    assert {key: type(value) for key, value in again.facts.items()} == {
+        key: type(value) for key, value in run.facts.items()
+    }
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_a_run_comes_back_to_the_last_bit_with_its_facts(name, run, written):
+    again = read_run(written / name)
+    assert_carried(run, again)
+    assert_same(run, again)
+
+
+@pytest.mark.parametrize("name", [*EXACT, *BAGS])
+def test_columns_of_a_users_own_keep_unit_frame_parts_and_rule(name, tmp_path):
+    run = Run({"t": np.arange(5.0), "head_k": np.full(5, 290.0), "coil": np.arange(15.0).reshape(5, 3)})
+    run = run.with_columns(p_world_base=np.zeros((5, 3)), q_world_base_xyzw=np.tile([0, 0, 0, 1.0], (5, 1)))
+    run = run.with_columns(valve=np.arange(5) > 2, est_q_xyzw=np.tile([0, 0, 0, 1.0], (5, 1)))
+    coil = Column("A", "magnetometer", "currents", 3, ("a", "b", "c"))
+    run = run.with_specs(head_k=Column("K", "", "temperature", interpolation="hold"), coil=coil)
+    write_run(run, tmp_path / name, **BAGS.get(name, {}))
+    again = read_run(tmp_path / name)
+    assert_same(run, again)
+    assert {key: again.spec(key) for key in again} == {key: run.spec(key) for key in run}
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_a_run_comes_back_from_a_bag_as_its_messages_carry_it(name, run, written):
+    again = read_run(written / name)
+    assert_carried(run, again)
+    for column, values in run.items():
+        if column in WITHIN:
+            np.testing.assert_allclose(again[column], values, **WITHIN[column], err_msg=column)
+        else:
+            assert again[column].tobytes() == values.tobytes(), column
+
+
+def test_a_run_goes_through_all_formats_one_after_the_other_and_is_itself(run, twin, written, tmp_path):
+    """Each reads what the one before wrote, the bag first, whose precision is what remains."""
+    again = first = read_run(written / "run.mcap")
+    for name in EXACT:
+        write_run(again, tmp_path / name, twin)
+        again = read_run(tmp_path / name)
+    assert_same(first, again)
+    assert_carried(run, again)
+
+
+@pytest.mark.parametrize("name", [*EXACT, "run.mcap", "run.db3", "bag"])
+def test_a_run_alone_is_written_too_where_no_scene_is_known(name, run, tmp_path):
+    write_run(run, tmp_path / name)
+    again = read_run(tmp_path / name)
+    assert_carried(run, again)
+    assert np.array_equal(again["b_measured_nt"], run["b_measured_nt"], equal_nan=True)
+
+
+def test_folders_are_read_by_what_is_in_them(run, written, tmp_path):
+    parts = ParquetParts(tmp_path / "run.parquet")
+    parts.append(run)
+    assert_same(read_run(parts.folder), run)
+    (tmp_path / "out").mkdir()
+    write_run(run, tmp_path / "out" / "run.parquet")
+    (tmp_path / "out" / "run.png").touch()
+    assert_same(read_run(tmp_path / "out"), run)
+    assert len(read_run(written / "sqlite3")) == len(run)
+    (tmp_path / "none").mkdir()
+    with pytest.raises(InputError, match="a folder without a run; name a file"):
+        read_run(tmp_path / "none")
+
+
+def test_a_bag_that_did_not_end_is_read_as_far_as_it_goes(run, twin, tmp_path):
+    writer = BagWriter(tmp_path / "run.mcap", twin)
+    writer.append(run.take(slice(0, 300)))
+    assert read_run(writer.partial).rows == 300
+    writer.close()
+    assert read_run(tmp_path / "run.mcap").rows == 300
+
+
+def test_options_of_another_format_and_unknown_endings_are_refused(run, tmp_path):
+    with pytest.raises(InputError, match="Parquet has no option 'units'; drop it"):
+        write_run(run, tmp_path / "run.parquet", units="nT")
+    with pytest.raises(InputError, match=r"run\.parqet: no known kind of run file; did you mean '\.parquet'"):
+        write_run(run, tmp_path / "run.parqet")
+    (tmp_path / "run.csv").touch()
+    with pytest.raises(InputError, match=r"no such run; did you mean 'run\.csv'"):
+        read_run(tmp_path / "rum.csv")
+    assert [p.name for p in tmp_path.iterdir()] == ["run.csv"]
+
+
+@pytest.mark.parametrize("name", [f"run{suffix}" for suffix, one in FORMATS.items() if one.write])
+def test_every_format_refuses_a_file_cut_short_or_of_another_kind(name, written, tmp_path):
+    whole = (written / name).read_bytes()
+    for content in (b"", b"nothing of the kind\n" * 40, whole[: len(whole) // 3]):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError) as refused:
+            read_run(tmp_path / name)
+        assert name in str(refused.value)
+        assert "\n" not in str(refused.value)
+
+
+def test_a_csv_cut_short_at_the_end_of_a_line_is_refused_by_its_count_of_rows(written, tmp_path):
+    lines = (written / "run.csv").read_bytes().splitlines(keepends=True)
+    (tmp_path / "run.csv").write_bytes(b"".join(lines[:-7]))
+    with pytest.raises(InputError, match="cut short, or edited"):
+        read_run(tmp_path / "run.csv")
+    edited = [line for line in lines[:-7] if not line.startswith(b"# rows")]
+    (tmp_path / "run.csv").write_bytes(b"".join(edited))
+    assert read_run(tmp_path / "run.csv").rows == read_run(written / "run.csv").rows - 7
+
+
+@pytest.mark.parametrize("name", [*EXACT, "run.mcap", "run.db3"])
+def test_every_format_refuses_a_run_whose_time_goes_backwards(name, tmp_path):
+    back = every_column().take(slice(None, None, -1))
+    with pytest.raises(InputError, match=r"t must ascend|backwards"):
+        write_run(back, tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", [*EXACT, "run.mcap", "run.db3", "bag"])
+def test_a_full_disk_is_refused_by_every_format_and_what_was_there_stays(name, run, twin, written, tmp_path):
+    write_run(run.take(slice(0, 20)), tmp_path / name)
+    before = read_run(tmp_path / name)
+    whole = written / ("mcap" if name == "bag" else name)
+    room = max(file.stat().st_size for file in (whole.iterdir() if whole.is_dir() else [whole])) // 2
+    with few_bytes(room), pytest.raises(InputError, match=r"cannot be written|full|too large"):
+        write_run(run, tmp_path / name, twin, force=True)
+    assert_same(read_run(tmp_path / name), before)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_convert_writes_any_format_from_any_other(run, written, tmp_path, capsys):
+    chain = ["run.rrd", "bag", "run.usdc", "run.npz", "run.mcap", "run.csv", "run.parquet"]
+    source = written / "run.parquet"
+    for name in chain:
+        options = ["--storage", "sqlite3"] if name == "bag" else []
+        main(["convert", str(source), str(tmp_path / name), *options])
+        source = tmp_path / name
+    assert f"Wrote {source}: {run.rows} rows, {len(run)} columns" in capsys.readouterr().out
+    assert_carried(run, read_run(source))
+    assert list((tmp_path / "bag").glob("*.db3"))
+
+
+def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_scene, tmp_path, capsys):
+    from pxr import Usd
+
+    main(["convert", str(written / "run.csv"), str(tmp_path / "a.usdc"), "--usd-fps", "10"])
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    assert stage.GetTimeCodesPerSecond() == 10
+    assert stage.GetPrimAtPath("/World/turtlebot4/base_link").IsValid()  # its scene is below it
+    main(["convert", str(written / "run.csv"), str(tmp_path / "b.usdc"), "--usd-fps", "0"])
+    assert Usd.Stage.Open(str(tmp_path / "b.usdc")).GetTimeCodesPerSecond() == pytest.approx(135)
+    main(["convert", str(written / "run.csv"), str(tmp_path / "c.mcap"), "--units", "nT"])
+    assert np.array_equal(read_run(tmp_path / "c.mcap")["b_measured_nt"], run["b_measured_nt"])
+    stray = run.with_facts(scene_file="gone.usda")
+    write_run(stray, tmp_path / "stray.parquet")
+    main(["convert", str(tmp_path / "stray.parquet"), str(tmp_path / "d.usdc")])
+    assert "without a scene: gone.usda: the scene of the run is not there" in capsys.readouterr().err
+    main(["convert", str(tmp_path / "stray.parquet"), str(tmp_path / "e.usdc"), "--scene", str(lab_scene)])
+    assert Usd.Stage.Open(str(tmp_path / "e.usdc")).GetPrimAtPath("/World/turtlebot4/base_link").IsValid()
+
+
+@pytest.mark.parametrize(
+    ("source", "out", "options", "message"),
+    [
+        ("run.parquet", "run.csv", [], "run.csv: exists already; give --force"),
+        ("run.parquet", "new.xyz", [], "no known kind of run file; known: .csv"),
+        ("run.parquet", "new.csv", ["--units", "nT"], "CSV has no option 'units'; drop it"),
+        ("run.parquet", "new.csv", ["--scene", "x.usda"], "a table shows no scene; drop --scene"),
+        ("run.parquet", "new.rrd", ["--scene", "x.usda"], "x.usda: no such scene"),
+        ("run.parquet", "new.mcap", ["--usd-fps", "5"], "rosbag2 has no option 'fps'"),
+        ("run.parquet", "new.usd", ["--usd-fps", "-5"], "fps must be above 0"),
+        ("run.parquet", "run.parquet", ["--force"], "is the run itself"),
+        ("none.csv", "new.parquet", [], "none.csv: no such run; did you mean"),
+    ],
+)
+def test_what_convert_cannot_do_is_refused_in_one_line(source, out, options, message, written, capsys):
+    before = sorted(p.name for p in written.iterdir())
+    assert message in refused(capsys, "convert", written / source, written / out, *options)
+    assert sorted(p.name for p in written.iterdir()) == before
+
+
+@pytest.mark.parametrize("name", [*EXACT, *BAGS])
+def test_info_of_every_format_tells_rows_columns_units_and_what_the_run_came_from(name, run, written, capsys):
+    main(["info", str(written / name), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert told["figures"]["readings"]["value"] == run.rows
+    assert told["figures"]["columns"]["value"] == len(run)
+    assert told["facts"]["columns"]["b_total_nt"].startswith("nT  b_map_nt + b_disturbance_nt")
+    for fact in ("seed", "scene_sha256", "map_sha256", "magtwin", "path"):
+        assert told["facts"][fact] == run.facts[fact]
+
+
+def test_info_of_a_playback_tells_of_the_run_where_its_scene_is_gone(run, tmp_path, capsys):
+    write_run(run, tmp_path / "run.usda")
+    text = (tmp_path / "run.usda").read_text()
+    (tmp_path / "run.usda").write_text(text.replace("(", "(\n    subLayers = [@./gone.usda@]", 1))
+    main(["info", str(tmp_path / "run.usda"), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert told["figures"]["readings"]["value"] == run.rows
+    assert "gone.usda" in told["facts"]["stage"]
+
+
+@pytest.fixture
+def shown(monkeypatch):
+    """What the viewer is given, in place of a window."""
+    seen = []
+
+    def show(rrd, *, shown=None):
+        from magtwin.io.rerun.file import read_runs
+
+        seen.append(read_runs(rrd))
+
+    for module in ("magtwin.io.rerun.file.show", "magtwin.io.rerun.viewer.show"):
+        monkeypatch.setattr(module, show)
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    return seen
+
+
+@pytest.mark.parametrize("name", ["run.csv", "run.usdc", "sqlite3", "run.rrd"])
+def test_view_shows_a_run_of_any_format(name, run, written, shown, capsys):
+    main(["view", str(written / name)])
+    assert "has changed" not in capsys.readouterr().err
+    assert np.array_equal(shown[0]["run"]["b_total_nt"], run["b_total_nt"])
+
+
+def test_view_shows_several_runs_in_one_recording(run, written, shown, tmp_path):
+    write_run(run.between(1.0), tmp_path / "later.csv")
+    main(["view", str(written / "run.parquet"), str(tmp_path / "later.csv")])
+    assert {name: r.rows for name, r in shown[0].items()} == {"run": run.rows, "later": run.rows - 135}
+
+
+def test_view_without_a_display_refuses_a_stage_and_names_the_picture(lab_scene, monkeypatch, capsys):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    monkeypatch.setattr("sys.platform", "linux")
+    assert "no display to show it on; magtwin picture draws it" in refused(capsys, "view", lab_scene)
+    assert "view needs a file" in refused(capsys, "view")

@@ -1,0 +1,295 @@
+"""`magtwin map import`, `fit` and `check`: any survey in, what is broken in it said and masked."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from test_cli import refused
+from test_gp import survey
+from test_latch import gridded
+from test_rosbag import at_middle, drive, write_bag
+
+from magtwin.author.scene import read_scene
+from magtwin.cli import main
+from magtwin.cli.map_input import earth_nt
+from magtwin.field.sources.earth import earth_field_nt
+from magtwin.field.survey.gridded import import_survey
+from magtwin.io.surveys.readings import load_readings, save_readings
+from magtwin.usd.maps import load_map
+
+
+def run(*arguments):
+    main([str(a) for a in arguments])
+
+
+def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, capsys, real_data):
+    maps = real_data / "aprilab/maps"
+    run("map", "import", maps, "--out", tmp_path / "a.usdc", "--licence", "MIT", "--json")
+    report = json.loads(capsys.readouterr().out)
+    field = load_map(tmp_path / "a.usdc")
+    assert report["figures"]["latched at every heading"]["value"] == 17
+    assert report["figures"]["masked nodes"]["value"] == np.count_nonzero(~field.valid) > 68
+    assert np.isnan(field.lookup([-1.25, 0.75], 0.0))
+    assert_array_equal(field.valid, import_survey(maps).valid)
+    run("map", "import", maps, "--out", tmp_path / "b.usdc", "--keep-latched", "--json")
+    whole = load_map(tmp_path / "b.usdc")
+    assert whole.valid.all()
+    assert whole.lookup([-1.25, 0.75], 0.0) == pytest.approx(35_602.1, abs=0.1)
+    report = json.loads(capsys.readouterr().out)
+    assert report["figures"]["latched at every heading"]["value"] == 17
+
+
+def test_readings_kept_as_parquet_make_the_same_layer_as_the_folder(tmp_path, capsys, real_data):
+    maps = real_data / "aprilab/maps"
+    about = ("--name", "lab", "--created", "2024-05-01", "--height", "0.35", "--licence", "MIT")
+    run("map", "import", maps, "--out", tmp_path / "a.parquet", *about)
+    run("map", "import", tmp_path / "a.parquet", "--out", tmp_path / "b.usdc", "--name", "lab")
+    run("map", "import", maps, "--out", tmp_path / "c.usdc", *about)
+    capsys.readouterr()
+    assert load_readings(tmp_path / "a.parquet").good.sum() == np.count_nonzero(
+        load_map(tmp_path / "c.usdc").valid
+    )
+    assert load_map(tmp_path / "b.usdc") == load_map(tmp_path / "c.usdc")
+    assert load_map(tmp_path / "b.usdc").height_m == pytest.approx(0.35)
+
+
+def test_a_table_becomes_a_file_of_readings_by_its_column_names(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("px,py,deg,b\n0,0,10,41\n1,0,20,42\n")
+    columns = (
+        "--x",
+        "px",
+        "--y",
+        "py",
+        "--heading",
+        "deg",
+        "--heading-unit",
+        "deg",
+        "--field",
+        "b",
+        "--unit",
+        "uT",
+    )
+    run("map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.parquet", *columns, "--json")
+    figures = json.loads(capsys.readouterr().out)["figures"]
+    assert figures["readings"]["value"] == 2
+    readings = load_readings(tmp_path / "a.parquet")
+    assert_array_equal(readings.b_nt, [41_000, 42_000])
+    assert_allclose(readings.yaw, np.radians([10, 20]))
+
+
+def test_a_bag_becomes_readings_by_the_command(tmp_path, capsys):
+    bag = write_bag(tmp_path / "bag", {"/pose": drive(), "/mag": at_middle(41_000 + np.arange(40.0))}, "mcap")
+    run("map", "import", bag, "--out", tmp_path / "a.parquet", "--pose-topic", "/pose")
+    assert "told by its size" in "".join(capsys.readouterr().out.split("\n")).replace("  ", "")
+    assert len(load_readings(tmp_path / "a.parquet")) == 40
+
+
+def test_scattered_readings_make_no_nodes_and_the_way_on_is_told(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n")
+    line = refused(capsys, "map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.usdc")
+    assert "survey 'a' is not gridded" in line
+    assert "magtwin map fit" in line
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        (("a.csv", "--x", "px"), "no column 'px'; did you mean 'x'"),
+        (("a.csv", "--vector", "a,b"), "vector takes 3 columns"),
+        (("a.csv", "--unit", "uT"), "say --unit nT"),
+        (("m.usdc",), "m.usdc: a stage or a map, not readings"),
+        (("b.csv",), "b.csv: no such source of readings; did you mean 'a.csv'"),
+        (("a.csv+b.csv",), "b.csv: no such file of readings"),
+        ((), "no source of readings given"),
+        (("a.csv", "--out", "a.txt"), "ends in .usdc or .usd or .parquet"),
+    ],
+)
+def test_what_cannot_be_imported_is_refused_in_one_line_and_nothing_is_written(
+    tmp_path, monkeypatch, capsys, arguments, what
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.csv").write_text("x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n")
+    (tmp_path / "m.usdc").write_text("")
+    out = () if "--out" in arguments else ("--out", "a.parquet")
+    assert what in refused(capsys, "map", "import", *arguments, *out)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "m.usdc"]
+
+
+def test_an_import_never_replaces_a_file_unasked(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n")
+    (tmp_path / "a.parquet").write_text("mine")
+    arguments = ("map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.parquet")
+    assert "exists already; give --force" in refused(capsys, *arguments)
+    assert (tmp_path / "a.parquet").read_text() == "mine"
+    run(*arguments, "--force")
+    assert len(load_readings(tmp_path / "a.parquet")) == 2
+
+
+def test_a_survey_whose_sensor_was_stuck_throughout_is_refused_unless_it_is_to_be_kept(tmp_path, capsys):
+    readings = gridded(0)
+    save_readings(readings.with_(b_nt=np.full(len(readings), 41_000.0)), tmp_path / "a.parquet")
+    arguments = ("map", "import", tmp_path / "a.parquet", "--out", tmp_path / "a.usdc")
+    line = refused(capsys, *arguments)
+    assert f"all {len(readings)} readings are those of a sensor that was stuck" in line
+    assert "--keep-latched" in line
+    run(*arguments, "--keep-latched")
+    assert load_map(tmp_path / "a.usdc").valid.all()
+
+
+def test_a_fit_and_a_check_run_from_readings_with_latched_ones_out(tmp_path, capsys):
+    def latch(b, rng):
+        b[:, 3:6, 4:8] = np.round(31_000 + 15 * rng.standard_normal((4, 3, 1)), 2)
+        return b
+
+    save_readings(gridded(0, change=latch), tmp_path / "a.parquet")
+    run("map", "fit", tmp_path / "a.parquet", "--method", "trilinear", "--out", tmp_path / "a.usdc", "--json")
+    report = json.loads(capsys.readouterr().out)
+    assert report["figures"]["latched at every heading"]["value"] == 12
+    field = load_map(tmp_path / "a.usdc")
+    assert field.values_nt[field.valid].min() > 32_000
+    run("map", "check", tmp_path / "a.parquet", "--method", "trilinear", "--json")
+    report = json.loads(capsys.readouterr().out)
+    assert report["figures"]["readings predicted"]["value"] == 4 * 11 * 17 - 48
+
+
+@pytest.mark.parametrize("headings", ["", "north", "0,nan", "0;90"])
+def test_headings_that_are_none_are_refused(tmp_path, capsys, headings):
+    save_readings(gridded(0), tmp_path / "a.parquet")
+    arguments = ("map", "fit", tmp_path / "a.parquet", "--out", tmp_path / "a.usdc", "--headings", headings)
+    assert "headings are degrees with commas between" in refused(capsys, *arguments)
+
+
+def test_frame_and_datum_are_said_at_import_or_fit_and_kept_from_readings_to_map(tmp_path, capsys, real_data):
+    maps = real_data / "aprilab/maps"
+    said = ("--frame", "world: x east, y north, z up", "--datum", "the door", "--licence", "MIT")
+    run("map", "import", maps, "--out", tmp_path / "a.parquet", *said)
+    run("map", "import", maps, "--out", tmp_path / "a.usdc", *said)
+    run("map", "fit", tmp_path / "a.parquet", "--method", "trilinear", "--out", tmp_path / "b.usdc")
+    run("map", "fit", maps, "--method", "trilinear", "--out", tmp_path / "c.usdc", *said[2:])
+    capsys.readouterr()
+    for name in ("a", "b"):
+        field = load_map(tmp_path / f"{name}.usdc")
+        assert (field.frame, field.datum, field.licence) == (said[1], "the door", "MIT")
+    assert (load_map(tmp_path / "c.usdc").frame, load_map(tmp_path / "c.usdc").datum) == ("", "the door")
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        (("--created", "yesterday"), "--created must be a day YYYY-MM-DD, got 'yesterday'"),
+        (("--height", "-1"), "height_m of Readings is a height above the floor, 0 m or more, got -1.0"),
+        (("--height", "nan"), "height_m of Readings is a height above the floor, 0 m or more, got nan"),
+    ],
+)
+def test_a_day_or_a_height_that_is_none_is_refused(tmp_path, capsys, real_data, said, why):
+    maps = real_data / "aprilab/maps"
+    assert why in refused(capsys, "map", "import", maps, "--out", tmp_path / "a.usdc", *said)
+    assert not (tmp_path / "a.usdc").exists()
+
+
+def test_a_refusal_names_the_survey_not_the_file_to_be_written(tmp_path, capsys):
+    (tmp_path / "hall.csv").write_text("x,y,heading,field\n0,0,0,41000\n1,0,0,42000\n")
+    with pytest.raises(SystemExit):
+        run("map", "fit", tmp_path / "hall.csv", "--out", tmp_path / "z.usdc")
+    assert "hall.csv: 2 of 2 readings are good" in capsys.readouterr().err
+
+
+def test_runs_under_several_licences_keep_all_of_them(tmp_path, capsys):
+    for name, licence in (("a", "MIT"), ("b", "CC-BY-4.0")):
+        (tmp_path / f"{name}.csv").write_text("x,y,heading,field\n0,0,0,41000\n1,0,0,42000\n")
+        run(
+            "map",
+            "import",
+            tmp_path / f"{name}.csv",
+            "--out",
+            tmp_path / f"{name}.parquet",
+            "--licence",
+            licence,
+        )
+    run("map", "import", tmp_path / "a.parquet", tmp_path / "b.parquet", "--out", tmp_path / "c.parquet")
+    capsys.readouterr()
+    assert load_readings(tmp_path / "c.parquet").licence == "MIT; CC-BY-4.0"
+
+
+def test_the_earths_field_is_taken_from_a_place_and_day_as_numbers_or_from_a_scene(lab_scene):
+    place = earth_nt("29.64, -82.35, 50, 2024-06-01")
+    assert place == earth_field_nt(29.64, -82.35, 50.0, "2024-06-01")
+    assert earth_nt("-2700,24000,-38400") == (-2700.0, 24000.0, -38400.0)
+    assert earth_nt(str(lab_scene)) == read_scene(lab_scene, check_network=False).earth.b_world_nt
+
+
+def test_a_survey_of_a_twin_knows_the_earths_field_and_keeps_it(tmp_path, capsys, lab_scene):
+    out = tmp_path / "a.parquet"
+    run("map", "survey", lab_scene, "--out", out, "--spacing", "1", "--readings", "1")
+    assert load_readings(out).earth_nt == read_scene(lab_scene, check_network=False).earth.b_world_nt
+
+
+def test_a_check_takes_the_kernel_of_the_gaussian_process_and_leaves_headings_out(tmp_path, capsys):
+    save_readings(survey(rows=5, columns=5), tmp_path / "a.parquet")
+
+    def told(*more):
+        run("map", "check", tmp_path / "a.parquet", "--json", *more)
+        report = json.loads(capsys.readouterr().out)
+        return report["facts"]["split"], report["figures"]
+
+    matern = told("--method", "gp", "--kernel", "matern")[1]["gp RMSE"]["value"]
+    poisson = told("--method", "gp", "--kernel", "poisson")[1]["gp RMSE"]["value"]
+    assert told("--method", "gp")[1]["gp RMSE"]["value"] == poisson != matern
+    split, figures = told("--method", "trilinear", "--split", "heading")
+    assert split == "one heading at a time"
+    assert figures["turns"]["value"] == 4
+    assert figures["trilinear predicted"]["value"] == 100
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        (("--method", "cubic", "--kernel", "matern"), "--kernel is for --method gp alone"),
+        (("--method", "gp", "--earth", "1,2,3"), "--earth is for --method harmonic alone"),
+        (("--earth", "1,2,south"), "--earth is a scene; latitude,longitude,height,date; or x,y,z in nT"),
+        (("--earth", "0,0,0"), "earth_nt must be three numbers"),
+        (
+            ("--earth", "29.65,-82.35,50"),
+            "is a field of 100.8 nT, and the Earth's is some 22,000 to 67,000",
+        ),
+        (("--earth", "29,-82,50,2050-01-01"), "lies beyond the IGRF-14"),
+        (("--earth", "lab.usda"), "there is no file 'lab.usda'"),
+    ],
+)
+def test_an_option_of_another_method_and_a_field_that_is_none_are_refused(
+    tmp_path, monkeypatch, capsys, arguments, what
+):
+    monkeypatch.chdir(tmp_path)
+    assert what in refused(capsys, "map", "fit", "a.csv", "--out", "a.usdc", *arguments)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_fit_of_one_heading_and_of_few_readings_says_that_they_are_doubtful(tmp_path, capsys):
+    rows = "".join(f"{x},{y},0.5,{41 + 0.1 * x * y:.3f}\n" for x in range(4) for y in range(4))
+    (tmp_path / "hall.csv").write_text("x,y,heading,field\n" + rows)
+    run(
+        "map",
+        "fit",
+        tmp_path / "hall.csv",
+        "--method",
+        "gp",
+        "--spacing",
+        "0.5",
+        "--out",
+        tmp_path / "z.usdc",
+    )
+    said = " ".join(capsys.readouterr().out.split())
+    assert "only 16 good readings" in said
+    assert "one heading only, 29 deg: nothing tells the robot's own field from the room's" in said
+    assert "field in uT, as its size tells (--unit)" in said
+
+
+@pytest.mark.parametrize("method", ["harmonic", "gp", "trilinear"])
+def test_too_few_readings_are_no_map(tmp_path, capsys, method):
+    rows = "".join(f"{x},{x % 2},{x},41000\n" for x in range(7))
+    (tmp_path / "hall.csv").write_text("x,y,heading,field\n" + rows)
+    with pytest.raises(SystemExit):
+        run("map", "fit", tmp_path / "hall.csv", "--method", method, "--out", tmp_path / "z.usdc")
+    assert "hall.csv: 7 of 7 readings are good; a map needs 8 at least" in capsys.readouterr().err

@@ -1,0 +1,260 @@
+"""What a run says of how it came about, and that it can be made once more from that."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pxr import Sdf, Usd
+
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.files import git_revision, sha256
+from magtwin.io.provenance import differences, repeat, repeat_of
+from magtwin.io.tables import read_parquet, write_parquet
+from magtwin.path import Path
+from magtwin.run.run import Run
+from magtwin.sim.motion.commands import Commands
+from magtwin.twin import open_twin, simulate, twin_of
+from magtwin.usd.layers import stage_sha256
+
+BRIEF = {"duration_s": 2.0, "rate_hz": 20.0}
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+@pytest.fixture(scope="module")
+def twin(lab_scene):
+    return open_twin(lab_scene, magnetometer="map-only")
+
+
+@pytest.fixture(scope="module")
+def run(twin):
+    return simulate(twin, "figure8", seed=5, **BRIEF)
+
+
+def test_a_run_names_its_files_with_checksums(run, lab_scene, twin):
+    facts = run.facts
+    assert facts["scene_file"] == lab_scene.as_posix()
+    assert facts["scene_sha256"] == stage_sha256(lab_scene)
+    assert facts["map_sha256"] == sha256(twin.scene.map_layer)
+    assert facts["asked_duration_s"] == 2.0
+    assert "path_file" not in facts
+
+
+def test_a_run_of_a_network_named_by_hand_says_its_file(lab_scene):
+    twin = open_twin(lab_scene, net=open_twin(lab_scene).scene.robot.magnetometer.network)
+    network = simulate(twin, "figure8", **BRIEF).facts["network_file"]
+    assert sha256(network) == twin.facts["network_sha256"]
+
+
+def test_the_stages_checksum_follows_content_in_any_layer_and_not_the_place(lab_scene, tmp_path):
+    for name in ("a", "b/deeper"):
+        _chain(tmp_path / name)
+    a, b = tmp_path / "a" / "root.usda", tmp_path / "b" / "deeper" / "root.usda"
+    whole = stage_sha256(a)
+    assert stage_sha256(b) == whole
+    shutil.move(tmp_path / "b" / "deeper" / "mesh.usdc", tmp_path / "b" / "other.usdc")
+    middle = Sdf.Layer.FindOrOpen(str(b.with_name("middle.usda")))
+    middle.UpdateCompositionAssetDependency("./mesh.usdc", "../other.usdc")
+    middle.Save()
+    assert stage_sha256(b) == whole
+    (tmp_path / "a" / "weights.bin").write_bytes(b"other")
+    assert stage_sha256(a) != whole
+    deepest = Usd.Stage.Open(str(tmp_path / "b" / "other.usdc"))
+    deepest.GetPrimAtPath("/mesh").SetDocumentation("changed")
+    deepest.Save()
+    assert stage_sha256(b) != whole
+
+
+def _chain(folder):
+    """A stage that references a layer that references another, and names a file."""
+    folder.mkdir(parents=True)
+    for name, below in (("mesh.usdc", None), ("middle.usda", "./mesh.usdc"), ("root.usda", "./middle.usda")):
+        stage = Usd.Stage.CreateNew(str(folder / name))
+        prim = stage.DefinePrim("/mesh")
+        stage.SetDefaultPrim(prim)
+        if below:
+            prim.GetReferences().AddReference(below)
+        if name == "root.usda":
+            prim.CreateAttribute("weights", Sdf.ValueTypeNames.Asset).Set("./weights.bin")
+        stage.Save()
+    (folder / "weights.bin").write_bytes(b"weights")
+
+
+def test_layers_that_name_each_other_have_a_checksum_too(tmp_path):
+    for name, other in (("a", "b"), ("b", "a")):
+        (tmp_path / f"{name}.usda").write_text(f"#usda 1.0\n(\n    subLayers = [@./{other}.usda@]\n)\n")
+    assert len(stage_sha256(tmp_path / "a.usda")) == 64
+
+
+def test_the_commit_is_read_from_a_checkout_a_worktree_and_packed_refs(tmp_path):
+    git = tmp_path / "main" / ".git"
+    (git / "refs" / "heads").mkdir(parents=True)
+    (git / "HEAD").write_text("ref: refs/heads/main\n")
+    inside = tmp_path / "main" / "scenes" / "lab"
+    inside.mkdir(parents=True)
+    assert git_revision(inside) == ""  # no commit yet
+    (git / "packed-refs").write_text(f"# pack-refs\n{COMMIT} refs/heads/main\n")
+    assert git_revision(inside) == COMMIT
+    (git / "refs" / "heads" / "main").write_text(COMMIT[::-1] + "\n")
+    assert git_revision(inside) == COMMIT[::-1]
+    tree = git / "worktrees" / "tree"
+    tree.mkdir(parents=True)
+    (tree / "HEAD").write_text("ref: refs/heads/main\n")
+    (tree / "commondir").write_text("../..\n")
+    (tmp_path / "tree").mkdir()
+    (tmp_path / "tree" / ".git").write_text(f"gitdir: {tree}\n")
+    assert git_revision(tmp_path / "tree") == COMMIT[::-1]
+    (git / "HEAD").write_text(COMMIT + "\n")
+    assert git_revision(inside) == COMMIT
+    (git / "HEAD").write_text("ref: refs/../../../secret\n")
+    (tmp_path / "secret").write_text(COMMIT)
+    assert git_revision(inside) == ""
+
+
+def test_a_run_of_every_kind_comes_out_again_to_the_bit(twin, tmp_path):
+    (tmp_path / "way.csv").write_text("-1,0\n0,0.5\n1,0\n")
+    (tmp_path / "drive.csv").write_text("t,v,w\n0,0.2,0\n0.4,0.1,0.5\n0.8,0.2,0\n1.2,0,0\n")
+    from magtwin.sim.motion.commands import read_commands
+
+    runs = [
+        simulate(twin, "sine", seed=1, speed=0.15, controller="stanley", lidar="on", **BRIEF),
+        simulate(twin, "A", seed=2, outside="clamp", **BRIEF),
+        simulate(twin, tmp_path / "way.csv", seed=3, **BRIEF),
+        simulate(twin, read_commands(tmp_path / "drive.csv"), seed=4, rate_hz=20.0),
+        simulate(twin, "random", seed=5, **BRIEF),
+    ]
+    for original in runs:
+        found = repeat(original)
+        assert found.equal, found.report("differs")
+        assert found.causes == ()
+        assert dict(found.again.facts) == dict(original.facts)
+
+
+def test_a_run_once_along_its_path_comes_out_again(twin, tmp_path):
+    (tmp_path / "way.csv").write_text("-0.2,0\n0.2,0\n")
+    run = simulate(twin, tmp_path / "way.csv", rate_hz=20.0)
+    assert "asked_duration_s" not in run.facts
+    assert repeat(run).equal
+
+
+def test_a_run_of_a_data_set_comes_out_again_in_its_session(lab_scene, tmp_path, capsys):
+    out = tmp_path / "runs"
+    options = ["--duration", "1", "--rate-hz", "20", "--columns", "p_world_base", "b_total_nt", "battery_v"]
+    main(
+        [
+            "runs",
+            str(lab_scene),
+            "--out",
+            str(out),
+            "--count",
+            "3",
+            "--sessions",
+            "2",
+            "--seed",
+            "7",
+            *options,
+        ]
+    )
+    capsys.readouterr()
+    main(["rerun-of", str(out / "run_00002.parquet"), "--json"])
+    figures = json.loads(capsys.readouterr().out)["figures"]
+    assert figures["equal"]["value"] == "yes, to the bit"
+    assert figures["equal columns"]["value"] == 4
+    a, b = (read_parquet(out / f"run_0000{k}.parquet").facts["config_sha256"] for k in (0, 2))
+    assert a != b
+
+
+@pytest.mark.parametrize("name", ["run.csv", "run.npz", "run.rrd", "run.usdc", "run.mcap", "bag"])
+def test_a_run_comes_out_again_from_a_file_of_any_format(run, twin, tmp_path, name):
+    from magtwin.io.formats import write_run
+
+    write_run(run, tmp_path / name, twin)
+    found = repeat_of(tmp_path / name)
+    assert found.causes == ()
+    assert found.equal, found.report(name)
+
+
+def test_a_run_that_was_resampled_says_so(run):
+    found = repeat(run.resample(rate_hz=10.0))
+    assert found.causes[0].startswith("the run was made from another: resample")
+    assert not found.equal
+
+
+def test_what_changed_is_named_first_and_the_columns_that_differ(lab_scene, tmp_path, run, capsys):
+    file = tmp_path / "run.parquet"
+    total = run["b_total_nt"].copy()
+    total[7:] += 12.5
+    claims = {"map_sha256": "0" * 64, "magtwin": "0.0.1"}
+    write_parquet(run.with_columns(b_total_nt=total).with_facts(**claims), file)
+    with pytest.raises(SystemExit) as stop:
+        main(["rerun-of", str(file)])
+    lines = capsys.readouterr().out.splitlines()
+    assert stop.value.code == 1
+    assert lines[0].startswith("another version of magtwin: magtwin was 0.0.1, is ")
+    assert lines[1].startswith(f"the map changed: map_sha256 was {'0' * 64}, is ")
+    column = next(line for line in lines if line.startswith("b_total_nt"))
+    assert "12.5" in column
+    assert f"{run.rows - 7} of {run.rows} rows, from row 8 on" in column
+
+
+def test_a_run_is_found_beside_its_scene_when_both_have_moved(run, lab_scene, tmp_path, monkeypatch):
+    there = tmp_path / "there"
+    moved = there / "scene" / lab_scene.name
+    there.mkdir()
+    moved.parent.symlink_to(lab_scene.parent)
+    monkeypatch.chdir(tmp_path)
+    told = run.with_facts(scene_file=f"scene/{lab_scene.name}")
+    with pytest.raises(InputError, match="the scene of the run is not there; name it"):
+        repeat(told)
+    assert repeat(told, near=there / "run.parquet").equal
+    assert repeat(told, near=there).equal
+    assert repeat(told, moved).equal
+
+
+def test_a_twin_is_opened_as_the_run_had_it_or_refused(run, lab_scene):
+    assert twin_of(run).scene.robot.magnetometer.kind == "map-only"
+    changed = run.with_facts(scene_sha256="0" * 64)
+    with pytest.raises(InputError, match="the scene is not what the run came from: scene_sha256 is "):
+        twin_of(changed)
+    assert twin_of(changed, check=False).scene_file == lab_scene
+
+
+def test_what_is_no_longer_at_hand_is_refused(twin, run):
+    for what, name in (
+        (Path("mine", [[-1, 0], [1, 0]]), "'mine'"),
+        (Commands("script", np.array([[0.0, 0.1, 0.0], [0.3, 0.0, 0.0]])), "'script'"),
+        (run, "'figure8'"),
+    ):
+        with pytest.raises(InputError, match=f"the run drove .*{name}, which came from no file"):
+            repeat(simulate(twin, what, duration_s=0.5, rate_hz=20.0))
+    lost = replace(run, facts={k: v for k, v in run.facts.items() if k != "seed"})
+    with pytest.raises(InputError, match="the run does not say its seed"):
+        repeat(lost)
+    with pytest.raises(InputError, match="does not say which scene it came from"):
+        repeat(Run(run.columns, {"seed": 1}))
+    with pytest.raises(InputError, match="do not say how it was made: could not convert"):
+        repeat(run.with_facts(rate_hz="often"))
+    with pytest.raises(InputError, match="/dev/null: the file that the run drove is not there"):
+        repeat(run.with_facts(path_file="/dev/null"))  # a device, as a file of a stranger's may name one
+    with pytest.raises(InputError, match="an engine of its maker's own, 'wings'"):
+        repeat(run.with_facts(engine="wings"))
+
+
+def test_a_missing_column_and_missing_rows_count_as_differences():
+    a = Run({"t": np.arange(4.0), "battery_v": np.array([1.0, np.nan, 3.0, 4.0])})
+    b = Run({"t": np.arange(3.0), "battery_v": np.array([1.0, np.nan, 3.5])})
+    t, volts = differences(a, b)
+    assert (t.column, t.rows, t.first) == ("t", 1, 3)
+    assert (volts.rows, volts.first, volts.greatest) == (2, 2, 0.5)
+    (lost,) = differences(a, Run({"t": np.arange(4.0)}))
+    assert (lost.column, lost.rows) == ("battery_v", 4)
+    assert differences(a, a) == ()
+
+
+def test_zeros_of_other_sign_and_nan_beside_a_number_differ_and_nan_beside_nan_does_not():
+    a = Run({"t": [0.0, 1.0, 2.0, 3.0], "yaw": [0.0, np.nan, np.nan, 1.0]})
+    b = Run({"t": [0.0, 1.0, 2.0, 3.0], "yaw": [-0.0, np.nan, 1.0, 1.0]})
+    (yaw,) = differences(a, b)
+    assert (yaw.column, yaw.rows, yaw.first) == ("yaw", 2, 0)

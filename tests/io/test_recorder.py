@@ -1,0 +1,304 @@
+"""A run that goes on: into files that survive whatever ends it, and into a viewer."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.io.bags.rosbag import BagWriter
+from magtwin.io.formats import read_run
+from magtwin.io.recorder import FLUSH_S, Recorder, in_step, partial_of
+from magtwin.io.rerun.file import read_run as read_rrd
+from magtwin.io.rerun.live import LiveViewer, RrdWriter
+from magtwin.io.rerun.viewer import headless_viewer, live_viewer
+from magtwin.io.tables import ParquetParts, read_parquet
+from magtwin.run.run import Column, Run
+from magtwin.twin import open_twin, simulate
+
+CHILD = """
+import sys
+from magtwin.io.rerun.live import RrdWriter
+from magtwin.io.recorder import Recorder, in_step
+from magtwin.io.bags.rosbag import BagWriter
+from magtwin.io.tables import ParquetParts, read_parquet
+
+folder = sys.argv[1]
+run = read_parquet(f"{folder}/whole.parquet")
+table, bag = ParquetParts(f"{folder}/run.parquet"), BagWriter(f"{folder}/run.mcap")
+with Recorder([RrdWriter(f"{folder}/run.rrd"), table, bag]) as recorder:
+    for block in in_step(run):
+        recorder.append(block)
+        print(block["t"][-1], flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def twin(lab_scene):
+    return open_twin(lab_scene, net="none")
+
+
+@pytest.fixture(scope="module")
+def run(twin) -> Run:
+    return simulate(twin, "figure8", seed=1, duration_s=12.0)
+
+
+def equal(a: Run, b: Run) -> bool:
+    same = list(a) == list(b) and dict(a.facts) == dict(b.facts)
+    return same and all(a[name].tobytes() == np.ascontiguousarray(b[name]).tobytes() for name in b)
+
+
+def rows(run: Run, part: slice) -> Run:
+    return run.take(part)
+
+
+def test_a_run_that_is_killed_leaves_files_that_lack_no_more_than_the_last_second(run, tmp_path):
+    from magtwin.io.tables import write_parquet
+
+    write_parquet(run, tmp_path / "whole.parquet")
+    child = subprocess.Popen([sys.executable, "-c", CHILD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    driven = 0.0
+    while driven < 2.5:
+        driven = float(child.stdout.readline())
+    child.kill()
+    driven = float(([driven, *child.stdout.read().split()])[-1])
+    child.wait()
+    child.stdout.close()
+    names = {"run.partial.rrd", "run.parquet.parts", "run.partial.mcap"}
+    assert {path.name for path in tmp_path.iterdir()} == names | {"whole.parquet"}
+    for name in names:
+        left = read_run(tmp_path / name)
+        assert left["t"][-1] > driven - 1.0, name
+        assert np.array_equal(left["b_total_nt"], run["b_total_nt"][: left.rows]), name
+        assert left.facts["seed"] == 1
+    assert equal(
+        read_run(tmp_path / "run.partial.rrd"), rows(run, slice(read_run(tmp_path / "run.partial.rrd").rows))
+    )
+
+
+def test_a_recording_that_broke_off_in_a_message_is_read_up_to_it(run, tmp_path):
+    writer = RrdWriter(tmp_path / "run.rrd")
+    for k in range(4):
+        writer.append(rows(run, slice(100 * k, 100 * (k + 1))))
+    bytes_ = writer.partial.read_bytes()
+    writer.abort()
+    sizes = []
+    for end in range(len(bytes_) - 20_000, len(bytes_), 1999):
+        (tmp_path / "cut.partial.rrd").write_bytes(bytes_[:end])
+        left = read_rrd(tmp_path / "cut.partial.rrd")
+        assert equal(left, rows(run, slice(left.rows)))
+        sizes.append(left.rows)
+    assert set(sizes) <= {100, 200, 300, 400}
+    (tmp_path / "cut.rrd").write_bytes(bytes_)
+    with pytest.raises(InputError, match="was cut short: it holds 400 rows of a run that did not end"):
+        read_rrd(tmp_path / "cut.rrd")
+    assert max(sizes) == 400
+
+
+def test_blocks_make_the_file_that_the_whole_run_makes(run, twin, tmp_path):
+    sinks = [RrdWriter(tmp_path / "run.rrd", twin), ParquetParts(tmp_path / "run.parquet")]
+    with Recorder([*sinks, BagWriter(tmp_path / "run.mcap", twin)]) as recorder:
+        for start in range(0, run.rows, 77):
+            recorder.append(rows(run, slice(start, start + 77)))
+        assert not (tmp_path / "run.rrd").exists()
+    assert recorder.rows == run.rows
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "run.parquet", "run.rrd"]
+    assert equal(read_rrd(tmp_path / "run.rrd"), run)
+    assert equal(read_parquet(tmp_path / "run.parquet"), run)
+    assert read_run(tmp_path / "run.mcap").rows == run.rows
+
+
+def test_blocks_keep_what_is_said_of_columns_of_a_users_own(tmp_path):
+    spec = Column("K", "room", "temperature", 2, ("in", "out"), interpolation="hold")
+    run = Run({"t": np.arange(9.0), "heat": np.ones((9, 2))}, {"seed": 1}, {"heat": spec})
+    names = ["run.rrd", "run.parquet", "run.mcap"]
+    sinks = [
+        kind(tmp_path / name) for kind, name in zip((RrdWriter, ParquetParts, BagWriter), names, strict=True)
+    ]
+    with Recorder(sinks) as recorder:
+        for block in in_step(run, 1e3):
+            recorder.append(block)
+    for name in names:
+        assert read_run(tmp_path / name).spec("heat") == spec
+
+
+def test_a_fault_leaves_what_there_is_under_its_unfinished_name(run, tmp_path):
+    with pytest.raises(ZeroDivisionError), Recorder([RrdWriter(tmp_path / "run.rrd")]) as recorder:  # noqa: PT012
+        recorder.append(rows(run, slice(50)))
+        recorder.flush()
+        raise ZeroDivisionError
+    assert [path.name for path in tmp_path.iterdir()] == ["run.partial.rrd"]
+    assert read_rrd(tmp_path / "run.partial.rrd").rows == 50
+    with pytest.raises(InputError, match=r"run\.partial\.rrd: exists already"):
+        RrdWriter(tmp_path / "run.rrd")
+
+
+def test_a_fault_before_the_first_rows_leaves_nothing_in_the_way(tmp_path):
+    sinks = [RrdWriter(tmp_path / "run.rrd"), ParquetParts(tmp_path / "run.parquet")]
+    with pytest.raises(ZeroDivisionError), Recorder([*sinks, BagWriter(tmp_path / "run.mcap")]):
+        raise ZeroDivisionError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unfinished_recording_under_a_finished_name_is_refused(run, tmp_path):
+    writer = RrdWriter(tmp_path / "run.rrd")
+    writer.append(run)
+    writer.abort()
+    writer.partial.rename(tmp_path / "moved.rrd")
+    with pytest.raises(InputError, match=r"was cut short.*rename it to moved\.partial\.rrd"):
+        read_rrd(tmp_path / "moved.rrd")
+
+
+def test_a_recording_of_no_rows_leaves_nothing(tmp_path):
+    with Recorder([RrdWriter(tmp_path / "run.rrd"), ParquetParts(tmp_path / "run.parquet")]):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_are_given_rows_at_least_once_a_second():
+    assert FLUSH_S <= 1.0
+    taken = []
+
+    class Sink:
+        def append(self, run):
+            taken.append((time.monotonic(), run.rows))
+
+        def close(self):
+            taken.append((time.monotonic(), 0))
+
+    run = Run({"t": np.arange(0, 2.2, 0.01)})
+    with Recorder([Sink()]) as recorder:
+        for block in in_step(run):
+            recorder.append(block)
+    assert sum(n for _, n in taken) == run.rows
+    assert len(taken) >= 4
+
+
+def test_a_run_in_step_with_the_clock_takes_its_time_and_ends_when_told():
+    run = Run({"t": 5 + np.arange(0, 1.0, 0.01)})
+    begun = time.monotonic()
+    blocks = list(in_step(run, 4.0))
+    took = time.monotonic() - begun
+    assert 0.22 < took < 1.0
+    assert np.array_equal(np.concatenate([block["t"] for block in blocks]), run["t"])
+    stop = threading.Event()
+    threading.Timer(0.2, stop.set).start()
+    begun = time.monotonic()
+    part = sum(block.rows for block in in_step(run, 0.5, stop=stop))
+    assert part < 50
+    assert time.monotonic() - begun < 1.0
+    assert [block.rows for block in in_step(run, np.inf)] == [run.rows]
+    with pytest.raises(InputError, match="pace must be above 0"):
+        next(in_step(run, 0.0))
+
+
+def deaf_address() -> str:
+    """Where something listens that is no viewer, and says nothing."""
+    server = socket.create_server(("127.0.0.1", 0))
+    port = server.getsockname()[1]
+
+    def hang_up() -> None:
+        for _ in range(20):
+            server.accept()[0].close()
+
+    threading.Thread(target=hang_up, daemon=True).start()
+    return f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+def test_ctrl_c_ends_a_live_run_and_keeps_what_was_driven(lab_scene, tmp_path, capsys):
+    def interrupt() -> None:
+        while not over.wait(0.05):
+            if len(list(tmp_path.glob("out/run.parquet.parts/*"))) > 1:
+                os.kill(os.getpid(), signal.SIGINT)
+                return
+
+    over, hand = threading.Event(), threading.Thread(target=interrupt)
+    hand.start()
+    arguments = ["run", str(lab_scene), "--net", "none", "--duration", "300", "--rate-hz", "50", "--json"]
+    outputs = ["--out", str(tmp_path / "out"), "--csv", str(tmp_path / "run.csv")]
+    try:
+        main([*arguments, *outputs, "--viewer", deaf_address()])
+    finally:
+        over.set()
+        hand.join()
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["run.parquet", "run.png", "run.rrd"]
+    table = read_run(tmp_path / "out" / "run.parquet")
+    assert 0 < table["t"][-1] < 60
+    assert equal(read_run(tmp_path / "out" / "run.rrd"), table)
+    assert equal(read_run(tmp_path / "run.csv"), table)
+
+
+def test_a_viewer_that_is_not_there_is_refused_before_anything_is_written(lab_scene, tmp_path, capsys):
+    arguments = ["run", str(lab_scene), "--net", "none", "--duration", "1", "--out", str(tmp_path / "out")]
+    for address, said in (
+        ("rerun+http://127.0.0.1:9/proxy", "no viewer listens there"),
+        ("127.0.0.1:9", "no address of a viewer"),
+    ):
+        with pytest.raises(SystemExit):
+            main([*arguments, "--viewer", address])
+        assert said in capsys.readouterr().err.splitlines()[-1]
+    for options, said in (
+        (["--pace", "2"], "--pace is for a run that is shown live"),
+        (["--live", "--pace", "0"], "--pace must be above 0"),
+        (["--live", "--viewer", "rerun+http://127.0.0.1:9/proxy"], "give one of them"),
+        (["--units", "nT"], "--units is for a bag"),
+        (["--usd-fps", "10"], "--usd-fps is for a layer"),
+        (["--usd", str(tmp_path / "run.csv")], r"ends in .usd or .usda or .usdc"),
+    ):
+        with pytest.raises(SystemExit):
+            main([*arguments, *options])
+        assert said in capsys.readouterr().err.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_live_run_that_is_refused_leaves_nothing(lab_scene, tmp_path, capsys):
+    far = tmp_path / "far.csv"
+    far.write_text("x,y\n0,0\n50,0\n")
+    live = ["--viewer", deaf_address(), "--out", str(tmp_path / "out"), "--bag", str(tmp_path / "a.mcap")]
+    with pytest.raises(SystemExit):
+        main(["run", str(lab_scene), "--net", "none", "--path", str(far), *live])
+    assert "far.csv" in capsys.readouterr().err
+    (tmp_path / "a.partial.mcap").touch()
+    with pytest.raises(SystemExit):
+        main(["run", str(lab_scene), "--net", "none", "--duration", "1", *live])
+    assert "a.partial.mcap: exists already" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.partial.mcap", "far.csv"]
+
+
+@pytest.fixture
+def drawable():
+    """Skips where nothing can be drawn."""
+    try:
+        with headless_viewer():
+            pass
+    except InputError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.usefixtures("drawable")
+def test_a_viewer_gets_the_run_as_it_goes_on_and_its_end_ends_no_run(run, twin, tmp_path):
+    file = RrdWriter(tmp_path / "run.rrd", twin)
+    with live_viewer(headless=True) as (address, client):
+        viewer = LiveViewer(address, twin, expected=run)
+        recorder = Recorder([file], [viewer])
+        recorder.append(rows(run, slice(700)))
+        deadline = time.monotonic() + 30
+        while not any(one.timelines for one in client.get_state().recordings):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        assert viewer.shown
+    with recorder:
+        recorder.append(rows(run, slice(700, 1400)))
+    assert not viewer.shown
+    assert read_rrd(tmp_path / "run.rrd").rows == 1400
+
+
+def test_partial_names_keep_the_ending_that_tells_the_kind(tmp_path):
+    assert partial_of(tmp_path / "a.b.rrd").name == "a.b.partial.rrd"

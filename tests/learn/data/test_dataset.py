@@ -1,0 +1,262 @@
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.io.tables import read_parquet
+from magtwin.learn.data import dataset as rooms
+from magtwin.learn.data.dataset import build_dataset, open_dataset
+from magtwin.learn.data.features import SETS, features
+from magtwin.learn.data.labels import Alignment, labels
+from magtwin.learn.data.recording import Source
+from magtwin.learn.data.split import split
+from magtwin.run.run import COLUMNS, Run
+
+
+def a_map():
+    x, y = np.arange(-2, 2.01, 0.1), np.arange(-1.5, 1.51, 0.1)
+    values = 41e3 + 1500 * np.sin(3.1 * x[None, :]) * np.cos(2.3 * y[:, None])
+    return AnomalyMap(
+        values_nt=values[None],
+        origin_m=(-2.0, -1.5),
+        cell_m=(0.1, 0.1),
+        headings_rad=np.zeros(1),
+        variance_nt2=np.full((1, *values.shape), 400.0),
+        name="hills",
+    )
+
+
+FIELD = a_map()
+
+
+def a_run(seed=0, rows=240, **facts):
+    """A drive with every column that features are made of, its labels 100 nT a m/s of speed, and noise."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(rows) / 10
+    columns = {}
+    for name, spec in COLUMNS.items():
+        values = rng.normal(size=(rows,) if spec.width == 1 else (rows, spec.width))
+        columns[name] = values > 9 if spec.unit == "bool" else values
+    phase = 0.2 * t + seed
+    p = np.column_stack([1.7 * np.sin(phase), 1.2 * np.cos(2 * phase), 0 * t])
+    yaw = np.arctan2(-2.4 * np.sin(2 * phase), 1.7 * np.cos(phase))
+    here = {"t": t, "p_world_base": p, "yaw": yaw}
+    columns = {k: v for k, v in columns.items() if not k.startswith("mocap")} | here
+    columns["b_measured_nt"] = (
+        FIELD.lookup(p[:, :2], yaw) + 100 * columns["odom_v"][:, 0] + rng.normal(0, 2, rows)
+    )
+    return Run(columns, facts)
+
+
+RUNS = {
+    "a": a_run(0, session=3, session_seed=7, path="sine"),
+    "b": a_run(1, session=4, session_seed=7, path="figure8"),
+    "c": a_run(2),
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return build_dataset(RUNS, FIELD, tmp_path_factory.mktemp("set") / "lab")
+
+
+def test_a_recording_comes_back_with_its_labels_to_the_last_bit(made):
+    for (one, run), (name, before) in zip(made.runs(), RUNS.items(), strict=True):
+        assert one.name == name
+        found = labels(before, FIELD)
+        assert_array_equal(run["label_nt"], found.value_nt)
+        assert_array_equal(run["b_map_nt"], found.map_nt)
+        assert_array_equal(run["b_map_gradient_nt_m"], found.gradient_nt_m)
+        assert_allclose(run["label_sd_nt"], 20.0)
+        for column in ("t", "p_world_base", "imu_q_xyzw", "battery_a", "b_measured_nt", "b_truth_nt"):
+            assert_array_equal(run[column], before[column])
+        assert "wheel_angle" not in run
+        assert one.labelled == run.rows == one.rows
+
+
+def test_sessions_and_paths_are_the_runs_own_or_their_names(made):
+    assert [one.session for one in made.recordings] == ["7-3", "7-4", "c"]
+    assert [one.path for one in made.recordings] == ["sine", "figure8", "c"]
+
+
+def test_rows_are_features_and_labels_in_the_order_of_the_recordings(made):
+    rows = made.rows("vector", ["c", "a"])
+    assert rows.names == ("c", "a")
+    assert rows.features == SETS["vector"]
+    assert_array_equal(np.bincount(rows.recording), [240, 240])
+    (_, c), (_, a) = made.runs(["c", "a"])
+    assert_array_equal(rows.x, np.vstack([features(c, "vector"), features(a, "vector")]))
+    assert_array_equal(rows.y, np.concatenate([c["label_nt"], a["label_nt"]]))
+    assert_array_equal(rows.sd, np.full(480, rows.sd[0]))
+    speed = made.rows(["odom_v_x"])
+    slope = np.polyfit(speed.x[:, 0], speed.y, 1)[0]
+    assert slope == pytest.approx(100, abs=1)
+
+
+def test_rows_without_a_label_or_with_a_nan_input_are_left_out_and_counted(tmp_path):
+    run = a_run(3)
+    lost, k = run["flag_lost_lock"].copy(), np.arange(run.rows)
+    lost[:10] = True
+    battery = np.where(k >= 220, np.nan, run["battery_a"])
+    found = build_dataset(
+        {"a": run.with_columns(flag_lost_lock=lost, battery_a=battery)}, FIELD, tmp_path / "d"
+    )
+    rows = found.rows("circular")
+    assert len(rows.y) == len(rows.x) == 210
+    assert rows.left_out == {"without a label": 10, "without an input": 20}
+    assert np.isfinite(rows.x).all()
+    assert found.recordings[0].labelled == 230
+    assert found.rows("full").left_out["without an input"] == 0
+
+
+def test_blocks_of_any_size_give_the_same_rows(tmp_path, monkeypatch, made):
+    monkeypatch.setattr(rooms, "BLOCK_ROWS", 64)
+    found = build_dataset(RUNS, FIELD, tmp_path / "d")
+    firsts = [(one.name, first, run.rows) for one, first, run in found.blocks(["yaw"])]
+    assert firsts[:4] == [("a", 0, 64), ("a", 64, 64), ("a", 128, 64), ("a", 192, 48)]
+    for part in ("train", "test"):
+        dealt = split(found.recordings, "row", (0.5, 0.2, 0.3), rng=np.random.default_rng(0))
+        one, other = (d.rows("full", split=dealt, part=part) for d in (found, made))
+        assert_array_equal(one.x, other.x)
+        assert_array_equal(one.recording, other.recording)
+        assert 0 < len(one.y) < 500
+
+
+def test_a_split_by_run_gives_whole_recordings(made):
+    dealt = split(made.recordings, "run", rng=np.random.default_rng(1))
+    assert made.rows("full", split=dealt, part="test").names == dealt.test
+    total = sum(len(made.rows("full", split=dealt, part=part).y) for part in ("train", "validation", "test"))
+    assert total == 720
+
+
+def test_the_same_runs_give_the_same_bytes_and_shards_are_runs_for_anyone(made, tmp_path):
+    again = build_dataset(RUNS, FIELD, tmp_path / "again")
+    for name in ("dataset.json", "runs/a.parquet"):
+        assert (made.folder / name).read_bytes() == (again.folder / name).read_bytes()
+    run = read_parquet(made.folder / "runs" / "a.parquet")
+    assert run.spec("label_nt").unit == "nT"
+    assert run.facts["path"] == "sine"
+
+
+def test_an_alignment_is_fitted_to_all_runs_together_and_kept(tmp_path):
+    late = {k: run.with_columns(b_measured_nt=np.roll(run["b_measured_nt"], 3)) for k, run in RUNS.items()}
+    found = build_dataset(late, FIELD, tmp_path / "d", alignment="fit")
+    assert found.alignment.latency_s == pytest.approx(0.3, abs=0.05)
+    assert open_dataset(found.folder).alignment == found.alignment
+    given = build_dataset(late, FIELD, tmp_path / "e", alignment=Alignment(latency_s=0.3))
+    assert given.facts["alignment"] == "given"
+    sds = [d.recordings[0].label_sd_nt for d in (given, build_dataset(late, FIELD, tmp_path / "f"))]
+    assert sds[0] < sds[1]
+
+
+def test_a_lower_rate_keeps_every_second_row(tmp_path):
+    found = build_dataset({"a": RUNS["a"]}, FIELD, tmp_path / "d", rate_hz=5.0)
+    ((one, run),) = found.runs()
+    assert one.rows == 120
+    assert_array_equal(run["t"], RUNS["a"]["t"][::2])
+
+
+def test_a_source_is_read_when_its_turn_comes_and_names_its_session(tmp_path):
+    told = []
+    sources = [Source(n, lambda n=n: told.append(n) or RUNS[n], session="monday", path="p") for n in "ab"]
+    seen = []
+    found = build_dataset(sources, FIELD, tmp_path / "d", progress=lambda *args: seen.append(args))
+    assert told == ["a", "b"]
+    assert {(one.session, one.path) for one in found.recordings} == {("monday", "p")}
+    assert seen == [(0, 2, "a"), (1, 2, "b"), (2, 2, "")]
+
+
+def test_the_report_says_what_there_is_to_learn_from(made):
+    report = made.report()
+    figures = {figure.name: figure for figure in report.figures}
+    assert figures["labels"].value == 720
+    assert figures["sessions"].value == 3
+    assert figures["label"].spread == pytest.approx(np.std(made.rows("full").y), rel=1e-6)
+    assert report.facts["feature sets"] == "full, correlated, circular, gradient, platform, vector"
+
+
+@pytest.mark.parametrize(
+    ("runs", "text"),
+    [
+        ({}, "a data set needs one recording at least"),
+        ({"../a": RUNS["a"]}, "a recording is named by letters, digits and _ . "),
+        ({"a": RUNS["a"], "A": RUNS["b"]}, "two recordings are called 'A'; rename one"),
+        (
+            {"a": Run({"t": np.arange(3.0)})},
+            "a: nothing to label: it has no column mocap_p with mocap_q_xyzw",
+        ),
+        (
+            {"a": RUNS["a"].select("p_world_base", "yaw")},
+            "a: nothing to label: it has no column b_measured_nt",
+        ),
+        (
+            {"a": RUNS["a"].with_columns(p_world_base=RUNS["a"]["p_world_base"] + 50)},
+            "a: none of 240 readings has a label on the map 'hills'",
+        ),
+        (
+            {"a": RUNS["a"].with_facts(magnetometer="neural")},
+            "a: its readings are those of a neural magnetometer, and what learns from them learns that model",
+        ),
+        (
+            {"a": RUNS["a"].with_columns(b_measured_nt=labels(RUNS["a"], FIELD).map_nt)},
+            "every label on the map 'hills' is 0 nT: there is nothing to learn",
+        ),
+    ],
+)
+def test_what_cannot_be_labelled_is_refused_and_leaves_nothing(tmp_path, runs, text):
+    with pytest.raises(InputError, match=text):
+        build_dataset(runs, FIELD, tmp_path / "d")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_feature_that_the_recordings_lack_is_refused_with_what_can_be_made(tmp_path):
+    run = Run({k: v for k, v in RUNS["a"].items() if k not in ("battery_a", "b_vector_measured_nt")})
+    found = build_dataset({"a": run, "b": RUNS["b"]}, FIELD, tmp_path / "d")
+    with pytest.raises(InputError, match=r"'battery_a' is made of column 'battery_a'.*: full, correlated$"):
+        found.rows("circular")
+    with pytest.raises(InputError, match="no recording 'bb'; did you mean 'b'"):
+        found.rows("full", ["bb"])
+
+
+def manifest(made, tmp_path, change):
+    data = json.loads((made.folder / "dataset.json").read_text())
+    change(data)
+    (tmp_path / "dataset.json").write_text(json.dumps(data))
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda d: d.update(kind="x"), "dataset.json: not the manifest of a data set"),
+        (lambda d: d.update(version=2), "of version 2; this magtwin reads 1: build it anew"),
+        (lambda d: d.pop("alignment"), "KeyError: 'alignment'"),
+        (lambda d: d["recordings"][0].update(name="../../x"), "a recording is named by letters"),
+        (lambda d: d["recordings"][0].update(rows=-1), "rows of a recording must be a whole number from 0"),
+        (lambda d: d["recordings"][0].update(labelled=10**12), "has 240 rows and 1000000000000 labels"),
+        (lambda d: d["recordings"][0].pop("sha256"), "not the manifest of a data set .TypeError"),
+        (lambda d: d.update(recordings=[]), "has no recording, or two of one name"),
+    ],
+)
+def test_a_manifest_that_was_tampered_with_is_refused(made, tmp_path, change, text):
+    manifest(made, tmp_path, change)
+    with pytest.raises(InputError, match=text):
+        open_dataset(tmp_path)
+
+
+def test_a_shard_that_was_changed_is_refused(tmp_path):
+    found = build_dataset({"a": RUNS["a"]}, FIELD, tmp_path / "d")
+    shard = found.folder / "runs" / "a.parquet"
+    data = bytearray(shard.read_bytes())
+    data[1000] ^= 1
+    shard.write_bytes(data)
+    for read in (found.check, found.rows, lambda: list(found.runs())):
+        with pytest.raises(InputError, match=r"not what dataset.json tells of, by its checksum"):
+            read()
+    shard.unlink()
+    with pytest.raises(InputError, match="no such shard of a data set"):
+        found.check()
+    with pytest.raises(InputError, match="a file; a data set is the folder"):
+        open_dataset(found.folder / "dataset.json")

@@ -1,0 +1,83 @@
+"""Residuals: offset, remainder and correlation time of errors that are drawn with known ones."""
+
+import numpy as np
+import pytest
+
+from magtwin.learn.data.residuals import PRIOR_SHARE, Held, residuals
+from magtwin.sim.sensors.noise import gauss_markov
+
+OFFSET, WITHIN, TIME_S, RATE_HZ = 100.0, 60.0, 3.0, 10.0
+
+
+def drawn(sessions, recordings, *, seconds=60.0, offset=OFFSET, within=WITHIN, time_s=TIME_S, seed=0):
+    """Errors of sessions with so many recordings each."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    held = []
+    for k in range(sessions):
+        constant = offset * rng.standard_normal()
+        for _ in range(recordings):
+            process = gauss_markov(rng.standard_normal(len(t)), time_s, RATE_HZ)
+            held.append(Held(str(k), t, constant + within * process))
+    return held
+
+
+@pytest.mark.parametrize("recordings", [1, 2, 5])
+def test_known_figures_are_found_whether_or_not_sessions_have_several_recordings(recordings):
+    found = residuals(drawn(200, recordings))
+    # 200 sessions tell a standard deviation to 1 / sqrt(400) = 5 %
+    assert found.offset_sd_nt == pytest.approx(OFFSET, rel=0.1)
+    assert found.within_sd_nt == pytest.approx(WITHIN, rel=0.1)
+    assert found.time_s == pytest.approx(TIME_S, rel=0.2)
+    assert found.sessions == 200
+
+
+@pytest.mark.parametrize("time_s", [0.5, 2.0, 8.0])
+def test_the_time_is_that_of_the_process(time_s):
+    assert residuals(drawn(100, 2, time_s=time_s)).time_s == pytest.approx(time_s, rel=0.25)
+
+
+def test_the_two_variances_add_up_to_that_of_the_errors():
+    held = drawn(7, 3)
+    found = residuals(held)
+    whole = np.mean(np.concatenate([one.error_nt for one in held]) ** 2)
+    assert found.offset_sd_nt**2 + found.within_sd_nt**2 == pytest.approx(whole, rel=1e-9)
+
+
+def test_errors_without_an_offset_and_errors_that_are_offsets_alone():
+    assert residuals(drawn(200, 2, offset=0.0)).offset_sd_nt < 0.2 * WITHIN
+    constant = residuals(drawn(200, 2, within=1e-6))
+    assert constant.within_sd_nt < 0.1 * constant.offset_sd_nt
+
+
+def test_the_share_of_a_single_session_stays_near_the_guess():
+    shares = []
+    for seed in range(20):
+        found = residuals(drawn(1, 2, seed=seed))
+        shares.append(found.offset_sd_nt**2 / (found.offset_sd_nt**2 + found.within_sd_nt**2))
+    # one session counts for one, the guess for two
+    assert min(shares) > 2 / 3 * PRIOR_SHARE - 1e-9
+    assert max(shares) < 2 / 3 * PRIOR_SHARE + 1 / 3 + 1e-9
+
+
+def test_rows_without_a_label_do_not_shift_the_others():
+    whole = drawn(50, 2, time_s=2.0)
+    rng = np.random.default_rng(1)
+    holed = []
+    for one in whole:
+        kept = rng.random(len(one.t)) < 0.7
+        holed.append(Held(one.session, one.t[kept], one.error_nt[kept]))
+    a, b = residuals(whole), residuals(holed)
+    assert b.time_s == pytest.approx(a.time_s, rel=0.05)
+    assert b.offset_sd_nt == pytest.approx(a.offset_sd_nt, rel=0.02)
+
+
+def test_nothing_is_found_in_no_error():
+    assert residuals([]) is None
+    assert residuals([Held("a", np.arange(5.0), np.zeros(5))]) is None
+
+
+def test_a_recording_of_one_row_gives_no_time():
+    found = residuals([Held(str(k), np.zeros(1), np.array([float(k)])) for k in range(-3, 4)])
+    assert found.time_s == 0.0
+    assert np.isfinite([found.offset_sd_nt, found.within_sd_nt]).all()

@@ -1,0 +1,174 @@
+"""The error budget of a twin: parts that add up to a model's error, and what closing each of them leaves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from magtwin.errors import InputError
+from magtwin.learn.data.dataset import build_dataset
+from magtwin.learn.data.labels import Alignment, labels
+from magtwin.learn.evaluation.budget import TERMS, Truth, budgets, steps, true_errors
+from magtwin.learn.evaluation.evaluate import (
+    NAIVE,
+    Contender,
+    Mean,
+    Trial,
+    chart_of,
+    evaluate,
+    naive,
+    tolles_lawson,
+)
+from magtwin.run.run import Run
+from magtwin.sim.survey import field_at_rest_nt
+from magtwin.twin import check_figures, in_session_of, open_twin, simulate
+
+SEED = 11
+
+
+@pytest.fixture(scope="module")
+def twin(lab_scene):
+    return open_twin(lab_scene, magnetometer="physical")
+
+
+@pytest.fixture(scope="module")
+def drives(twin):
+    """Short drives of two sessions, as `magtwin runs` deals them."""
+
+    def drive(day, path):
+        facts = {"session_seed": SEED, "session": day}
+        run = simulate(in_session_of(twin, facts), path, seed=day, duration_s=25.0, rate_hz=10.0)
+        return run.with_facts(**facts)
+
+    return {f"d{day}": drive(day, path) for day, path in enumerate(("figure8", "sine", "figure8"))}
+
+
+@pytest.fixture(scope="module")
+def truth(twin):
+    def day_of(name, run):
+        scene = in_session_of(twin, run.facts).scene
+        check_figures(scene, run.facts, name)
+        return scene
+
+    return Truth(twin.scene, day_of)
+
+
+@pytest.fixture(scope="module")
+def chart(twin):
+    return chart_of("lab", twin.field)
+
+
+@pytest.fixture(scope="module")
+def train(drives, chart, tmp_path_factory):
+    learned = {name: drives[name] for name in ("d0", "d1")}
+    return build_dataset(learned, chart.field, tmp_path_factory.mktemp("budget") / "set")
+
+
+@pytest.fixture(scope="module")
+def found(drives, chart, train):
+    models = [naive(chart, dataset=train), tolles_lawson(chart, train)]
+    return evaluate(models, [Trial("d2", lambda: drives["d2"])], rng=np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def made(found, truth, train):
+    return budgets(found, [0, 1], truth, train)
+
+
+def test_the_parts_of_a_label_add_up_to_it(truth, drives, chart):
+    run, alignment = drives["d2"], Alignment((0.03, 0.01), -0.02)
+    label = labels(run, chart.field, alignment)
+    rows = np.flatnonzero(label.known)
+    parts = truth.parts("d2 moved", run, rows, label.map_nt[rows], alignment, run["b_measured_nt"][rows])
+    assert_allclose(parts.sum(axis=0), -label.value_nt[rows], atol=1e-6)  # fields of 4e4 nT, double precision
+
+
+def test_the_exact_field_is_that_of_a_robot_at_rest(truth, twin):
+    p = np.random.default_rng(0).uniform(-1.4, 1.4, (40, 2))
+    yaw = np.linspace(-3, 3, 40)
+    assert_allclose(truth.at_rest(p, yaw), field_at_rest_nt(twin.scene, p, yaw), atol=1e-3)
+    p[3] = np.nan
+    assert np.isnan(truth.at_rest(p, yaw)[3])
+
+
+def test_a_robot_with_the_true_lever_arm_and_no_drift_errs_by_neither(twin, chart):
+    still = Truth(twin.scene, lambda name, run: twin.scene)
+    run = simulate(twin, "figure8", seed=3, duration_s=10.0, rate_hz=10.0)
+    rows = np.arange(5, run.rows)
+    parts = still.parts("a", run, rows, chart.field.lookup(run["p_world_base"][rows, :2], run["yaw"][rows]),
+                        Alignment(twin.scene.robot.mocap.offset_m), run["b_measured_nt"][rows])  # fmt: skip
+    told = dict(zip(TERMS, parts, strict=True))
+    assert np.abs(told["lever arm"]).max() == 0
+    assert np.abs(told["sessions"]).max() == 0
+    assert_allclose(told["sensor"], -run["b_noise_nt"][rows], atol=1e-6)
+    assert np.abs(told["latency"]).max() > 0  # of motion capture, which comes late
+
+
+def test_all_terms_closed_leave_nothing_and_what_each_bought_adds_up(made):
+    for one in made:
+        assert [term.name for term in one.terms] == list(TERMS)
+        assert one.terms[-1].after_nt == pytest.approx(0, abs=1e-6)
+        assert sum(one.bought) == pytest.approx(one.mae_nt)
+
+
+def test_closing_the_map_leaves_what_naive_errs_by_on_an_exact_map(made, found, truth, train, drives):
+    def exact_label(run):
+        p = run["mocap_p"][:, :2]
+        label = labels(run, found.charts[0].field)
+        yaw = 2 * np.arctan2(run["mocap_q_xyzw"][:, 2], run["mocap_q_xyzw"][:, 3])
+        return np.where(label.known, run["b_measured_nt"] - truth.at_rest(p, yaw), np.nan)
+
+    mean = np.mean(np.concatenate([v[np.isfinite(v)] for _, run in train.runs() for v in [exact_label(run)]]))
+    error = mean - exact_label(drives["d2"])
+    closed = made[0].terms[TERMS.index("map")].alone_nt
+    assert closed == pytest.approx(np.nanmean(np.abs(error)), rel=1e-3)  # headings by arctan, tilt left out
+
+
+def test_what_a_map_misses_is_counted_where_the_robot_was(found, truth, twin, drives):
+    (one,) = true_errors(found, truth)
+    run = drives["d2"]
+    p = run["p_world_base"][:, :2]
+    missed = twin.field.lookup(p, run["yaw"]) - field_at_rest_nt(twin.scene, p, run["yaw"])
+    assert one.mae_nt == pytest.approx(np.nanmean(np.abs(missed)), rel=0.1)  # seen 2 cm off, by its offset
+
+
+def test_steps_go_from_naive_over_the_first_map_to_the_weights_on_the_last(chart):
+    other = replace(chart, name="other")
+    cosines = Mean(0.0, 1.0, ("yaw_cos",))
+    gradient = Mean(0.0, 1.0, ("map_gradient_left",))
+    own = {"sha256": "0"}
+    models = [
+        Contender(NAIVE, Mean(0.0, 1.0), chart),
+        Contender("hybrid", gradient, other, Alignment(), own),
+        Contender("paper", cosines, chart, Alignment(), own),
+        Contender("ridge with gradient", gradient, other),
+        Contender("ridge aligned", cosines, other, Alignment((0.1, 0.0))),
+        Contender("ridge", cosines, other),
+        Contender("ridge on the first", cosines, chart),
+    ]
+
+    class Found:
+        contenders, charts = models, (chart, other)
+
+    wanted = [NAIVE, "paper", "ridge on the first", "ridge", "ridge aligned", "ridge with gradient", "hybrid"]
+    assert [models[m].name for m in steps(Found())] == wanted
+
+
+def test_a_run_of_another_scene_is_refused(drives, truth, found, train):
+    changed = drives["d2"].with_facts(config_sha256="0" * 64)
+    other = replace(found, judged=(replace(found.judged[0], name="d9", run=changed),))
+    with pytest.raises(InputError, match="d9: came from a scene whose figures have the sha256 0000"):
+        budgets(other, [0], truth, train)
+
+
+def test_a_run_of_no_known_session_is_refused(twin):
+    with pytest.raises(InputError, match="do not say which session it was of"):
+        in_session_of(twin, {"session_seed": 1, "session": "monday"})
+
+
+def test_a_run_without_the_truth_is_refused(drives, truth, found, train):
+    bare = Run({k: v for k, v in drives["d2"].items() if k != "b_truth_nt"}, drives["d2"].facts)
+    other = replace(found, judged=(replace(found.judged[0], name="d8", run=bare),))
+    with pytest.raises(InputError, match="d8: tells no b_truth_nt, and an error budget needs the truth"):
+        budgets(other, [0], truth, train)

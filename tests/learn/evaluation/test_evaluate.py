@@ -1,0 +1,276 @@
+"""Evaluation: models on their maps, judged by recordings that they never saw."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.learn.data.dataset import build_dataset
+from magtwin.learn.data.labels import Alignment, labelled
+from magtwin.learn.data.split import split
+from magtwin.learn.evaluation.evaluate import (
+    NAIVE,
+    Contender,
+    Mean,
+    Trial,
+    chart_of,
+    check_apart,
+    contender,
+    evaluate,
+    naive,
+    tolles_lawson,
+    trials_of,
+    unseen,
+)
+from magtwin.learn.training.config import TrainConfig
+from magtwin.learn.training.result import fit
+from magtwin.run.run import COLUMNS, Run
+
+
+def a_map(name="hills", level=41e3, variance=400.0, valid=None):
+    x, y = np.arange(-2, 2.01, 0.2), np.arange(-1.6, 1.61, 0.2)
+    values = level + 1500 * np.sin(3.1 * x[None, :]) * np.cos(2.3 * y[:, None])
+    return AnomalyMap(
+        values_nt=values[None],
+        origin_m=(-2.0, -1.6),
+        cell_m=(0.2, 0.2),
+        headings_rad=np.zeros(1),
+        variance_nt2=None if variance is None else np.full((1, *values.shape), variance),
+        valid=valid,
+        name=name,
+    )
+
+
+HILLS = chart_of("hills", a_map())
+HIGHER = chart_of("higher", a_map("higher", 41.5e3))
+
+
+def a_run(seed=0, rows=300, **facts):
+    """A drive whose disturbance is 300 nT, 100 nT a m/s of speed, and noise."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(rows) / 10
+    columns = {}
+    for name, spec in COLUMNS.items():
+        values = rng.normal(size=(rows,) if spec.width == 1 else (rows, spec.width))
+        columns[name] = values > 9 if spec.unit == "bool" else values
+    columns = {k: v for k, v in columns.items() if not k.startswith("mocap") and k != "b_truth_nt"}
+    phase = 0.2 * t + seed
+    p = np.column_stack([1.7 * np.sin(phase), 1.2 * np.cos(2 * phase), 0 * t])
+    yaw = np.arctan2(-2.4 * np.sin(2 * phase), 1.7 * np.cos(phase))
+    columns |= {"t": t, "p_world_base": p, "yaw": yaw}
+    field = HILLS.field.lookup(p[:, :2], yaw)
+    columns["b_measured_nt"] = field + 300 + 100 * columns["odom_v"][:, 0] + rng.normal(0, 20, rows)
+    return Run(columns, {"session": seed % 4, "session_seed": 1, **facts})
+
+
+def trial(name="one", run=None, **told):
+    run = a_run(7, path="figure8") if run is None else run
+    return Trial(name, lambda: run, **told)
+
+
+def judged(contenders, *trials, **options):
+    return evaluate(contenders, trials or [trial()], rng=np.random.default_rng(0), **options)
+
+
+FLAT = Contender(NAIVE, Mean(300.0, 100.0), HILLS)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    runs = {f"r{k}": a_run(k, path=("sine", "figure8")[k % 2]) for k in range(8)}
+    return build_dataset(runs, HILLS.field, tmp_path_factory.mktemp("data") / "set")
+
+
+@pytest.fixture(scope="module")
+def weights(data, tmp_path_factory):
+    """A linear model of the data set, with the split that its facts repeat."""
+    config = TrainConfig(model="linear", features="circular", seed=3)
+    deals, draws = np.random.default_rng(config.seed).spawn(2)
+    parts = split(data.recordings, config.split, rng=deals)
+    made = fit(config, data, parts, rng=draws)
+    path = tmp_path_factory.mktemp("weights") / "line.safetensors"
+    made.net.save(path)
+    return path, parts
+
+
+def test_an_error_is_map_and_prediction_less_what_was_measured():
+    run = a_run(3, path="figure8")
+    found = judged([FLAT], trial(run=run))
+    error = HILLS.field.lookup(run["p_world_base"][:, :2], run["yaw"]) + 300 - run["b_measured_nt"]
+    assert found.every.scores[0].mae_nt == pytest.approx(np.abs(error).mean())
+    assert found.every.scores[0].ratio == 1.0
+
+
+def test_models_on_different_maps_are_judged_by_the_total_field():
+    found = judged([FLAT, Contender("other", Mean(-200.0, 100.0), HIGHER)])
+    first, second = found.every.scores
+    assert second.mae_nt == pytest.approx(first.mae_nt)
+    assert second.bias_nt == pytest.approx(first.bias_nt)
+
+
+def test_a_model_looks_its_map_up_with_its_own_lever_arm_and_latency():
+    alignment = Alignment((0.05, -0.02), 0.1)
+    run = a_run(5, path="figure8")
+    moved = labelled(run, HILLS.field, alignment)
+    found = judged([FLAT, Contender("moved", Mean(300.0, 1.0), HILLS, alignment)], trial(run=run))
+    kept = np.isfinite(moved["label_nt"])
+    assert found.every.scores[1].rows == kept.sum() < run.rows
+    assert found.every.scores[1].mae_nt == pytest.approx(np.abs(300 - moved["label_nt"][kept]).mean())
+
+
+def test_all_models_are_judged_on_common_readings_and_what_is_left_out_is_counted():
+    masked = np.ones((1, 17, 21), bool)
+    masked[0, :, :8] = False
+    holed = chart_of("holed", a_map("holed", valid=masked))
+    found = judged([FLAT, Contender("holed", Mean(300.0, 1.0), holed)])
+    assert found.left_out == {"have no label on holed": 300 - found.every.scores[0].rows}
+    assert {score.rows for score in found.every.scores} == {found.every.scores[0].rows}
+
+
+def test_paths_of_the_paper_are_its_cases_and_others_go_by_their_names():
+    runs = [
+        trial(path, a_run(k, path=path)) for k, path in enumerate(("spiral", "narrow_figure8", "fast_sine"))
+    ]
+    found = judged([FLAT], *runs, cases={"D": "spiral"})
+    assert [case.name for case in found.cases] == ["A", "D", "E", "all", "mean"]
+    found = judged([FLAT], *runs)
+    assert [case.name for case in found.cases] == ["A", "E", "spiral", "all", "mean"]
+
+
+def test_the_noise_floor_of_a_map_is_the_mean_size_of_a_normal_error_of_its_own_variance():
+    mae, rms = judged([FLAT]).floor(HILLS)
+    assert rms == pytest.approx(20.0)
+    assert mae == pytest.approx(20.0 * np.sqrt(2 / np.pi))
+
+
+def test_naive_is_the_mean_training_label_on_the_map_at_hand(data):
+    assert naive(HILLS, dataset=data).model.mean_nt == pytest.approx(
+        np.mean(np.concatenate([run["label_nt"] for _, run in data.runs()]))
+    )
+    on_higher = naive(HIGHER, dataset=data).model.mean_nt
+    assert on_higher == pytest.approx(naive(HILLS, dataset=data).model.mean_nt - 500)
+
+
+def test_weights_tell_their_mean_label_where_no_training_set_is_at_hand(weights):
+    own = contender(weights[0], [HILLS])
+    assert naive(HILLS, weights=[own]).model.mean_nt == own.facts["label_mean_nt"]
+    with pytest.raises(InputError, match="nothing tells the mean training label on the map higher"):
+        naive(HIGHER, weights=[own])
+
+
+def test_tolles_lawson_beats_the_mean_where_speed_makes_a_field(data):
+    found = judged([naive(HILLS, dataset=data), tolles_lawson(HILLS, data)])
+    assert found.every.scores[1].mae_nt == pytest.approx(20 * np.sqrt(2 / np.pi), rel=0.15)
+    assert found.every.scores[1].ratio < 0.3
+
+
+def test_weights_take_the_map_that_they_were_trained_on_by_its_checksum(weights):
+    assert contender(weights[0], [HIGHER, HILLS]).chart is HILLS
+
+
+def test_weights_for_another_map_are_refused_naming_both(weights):
+    with pytest.raises(InputError, match=r"line.*trained on the map 'hills'.*higher has") as refusal:
+        contender(weights[0], [HIGHER])
+    for checksum in (*HILLS.checksums, *HIGHER.checksums):
+        assert checksum in str(refusal.value)
+    assert contender(weights[0], [HIGHER], any_map=True).chart is HIGHER
+
+
+def test_released_weights_which_name_no_map_take_the_first(real_data):
+    released = contender(
+        real_data / "aprilab" / "models" / "nn_magnetometer_model_v0.0.1.pth", [HIGHER, HILLS]
+    )
+    assert released.chart is HIGHER
+    score = judged([Contender(NAIVE, Mean(300.0, 1.0), HIGHER), released]).every.scores[1]
+    assert np.isfinite(score.mae_nt)
+    assert score.outside == 1.0  # inputs drawn at random are nothing that it knows
+
+
+def test_of_the_set_that_weights_were_trained_on_their_test_recordings_judge(data, weights):
+    path, parts = weights
+    names, learned = unseen(data, [contender(path, [HILLS])])
+    assert names == tuple(name for name in data.names if name in parts.test)
+    assert set(learned) == set(parts.train)
+    assert unseen(data, [FLAT]) == (data.names, data.names)
+    assert [one.name for one in trials_of(data, names)] == list(names)
+
+
+def test_baselines_are_not_judged_by_what_they_learn_from(data):
+    with pytest.raises(InputError, match="'r1' and 0 more recordings"):
+        check_apart(data, ["r0", "r1"], data, ["r1", "r2"])
+    check_apart(data, ["r0", "r1"], data, ["r2"])
+
+
+def test_weights_trained_on_rows_of_every_recording_are_refused(data, weights):
+    one = contender(weights[0], [HILLS])
+    leaky = replace(one, facts={**one.facts, "config": 'split = "row"\nseed = 3\n'})
+    with pytest.raises(InputError, match="trained on rows of every recording"):
+        unseen(data, [leaky])
+
+
+def test_the_exact_field_judges_where_it_is_asked_for():
+    run = a_run(2, path="figure8")
+    exact = run.with_columns(b_truth_nt=run["b_measured_nt"] + 50)
+    found = judged([FLAT], trial(run=exact), truth=True)
+    assert found.every.scores[0].bias_nt == pytest.approx(
+        judged([FLAT], trial(run=exact)).every.scores[0].bias_nt - 50
+    )
+    with pytest.raises(InputError, match="one: tells no b_truth_nt"):
+        judged([FLAT], trial(run=run), truth=True)
+
+
+def test_readings_that_are_a_networks_own_are_refused():
+    run = a_run(2, path="figure8", magnetometer="neural")
+    with pytest.raises(InputError, match="those of a neural magnetometer, a model's own"):
+        judged([FLAT], trial(run=run))
+
+
+def test_a_run_off_the_map_is_refused():
+    run = a_run(2, path="figure8")
+    far = run.with_columns(p_world_base=run["p_world_base"] + [50.0, 0, 0])
+    with pytest.raises(InputError, match="one: naive: none of 300 readings has a label on the map 'hills'"):
+        judged([FLAT], trial(run=far))
+
+
+def test_a_run_without_an_input_is_refused_with_the_near_name(weights):
+    run = a_run(2, path="figure8")
+    bare = Run({name: v for name, v in run.items() if name != "odom_v"}, run.facts)
+    with pytest.raises(InputError, match=r"one: line\.safetensors: no column 'odom_v'; did you mean 'odom_"):
+        judged([FLAT, contender(weights[0], [HILLS])], trial(run=bare))
+
+
+def test_a_constant_label_is_refused():
+    run = a_run(2, path="figure8")
+    flat = run.with_columns(b_measured_nt=HILLS.field.lookup(run["p_world_base"][:, :2], run["yaw"]) + 5)
+    with pytest.raises(InputError, match="every label is 5 nT on all 300 readings"):
+        judged([FLAT], trial(run=flat))
+
+
+def test_readings_on_no_common_ground_are_refused_with_counts():
+    left, right = (np.ones((1, 17, 21), bool) for _ in range(2))
+    left[0, :, 11:] = False
+    right[0, :, :10] = False
+    halves = [chart_of(name, a_map(name, valid=v)) for name, v in (("left", left), ("right", right))]
+    with pytest.raises(
+        InputError, match=r"no reading that every model can be judged on: \d+ have no label on"
+    ):
+        judged([Contender(one.name, Mean(0.0, 1.0), one) for one in halves])
+
+
+def test_a_path_that_is_called_as_a_total_is_told_from_it():
+    runs = [trial("a", a_run(0, path="all")), trial("b", a_run(1, path="sine"))]
+    assert [case.name for case in judged([FLAT], *runs).cases] == ["path all", "sine", "all", "mean"]
+
+
+def test_two_of_one_name_are_refused():
+    with pytest.raises(InputError, match="two models are called 'naive'"):
+        judged([FLAT, FLAT])
+    with pytest.raises(InputError, match="two recordings are called 'one'"):
+        judged([FLAT], trial(), trial())
+
+
+def test_nothing_to_judge_by_is_refused():
+    with pytest.raises(InputError, match="nothing to evaluate"):
+        evaluate([FLAT], [], rng=np.random.default_rng(0))

@@ -1,0 +1,239 @@
+"""Predictors of every kind: their files, and what a magnetometer makes of them."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from test_features import a_run
+from test_model import RELEASED, a_net
+
+from magtwin.errors import InputError
+from magtwin.learn.data.features import SETS, features
+from magtwin.learn.data.inputs import inputs_of
+from magtwin.learn.magnetometer import NeuralMagnetometer
+from magtwin.learn.models.calibration import Spread
+from magtwin.learn.models.ensemble import Ensemble, Members
+from magtwin.learn.models.hybrid import Hybrid
+from magtwin.learn.models.linear import Linear
+from magtwin.learn.models.network import load_net
+from magtwin.learn.models.predictor import load_predictor
+from magtwin.learn.models.temporal import Convolutions, Temporal
+from magtwin.twin import open_twin, simulate, simulate_many
+
+NAMES = SETS["gradient"]
+KINDS = ("mlp", "linear", "hybrid", "base alone", "ensemble", "tcn")
+
+
+def a_predictor(kind, names=NAMES, step_s=1 / 135):
+    """A small one of a kind, with figures that are all different."""
+    rng = np.random.default_rng(0)
+    of = inputs_of(rng.normal(0, 30, (100, len(names))), names)
+    spread = Spread(400.0, rng.uniform(0, 900, len(names)))
+    coefficients = rng.normal(0, 90, len(names))
+    base = Linear(
+        inputs=of, constant_nt=333.0, coefficients_nt=coefficients, spread=spread, penalty=0.01, weighted=True
+    )
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        members, net = Members(len(names), (6, 5), 3), Convolutions(len(names), (6, 6), 3)
+    heads = {"inputs": of, "y_mean_nt": 300.0, "y_scale_nt": 500.0, "sd_factor": 1.25}
+    found = {
+        "mlp": lambda: a_net(names, (6, 5), residual_sd_nt=44.0),
+        "linear": lambda: base,
+        "hybrid": lambda: Hybrid(base=base, net=a_net(names, (6, 5), dropout=0.2), sd_factor=1.5),
+        "base alone": lambda: Hybrid(base=base, net=None, sd_factor=1.5),
+        "ensemble": lambda: Ensemble(net=members.eval(), **heads),
+        "tcn": lambda: Temporal(net=net.eval(), step_s=step_s, **heads),
+    }[kind]()
+    found.residual_sd_nt = 44.0
+    found.facts.update(source="here", rows=7)
+    return found
+
+
+@pytest.fixture(params=KINDS)
+def predictor(request):
+    return a_predictor(request.param)
+
+
+def test_every_kind_comes_back_from_its_file_to_the_bit(predictor, tmp_path):
+    predictor.save(tmp_path / "a.safetensors")
+    again = load_predictor(tmp_path / "a.safetensors")
+    again.save(tmp_path / "b.safetensors")
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+    x = features(a_run(60), NAMES)
+    for ours, its in zip(predictor.predict(x), again.predict(x), strict=True):
+        assert_array_equal(ours, its)
+    assert_array_equal(predictor.outside(x), again.outside(x))
+    assert (again.kind, again.features, again.residual_sd_nt) == (predictor.kind, NAMES, 44.0)
+    assert again.facts == {"source": "here", "rows": 7}
+
+
+def test_a_file_that_is_there_is_kept(predictor, tmp_path):
+    (tmp_path / "a.safetensors").write_text("mine")
+    with pytest.raises(InputError, match=r"a\.safetensors: exists already"):
+        predictor.save(tmp_path / "a.safetensors")
+
+
+def test_every_kind_tells_what_it_is(predictor):
+    figures = {figure.name: figure.value for figure in predictor.report("p").figures}
+    assert figures["residual sd"] == 44.0
+    assert predictor.parameters_count > 0
+    assert predictor.layers_text
+
+
+def test_a_magnetometer_tells_of_each_row_its_own_spread(predictor):
+    run = a_run(40)
+    x = features(run, NAMES)
+    (read,) = NeuralMagnetometer(predictor).read([run.with_columns(t=np.arange(40) / 135)])
+    mean, sd = predictor.predict(x)
+    assert_array_equal(read.disturbance_nt, mean)
+    assert_array_equal(read.sd_nt, sd)
+    assert_array_equal(read.outside, predictor.outside(x))
+    assert (len(np.unique(sd)) == 1) == (predictor.kind == "mlp")
+
+
+def test_the_facts_of_a_run_tell_the_kind_where_it_is_no_perceptron(predictor):
+    assert NeuralMagnetometer(predictor).facts.get("network_kind", "mlp") == predictor.kind
+
+
+def test_runs_in_one_stream_are_read_as_if_each_were_alone(predictor):
+    runs = [a_run(rows, seed).with_columns(t=np.arange(rows) / 135) for seed, rows in enumerate((30, 1, 520))]
+    magnetometer = NeuralMagnetometer(predictor)
+    for run, read in zip(runs, magnetometer.read(runs), strict=True):
+        (alone,) = magnetometer.read([run])
+        assert_array_equal(read.disturbance_nt, alone.disturbance_nt)
+        assert_array_equal(read.sd_nt, alone.sd_nt)
+
+
+def test_a_released_checkpoint_is_a_predictor(real_data):
+    assert load_predictor(real_data / RELEASED).kind == "mlp"
+
+
+def test_one_look_back_lasts_as_long_at_twice_the_rate():
+    magnetometer = NeuralMagnetometer(a_predictor("tcn", step_s=0.1))
+    run = a_run(50)
+    slow = run.with_columns(t=np.arange(50) / 10)
+    twice = type(run)({name: np.repeat(values, 2, axis=0) for name, values in run.items()}, run.facts)
+    twice = twice.with_columns(t=np.arange(100) / 20)
+    found, peer = magnetometer.disturbance_nt(twice), magnetometer.disturbance_nt(slow)
+    assert_array_equal(found[::2], peer)
+    assert_array_equal(found[1::2], peer)
+    for rate in (5, 14):
+        with pytest.raises(InputError, match=r"looks back over rows 0\.1 s apart, the run has them"):
+            magnetometer.disturbance_nt(run.with_columns(t=np.arange(50) / rate))
+
+
+@pytest.mark.parametrize("kind", ["hybrid", "tcn"])
+def test_a_simulation_is_read_by_any_kind_and_many_as_one(lab_scene, tmp_path, kind):
+    a_predictor(kind).save(tmp_path / "n.safetensors")
+    twin = open_twin(lab_scene, net=tmp_path / "n.safetensors")
+    one = simulate(twin, seed=3, duration_s=1.0)
+    assert one.facts["network_kind"] == kind
+    x = features(one, NAMES)
+    noise = twin.scene.robot.magnetometer.noise_density_nt * math.sqrt(135 / 2)
+    assert_allclose(one["b_sd_nt"], np.hypot(twin.magnetometer.net.predict(x)[1], noise))
+    both = simulate_many(twin, ["figure8", "figure8"], [8, 3], duration_s=1.0)
+    for name in ("b_disturbance_nt", "b_sd_nt", "b_measured_nt", "flag_out_of_distribution"):
+        assert_array_equal(both[1][name], one[name])
+
+
+def test_robots_that_step_together_have_no_network_that_looks_back(lab_scene, tmp_path):
+    pytest.importorskip("gymnasium")
+    from magtwin.gym import MagNavEnv
+
+    a_predictor("tcn").save(tmp_path / "n.safetensors")
+    with pytest.raises(InputError, match=r"n\.safetensors: a tcn looks at 6 earlier readings"):
+        MagNavEnv(scene=lab_scene, net=tmp_path / "n.safetensors")
+
+
+@pytest.mark.parametrize("inputs", SETS)
+def test_robots_that_step_together_read_every_set_of_inputs_but_the_vector_axes(lab_scene, tmp_path, inputs):
+    pytest.importorskip("gymnasium")
+    from magtwin.gym import MagNavEnv
+
+    a_predictor("hybrid", SETS[inputs]).save(tmp_path / "h.safetensors")
+    if inputs == "vector":
+        with pytest.raises(InputError, match="reads b_vector_measured_nt, which MagNav does not simulate"):
+            MagNavEnv(scene=lab_scene, net=tmp_path / "h.safetensors")
+        return
+    env = MagNavEnv(scene=lab_scene, net=tmp_path / "h.safetensors")
+    env.reset(seed=0)
+    assert np.isfinite(env.step(np.array([0.2, 0.1], np.float32))[0]).all()
+
+
+# Files that are not what they should be
+
+
+def changed(tmp_path, kind, *, about=None, drop=None, **tensors):
+    """A file of a small predictor with tensors, or what it says of itself, changed."""
+    path = tmp_path / "n.safetensors"
+    a_predictor(kind, ("yaw_sin", "odom_v_x")).save(path)
+    with safe_open(path, framework="np") as file:
+        said = json.loads(file.metadata()["magtwin"])
+    held = {name: value for name, value in load_file(path).items() if name != drop}
+    held |= {name.replace("__", "."): value for name, value in tensors.items()}
+    save_file(held, path, metadata={"magtwin": json.dumps(said | (about or {}))})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "text"),
+    [
+        ("mlp", {"about": {"kind": "oracle"}}, "holds a 'oracle', this magtwin reads mlp, linear, hybrid"),
+        ("mlp", {"about": {"kind": ["mlp"]}}, "holds a ['mlp'], this magtwin reads"),
+        (
+            "linear",
+            {"about": {"format_version": 1}},
+            "format version 1, this magtwin reads 2; update magtwin",
+        ),
+        ("linear", {"about": {"penalty": "much"}}, "'penalty' of its metadata is missing or of the wrong"),
+        ("linear", {"about": {"weighted": 1}}, "'weighted' of its metadata is missing or of the wrong type"),
+        ("linear", {"about": {"features": ["yaw_sin", "odom_x"]}}, "no feature 'odom_x'; did you mean"),
+        ("hybrid", {"about": {"sd_factor": 0}}, "'sd_factor' of its metadata must be above 0 and finite"),
+        ("hybrid", {"about": {"sd_factor": True}}, "'sd_factor' of its metadata must be above 0 and finite"),
+        ("hybrid", {"drop": "net.layers.1.weight"}, "tensor 'layers.1.weight' is missing; train or convert"),
+        ("hybrid", {"drop": "base.constant_nt"}, "tensor 'constant_nt' is missing; train the hybrid again"),
+        ("hybrid", {"spare": torch.ones(1)}, "tensor 'spare' belongs to no layer of a hybrid"),
+        ("ensemble", {"about": {"members": 0}}, "has 0 members; 1 to 1000 are read"),
+        ("ensemble", {"about": {"members": 2}}, "tensor 'weights.0' is float32 (3, 6, 2), the 2 features"),
+        ("ensemble", {"about": {"hidden": []}}, "'hidden' of its metadata must be widths of layers, got []"),
+        ("ensemble", {"about": {"hidden": [10**12]}}, "must be widths of layers, got [1000000000000]"),
+        (
+            "ensemble",
+            {"about": {"hidden": [99, 99]}},
+            "its metadata ask for 30,591 weights, its tensors hold",
+        ),
+        (
+            "ensemble",
+            {"about": {"y_scale_nt": -1}},
+            "'y_scale_nt' of its metadata must be above 0 and finite",
+        ),
+        ("ensemble", {"weights__1": torch.full((3, 5, 6), math.inf)}, "'weights.1' has numbers that are nan"),
+        (
+            "tcn",
+            {"about": {"kernel": 1}},
+            "2 layers with a kernel of 1 rows; at most 100,000 rows are looked",
+        ),
+        ("tcn", {"about": {"kernel": 99_999}}, "2 layers with a kernel of 99999 rows"),
+        ("tcn", {"about": {"channels": [1] * 60}}, "60 layers with a kernel of 3 rows"),
+        ("tcn", {"about": {"step_s": 0}}, "'step_s' of its metadata must be above 0 and finite, got 0"),
+        ("tcn", {"last__bias": torch.zeros(3)}, "tensor 'last.bias' is float32 (3,), the 2 features"),
+    ],
+)
+def test_a_file_that_does_not_hold_together_is_refused(tmp_path, kind, change, text):
+    path = changed(tmp_path, kind, **change)
+    with pytest.raises(InputError) as refused:
+        load_predictor(path)
+    assert str(refused.value).startswith(f"{path}: ")
+    assert text in str(refused.value)
+
+
+def test_what_wants_a_perceptron_refuses_a_hybrid(tmp_path):
+    a_predictor("hybrid").save(tmp_path / "h.safetensors")
+    with pytest.raises(InputError, match="holds a hybrid, no multilayer perceptron; give one of those"):
+        load_net(tmp_path / "h.safetensors")

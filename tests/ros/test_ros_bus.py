@@ -1,0 +1,254 @@
+"""The bus: what one node says another hears, over DDS and in rclpy, on this machine only."""
+
+import os
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from nodes import DOMAINS, spin
+from places import ROOT
+
+from magtwin.errors import InputError
+from magtwin.io.bags.messages import LATCHED, ODOMETRY, SENSOR_DATA, TOPICS, TYPES, Qos
+from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
+from magtwin.ros.clock import Clock
+
+pytest.importorskip("cyclonedds", reason="extra ros is not installed")
+
+JAZZY = ROOT / "build" / "ros-jazzy" / "bin" / "python"
+FIELD = "sensor_msgs/msg/MagneticField"
+
+
+@pytest.fixture
+def domain(monkeypatch: pytest.MonkeyPatch) -> int:
+    """A domain of a test's own, on loopback only."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+    return next(DOMAINS)
+
+
+@pytest.fixture
+def pair(domain: int) -> Iterator[tuple[Bus, Bus]]:
+    """Two nodes of cyclonedds."""
+    nodes = tuple(open_bus(name, backend="cyclonedds", domain=domain) for name in ("one", "other"))
+    yield nodes  # type: ignore[misc]
+    for node in nodes:
+        node.close()
+
+
+def test_every_type_of_the_table_crosses_unchanged(pair: tuple[Bus, Bus]) -> None:
+    one, other = pair
+    heard: dict[str, Message] = {}
+    said: dict[str, bytes] = {}
+    offered = []
+    for k, kind in enumerate(TYPES):
+        offered.append(one.publisher(f"t{k}", kind, Qos()))
+        other.subscribe(f"t{k}", kind, lambda m: heard.__setitem__(m.kind, m), Qos())
+        said[kind] = to_bytes(kind, {"header.frame_id": "base_link", "pose.position": [1.0, 2.0, 3.0]})
+    spin(lambda: all(p.subscribers() for p in offered), one, other)
+    for publisher in offered:
+        publisher.publish(said[publisher.kind])
+    spin(lambda: len(heard) == len(TYPES), one, other)
+    for kind, message in heard.items():
+        assert message.data[: len(said[kind])] == said[kind]  # DDS pads to four bytes
+        assert not any(message.data[len(said[kind]) :])
+
+
+def test_our_bytes_are_those_that_cyclonedds_itself_writes() -> None:
+    from cyclonedds.idl import IdlStruct
+
+    from magtwin.ros.types import _whole
+
+    struct = _whole(FIELD)
+    header, field = (struct.__annotations__[name] for name in ("header", "magnetic_field"))
+    stamp = header.__annotations__["stamp"]
+    sample = struct(
+        header=header(stamp=stamp(sec=7, nanosec=5), frame_id="head"),
+        magnetic_field=field(x=1e-5, y=-2e-5, z=3e-5),
+        magnetic_field_covariance=[float(k) for k in range(9)],
+    )
+    assert isinstance(sample, IdlStruct)
+    ours = to_bytes(
+        FIELD,
+        {
+            "header.stamp": np.int64(7_000_000_005),
+            "header.frame_id": "head",
+            "magnetic_field": [1e-5, -2e-5, 3e-5],
+            "magnetic_field_covariance": np.arange(9.0),
+        },
+    )
+    assert sample.serialize(use_version_2=False)[4:] == ours[4:]
+
+
+def test_who_comes_late_gets_what_is_latched_and_nothing_else(pair: tuple[Bus, Bus]) -> None:
+    one, other = pair
+    heard: list[str] = []
+    for topic, qos in (("latched", LATCHED), ("passing", Qos())):
+        one.publisher(topic, "std_msgs/msg/String", qos).publish(
+            to_bytes("std_msgs/msg/String", {"data": topic})
+        )
+        other.subscribe(topic, "std_msgs/msg/String", lambda m: heard.append(m.read(["data"])["data"]), qos)
+    spin(lambda: heard, one, other)
+    for _ in range(10):
+        other.spin_once(0.01)
+    assert heard == ["latched"]
+
+
+def test_a_node_sees_how_many_send_on_a_topic_and_in_which_types(pair: tuple[Bus, Bus]) -> None:
+    one, other = pair
+    heard = other.subscribe("odom", ODOMETRY.kind, lambda m: None, SENSOR_DATA)
+    assert heard.publishers() == 0
+    offered = [node.publisher("odom", ODOMETRY.kind, SENSOR_DATA) for node in pair]
+    spin(lambda: heard.publishers() == 2, one, other)
+    spin(lambda: other.types("odom") == (ODOMETRY.kind,), one, other)
+    assert [p.topic for p in offered] == ["/robot/odom"] * 2
+
+
+def test_who_left_offers_nothing_more(domain: int) -> None:
+    ear, (one, other) = (
+        open_bus("ear", backend="cyclonedds", domain=domain),
+        (open_bus(name, backend="cyclonedds", domain=domain) for name in ("one", "other")),
+    )
+    for node in (one, other):
+        node.publisher(ODOMETRY.name, ODOMETRY.kind, ODOMETRY.qos)
+    spin(lambda: ear.publishers(ODOMETRY.name) == 2, ear)
+    one.close()
+    spin(lambda: ear.publishers(ODOMETRY.name) == 1, ear)
+    other.close()
+    spin(lambda: not ear.types(ODOMETRY.name), ear)
+    ear.close()
+
+
+def test_a_broken_message_tells_no_clock_and_wall_timers_go_on_without_it(domain: int) -> None:
+    bus = open_bus("node", backend="cyclonedds", domain=domain, sim_time=True)
+    due: list[str] = []
+    bus.timer(0.01, lambda: due.append("sim"))
+    bus.timer(0.01, lambda: due.append("wall"), wall=True)
+    bus._told(Message("rosgraph_msgs/msg/Clock", b"\0\1\0\0\5", 0, 0))
+    spin(lambda: len(due) > 2, bus)
+    assert bus.now_ns() == 0
+    assert set(due) == {"wall"}
+    bus.close()
+
+
+def test_timers_of_sim_time_follow_slash_clock(domain: int) -> None:
+    one = open_bus("one", backend="cyclonedds", domain=domain)
+    other = open_bus("other", backend="cyclonedds", domain=domain, sim_time=True)
+    due: list[int] = []
+    other.timer(0.1, lambda: due.append(other.now_ns()))
+    clock = one.publisher("/clock", "rosgraph_msgs/msg/Clock", TOPICS["/clock"].qos)
+    spin(lambda: clock.subscribers(), one, other)
+    for step in range(1, 11):
+        now = step * 50_000_000
+        clock.publish(to_bytes("rosgraph_msgs/msg/Clock", {"clock": np.int64(now)}))
+        spin(lambda now=now: other.now_ns() == now, other)
+    assert due == [150_000_000, 250_000_000, 350_000_000, 450_000_000]
+    one.close()
+    other.close()
+
+
+def test_a_timer_begins_anew_where_time_jumps_back() -> None:
+    clock, due = Clock(sim_time=True), []
+    clock.timer(1.0, lambda: due.append(clock.now_ns() // 10**9))
+    for t in (10, 11, 12, 2, 3, 4):
+        clock.tell(t * 10**9)
+        clock.run_due()
+    assert due == [11, 12, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("namespace", "remaps", "name", "whole"),
+    [
+        ("robot", (), "/robot/odom", "/robot/odom"),
+        ("tb4", (), "/robot/odom", "/tb4/odom"),
+        ("", (), "odom", "/odom"),
+        ("robot", (), "/clock", "/clock"),
+        ("robot", ("odom:=/vicon/odom",), "/robot/odom", "/vicon/odom"),
+        ("a/b", ("/a/b/odom:=wheel",), "/robot/odom", "/a/b/wheel"),
+        ("robot", ("/tf:=tf",), "/tf", "/robot/tf"),
+    ],
+)
+def test_names_stand_in_their_namespace_and_are_remapped(
+    namespace: str, remaps: tuple[str, ...], name: str, whole: str
+) -> None:
+    assert names_of(namespace, remaps).resolve(name) == whole
+
+
+@pytest.mark.parametrize("remap", ["odom", "odom=x", "odom:=", "a b:=c", "odom:=2x"])
+def test_what_is_no_remap_is_refused(remap: str) -> None:
+    with pytest.raises(InputError, match="a remap is a name:=another"):
+        names_of("robot", (remap,))
+
+
+def test_without_either_backend_one_line_tells_both_ways(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"source an installation .*pip install 'magtwin\[ros\]'"):
+        open_bus("node")
+
+
+def test_where_rclpy_is_broken_cyclonedds_is_taken_and_who_asks_for_rclpy_is_told(
+    domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "rclpy.py").write_text("raise ImportError('librcl.so: cannot open')")
+    monkeypatch.syspath_prepend(tmp_path)
+    node = open_bus("node", domain=domain)
+    assert node.backend == "cyclonedds"
+    node.close()
+    with pytest.raises(InputError, match="rclpy is installed but cannot be imported: librcl"):
+        open_bus("node", domain=domain, backend="rclpy")
+
+
+def test_a_topic_is_of_one_type_in_a_node(pair: tuple[Bus, Bus]) -> None:
+    pair[0].publisher("odom", ODOMETRY.kind, SENSOR_DATA)
+    with pytest.raises(InputError, match="/robot/odom has messages of nav_msgs/msg/Odometry"):
+        pair[0].subscribe("odom", FIELD, lambda m: None, SENSOR_DATA)
+
+
+@pytest.fixture(scope="module")
+def jazzy() -> Path:
+    """A Python with rclpy of Jazzy's wheels, whose environment is built apart."""
+    if not JAZZY.exists():
+        pytest.skip("no rclpy: `make ros` installs that of ROS 2 Jazzy into build/ros-jazzy")
+    return JAZZY
+
+
+ECHO = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from magtwin.io.bags.messages import LATCHED, Qos
+from magtwin.ros.bus import open_bus
+node = open_bus("echo", backend="rclpy")
+there = node.publisher("back", "sensor_msgs/msg/MagneticField", Qos(depth=50))
+node.subscribe("out", "sensor_msgs/msg/MagneticField", lambda m: there.publish(m.data), Qos(depth=50))
+while True:
+    node.spin_once(0.1)
+"""
+
+
+def test_rclpy_hears_what_cyclonedds_says_and_the_reverse(jazzy: Path, domain: int) -> None:
+    env = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+    echo = subprocess.Popen([jazzy, "-c", ECHO, str(ROOT)], env=env)
+    node = open_bus("one", backend="cyclonedds", domain=domain)
+    try:
+        heard: list[Message] = []
+        out = node.publisher("out", FIELD, Qos(depth=50))
+        back = node.subscribe("back", FIELD, heard.append, Qos(depth=50))
+        spin(lambda: out.subscribers() and back.publishers(), node)
+        time.sleep(0.2)
+        field = [1.2e-5, -3.4e-5, 5.6e-5]
+        for k in range(20):
+            stamp = np.int64(k * 10**9 + 7)
+            fields = {"header.stamp": stamp, "header.frame_id": "head", "magnetic_field": field}
+            out.publish(to_bytes(FIELD, fields))
+        spin(lambda: len(heard) == 20, node)
+    finally:
+        echo.terminate()
+        echo.wait()
+        node.close()
+    read = [m.read(["header.stamp", "header.frame_id", "magnetic_field"]) for m in heard]
+    assert [one["header.stamp"] for one in read] == [k * 10**9 + 7 for k in range(20)]
+    assert {one["header.frame_id"] for one in read} == {"head"}
+    np.testing.assert_array_equal([one["magnetic_field"] for one in read], [field] * 20)

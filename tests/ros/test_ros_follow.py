@@ -1,0 +1,268 @@
+"""The path follower and the hand as nodes: they drive the twin, and stand where they do not know where."""
+
+import os
+import threading
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from nodes import DOMAINS, spin
+
+from magtwin.errors import InputError
+from magtwin.files import shipped
+from magtwin.frames import quat_from_yaw
+from magtwin.io.bags.messages import CLOCK, COMMAND, ODOMETRY, POSE, Qos
+from magtwin.path import PATHS, Path
+from magtwin.ros.bus import Bus, Message, open_bus, to_bytes
+from magtwin.ros.diagnostics import KIND, Status, from_message
+from magtwin.ros.follow import Follower
+from magtwin.ros.simulate import Simulator
+from magtwin.ros.teleop import Teleop
+from magtwin.sim.motion.manual import Keyboard
+from magtwin.spec.scene import DriveSpec
+from magtwin.twin import Twin, open_twin
+
+pytest.importorskip("cyclonedds", reason="extra ros is not installed")
+
+NS = 10**9
+TICK_S = 0.02
+LINE = Path("line", np.array([[0.0, 0.0], [0.3, 0.0], [0.5, 0.1]]))
+
+
+@pytest.fixture
+def nodes() -> Iterator[Callable[..., Bus]]:
+    """Makes nodes in a domain of the test's own, on loopback only."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.delenv("CYCLONEDDS_URI", raising=False)
+        domain, made = next(DOMAINS), []
+
+        def node(name: str, **rest: object) -> Bus:
+            made.append(open_bus(name, backend="cyclonedds", domain=domain, **rest))  # type: ignore[arg-type]
+            return made[-1]
+
+        yield node
+        for one in made:
+            one.close()
+
+
+@pytest.fixture(scope="module")
+def twin() -> Twin:
+    return open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="map-only")
+
+
+class Ideal:
+    """A robot that does at once what it is commanded, and says where it is at each tick of its clock."""
+
+    def __init__(self, nodes: Callable[..., Bus], kind: str = COMMAND.kind) -> None:
+        self.bus = nodes("robot")
+        self.clock, self.poses, self.twists = (
+            self.bus.publisher(t.name, t.kind, Qos(depth=100)) for t in (CLOCK, POSE, ODOMETRY)
+        )
+        self.kind, self.commands = kind, list[tuple[float, float]]()
+        self.bus.subscribe(COMMAND.name, kind, self._hear, Qos(depth=100))
+        self.t, self.x, self.y, self.yaw = 3.0, 0.0, 0.0, 0.0
+        self.track: list[tuple[float, float]] = []
+
+    def tick(self, follower: Bus, times: int = 1, *, silent: bool = False) -> None:
+        for _ in range(times):
+            self.t += TICK_S
+            stamp = np.int64(round(self.t * NS))
+            v, w = self.commands[-1] if self.commands else (0.0, 0.0)
+            self.yaw += w * TICK_S
+            self.x += v * TICK_S * np.cos(self.yaw)
+            self.y += v * TICK_S * np.sin(self.yaw)
+            self.track.append((self.x, self.y))
+            if not silent:
+                place = {
+                    "header.stamp": stamp,
+                    "pose.position": [self.x, self.y, 0.0],
+                    "pose.orientation": quat_from_yaw(self.yaw),
+                }
+                self.poses.publish(to_bytes(POSE.kind, place))
+                moving = {"twist.twist.linear": [v, 0, 0], "twist.twist.angular": [0, 0, w]}
+                turned = {"pose.pose.orientation": quat_from_yaw(self.yaw)}
+                self.twists.publish(to_bytes(ODOMETRY.kind, {"header.stamp": stamp, **turned, **moving}))
+            self.clock.publish(to_bytes(CLOCK.kind, {"clock": stamp}))
+            spin(lambda stamp=stamp: follower.now_ns() == stamp, follower)
+            self.bus.spin_once(0.001)
+
+    def _hear(self, message: Message) -> None:
+        linear, angular = COMMAND.leaves[self.kind]
+        read = message.read([linear, angular])
+        self.commands.append((float(read[linear][0]), float(read[angular][2])))
+
+
+def started(robot: Ideal, nodes: Callable[..., Bus], **how: object) -> tuple[Follower, Bus]:
+    bus = nodes("follower", sim_time=True)
+    for topic in (POSE, ODOMETRY):
+        spin(lambda topic=topic: bus.types(topic.name), bus)
+    node = Follower(LINE, DriveSpec(), bus, **how)  # type: ignore[arg-type]
+    senders = (robot.clock, robot.poses)
+    spin(lambda: all(p.subscribers() for p in senders), bus, robot.bus)
+    return node, bus
+
+
+def driven(
+    twin: Twin, nodes: Callable[..., Bus], path: Path, *, clock: float, **how: object
+) -> tuple[Follower, np.ndarray]:
+    """A follower that has driven the twin along a path, and each step's true x, y, yaw."""
+    simulator = Simulator(twin, nodes("sim"), session="survey", speed=clock)  # poses without an offset
+    bus = nodes("follower", sim_time=True)
+    node = Follower(path, twin.scene.robot.drive, bus, **how)  # type: ignore[arg-type]
+    track: list[tuple[float, float, float]] = []
+
+    def ended() -> bool:
+        track.append(simulator.online.pose)
+        return node.done
+
+    most_s = 30.0 + 2 * path.length / 0.2
+    simulated = threading.Thread(target=simulator.run, args=(ended,), kwargs={"duration_s": most_s})
+    simulated.start()
+    while simulated.is_alive():
+        bus.spin_once(0.01)
+    assert node.done
+    return node, np.array(track)
+
+
+def test_the_twin_is_driven_along_a_path_over_ros_and_stands_at_its_end(
+    twin: Twin, nodes: Callable[..., Bus]
+) -> None:
+    x, y, yaw = twin.scene.start
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    bend = np.array([[0, 0], [0.2, 0.0], [0.35, 0.05], [0.45, 0.15]])
+    path = Path("bend", bend @ turn.T + [x, y])
+    lines: list[str] = []
+    node, track = driven(twin, nodes, path, clock=2.0, speed=0.25, say=lines.append)
+    _, off = path.nearest(track[:, :2])
+    assert np.sqrt(np.mean(off**2)) < 0.01  # the standard is 0.06 m
+    assert node.progress.rms_m < 0.01
+    np.testing.assert_allclose(track[-1, :2], path.p_xy[-1], atol=0.03)
+    assert np.ptp(track[-20:], axis=0).max() < 1e-3
+    assert lines[-1] == "the end is reached"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PATHS)
+def test_the_twin_is_driven_around_every_path_over_ros(
+    twin: Twin, nodes: Callable[..., Bus], name: str
+) -> None:
+    path = PATHS[name]()
+    node, track = driven(twin, nodes, path, clock=3.0)
+    begun = int(np.argmin(np.hypot(*(track[:, :2] - path.p_xy[0]).T)[: len(track) // 3]))
+    _, off = path.nearest(track[begun:, :2])
+    assert np.sqrt(np.mean(off**2)) < 0.06
+    assert node.progress.rms_m < 0.06
+    _, missed = Path("driven", track[begun:, :2]).nearest(path.p_xy)
+    assert missed.max() < 0.1  # all of it was driven
+
+
+def test_without_a_fresh_pose_it_stands_and_then_drives_on(nodes: Callable[..., Bus]) -> None:
+    robot = Ideal(nodes)
+    node, bus = started(robot, nodes)
+    robot.tick(bus, 60)
+    assert robot.commands[-1][0] > 0.1
+    robot.tick(bus, 20, silent=True)
+    assert robot.commands[-1] == (0.0, 0.0)
+    here = robot.x
+    robot.tick(bus, 25)
+    assert max(v for v, _ in robot.commands[-20:]) > 0.1
+    assert robot.x > here
+    assert not node.done
+
+
+def test_where_time_jumps_back_the_path_begins_anew(nodes: Callable[..., Bus]) -> None:
+    robot = Ideal(nodes)
+    node, bus = started(robot, nodes)
+    robot.tick(bus, 100)
+    assert robot.x > 0.2
+    robot.t, robot.x, robot.y, robot.yaw = 0.1, 0.0, 0.0, 0.0  # as after a reset
+    robot.track.clear()
+    while not node.done and robot.t < 10:
+        robot.tick(bus, 5)
+    assert node.progress.laps == 1
+    assert min(x for x, _ in robot.track) > -0.01
+    np.testing.assert_allclose((robot.x, robot.y), LINE.p_xy[-1], atol=0.03)
+
+
+def test_another_who_commands_the_robot_is_told_of(nodes: Callable[..., Bus]) -> None:
+    robot, said = Ideal(nodes), list[Status]()
+    robot.bus.subscribe("/diagnostics", KIND, lambda m: said.extend(from_message(m)), Qos(depth=100))
+    nodes("other").publisher(COMMAND.name, COMMAND.kind, COMMAND.qos)
+    _, bus = started(robot, nodes)
+    robot.tick(bus, 60)
+    spin(lambda: said, robot.bus)
+    assert said[0].level == "warn"
+    assert said[0].message == "driving; 1 others command the robot too"
+
+
+def test_an_open_path_is_driven_back_and_forth(nodes: Callable[..., Bus]) -> None:
+    robot = Ideal(nodes)
+    node, bus = started(robot, nodes, laps=2, speed=0.3)
+    while not node.done and robot.t < 30:
+        robot.tick(bus, 5)
+    assert node.progress.laps == 2
+    assert max(x for x, _ in robot.track) > 0.45
+    np.testing.assert_allclose((robot.x, robot.y), LINE.p_xy[0], atol=0.03)
+    assert node.progress.rms_m < 0.02
+
+
+def test_a_flipped_path_is_driven_from_its_end_with_stamped_commands(nodes: Callable[..., Bus]) -> None:
+    robot = Ideal(nodes, "geometry_msgs/msg/TwistStamped")
+    robot.x, robot.y, robot.yaw = 0.5, 0.1, np.pi
+    node, bus = started(robot, nodes, flip=True, speed=0.3, stamped_commands=True, controller="stanley")
+    while not node.done and robot.t < 20:
+        robot.tick(bus, 5)
+    np.testing.assert_allclose((robot.x, robot.y), LINE.p_xy[0], atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ({"laps": 0}, "laps must be 1 or more"),
+        ({"source": "gps"}, "no source 'gps'"),
+        ({"speed": 9.0}, "speed must be above 0"),
+        ({"controller": "stanly"}, "did you mean 'stanley'"),
+    ],
+)
+def test_what_cannot_be_driven_is_refused(nodes: Callable[..., Bus], how: dict, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        Follower(LINE, DriveSpec(), nodes("follower"), **how)
+
+
+def test_keys_become_commands_until_the_end_which_is_a_stand(nodes: Callable[..., Bus]) -> None:
+    bus, robot = nodes("hand"), nodes("robot")
+    heard: list[Message] = []
+    robot.subscribe(COMMAND.name, COMMAND.kind, heard.append, Qos(depth=100))
+    keys, pressed = os.pipe()
+    node = Teleop(bus, Keyboard(DriveSpec()), keys)
+    spin(lambda: bus.types(COMMAND.name) and node.listeners(), bus)
+    os.write(pressed, b"wwwa")
+
+    def step() -> None:
+        robot.spin_once(0.0)
+        if node.sent > 5:
+            os.write(pressed, b"q")
+
+    node.run(step)
+    node.stop()
+    spin(lambda: heard and heard[-1].read(["linear"])["linear"][0] == 0, robot)
+    os.close(keys)
+    os.close(pressed)
+    said = [m.read(["linear", "angular"]) for m in heard]
+    assert max(one["linear"][0] for one in said) == pytest.approx(0.15)
+    assert max(one["angular"][2] for one in said) == pytest.approx(0.25)
+
+
+def test_a_simulated_robot_is_told_from_a_real_one_by_its_stamps(nodes: Callable[..., Bus]) -> None:
+    robot, lines = Ideal(nodes), list[str]()
+    bus = nodes("follower")
+    for topic in (POSE, ODOMETRY):
+        spin(lambda topic=topic: bus.types(topic.name), bus)
+    Follower(LINE, DriveSpec(), bus, say=lines.append)
+    spin(robot.poses.subscribers, bus)
+    for _ in range(3):
+        place = {"header.stamp": np.int64(3 * NS), "pose.orientation": quat_from_yaw(0.0)}
+        robot.poses.publish(to_bytes(POSE.kind, place))
+    spin(lambda: any("of another clock (it is simulated: --sim-time" in line for line in lines), bus)
+    assert not robot.commands

@@ -1,0 +1,257 @@
+"""A plain program of rclpy, without magtwin, meets the simulated robot: types, units, frames and time."""
+
+import json
+import os
+import subprocess
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from nodes import DOMAINS
+from places import ROOT
+
+from magtwin.files import shipped
+from magtwin.io.bags.messages import MAGNITUDE
+from magtwin.ros.bus import Message, open_bus
+from magtwin.ros.simulate import Simulator
+from magtwin.twin import Twin, open_twin
+
+pytest.importorskip("cyclonedds", reason="extra ros is not installed")
+
+BUILD = ROOT / "build"
+
+STRANGER = """
+import json, time
+import rclpy
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
+from geometry_msgs.msg import PoseStamped, Twist
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import BatteryState, Imu, JointState, LaserScan, MagneticField
+from std_msgs.msg import Float64, String
+from rclpy.qos import QoSProfile, DurabilityPolicy
+
+rclpy.init()
+node = Node("stranger", parameter_overrides=[Parameter("use_sim_time", value=True)])
+heard, due = {}, []
+
+def keep(name):
+    return lambda m: heard.setdefault(name, []).append(m)
+
+sensor = qos_profile_sensor_data
+latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+for name, kind, qos in (
+    ("qtfm/magnitude", MagneticField, 10), ("qtfm/field", MagneticField, 10),
+    ("qtfm/total_field_nt", Float64, 10), ("odom", Odometry, sensor), ("imu", Imu, sensor),
+    ("enu/pose", PoseStamped, 10), ("scan", LaserScan, sensor), ("joint_states", JointState, 10),
+    ("battery_state", BatteryState, sensor), ("robot_description", String, latched),
+):
+    node.create_subscription(kind, "/robot/" + name, keep(name), qos)
+drive = node.create_publisher(Twist, "/robot/cmd_vel", 10)
+
+def tick():
+    now = node.get_clock().now().nanoseconds
+    if now:
+        due.append(now / 1e9)
+    command = Twist()
+    command.linear.x = 0.25
+    drive.publish(command)
+
+node.create_timer(0.1, tick)
+begin = time.monotonic()
+while len(due) < 20 and time.monotonic() < begin + 25:
+    rclpy.spin_once(node, timeout_sec=0.1)
+field, odom = heard["qtfm/magnitude"][-1], heard["odom"][-1]
+print(json.dumps({
+    "heard": sorted(heard),
+    "tesla": field.magnetic_field.x, "sd": field.magnetic_field_covariance[0] ** 0.5,
+    "vector": [heard["qtfm/field"][-1].magnetic_field.x, heard["qtfm/field"][-1].magnetic_field.z],
+    "nt": heard["qtfm/total_field_nt"][-1].data,
+    "frames": [field.header.frame_id, odom.header.frame_id, odom.child_frame_id,
+               heard["enu/pose"][-1].header.frame_id, heard["imu"][-1].header.frame_id],
+    "stamp": field.header.stamp.sec + 1e-9 * field.header.stamp.nanosec,
+    "speed": max(o.twist.twist.linear.x for o in heard["odom"]),
+    "wheels": list(heard["joint_states"][-1].name),
+    "volts": heard["battery_state"][-1].voltage if "battery_state" in heard else None,
+    "rays": len(heard["scan"][-1].ranges),
+    "urdf": heard["robot_description"][-1].data[:200],
+    "sim": due,
+}))
+"""
+
+
+@pytest.fixture(scope="module")
+def twin() -> Twin:
+    return open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="map-only")
+
+
+@pytest.mark.parametrize(("distribution", "speed"), [("jazzy", 1.0), ("jazzy", 4.0), ("kilted", 4.0)])
+def test_a_stranger_in_rclpy_sees_the_robot_obeys_its_clock_and_drives_it(
+    twin: Twin, monkeypatch: pytest.MonkeyPatch, distribution: str, speed: float
+) -> None:
+    python = BUILD / f"ros-{distribution}" / "bin" / "python"
+    if not python.exists():
+        pytest.skip(f"no rclpy of {distribution}: `make ros` installs it into build/ros-{distribution}")
+    domain = next(DOMAINS)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+    bus = open_bus("sim", backend="cyclonedds", domain=domain)
+    simulator, over = Simulator(twin, bus, speed=speed, lidar="on"), threading.Event()
+    simulated = threading.Thread(target=simulator.run, args=(over.is_set,))
+    simulated.start()
+    try:
+        env = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+        ended = subprocess.run([python, "-c", STRANGER], env=env, capture_output=True, text=True, timeout=60)
+    finally:
+        over.set()
+        simulated.join()
+        bus.close()
+    assert ended.returncode == 0, ended.stderr
+    seen = json.loads(ended.stdout.splitlines()[-1])
+    assert {"qtfm/magnitude", "odom", "imu", "enu/pose", "scan", "joint_states"} <= set(seen["heard"])
+    assert 2e-5 < seen["tesla"] < 7e-5
+    assert seen["nt"] == pytest.approx(1e9 * seen["tesla"], rel=0.05)  # perhaps of the reading beside it
+    assert seen["frames"] == ["magnetometer_link", "odom", "base_link", "map", "imu_link"]
+    assert seen["wheels"] == ["left_wheel_joint", "right_wheel_joint"]
+    assert seen["rays"] == 720
+    assert "<robot" in seen["urdf"]
+    assert seen["speed"] > 0.2
+    sim = seen["sim"]
+    assert abs(seen["stamp"] - sim[-1]) < 0.5
+    assert sorted(set(sim)) == sim
+    # 19 steps of 0.1 s of /clock; by the wall they would be 7.6 s of it at four times real time.
+    assert 1.7 < sim[-1] - sim[0] < 4.0
+
+
+OURS = """
+import sys, threading, time
+sys.path[:0] = sys.argv[1:]
+from magtwin.files import shipped
+from magtwin.ros.bus import open_bus
+from magtwin.ros.simulate import Simulator
+from magtwin.twin import open_twin
+import rclpy
+from std_srvs.srv import Empty
+
+twin = open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="map-only")
+lines = []
+bus = open_bus("sim")
+simulator, over = Simulator(twin, bus, speed=2.0, say=lines.append), threading.Event()
+simulated = threading.Thread(target=simulator.run, args=(over.is_set,))
+simulated.start()
+rclpy.init()
+node = rclpy.create_node("caller")
+client = node.create_client(Empty, "/robot/reset")
+assert client.wait_for_service(10.0)
+while simulator.online.t < 3.0:
+    time.sleep(0.05)
+rclpy.spin_until_future_complete(node, client.call_async(Empty.Request()), timeout_sec=10.0)
+while not any("reset" in line for line in lines):
+    time.sleep(0.01)
+assert simulator.online.t < 2.0
+over.set()
+simulated.join()
+print(bus.backend, len(lines))
+bus.close()
+"""
+
+
+def test_the_robot_is_simulated_on_rclpy_too_and_reset_by_its_service(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    python = BUILD / "ros-jazzy" / "bin" / "python"
+    if not python.exists():
+        pytest.skip("no rclpy of jazzy: `make ros` installs it into build/ros-jazzy")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    domain = next(DOMAINS)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    libraries = str(Path(np.__file__).parents[1])  # magtwin's own, beside rclpy of that environment
+    ear, heard = open_bus("ear", backend="cyclonedds"), list[Message]()
+    ear.subscribe(MAGNITUDE.name, MAGNITUDE.kind, heard.append, MAGNITUDE.qos)
+    command = [python, "-c", OURS, str(BUILD.parent), libraries]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ours:
+        while ours.poll() is None:
+            ear.spin_once(0.05)
+        said, errors = ours.communicate()
+    ear.close()
+    assert said.startswith("rclpy"), errors
+    stamps = [m.read(["header.stamp"])["header.stamp"] for m in heard]
+    assert len(stamps) > 50  # who hears late hears less
+    assert min(np.diff(stamps)) < -1e9  # time began anew
+    assert 2e-5 < heard[-1].read(["magnetic_field"])["magnetic_field"][0] < 7e-5
+
+
+ASKED = """
+import json, sys, threading
+sys.path[:0] = sys.argv[1:]
+from magtwin.files import shipped
+from magtwin.ros.bus import open_bus
+from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
+from magtwin.ros.parameters import settings
+from magtwin.twin import open_twin
+import rclpy
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+
+twin = open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="map-only")
+bus, lines = open_bus("magnetometer"), []
+node = Magnetometer(twin, bus, settings(PARAMETERS, ("rate_hz:=20",)), say=lines.append)
+over = threading.Event()
+
+def spin():
+    while not over.is_set():
+        bus.spin_once(0.05)
+
+spun = threading.Thread(target=spin)
+spun.start()
+rclpy.init()
+asker = rclpy.create_node("asker")
+client = AsyncParameterClient(asker, "/robot/magnetometer")
+assert client.wait_for_services(10.0)
+
+def asked(future):
+    rclpy.spin_until_future_complete(asker, future, timeout_sec=10.0)
+    return future.result()
+
+(rate, units) = asked(client.describe_parameters(["rate_hz", "units"])).descriptors
+was = asked(client.get_parameters(["rate_hz"])).values[0].double_value
+answers = {}
+for name, value in (
+    ("rate_hz", 50.0), ("rate_hz", 5000.0), ("rate_hz", "fast"), ("units", "nT"), ("units", "gauss")
+):
+    (answer,) = asked(client.set_parameters([Parameter(name, value=value)])).results
+    answers[f"{name} {value}"] = [answer.successful, answer.reason]
+over.set()
+spun.join()
+print(json.dumps({
+    "doc": rate.description,
+    "range": [rate.floating_point_range[0].from_value, rate.floating_point_range[0].to_value],
+    "words": units.additional_constraints, "was": was, "answers": answers, "lines": lines,
+}))
+bus.close()
+"""
+
+
+def test_the_magnetometers_parameters_are_told_with_their_ranges_and_set_while_it_runs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    python = BUILD / "ros-jazzy" / "bin" / "python"
+    if not python.exists():
+        pytest.skip("no rclpy of jazzy: `make ros` installs it into build/ros-jazzy")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(next(DOMAINS)))
+    libraries = str(Path(np.__file__).parents[1])
+    command = [python, "-c", ASKED, str(BUILD.parent), libraries]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=90)
+    assert ended.returncode == 0, ended.stderr
+    seen = json.loads(ended.stdout.splitlines()[-1])
+    assert (seen["doc"], seen["range"]) == ("readings a second [Hz]", [1.0, 1000.0])
+    assert (seen["words"], seen["was"]) == ("T or nT", 20.0)
+    answers = seen["answers"]
+    assert [name for name, (done, _) in answers.items() if done] == ["rate_hz 50.0", "units nT"]
+    assert "T or nT" in answers["units gauss"][1]
+    assert "range" in answers["rate_hz 5000.0"][1]
+    assert seen["lines"][:2] == ["rate_hz is 50.0 now", "units is nT now"]
+    assert "nT" in seen["lines"][2]

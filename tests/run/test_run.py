@@ -1,0 +1,314 @@
+"""The table of a Run."""
+
+import itertools
+import json
+import runpy
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from places import DOCS
+from scipy.spatial.transform import Rotation, Slerp
+
+import magtwin
+from magtwin.errors import InputError, UnknownNameError
+from magtwin.run.run import COLUMNS, Column, Run
+
+
+def every_column(rows=40, seed=0, start_s=0.0):
+    """A run with every column, random numbers in it, unit quaternions, nan where a run may have them."""
+    rng = np.random.default_rng(seed)
+    columns = {}
+    for name, column in COLUMNS.items():
+        shape = (rows,) if column.width == 1 else (rows, column.width)
+        columns[name] = rng.random(shape) < 0.5 if column.unit == "bool" else rng.normal(0, 2, shape)
+        if name.endswith("_xyzw"):
+            columns[name] /= np.linalg.norm(columns[name], axis=1, keepdims=True)
+    columns["t"] = start_s + np.cumsum(rng.uniform(0.001, 0.01, rows))
+    columns["yaw"] = rng.uniform(-np.pi, np.pi, rows)
+    columns["b_sd_nt"][::3] = np.nan
+    return Run(columns, {"seed": seed, "path": "figure8"})
+
+
+def assert_same(a, b):
+    assert list(a) == list(b)
+    for name in a:
+        assert a[name].dtype == b[name].dtype, name
+        assert a[name].tobytes() == b[name].tobytes(), name
+
+
+def test_columns_come_back_by_name_and_a_misspelt_one_names_the_near():
+    run = Run({"t": [0, 1], "b_total_nt": [4e4, 4.1e4]})
+    assert run["b_total_nt"].dtype == float
+    assert run.rows == 2
+    assert run.duration_s == 1.0
+    with pytest.raises(UnknownNameError, match="no column 'b_totl_nt'; did you mean 'b_total_nt'"):
+        run["b_totl_nt"]
+    assert run.get("nothing") is None  # a Mapping's own behaviour, since the refusal is a KeyError
+
+
+def test_unequal_columns_and_wrong_shapes_are_refused():
+    with pytest.raises(InputError, match=r"equally long, got {'t': 2, 'yaw': 3}"):
+        Run({"t": [0, 1], "yaw": [0, 1, 2]})
+    with pytest.raises(InputError, match=r"'odom_p' must have shape \(2, 3\), got \(2, 2\)"):
+        Run({"odom_p": np.zeros((2, 2))})
+
+
+def test_a_run_is_not_changed_in_place():
+    run = Run({"t": [0.0]}, {"seed": 1})
+    other = run.with_columns(yaw=np.array([1.0])).with_facts(path="sine")
+    assert "yaw" not in run
+    assert list(other) == ["t", "yaw"]
+    assert dict(other.facts) == {"seed": 1, "path": "sine"}
+    with pytest.raises(TypeError):
+        run.columns["t"] = np.zeros(1)
+
+
+def test_every_column_has_a_name_for_each_of_its_numbers():
+    for name, column in COLUMNS.items():
+        assert len(column.parts) == (column.width if column.width > 1 else 0), name
+        assert column.doc
+        assert name.endswith("_nt") == (column.unit == "nT"), name
+
+
+def test_the_report_counts_what_happened():
+    run = Run(
+        {
+            "t": [0, 1, 2],
+            "p_world_base": [[0, 0, 0], [3, 4, 0], [3, 4, 0]],
+            "b_total_nt": [40, 50, np.nan],
+            "b_truth_nt": [41, 53, np.nan],
+            "flag_bump": [False, True, False],
+        }
+    )
+    figures = {f.name: f for f in run.report().figures}
+    assert figures["distance driven"].value == 5
+    assert figures["b_total_nt"].value == 45
+    assert figures["b_total_nt"].spread == 5
+    assert figures["error"].value == 2
+    assert figures["flag_bump"].value == 1
+    assert json.loads(run.report("x").to_json())["figures"]["duration"] == {"value": 2.0, "unit": "s"}
+
+
+def test_public_names_resolve_and_others_are_refused():
+    for name in magtwin.__all__:
+        assert getattr(magtwin, name) is not None
+    with pytest.raises(AttributeError, match="has no attribute 'simulat'"):
+        _ = magtwin.simulat
+
+
+def test_to_pandas_has_a_column_a_part_with_units():
+    pytest.importorskip("pandas")
+    run = every_column()
+    frame = run.to_pandas()
+    assert len(frame) == run.rows
+    assert np.array_equal(frame["imu_q_xyzw_w"], run["imu_q_xyzw"][:, 3])
+    assert frame.attrs["units"]["b_total_nt"] == "nT"
+    assert frame.attrs["facts"] == dict(run.facts)
+
+
+def test_to_xarray_keeps_vectors_whole_with_named_parts_on_the_clock():
+    pytest.importorskip("xarray")
+    run = every_column()
+    data = run.to_xarray()
+    assert np.array_equal(data["t"], run["t"])
+    assert np.array_equal(data["p_world_base"].sel(x_y_z="y"), run["p_world_base"][:, 1])
+    assert data["imu_w"].attrs == {"units": "rad/s", "frame": "imu_link", "long_name": "gyroscope"}
+    assert data.attrs == dict(run.facts)
+
+
+@pytest.mark.parametrize("module", ["pandas", "polars", "xarray"])
+def test_an_absent_library_is_refused_with_the_line_that_installs_it(module, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=rf"{module} is not installed.*pip install 'magtwin\[{module}\]'"):
+        getattr(every_column(), f"to_{module}")()
+
+
+def test_to_polars_has_a_column_a_part():
+    pytest.importorskip("polars")
+    run = every_column()
+    frame = run.to_polars()
+    assert frame.columns == list(run.flat())
+    assert np.array_equal(frame["wheel_angle_right"].to_numpy(), run["wheel_angle"][:, 1])
+
+
+def test_select_keeps_the_clock_and_takes_patterns_in_the_order_asked():
+    run = every_column()
+    assert list(run.select("yaw", "b_t*")) == ["t", "yaw", "b_total_nt", "b_truth_nt"]
+    assert run.select("yaw").facts["derived"] == "select(yaw)"
+    with pytest.raises(UnknownNameError, match="no column 'b_totl_nt'; did you mean 'b_total_nt'"):
+        run.select("b_totl_nt")
+    with pytest.raises(UnknownNameError, match=r"no column 'est_\*'"):
+        run.select("est_*")
+
+
+@given(cuts=st.lists(st.floats(0, 0.3), max_size=4).map(sorted))
+def test_slices_by_time_put_together_are_the_run(cuts):
+    run = every_column()
+    t = run["t"]
+    edges = [None, *sorted({c for c in cuts if t[0] < c <= t[-1]}), None]
+    parts = []
+    for a, b in itertools.pairwise(edges):
+        rows = (t >= (a or -1)) & (t < (b or 9))
+        if rows.any():
+            parts.append(run.between(a, b))
+            assert np.array_equal(parts[-1]["t"], t[rows])
+    assert_same(Run.concat(parts), run)
+
+
+def test_a_time_without_rows_is_refused_with_where_the_run_is():
+    run = Run({"t": [1.0, 2.0]})
+    with pytest.raises(InputError, match="no row from 3 to 4 s; the run goes from 1 to 2 s"):
+        run.between(3, 4)
+    with pytest.raises(InputError, match="start_s must be before end_s, got 4 and 3"):
+        run.between(4, 3)
+    with pytest.raises(InputError, match="start_s must be before end_s, got nan"):
+        run.between(float("nan"), 3)
+
+
+def test_a_run_read_at_its_own_instants_is_itself_to_the_bit():
+    run = every_column()
+    assert_same(run.resample(run["t"]), run)
+    assert_same(run.resample(run["t"][5:9]), run.take(slice(5, 9)))
+
+
+def test_flags_commands_and_slow_sensors_hold_what_was_known_by_then():
+    run = every_column()
+    at = (run["t"][:-1] + run["t"][1:]) / 2
+    held = run.resample(at)
+    for name in (
+        "v_cmd",
+        "flag_bump",
+        "lidar_on",
+        "imu_q_xyzw",
+        "odom_p",
+        "battery_v",
+        "b_vector_measured_nt",
+    ):
+        assert np.array_equal(held[name], run[name][:-1]), name
+        assert held[name].dtype == run[name].dtype
+
+
+def test_fields_are_linear_and_nothing_is_read_across_nan():
+    run = Run({"t": [0, 1, 2, 4], "b_total_nt": [10, 20, np.nan, 40]})
+    read = run.resample([0.25, 1.0, 1.5, 2.0, 3.0, 4.0])["b_total_nt"]
+    assert_allclose(read, [12.5, 20, np.nan, np.nan, np.nan, 40])
+
+
+def test_yaw_goes_the_shorter_way_round():
+    run = Run({"t": [0.0, 1.0], "yaw": [np.pi - 0.1, -np.pi + 0.3]})
+    assert_allclose(run.resample([0.25, 0.75])["yaw"], [-np.pi, -np.pi + 0.2], atol=1e-12)
+
+
+def test_orientations_turn_as_scipys_slerp_does_whatever_their_signs():
+    run = every_column()
+    q = run["q_world_base_xyzw"]
+    at = np.linspace(run["t"][0], run["t"][-1], 200)
+    peer = Slerp(run["t"], Rotation.from_quat(q))(at)
+    read = Rotation.from_quat(run.resample(at)["q_world_base_xyzw"])
+    assert (read.inv() * peer).magnitude().max() < 1e-7
+    near = Run({"t": [0, 1], "q_world_base_xyzw": [[0, 0, 0, 1], [0, 0, 1e-9, 1]]})
+    assert_allclose(near.resample([0.5])["q_world_base_xyzw"], [[0, 0, 5e-10, 1]], atol=1e-18)
+
+
+def test_a_rate_gives_instants_from_the_start_none_after_the_end():
+    run = Run({"t": np.arange(28) / 135, "yaw": np.zeros(28)})
+    assert np.array_equal(run.resample(rate_hz=135)["t"], run["t"])
+    assert_allclose(run.resample(rate_hz=10)["t"], [0, 0.1, 0.2])
+    assert run.resample(rate_hz=10).facts["derived"] == "resample(rate_hz=10)"
+
+
+def test_another_rule_can_be_asked_for_a_column():
+    run = Run({"t": [0.0, 1.0], "odom_p": [[0, 0, 0], [2, 0, 0]], "flag_bump": [False, True]})
+    assert run.resample([0.5])["odom_p"][0, 0] == 0
+    assert run.resample([0.5], interpolation={"odom_p": "linear"})["odom_p"][0, 0] == 1
+    with pytest.raises(InputError, match="'flag_bump' holds flags, which are held, not linear"):
+        run.resample([0.5], interpolation={"flag_bump": "linear"})
+    with pytest.raises(InputError, match=r"'odom_p' has rows of shape \(3,\), not quaternions"):
+        run.resample([0.5], interpolation={"odom_p": "quaternion"})
+    with pytest.raises(UnknownNameError, match="no interpolation 'cubic'"):
+        run.resample([0.5], interpolation={"odom_p": "cubic"})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "needs t or rate_hz, one of the two"),
+        ({"t": [0.5], "rate_hz": 1.0}, "needs t or rate_hz, one of the two"),
+        ({"t": [0.5, 3.0]}, "t = 3 s lies outside the run; the run goes from 0 to 2 s"),
+        ({"t": [-0.1]}, "t = -0.1 s lies outside the run"),
+        ({"t": [1.0, 0.5]}, "row 1 has 0.5 s after 1 s"),
+        ({"t": [1.0, np.nan]}, "t must be finite, got nan in row 1"),
+        ({"t": ["now"]}, r"t must be numbers of shape \(N,\)"),
+        ({"rate_hz": 0.0}, "rate_hz must be above 0 Hz"),
+        ({"rate_hz": 1e15}, "gives 2e\\+15 rows in 2 s"),
+    ],
+)
+def test_instants_that_no_run_can_be_read_at_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        Run({"t": [0.0, 1.0, 2.0]}).resample(**options)
+
+
+def test_a_joined_run_is_held_causally_on_the_clock_of_the_first():
+    run = Run({"t": [1.0, 2.0, 3.0, 4.0], "yaw": np.zeros(4)}, {"seed": 1})
+    other = Run({"t": [0.5, 2.0, 3.5], "yaw": [5, 6, 7], "flag_bump": [True, False, True]}, {"seed": 2})
+    both = run.join(other, "_b")
+    assert np.array_equal(both["yaw_b"], [5, 6, 6, 7])
+    assert np.array_equal(both["flag_bump_b"], [True, False, False, True])
+    assert both.spec("yaw_b") == COLUMNS["yaw"]
+    assert both.facts == {"seed": 1, "seed_b": 2, "derived": "join(_b)"}
+
+
+def test_a_run_that_does_not_cover_the_first_or_shares_names_is_refused():
+    run = Run({"t": [1.0, 2.0], "yaw": np.zeros(2)})
+    with pytest.raises(InputError, match=r"goes from 1\.5 to 3 s and does not cover this one"):
+        run.join(Run({"t": [1.5, 3.0]}))
+    with pytest.raises(InputError, match=r"goes from 0 to 0\.5 s and does not cover this one"):
+        run.join(Run({"t": [0.0, 0.5]}))
+    with pytest.raises(InputError, match="column 'yaw' is in both runs; give another suffix"):
+        run.join(run, "")
+
+
+def test_runs_that_do_not_run_on_are_refused_or_shifted():
+    a = Run({"t": [0.0, 0.5], "yaw": [1, 2]}, {"seed": 1, "scene": "lab"})
+    b = Run({"t": [0.0, 0.5], "yaw": [3, 4]}, {"seed": 2, "scene": "lab"})
+    with pytest.raises(InputError, match=r"run 1 begins at 0 s, and the one before it ends at 0.5 s"):
+        Run.concat([a, b])
+    both = Run.concat([a, b], offset=True)
+    assert_allclose(both["t"], [0, 0.5, 1.0, 1.5])
+    assert np.array_equal(both["yaw"], [1, 2, 3, 4])
+    assert both.facts == {"scene": "lab", "derived": "concat(2 runs)"}
+    with pytest.raises(InputError, match="runs 0 and 1: column 'yaw' is in one alone"):
+        Run.concat([a, b.select()])
+    with pytest.raises(InputError, match="at least one run"):
+        Run.concat([])
+
+
+def test_a_users_own_column_keeps_what_it_was_said_to_hold():
+    spec = Column("K", "", "temperature of the head")
+    run = Run({"t": [0.0, 1.0], "head_k": [290.0, 291.0]}).with_specs(head_k=spec)
+    assert run.spec("head_k") == spec
+    for other in (run.with_facts(a=1), run.select("head_k"), run.resample([0.5]), Run.concat([run])):
+        assert other.spec("head_k") == spec
+    assert run.with_columns(est_q_xyzw=np.zeros((2, 4))).spec("est_q_xyzw").interpolation == "quaternion"
+    assert run.with_columns(flag_x=np.zeros(2, bool)).spec("flag_x").interpolation == "hold"
+
+
+def test_a_spec_that_does_not_fit_its_column_is_refused():
+    run = Run({"t": [0.0, 1.0], "head": np.zeros((2, 3))})
+    with pytest.raises(InputError, match="'head' has rows of 3 parts, and its spec names 2"):
+        run.with_specs(head=Column("K", "", "", 2, ("in", "out")))
+    with pytest.raises(InputError, match="'est_x' has rows of no parts, and its spec names 1"):
+        Run({"t": [0.0], "est_x": [1.0]}, {}, {"est_x": Column("", "", "", 1, ("a",))})
+
+
+def test_the_documented_columns_are_those_of_the_code():
+    docs = DOCS
+    page = runpy.run_path(str(docs / "columns.py"))["page"]()
+    written = (docs / "columns.md").read_text(encoding="utf-8")
+    assert written == page, "python docs/columns.py writes it anew"
+    for name, column in COLUMNS.items():
+        assert f"| `{name}` | {', '.join(column.parts)} | {column.unit} | {column.frame} |" in written

@@ -1,0 +1,335 @@
+"""Engines: kinematic, Newton and replay move one robot alike; scripts of commands; the human-like driver."""
+
+import importlib.util
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.files import shipped
+from magtwin.io.tables import read_parquet
+from magtwin.path import figure8, path_named, sine
+from magtwin.run.run import Run
+from magtwin.sim.engines.newton import Newton
+from magtwin.sim.engines.replay import replayed
+from magtwin.sim.motion.commands import Commands, read_commands, write_commands
+from magtwin.sim.motion.controllers import guide_by_commands
+from magtwin.sim.motion.driver import Driver
+from magtwin.sim.motion.engine import Kinematic
+from magtwin.sim.motion.follow import course_along, follow, play
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.scene import DriveSpec
+from magtwin.twin import open_twin, simulate
+
+DRIVE = DriveSpec()
+
+
+@pytest.fixture(scope="module")
+def twin(lab_scene):
+    return open_twin(lab_scene, net="none")
+
+
+def test_a_run_that_is_replayed_has_the_poses_of_the_run_to_the_last_bit(twin):
+    path = figure8(half_length_m=0.6, half_width_m=0.3)
+    first = simulate(twin, path, seed=3)
+    again = simulate(twin, first, seed=3)
+    assert_allclose(again["yaw"], first["yaw"], atol=1e-15)  # unwrapped, and wrapped again
+    for name in ("t", "p_world_base", "v_base", "w_base", "v_cmd", "w_cmd", "flag_bump"):
+        assert_array_equal(again[name], first[name], err_msg=name)
+    assert again.facts["engine"] == "replay"
+    # what is computed from between the rows is the same too, to rounding, though torques jump there
+    assert np.ptp(first["b_truth_nt"]) > 1000
+    assert_allclose(again["b_truth_nt"], first["b_truth_nt"], atol=1e-8)
+    for name in ("b_vector_nt", "imu_a", "imu_w", "odom_p", "odom_v", "mocap_p", "battery_v"):
+        assert_allclose(again[name], first[name], atol=1e-9, err_msg=name)
+
+
+def test_a_run_without_commands_is_not_replayed_for_a_network_that_reads_them(lab_scene):
+    neural = open_twin(lab_scene)
+    assert "lag_v" in neural.magnetometer.features
+    t = np.arange(200) / 20.0
+    p = np.column_stack([0.2 * t - 1, 0 * t, 0.05 + 0 * t])
+    told = Run({"t": t, "p_world_base": p, "yaw": 0 * t})
+    with pytest.raises(InputError, match=r"has no 'v_cmd', and the network turtlebot4_hybrid\.safetensors"):
+        simulate(neural, told)
+    paper = open_twin(lab_scene, net=shipped("weights", "turtlebot4_paper.safetensors"))
+    assert np.isfinite(simulate(paper, told)["b_total_nt"]).all()
+
+
+def test_a_replay_of_rows_that_do_not_tell_the_steps_goes_evenly_from_row_to_row(twin):
+    path = figure8(half_length_m=0.6, half_width_m=0.3)
+    slow = simulate(twin, path, seed=3, rate_hz=20)  # more than one step a row
+    assert replayed(slow, DRIVE).step_s is None
+    whole = simulate(twin, path, seed=3)
+    assert replayed(whole, DRIVE).step_s == 0.02
+    cut = Run({name: values[100:] for name, values in whole.items()}, whole.facts)
+    assert replayed(cut, DRIVE).step_s is None
+    again = simulate(twin, cut, seed=3)
+    assert_allclose(again["p_world_base"], cut["p_world_base"], atol=1e-12)
+
+
+def test_a_replay_between_its_samples_is_the_drive_itself():
+    motion = follow(figure8(half_length_m=0.6, half_width_m=0.3), DRIVE, speed=0.2)
+    t = np.arange(0, motion.duration_s, 1 / 135)
+    seen = motion.at(t)
+    zero = np.zeros(len(t))
+    run = Run(
+        {
+            "t": t,
+            "p_world_base": np.column_stack([seen.pose[:, :2], zero]),
+            "yaw": (seen.pose[:, 2] + np.pi) % (2 * np.pi) - np.pi,
+            "v_base": np.column_stack([seen.v, zero, zero]),
+            "w_base": np.column_stack([zero, zero, seen.w]),
+            "wheel_angle": seen.wheel_angle,
+        }
+    )
+    between = (t[:-1] + t[1:]) / 2
+    got, want = replayed(run, DRIVE).at(between), motion.at(between)
+    assert_allclose(got.pose, want.pose, atol=1e-4)
+    assert_allclose(got.wheel_angle, want.wheel_angle, atol=1e-3)
+    bare = Run({name: run[name] for name in ("t", "p_world_base", "yaw")})
+    guessed = replayed(bare, DRIVE).at(between)
+    assert_allclose(guessed.pose, want.pose, atol=2e-4)
+    assert_allclose(guessed.wheel_angle, want.wheel_angle, atol=0.3)  # of 80 rad, by speeds of differences
+
+
+@pytest.mark.parametrize(
+    ("t", "x", "what"),
+    [([0, 1, 1], [0, 1, 2], "row 3"), ([0, 1, 2], [0, np.nan, 2], "row 2"), ([0], [0], "two or more")],
+)
+def test_a_run_that_cannot_be_replayed_is_refused(t, x, what):
+    zero = np.zeros(len(t))
+    run = Run({"t": np.array(t, float), "p_world_base": np.column_stack([x, zero, zero]), "yaw": zero})
+    with pytest.raises(InputError, match=what):
+        replayed(run, DRIVE)
+
+
+def test_a_script_is_no_run_to_replay():
+    script = Run({"t": np.arange(3.0)})
+    with pytest.raises(InputError, match=r"needs p_world_base, yaw or q_world_base_xyzw, and has only t; "):
+        replayed(script, DRIVE)
+
+
+def test_commands_are_read_as_they_were_written(tmp_path):
+    rows = np.column_stack([np.arange(5) / 50, np.linspace(0, 1, 5) / 3, np.full(5, 0.1)])
+    write_commands(Commands("mine", rows), tmp_path / "mine.csv")
+    assert_array_equal(read_commands(tmp_path / "mine.csv").rows, rows)
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("t,v,w\n0,0.1,0\n0.5,0.1,0\n0.4,0.1,0\n", ":4: time must go on"),
+        ("0,nan,0\n", ":1: a command must be finite"),
+        ("0,0.1\n", ":1: a command is three numbers"),
+        ("t,v,w\nx,y,z\n", ":2: not a number"),
+        ("-1,0.1,0\n", ":1: time must go on"),
+        ("t,v,w\n", "no commands"),
+    ],
+)
+def test_commands_that_make_no_sense_are_refused_with_their_line(tmp_path, text, what):
+    (tmp_path / "c.csv").write_text(text)
+    with pytest.raises(InputError, match=what):
+        read_commands(tmp_path / "c.csv")
+
+
+def test_what_is_beyond_a_drive_is_said_and_limited():
+    rows = np.array([[0, 0.5, 0], [0.1, 0.2, -3.0], [3.0, 0.9, 0.0]])
+    said = Commands("fast.csv", rows).beyond(DRIVE)
+    assert "2 of 3 commands have |v| above 0.306" in said
+    assert "1 of 3 commands have |w| above 1.9" in said
+    assert Commands("slow.csv", rows * [1, 0.1, 0.1]).beyond(DRIVE) == ""
+    motion = play(rows, DRIVE)
+    assert np.abs(motion.v).max() <= DRIVE.v_max
+    assert np.abs(motion.w).max() <= DRIVE.w_max
+
+
+def test_the_commands_of_a_drive_drive_it_again_to_the_last_bit():
+    motion = follow(sine(x_first_m=-0.5, x_last_m=0.5, amplitude_m=0.2), DRIVE, speed=0.2)
+    rows = np.column_stack([np.arange(len(motion.v)) * motion.dt, motion.v_cmd, motion.w_cmd])
+    again = play(rows, DRIVE, start=motion.pose0, duration_s=motion.duration_s)
+    assert_array_equal(again.poses[: len(motion.poses)], motion.poses)
+
+
+def box(name, x, y, half):
+    return name, [[x - half, y - half], [x + half, y - half], [x + half, y + half], [x - half, y + half]]
+
+
+def drive_about(seed, *, duration_s=300.0, obstacles, wheel_errors=(0.0, 0.0)):
+    driver = Driver(
+        DRIVE,
+        np.random.default_rng(seed),
+        floor_m=(6.0, 3.5),
+        obstacles=obstacles,
+        footprint_radius_m=0.171,
+        start=(0.0, 0.0, 0.0),
+        duration_s=duration_s,
+    )
+    return play(
+        [[0.0, 0.0, 0.0]],
+        DRIVE,
+        duration_s=duration_s,
+        controller=driver,
+        obstacles=obstacles,
+        footprint_radius_m=0.171,
+        wheel_errors=wheel_errors,
+    )
+
+
+ROOM = (box("desk", 1.5, 0.9, 0.4), box("chair", -1.2, -0.6, 0.2), box("cabinet", -2.7, 1.5, 0.25))
+OBSTACLES = Obstacles(tuple(n for n, _ in ROOM), tuple(np.array(o) for _, o in ROOM))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_driver_covers_the_floor_and_never_bumps(seed):
+    errors = np.random.default_rng(seed).normal(0, [0.004, 0.006]).tolist()
+    motion = drive_about(seed, obstacles=OBSTACLES, wheel_errors=tuple(errors))
+    assert not motion.bump.any()
+    distance, _ = OBSTACLES.clearance(motion.poses[:, :2])
+    wall = np.min(np.array([3.0, 1.75]) - np.abs(motion.poses[:, :2]), axis=1)
+    assert min(distance.min(), wall.min()) > 0.171
+    cells = {tuple(c) for c in np.floor(motion.poses[:, :2] / 0.5).astype(int).tolist()}
+    assert len(cells) >= 40  # of 84, of which it cannot come into those in the corners, and at obstacles
+    going = motion.v[motion.v > 0.02]
+    assert 0.4 < len(going) / len(motion.v) < 0.98  # it stands, too
+    assert 0.1 < going.mean() < 0.25
+    assert going.std() > 0.03
+    assert np.abs(motion.w).max() <= DRIVE.w_max
+    assert -0.4 < motion.w.mean() < 0.4
+    assert motion.w.std() > 0.2
+
+
+def test_one_seed_is_one_driver_and_another_seed_another():
+    a, b, c = (drive_about(seed, duration_s=20.0, obstacles=OBSTACLES) for seed in (1, 1, 2))
+    assert_array_equal(a.poses, b.poses)
+    assert not np.array_equal(a.poses[: len(c.poses)], c.poses[: len(a.poses)])
+
+
+def test_a_driver_without_room_is_refused():
+    with pytest.raises(InputError, match="no room"):
+        Driver(
+            DRIVE,
+            np.random.default_rng(0),
+            floor_m=(6.0, 3.5),
+            obstacles=Obstacles(),
+            footprint_radius_m=0.171,
+            start=(2.9, 0.0, 0.0),
+        )
+
+
+def test_run_drives_at_random_by_commands_and_by_replay(lab_scene, tmp_path, capsys):
+    arguments = ["run", str(lab_scene), "--net", "none", "--json"]
+    once, again = tmp_path / "a.parquet", tmp_path / "b.parquet"
+    main([*arguments, "--path", "random", "--duration", "5", "--parquet", str(once)])
+    main([*arguments, "--engine", "replay", "--replay", str(once), "--parquet", str(again)])
+    assert_array_equal(read_parquet(once)["p_world_base"], read_parquet(again)["p_world_base"])
+    (tmp_path / "c.csv").write_text("t,v,w\n0,0.5,0\n0.4,0,0\n")
+    capsys.readouterr()
+    main([*arguments, "--commands", str(tmp_path / "c.csv"), "--parquet", str(tmp_path / "c.parquet")])
+    assert "|v| above 0.306 m/s" in capsys.readouterr().err
+    run = read_parquet(tmp_path / "c.parquet")
+    assert 0.05 < run["p_world_base"][-1, 0] - run["p_world_base"][0, 0] < 0.2
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        (["--path", "sine", "--commands", "c.csv"], "--path and --commands"),
+        (["--engine", "replay"], "--replay RUN"),
+        (["--path", "random", "--controller", "stanley"], "--controller stanley follows a path"),
+        (["--commands", "c.csv", "--speed", "0.1"], "--speed is for a path"),
+        (["--engine", "newton", "--replay", "r.parquet"], "--engine newton cannot"),
+    ],
+)
+def test_run_refuses_two_ways_of_driving(lab_scene, options, what, capsys):
+    with pytest.raises(SystemExit):
+        main(["run", str(lab_scene), *options])
+    assert what in capsys.readouterr().err
+
+
+def test_newton_that_is_not_installed_is_refused_with_how_to_get_it(monkeypatch, lab_scene, capsys):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == "newton" else found(n, *a))
+    with pytest.raises(SystemExit):
+        main(["run", str(lab_scene), "--engine", "newton"])
+    assert "pip install 'magtwin[physics]'" in capsys.readouterr().err
+
+
+PHYSICS = [
+    pytest.mark.physics,
+    pytest.mark.skipif(
+        importlib.util.find_spec("newton") is None or importlib.util.find_spec("mujoco") is None,
+        reason="newton is not installed: pip install magtwin[physics]",
+    ),
+]
+
+
+def physics(test):
+    for mark in PHYSICS:
+        test = mark(test)
+    return test
+
+
+def by_equal_commands(twin, path, wheel_errors=(0.0, 0.0)):
+    """What both engines make of the commands of a drive without slip, at the same times."""
+    drive = replace(twin.scene.robot.drive, slip_s2_m=0.0, yaw_slip=0.0)
+    course = replace(course_along(path, drive, speed=0.2), wheel_errors=wheel_errors)
+    want = Kinematic().drive(course, None, None)
+    rows = np.column_stack([np.arange(len(want.v)) * course.dt, want.v_cmd, want.w_cmd])
+    scripted = replace(course, guide=guide_by_commands(rows, drive), steps=len(want.v))
+    got = Newton(twin.scene_file, twin.scene.robot).drive(scripted, None, None)
+    t = np.arange(0, want.duration_s, 0.02)
+    return want.at(t), got.at(t)
+
+
+def rms_apart_m(a, b):
+    return np.sqrt(np.mean(np.sum((a.pose - b.pose)[:, :2] ** 2, axis=1)))
+
+
+@physics
+@pytest.mark.parametrize("name", ["sine", "figure8", "lawnmower"])  # of 11, 15 and 38 m
+def test_kinematic_and_newton_go_the_same_way_by_the_same_commands_within_5_cm(twin, name):
+    a, b = by_equal_commands(twin, path_named(name))
+    assert rms_apart_m(a, b) < 0.02  # the requirement is 0.05
+    assert_allclose(b.pose[:, 2], a.pose[:, 2], atol=0.02)
+    assert_allclose(b.wheel_angle, a.wheel_angle, atol=2e-4 * a.wheel_angle.max() + 0.05)
+
+
+@physics
+def test_newtons_wheels_have_the_errors_of_a_session(twin):
+    path = figure8(half_length_m=0.6, half_width_m=0.3)
+    a, b = by_equal_commands(twin, path, wheel_errors=(0.03, -0.04))
+    assert rms_apart_m(a, b) < 0.02
+    assert_allclose(b.wheel_angle, a.wheel_angle, atol=0.05)
+
+
+@physics
+def test_newton_follows_a_path_by_the_same_controller_and_gives_the_same_bits_again(twin):
+    path = sine(x_first_m=-0.3, x_last_m=0.3, amplitude_m=0.15)
+    runs = [simulate(twin, path, engine="newton", seed=1) for _ in range(2)]
+    for name in runs[0]:
+        assert_array_equal(runs[0][name], runs[1][name], err_msg=name)
+    _, aside = path.nearest(runs[0]["p_world_base"][:, :2])
+    assert np.abs(aside).max() < 0.02
+    assert runs[0].facts["engine"] == "newton"
+
+
+@physics
+def test_newton_stops_at_a_wall_and_says_so(twin):
+    drive = twin.scene.robot.drive
+    commands = [[t, 0.3, 0.0] for t in np.arange(0.0, 2.0, 0.1)]
+    motion = play(
+        commands,
+        drive,
+        start=(2.5, 0.0, 0.0),
+        obstacles=twin.obstacles,
+        footprint_radius_m=twin.scene.robot.footprint_radius_m,
+        engine=Newton(twin.scene_file, twin.scene.robot),
+    )
+    end = motion.at([motion.duration_s])
+    assert abs(end.pose[0, 0] + twin.scene.robot.footprint_radius_m - 3.0) < 0.02  # the wall's face
+    assert end.bump[0]
+    assert not motion.at([0.5]).bump[0]

@@ -1,0 +1,503 @@
+"""The closed loop: plain Python and machine code give the same bits; drive and contact have closed forms."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.errors import InputError
+from magtwin.path import Path, path_named
+from magtwin.sim.motion import course as courses
+from magtwin.sim.motion.controllers import CONTROLLERS, guide_by_commands
+from magtwin.sim.motion.course import Chassis, Course, run_courses
+from magtwin.sim.motion.drive import Motion, draw_wheel_errors
+from magtwin.sim.motion.follow import course_along, follow, play
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.scene import DriveSpec
+
+REAL = DriveSpec()
+IDEAL = dataclasses.replace(REAL, motor_lag_s=0.0, slip_s2_m=0.0, yaw_slip=0.0)
+PROMPT = dataclasses.replace(IDEAL, a_max=1e6, alpha_max=1e6)
+"""A drive that does at once what it is told."""
+
+RADIUS = 0.171
+COLUMNS = ("v", "w", "wheel_v", "wheel_w", "v_cmd", "w_cmd", "bump", "poses", "wheel_angles")
+
+
+def box(x0: float, y0: float, x1: float, y1: float) -> np.ndarray:
+    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+
+
+def wall(x: float) -> Obstacles:
+    return Obstacles(("wall",), (box(x, -9.0, x + 0.1, 9.0),))
+
+
+ROOM = Obstacles(
+    ("north", "south", "east", "west", "desk"),
+    (
+        box(-3, 1.75, 3, 1.8),
+        box(-3, -1.8, 3, -1.75),
+        box(3, -2, 3.1, 2),
+        box(-3.1, -2, -3, 2),
+        box(-0.3, -0.2, 0.3, 0.2),
+    ),
+)
+
+
+@pytest.fixture(params=["plain", "compiled"])
+def way(request, monkeypatch):
+    """Each way of running the loop."""
+    monkeypatch.setattr(courses._Loop, "compiled", None)
+    monkeypatch.setattr(courses, "PAYS", math.inf)
+    if request.param == "compiled":
+        courses.warm_up()
+    return request.param
+
+
+@pytest.fixture
+def both(monkeypatch):
+    """A function that runs courses in both ways."""
+
+    def run(chosen: list[Course], obstacles: Obstacles | None = None) -> tuple[list[Motion], list[Motion]]:
+        monkeypatch.setattr(courses, "PAYS", math.inf)
+        monkeypatch.setattr(courses._Loop, "compiled", None)
+        plain = run_courses(chosen, obstacles)
+        courses.warm_up()
+        return plain, run_courses(chosen, obstacles)
+
+    return run
+
+
+def assert_same(one: Motion, other: Motion) -> None:
+    for column in COLUMNS:
+        assert_array_equal(getattr(one, column), getattr(other, column), err_msg=column)
+
+
+def held(v: float, w: float, seconds: float) -> np.ndarray:
+    """A command said ten times a second."""
+    t = np.arange(0.0, seconds, 0.1)
+    return np.column_stack([t, np.full(len(t), v), np.full(len(t), w)])
+
+
+# --- one source, two ways ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_plain_python_and_machine_code_drive_to_the_same_bits(both, name):
+    rng = np.random.default_rng(3)
+    chosen = [
+        course_along(
+            path_named(path),
+            drive,
+            speed=0.25,
+            duration_s=60.0,
+            controller=name,
+            footprint_radius_m=RADIUS,
+            wheel_errors=draw_wheel_errors(drive, rng),
+        )
+        for path in ("figure8", "lawnmower", "narrow_figure8", "fast_sine")
+        for drive in (REAL, IDEAL)
+    ]
+    walls = Obstacles(ROOM.names[:4], ROOM.outlines[:4])
+    for obstacles in (None, walls):
+        for plain, compiled in zip(*both(chosen, obstacles), strict=True):
+            assert_same(plain, compiled)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_any_script_among_obstacles_is_driven_to_the_same_bits(seed):
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(rng.exponential(0.3, 60))
+    script = np.column_stack([t, rng.uniform(-0.6, 0.6, 60), rng.uniform(-3, 3, 60)])
+    kept, courses._Loop.compiled = courses._Loop.compiled, None
+    try:
+        plain = play(script, REAL, start=(-1.0, 0.5, 0.3), obstacles=ROOM, footprint_radius_m=RADIUS)
+        courses.warm_up()
+        compiled = play(script, REAL, start=(-1.0, 0.5, 0.3), obstacles=ROOM, footprint_radius_m=RADIUS)
+    finally:
+        courses._Loop.compiled = kept
+    assert_same(plain, compiled)
+    distance, _ = ROOM.clearance(plain.poses[:, :2])
+    assert distance.min() > RADIUS - 1e-5
+
+
+def test_a_robot_drives_to_the_same_bits_alone_in_blocks_and_among_others(both, monkeypatch):
+    rng = np.random.default_rng(1)
+    chosen = [
+        course_along(
+            path_named(path),
+            REAL,
+            speed=speed,
+            controller=name,
+            footprint_radius_m=RADIUS,
+            wheel_errors=draw_wheel_errors(REAL, rng),
+        )
+        for path, speed, name in (
+            ("curvilinear", 0.2, "follower"),
+            ("figure8", 0.3, "stanley"),
+            ("sine", 0.1, "pure_pursuit"),
+        )
+    ]
+    plain, together = both(chosen)
+    monkeypatch.setattr(courses, "BLOCK", 333)
+    plain_in_blocks, in_blocks = both(chosen)
+    backward = run_courses(chosen[::-1])[::-1]
+    monkeypatch.setattr(courses, "RECORDED", 1)
+    one_by_one = run_courses(chosen)
+    monkeypatch.setattr(courses, "SHARE", 1)
+    in_threads = run_courses(chosen)
+    for n, first in enumerate(plain):
+        for other in (together, plain_in_blocks, in_blocks, backward, one_by_one, in_threads):
+            assert_same(first, other[n])
+
+
+def test_courses_are_not_changed_by_running_them(way):
+    course = course_along(path_named("sine"), REAL, speed=0.2)
+    assert_same(run_courses([course])[0], run_courses([course])[0])
+
+
+def test_the_loop_opens_its_machine_code_when_that_has_paid(monkeypatch):
+    monkeypatch.setattr(courses._Loop, "compiled", None)
+    monkeypatch.setattr(courses._Loop, "made", 0)
+    monkeypatch.setattr(courses.Lookup, "compiled", None)
+    monkeypatch.setattr(courses, "PAYS", 6000)
+    path = path_named("figure8")
+    first = follow(path, REAL, speed=0.2, duration_s=60.0)
+    assert courses._Loop.compiled is None
+    second = follow(path, REAL, speed=0.2, duration_s=60.0)
+    assert courses._Loop.compiled is not None
+    assert courses.Lookup.compiled is not None  # which costs little more then
+    assert_same(first, second)
+
+
+def test_with_other_machine_code_open_the_loops_pays_sooner(monkeypatch):
+    monkeypatch.setattr(courses._Loop, "compiled", None)
+    monkeypatch.setattr(courses._Loop, "made", 0)
+    monkeypatch.setattr(courses, "PAYS", 60_000)
+    courses.lookup.warm_up()
+    follow(path_named("figure8"), REAL, speed=0.2, duration_s=50.0)
+    assert courses._Loop.compiled is None
+    follow(path_named("figure8"), REAL, speed=0.2, duration_s=60.0)
+    assert courses._Loop.compiled is not None
+
+
+# --- the drive --------------------------------------------------------------------------------------------
+
+
+def test_a_prompt_drive_goes_the_closed_ways_of_its_commands(way):
+    line = play(held(0.2, 0.0, 5.0), PROMPT, start=(1.0, 2.0, 0.5), duration_s=5.0)
+    assert_allclose(line.poses[-1], [1 + math.cos(0.5), 2 + math.sin(0.5), 0.5], atol=1e-12)
+    arc = play(held(0.2, 0.8, 5.0), PROMPT, duration_s=5.0)
+    assert_allclose(arc.poses[-1], [0.25 * math.sin(4), 0.25 * (1 - math.cos(4)), 4.0], atol=1e-12)
+    spin = play(held(0.0, -1.5, 4.0), PROMPT, duration_s=4.0)
+    assert_allclose(spin.poses[-1], [0.0, 0.0, -6.0], atol=1e-12)
+
+
+def test_there_and_back_ends_where_it_began(way):
+    there = held(0.25, 0.7, 3.0)
+    back = there[::-1] * [-1.0, -1.0, -1.0] + [5.9, 0.0, 0.0]
+    motion = play(np.vstack([there, back]), PROMPT, duration_s=6.0)
+    assert np.abs(motion.poses[150]).max() > 0.3
+    assert_allclose(motion.poses[-1], 0, atol=1e-12)
+
+
+def test_the_motors_lag_is_the_closed_form_of_first_order(way):
+    lagging = dataclasses.replace(PROMPT, motor_lag_s=0.15)
+    motion = play(held(0.3, 0.9, 2.0), lagging, duration_s=2.0)
+    t = np.arange(101) * 0.02
+    share = t - 0.15 * (1 - np.exp(-t / 0.15))
+    assert_allclose(motion.poses[:, 2], 0.9 * share, atol=1e-12)
+    way_m = np.concatenate([[0.0], np.cumsum(motion.v) * 0.02])
+    assert_allclose(way_m, 0.3 * share, atol=1e-12)
+    # v and w rise together, so it drives along one circle.
+    assert_allclose(np.hypot(motion.poses[:, 0], motion.poses[:, 1] - 1 / 3), 1 / 3, rtol=1e-12)
+
+
+@pytest.mark.parametrize("ahead", [1, -1])
+def test_slip_takes_its_share_of_what_speeds_up_and_gives_it_back_where_it_slows(way, ahead):
+    slipping = dataclasses.replace(IDEAL, slip_s2_m=0.1)
+    motion = play(held(0.3 * ahead, 0.0, 2.0), slipping)
+    rolled, went = ahead * np.asarray(motion.wheel_v), ahead * motion.v
+    gain = np.diff(rolled, prepend=0.0) / motion.dt
+    assert_allclose(went, rolled * (1 - 0.1 * gain), atol=1e-15)
+    faster = gain > 0.899
+    assert_allclose(went[faster], rolled[faster] * (1 - 0.1 * 0.9), rtol=1e-12)
+    assert (went[gain < -0.1] > rolled[gain < -0.1]).any()
+
+
+def test_scrubbing_and_wheels_of_another_size_scale_the_twist(way):
+    scrubbing = dataclasses.replace(PROMPT, yaw_slip=0.05)
+    motion = play(held(0.2, 1.0, 2.0), scrubbing, duration_s=2.0, wheel_errors=(0.01, -0.02))
+    assert_allclose(motion.v, 0.2 * 1.01, rtol=1e-14)
+    assert_allclose(motion.w, 1.0 * 1.01 / 0.98 * 0.95, rtol=1e-14)
+    assert_allclose(motion.wheel_rates[10], [(0.2 - 0.1165) / 0.03575, (0.2 + 0.1165) / 0.03575], rtol=1e-12)
+
+
+def test_wheel_errors_are_drawn_with_the_drives_deviations():
+    rng = np.random.default_rng(0)
+    errors = np.array([draw_wheel_errors(REAL, rng) for _ in range(4000)])
+    # a sample deviation of 4,000 is off by 1.1 %
+    assert_allclose(errors.std(axis=0), [0.002, 0.003], rtol=0.05)
+
+
+def test_wheel_angles_are_the_path_length_over_the_radius(way):
+    motion = follow(path_named("figure8"), IDEAL, speed=0.2)
+    driven = np.abs(np.sum(motion.v) * motion.dt)
+    assert_allclose(motion.wheel_angles[-1].mean() * IDEAL.wheel_radius_m, driven, rtol=1e-12)
+    turned = np.diff(motion.wheel_angles[-1])[0] * IDEAL.wheel_radius_m / IDEAL.wheel_separation_m
+    assert_allclose(turned, motion.poses[-1, 2] - motion.poses[0, 2], atol=1e-10)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000), lag=st.sampled_from([0.0, 0.05, 0.4]))
+def test_no_limit_is_exceeded_whatever_is_commanded(seed, lag):
+    drive = dataclasses.replace(IDEAL, motor_lag_s=lag)
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.uniform(0, 8, 40))
+    motion = play(np.column_stack([t, rng.normal(0, 1, 40), rng.normal(0, 6, 40)]), drive)
+    slack = 1 + 1e-9
+    for x, top, rate in ((motion.v, drive.v_max, drive.a_max), (motion.w, drive.w_max, drive.alpha_max)):
+        assert np.abs(x).max() <= top * slack
+        assert np.abs(np.diff(x, prepend=0.0)).max() <= rate * motion.dt * slack
+    assert np.abs(motion.wheel_rates).max() <= drive.wheel_rate_max * slack
+
+
+def test_a_turn_slows_the_robot_where_its_outer_wheel_is_at_its_limit(way):
+    motion = play(held(0.306, 1.9, 3.0), IDEAL, duration_s=3.0)
+    assert motion.w[-1] == 1.9
+    assert_allclose(motion.wheel_rates[-1, 1], IDEAL.wheel_rate_max, rtol=1e-12)
+    assert_allclose(motion.v[-1], 12.87 * 0.03575 - 1.9 * 0.1165, rtol=1e-12)
+
+
+def test_a_command_that_is_too_old_stops_the_robot(way):
+    motion = play([[0.0, 0.2, 0.0]], PROMPT)
+    assert_allclose(motion.v[:26], 0.2)  # 0.5 s of 0.02 s, the last begun as it is just old enough
+    assert_allclose(motion.v[26:], 0.0)
+    assert_allclose(motion.v_cmd[26:], 0.0)
+    late = play([[1.0, 0.2, 0.0], [1.2, -0.1, 0.0]], PROMPT)
+    assert_allclose(late.v[[49, 50, 59, 60, 85, 86]], [0.0, 0.2, 0.2, -0.1, -0.1, 0.0])
+
+
+# --- contact ----------------------------------------------------------------------------------------------
+
+
+def test_a_robot_that_drives_at_a_wall_stands_when_it_touches(way):
+    motion = play(held(0.25, 0.0, 6.0), PROMPT, obstacles=wall(1.0), footprint_radius_m=RADIUS)
+    assert_allclose(motion.poses[-1], [1.0 - RADIUS, 0.0, 0.0], atol=1e-9)
+    touched = int(np.flatnonzero(motion.bump)[0])
+    assert touched == int((1.0 - RADIUS) / (0.25 * 0.02))
+    assert motion.bump[touched:].all()
+    assert not motion.bump[:touched].any()
+    assert_allclose(motion.wheel_rates[touched + 1 :], 0.0, atol=1e-9)  # the motors stall
+    assert_allclose(motion.v_cmd[touched + 1], 0.25)
+
+
+@pytest.mark.parametrize("angle", [-1.2, -0.4, 0.3, 1.0])
+def test_it_stops_where_its_circle_meets_a_slanting_wall(way, angle):
+    motion = play(
+        held(0.25, 0.0, 20.0), PROMPT, start=(0.0, 0.0, angle), obstacles=wall(1.0), footprint_radius_m=RADIUS
+    )
+    x = 1.0 - RADIUS
+    assert_allclose(motion.poses[-1, :2], [x, x * math.tan(angle)], atol=1e-9)
+
+
+@pytest.mark.parametrize("aside", [-0.15, -0.02, 0.0, 0.1, 0.17])
+def test_it_stops_where_its_circle_meets_a_corner(way, aside):
+    wedge = Obstacles(("wedge",), (np.array([[1.0, 0.0], [2.0, -1e-3], [2.0, 1e-3]]),))
+    motion = play(
+        held(0.25, 0.0, 6.0), PROMPT, start=(0.0, aside, 0.0), obstacles=wedge, footprint_radius_m=RADIUS
+    )
+    assert_allclose(motion.poses[-1, :2], [1.0 - math.sqrt(RADIUS**2 - aside**2), aside], atol=2e-3)
+    assert_allclose(wedge.clearance(motion.poses[-1:, :2])[0], RADIUS, atol=1e-9)
+    assert motion.bump[-1]
+
+
+def test_it_passes_what_it_only_grazes(way):
+    post = Obstacles(("post",), (box(0.9, RADIUS + 1e-6, 1.0, 0.4),))
+    motion = play(held(0.25, 0.0, 6.0), PROMPT, obstacles=post, footprint_radius_m=RADIUS)
+    assert motion.poses[-1, 0] > 1.4
+    assert not motion.bump.any()
+
+
+def test_at_a_wall_it_can_turn_on_the_spot_and_drive_away(way):
+    script = np.vstack(
+        [
+            held(0.25, 0.0, 6.0),
+            np.add(held(0.25, 1.0, 2.0), [6.0, 0.0, 0.0]),
+            np.add(held(0.25, 0.0, 2.0), [8.0, 0.0, 0.0]),
+        ]
+    )
+    motion = play(script, PROMPT, obstacles=wall(1.0), footprint_radius_m=RADIUS, duration_s=10.0)
+    at_wall = motion.poses[300]
+    assert_allclose(motion.poses[375, :2], at_wall[:2], atol=1e-6)  # turned by 1.5 rad it stands there still
+    assert_allclose(motion.poses[375, 2], 1.5, atol=1e-9)
+    away = 300 + math.ceil(math.pi / 2 / 0.02)  # when it faces away from the wall
+    assert motion.bump[170:away].all()
+    assert not motion.bump[away + 2 :].any()
+    assert wall(1.0).clearance(motion.poses[:, :2])[0].min() > RADIUS - 1e-6
+
+
+def test_a_fast_robot_does_not_jump_through_a_thin_wall(way):
+    fast = dataclasses.replace(PROMPT, v_max=100.0, wheel_rate_max=1e6)
+    thin = Obstacles(("sheet",), (box(1.0, -9.0, 1.001, 9.0),))
+    motion = play(held(90.0, 0.0, 1.0), fast, obstacles=thin, footprint_radius_m=RADIUS, duration_s=1.0)
+    assert_allclose(motion.poses[-1, 0], 1.0 - RADIUS, atol=1e-9)
+
+
+# --- step by step -----------------------------------------------------------------------------------------
+
+
+class Straight:
+    """A controller of somebody's own, which speaks only now and then."""
+
+    def __init__(self, every: int = 1, speed: float = 0.2):
+        self.calls, self.every, self.speed, self.done = 0, every, speed, False
+
+    def command(self, t, x, y, yaw, v, w):
+        assert t == pytest.approx(self.calls * 0.02)
+        self.calls += 1
+        self.done = x > 1.0
+        if self.done:
+            return 0.0, 0.0
+        return (self.speed, 0.0) if (self.calls - 1) % self.every == 0 else None
+
+
+LINE = Path("line", np.array([[0.0, 0.0], [2.0, 0.0]]))
+
+
+def test_a_controller_of_ones_own_drives_until_it_is_done_and_the_robot_stands():
+    motion = follow(LINE, REAL, speed=0.2, controller=Straight())
+    assert motion.poses[-1, 0] == pytest.approx(1.0, abs=0.05)
+    assert motion.v[-1] == pytest.approx(0.0, abs=2e-3)
+    assert len(motion.v) < 400
+
+
+def test_a_controller_that_falls_silent_is_obeyed_until_the_drive_loses_patience():
+    spoken = follow(LINE, PROMPT, speed=0.2, controller=Straight(every=20), duration_s=3.0)
+    assert_allclose(spoken.v, 0.2)
+    silent = follow(LINE, PROMPT, speed=0.2, controller=Straight(every=10**6), duration_s=3.0)
+    assert_allclose(silent.v[:26], 0.2)
+    assert_allclose(silent.v[26:], 0.0)
+
+
+def test_a_guide_asked_step_by_step_drives_as_the_loop_does():
+    course = course_along(path_named("figure8"), REAL, speed=0.25, duration_s=40.0, footprint_radius_m=RADIUS)
+    chassis = Chassis(course)
+    guide = dataclasses.replace(course.guide)
+    while not guide.done and chassis.t < 40.0 - 1e-9:
+        chassis.step(guide.command(chassis.t, *chassis.pose, *chassis.twist))
+    assert_same(chassis.motion(), run_courses([course])[0])
+
+
+def test_a_chassis_tells_where_it_is_and_what_it_touches():
+    course = Course(
+        drive=PROMPT,
+        guide=guide_by_commands([[0.0, 0.0, 0.0]], PROMPT),
+        dt=0.02,
+        pose0=(0.0, 0.0, 0.0),
+        steps=1,
+        footprint_radius_m=RADIUS,
+    )
+    chassis = Chassis(course, wall(0.3))
+    for _ in range(50):
+        chassis.step((0.2, 0.0))
+    assert chassis.bump
+    assert chassis.t == pytest.approx(1.0)
+    assert_allclose(chassis.pose, [0.3 - RADIUS, 0.0, 0.0], atol=1e-9)
+    assert chassis.twist == (0.0, 0.0)
+    assert_array_equal(chassis.motion().poses[-1], chassis.pose)
+
+
+# --- refusals ---------------------------------------------------------------------------------------------
+
+
+class Broken(Straight):
+    def command(self, t, x, y, yaw, v, w):
+        super().command(t, x, y, yaw, v, w)
+        return (math.nan if t > 0.09 else 0.2), 0.0
+
+
+@pytest.mark.parametrize(
+    ("script", "says"),
+    [
+        ([[0.0, math.nan, 0.0]], r"command 1 of 1 is not finite: t, v, w = \[0\.0, nan, 0\.0\]"),
+        ([[0.0, 0.1, 0.0], [0.1, 0.1, math.inf]], "command 2 of 2 is not finite"),
+        ([[0.0, 0.1, 0.0], [0.2, 0.1, 0.0], [0.1, 0.1, 0.0]], r"command 3 of 3 has t = 0\.1 s after 0\.2 s"),
+        ([[-1.0, 0.1, 0.0]], r"from 0 s up: command 1 of 1 has t = -1 s"),
+        ([[0.0, 0.1]], r"of shape \(K, 3\), got \(1, 2\)"),
+        (np.empty((0, 3)), r"of shape \(K, 3\), got \(0, 3\)"),
+    ],
+)
+def test_a_script_that_cannot_be_played_is_refused(script, says):
+    with pytest.raises(InputError, match=says):
+        play(script, REAL)
+
+
+def test_a_nan_command_of_ones_own_controller_is_refused_with_its_time():
+    with pytest.raises(InputError, match=r"the command at 0\.100 s is not finite: v = nan m/s"):
+        follow(LINE, REAL, speed=0.2, controller=Broken())
+
+
+def test_a_start_in_a_wall_is_refused_with_its_place():
+    says = r"begin in wall: at \(0\.000, 0\.000\) m its footprint of radius 0\.171 m is 0\.071 m too near"
+    with pytest.raises(InputError, match=says):
+        play(held(0.1, 0.0, 1.0), REAL, obstacles=wall(0.1), footprint_radius_m=RADIUS)
+    with pytest.raises(InputError, match=r"path line, from its start runs into wall"):
+        follow(LINE, REAL, speed=0.2, start=(-2.0, 0.0, 0.0), obstacles=wall(-1.0), footprint_radius_m=RADIUS)
+
+
+def test_a_path_through_a_desk_is_refused_with_where_it_meets_it():
+    with pytest.raises(InputError, match=r"path figure8 runs into desk: .* m along it"):
+        follow(path_named("figure8"), REAL, speed=0.2, obstacles=ROOM, footprint_radius_m=RADIUS)
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -50.0, math.nan, math.inf])
+def test_a_control_rate_that_is_not_above_0_is_refused(rate_hz):
+    with pytest.raises(InputError, match="rate_hz of a controller must be above 0 Hz and finite"):
+        play(held(0.1, 0.0, 1.0), REAL, rate_hz=rate_hz)
+
+
+def test_a_control_rate_at_which_every_command_is_void_before_the_next_is_refused():
+    with pytest.raises(InputError, match=r"must be above 2 Hz, or the drive would stop between commands"):
+        play(held(0.1, 0.0, 1.0), REAL, rate_hz=2.0)
+
+
+def test_an_unknown_controller_is_refused_with_the_nearest_one():
+    with pytest.raises(InputError, match=r"no controller 'stanly'; did you mean 'stanley'\?"):
+        follow(LINE, REAL, speed=0.2, controller="stanly")
+
+
+def test_courses_of_different_steps_are_not_run_at_once():
+    chosen = [course_along(LINE, REAL, speed=0.2, rate_hz=rate) for rate in (50.0, 20.0)]
+    with pytest.raises(InputError, match="the same length of a step"):
+        run_courses(chosen)
+
+
+def test_a_shipped_scene_refuses_a_path_through_its_wall_or_its_furniture():
+    from magtwin.files import shipped
+    from magtwin.twin import open_twin, simulate
+
+    twin = open_twin(shipped("scenes", "lab", "lab.usda"), net="none")
+    desk = next(i for i, name in enumerate(twin.obstacles.names) if "desk" in name)
+    x, y = twin.obstacles.outlines[desk].mean(axis=0)
+    scene = dataclasses.replace(twin.scene, lab=dataclasses.replace(twin.scene.lab, floor_m=(40.0, 40.0)))
+    through = Path("through", np.array([[x - 1.0, y], [x + 1.0, y]]))
+    with pytest.raises(InputError, match=r"path through runs into /World/"):
+        simulate(dataclasses.replace(twin, scene=scene), through)
+
+
+@pytest.mark.parametrize("name", ["stanley", "pure_pursuit"])
+def test_a_run_tells_which_controller_drove(name):
+    from magtwin.files import shipped
+    from magtwin.twin import open_twin, simulate
+
+    run = simulate(
+        open_twin(shipped("scenes", "lab", "lab.usda"), net="none"), duration_s=5.0, controller=name
+    )
+    assert run.facts["controller"] == name
+    assert not run["flag_bump"].any()

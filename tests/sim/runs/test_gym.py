@@ -1,0 +1,273 @@
+"""Gymnasium: the checker, seeds, vectors against single robots, signals, rewards, ends, refusals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+from gymnasium.vector import SyncVectorEnv  # noqa: E402
+
+import magtwin.gym  # noqa: E402
+from magtwin.errors import InputError  # noqa: E402
+from magtwin.run.run import COLUMNS  # noqa: E402
+from magtwin.sim.runs.fleet import Fleet  # noqa: E402
+from magtwin.sim.session import draw_session  # noqa: E402
+from magtwin.twin import Twin, open_twin  # noqa: E402
+
+NAME = "magtwin/MagNav-v0"
+AHEAD = np.array([0.2, 0.0], np.float32)
+
+
+@pytest.fixture(scope="module")
+def twin(lab_scene) -> Twin:
+    return open_twin(lab_scene, magnetometer="physical")
+
+
+@pytest.fixture(scope="module")
+def line(tmp_path_factory) -> str:
+    file = tmp_path_factory.mktemp("path") / "line.csv"
+    file.write_text("-2.0,-1.2\n0.0,-1.2\n")
+    return str(file)
+
+
+def vector(twin, count, **options):
+    return gymnasium.make_vec(NAME, num_envs=count, scene=twin, **options)
+
+
+def drive(env, actions, seed=0):
+    """Observations and rewards of an episode, stacked."""
+    observations, rewards = [env.reset(seed=seed)[0]], []
+    for action in actions:
+        observation, reward, *_ = env.step(action)
+        observations.append(observation)
+        rewards.append(reward)
+    return np.array(observations), np.array(rewards)
+
+
+def column(env, observations, name):
+    """A signal of observations (..., F)."""
+    signals = env.unwrapped.robots.signals if hasattr(env.unwrapped, "robots") else env.unwrapped.signals
+    first = sum(COLUMNS[s].width for s in signals[: signals.index(name)])
+    return observations[..., first : first + COLUMNS[name].width]
+
+
+@pytest.mark.filterwarnings("ignore:.*symmetric and normalized space")  # ours is in m/s and rad/s
+@pytest.mark.parametrize("session", ["drawn", "survey"])
+def test_gymnasiums_checker_passes(twin, session):
+    check_env(gymnasium.make(NAME, scene=twin, session=session).unwrapped)
+
+
+def test_robots_on_a_survey_alone_read_its_map_and_their_own_field(twin):
+    bare = replace(twin, scene=replace(twin.scene, earth=None, sources=(), furniture=()))
+    env = vector(bare, 3)
+    env.reset(seed=1)
+    for _ in range(5):
+        env.step(np.tile(AHEAD, (3, 1)))
+    table = env.unwrapped.fleet.columns
+    assert np.isfinite(table["b_total_nt"]).all()
+    assert (np.abs(table["b_disturbance_nt"]) > 10).all(), "of drawn sessions, in motion"
+
+
+def test_each_episode_is_a_session_of_its_own_unless_that_of_the_survey_is_wanted(twin):
+    names = ("battery_fraction", "imu_q_xyzw", "b_total_nt")
+    for session in ("drawn", "survey"):
+        env = vector(twin, 2, signals=names, session=session)
+        first, _ = env.reset(seed=4)
+        again, _ = env.reset()
+        charges = np.concatenate([column(env, o, "battery_fraction").ravel() for o in (first, again)])
+        assert len(set(charges.tolist())) == (4 if session == "drawn" else 1)
+        yaw = np.concatenate([column(env, o, "imu_q_xyzw")[:, 2:] for o in (first, again)])
+        apart = np.abs(yaw - yaw[0]).max()
+        assert apart > 0.02 if session == "drawn" else apart < 0.01
+        field = np.concatenate([column(env, o, "b_total_nt").ravel() for o in (first, again)])
+        assert np.ptp(field) > 50 if session == "drawn" else np.ptp(field) < 1
+
+
+def test_robots_of_many_days_do_together_what_each_does_in_a_scene_of_its_day(twin):
+    days = [draw_session(twin.scene.robot, np.random.default_rng(day)) for day in range(6)]
+    poses = [(-2.0 + 0.5 * i, -1.2, 0.3 * i) for i in range(6)]
+    common = {"anomaly_map": twin.field, "obstacles": twin.obstacles, "step_s": 0.1}
+
+    def driven(fleet, which):
+        fleet.begin(
+            list(range(len(which))),
+            [poses[i] for i in which],
+            [np.random.default_rng(i) for i in which],
+            None if len(which) == 1 else days,
+        )
+        for k in range(12):
+            fleet.step(np.tile([0.2, 0.05 * k], (len(which), 1)))
+        return fleet.columns
+
+    together = driven(Fleet(twin.scene, 6, **common), range(6))
+    assert 0 < together["lidar_on"].sum() < 6
+    for i, day in enumerate(days):
+        alone = driven(Fleet(replace(twin.scene, robot=day), 1, **common), [i])
+        for name, values in alone.items():
+            assert_allclose(together[name][i], values[0], rtol=1e-9, atol=1e-9, err_msg=name)
+
+
+def test_one_seed_is_one_episode_and_another_seed_another(twin):
+    env = gymnasium.make(NAME, scene=twin)
+    actions = np.random.default_rng(1).uniform(-1, 1, (20, 2)).astype(np.float32) * env.action_space.high
+    a, b, c = (drive(env, actions, seed=seed) for seed in (5, 5, 6))
+    assert_array_equal(a[0], b[0])
+    assert_array_equal(a[1], b[1])
+    assert not np.array_equal(a[0], c[0])
+
+
+def test_robots_that_step_together_do_what_each_does_alone(twin):
+    many = vector(twin, 3, random_start=True)
+    actions = np.random.default_rng(1).uniform(-1, 1, (15, 3, 2)) * many.single_action_space.high
+    actions = actions.astype(np.float32)
+    together = drive(many, actions, seed=7)
+    for i in range(3):
+        one = gymnasium.make(NAME, scene=twin, random_start=True)
+        alone = drive(one, actions[:, i], seed=7 + i)
+        assert_allclose(together[0][:, i], alone[0], rtol=1e-6, atol=1e-6)
+        assert_allclose(together[1][:, i], alone[1], atol=1e-12)
+
+
+def test_vectors_agree_with_gymnasiums_own_through_the_ends_of_episodes(twin):
+    options = {"scene": twin, "duration_s": 0.5, "random_start": True}
+    ours = vector(twin, 2, duration_s=0.5, random_start=True)
+    theirs = SyncVectorEnv([lambda: gymnasium.make(NAME, **options)] * 2)
+    a, b = ours.reset(seed=3), theirs.reset(seed=3)
+    assert_allclose(a[0], b[0], rtol=1e-6, atol=1e-6)
+    for _ in range(14):
+        actions = np.tile(AHEAD, (2, 1))
+        a, b = ours.step(actions), theirs.step(actions)
+        assert_allclose(a[0], b[0], rtol=1e-6, atol=1e-6)
+        for x, y in zip(a[1:4], b[1:4], strict=True):
+            assert_allclose(np.asarray(x, float), np.asarray(y, float), atol=1e-12)
+        assert a[4].keys() == b[4].keys()
+        for name in ("p_world_base", "yaw", "bump", "_bump"):
+            assert_allclose(np.asarray(a[4][name], float), np.asarray(b[4][name], float), atol=1e-12)
+
+
+def test_spaces_hold_what_the_documentation_says(twin):
+    env, many = gymnasium.make(NAME, scene=twin), vector(twin, 2)
+    robot = twin.scene.robot.drive
+    assert_allclose(env.action_space.high, [robot.v_max, robot.w_max], rtol=1e-6)
+    assert env.observation_space.shape == (sum(COLUMNS[s].width for s in magtwin.gym.SIGNALS),)
+    assert many.observation_space.shape == (2, *env.observation_space.shape)
+    observations, _ = many.reset(seed=0)
+    assert observations in many.observation_space
+    assert observations.dtype == np.float32
+    assert set(magtwin.gym.BOUNDS) <= set(COLUMNS)
+
+
+def test_sensors_tell_what_the_robot_did_within_their_errors(twin, line):
+    env = gymnasium.make(NAME, scene=twin, path=line, signals=(*magtwin.gym.SIGNALS, "b_total_nt"))
+    observations, rewards = drive(env, [AHEAD] * 50)
+    x = column(env, observations, "odom_p")[-1, 0]
+    truth = env.unwrapped.robots.fleet.columns
+    way = truth["p_world_base"][0, 0] + 2.0
+    assert 0.9 < way < 1.0  # 5 s at 0.2 m/s, and the time to get there
+    assert_allclose(x, way, rtol=0.03)
+    assert_allclose(column(env, observations, "odom_v")[10:, 0].mean(), 0.2, rtol=0.03)
+    assert_allclose(rewards.sum(), way, atol=0.03)
+    charge = column(env, observations, "battery_fraction")[:, 0]
+    assert np.all(np.diff(charge) < 0)
+    read, total = (column(env, observations, name)[:, 0] for name in ("b_measured_nt", "b_total_nt"))
+    assert 0 < np.abs(read - total).max() < 100
+    assert np.ptp(total) > 10
+
+
+def test_the_field_is_the_exact_one_of_a_run_at_the_same_pose(twin, line):
+    """A robot at rest: nothing but its place, its own iron and its electronics make the field."""
+    robot = twin.scene.robot
+    still = replace(robot.platform, left_motor_nt_nm=(0.0, 0.0, 0.0), right_motor_nt_nm=(0.0, 0.0, 0.0))
+    twin = replace(twin, scene=replace(twin.scene, robot=replace(robot, platform=still)))
+    run = magtwin.simulate(
+        twin, line, seed=0, session="survey", duration_s=0.1, rate_hz=135.0
+    )  # its motors start at once
+    env = gymnasium.make(NAME, scene=twin, path=line, signals=("b_total_nt", "b_map_nt"), session="survey")
+    observation, _ = env.reset(seed=0)
+    assert_allclose(observation[1], run["b_map_nt"][0], rtol=1e-6)
+    assert_allclose(observation[0], run["b_total_nt"][0], atol=5.0)  # electronics
+
+
+def test_an_episode_is_truncated_by_time_and_not_before(twin):
+    env = vector(twin, 2, duration_s=1.0)
+    env.reset(seed=0)
+    cuts = [env.step(np.zeros((2, 2), np.float32))[3].all() for _ in range(10)]
+    assert cuts == [False] * 9 + [True]
+    _, rewards, ended, truncated, _ = env.step(np.zeros((2, 2), np.float32))
+    assert not rewards.any()
+    assert not ended.any()
+    assert not truncated.any()
+
+
+def test_a_bump_is_told_and_ends_the_episode_where_that_is_asked_for(twin, tmp_path):
+    (tmp_path / "out.csv").write_text("2.0,0.0\n2.5,0.0\n")
+    for end in (False, True):
+        env = gymnasium.make(
+            NAME, scene=twin, path=str(tmp_path / "out.csv"), end_on_bump=end, duration_s=20.0
+        )
+        env.reset(seed=0)
+        for _ in range(100):
+            _, _, ended, _, info = env.step(AHEAD)
+            if info["bump"]:
+                break
+        assert info["bump"]
+        assert ended is end
+
+
+def test_a_reward_of_ones_own_is_asked_for_each_step(twin):
+    seen = []
+
+    def mine(step: magtwin.gym.Transition) -> np.ndarray:
+        seen.append(step)
+        return step.after["b_total_nt"] - step.before["b_total_nt"]
+
+    env = vector(twin, 2, reward=mine)
+    env.reset(seed=0)
+    before = env.unwrapped.fleet.columns["b_total_nt"].copy()
+    _, rewards, *_ = env.step(np.tile(AHEAD, (2, 1)))
+    assert_array_equal(rewards, env.unwrapped.fleet.columns["b_total_nt"] - before)
+    assert len(seen) == 1
+    assert seen[0].action.shape == (2, 2)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"scene": None}, "needs a scene"),
+        ({"net": "none"}, "go to open_twin"),
+        ({"signals": ("b_mesured_nt",)}, "did you mean 'b_measured_nt'"),
+        ({"signals": ()}, "signals are empty"),
+        ({"step_s": 0.03}, "multiple of the control step"),
+        ({"step_s": 0.6}, "command_timeout_s"),
+        ({"step_s": float("nan")}, "step_s"),
+        ({"duration_s": 0.0}, "duration_s"),
+        ({"path": "figure9"}, "figure8"),
+        ({"reward": 1.0}, r"reward must be a function of a Transition, got 1\.0"),
+        ({"render_mode": "human"}, "render_mode"),
+    ],
+)
+def test_bad_options_are_refused(twin, options, text):
+    with pytest.raises(InputError, match=text):
+        magtwin.gym.MagNavEnv(**{"scene": twin, **options})
+
+
+def test_commands_that_are_not_finite_are_refused(twin):
+    env = magtwin.gym.MagNavEnv(scene=twin)
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="must be finite"):
+        env.step([np.nan, 0.0])
+
+
+def test_seeds_must_be_as_many_as_robots(twin):
+    with pytest.raises(InputError, match="as many as robots, 2, got 3"):
+        magtwin.gym.MagNavVectorEnv(2, scene=twin).reset(seed=[0, 1, 2])
+
+
+def test_a_reward_of_the_wrong_shape_is_refused(twin):
+    env = magtwin.gym.MagNavVectorEnv(2, scene=twin, reward=lambda step: np.zeros(3))
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="reward must give shape"):
+        env.step(np.zeros((2, 2)))

@@ -1,0 +1,525 @@
+"""simulate: every column, the field's closed forms, determinism, refusals."""
+
+import dataclasses
+from pathlib import Path as FilePath
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.frames import quat_from_rpy, rotate, yaw_from_quat
+from magtwin.path import Path, path_named
+from magtwin.run.run import COLUMNS, Run
+from magtwin.sim.interference import ambient_gradient_nt_m
+from magtwin.sim.runs.simulate import simulate
+from magtwin.spec.scene import (
+    EarthFieldSpec,
+    ImuSpec,
+    LabSpec,
+    MagnetometerSpec,
+    PlatformFieldSpec,
+    RobotSpec,
+    Scene,
+    SourceSpec,
+)
+
+EARTH_NT = np.array([-2_600.0, 24_000.0, -38_000.0])
+EARTH = EarthFieldSpec(
+    b_world_nt=tuple(EARTH_NT.tolist()),
+    latitude_deg=29.6,
+    longitude_deg=-82.3,
+    height_m=30.0,
+    date="2026-01-01",
+)
+ROBOT = RobotSpec(
+    name="robot",
+    asset=FilePath("robot.usda"),
+    p_base_magnetometer=(0.05, 0.0, 0.36),
+    platform=PlatformFieldSpec(hard_iron_nt=(620.0, -430.0, 250.0), lidar_nt=(160.0, -90.0, 130.0)),
+)
+SOURCES = (
+    SourceSpec(name="chair", p_world=(0.5, 0.3, -0.5), m_world=(5.0, -3.0, 20.0)),
+    SourceSpec(name="desk", p_world=(-1.0, 0.8, -0.4), m_world=(-9.0, 4.0, -12.0)),
+)
+SURVEYED = Scene(name="surveyed", map_layer=FilePath("map.usdc"), robot=ROBOT)
+KNOWN = Scene(name="known", map_layer=FilePath("map.usdc"), robot=ROBOT, earth=EARTH, sources=SOURCES)
+LINE = Path("line", np.array([[-0.5, 0.2], [0.5, 0.2]]))
+
+
+def wavy_map(extent_m: tuple[float, float] = (6.0, 3.5)) -> AnomalyMap:
+    values = 41_000 + 1_000 * np.random.default_rng(5).standard_normal((4, 15, 25))
+    return AnomalyMap(
+        values_nt=values,
+        origin_m=(-extent_m[0] / 2, -extent_m[1] / 2),
+        cell_m=(extent_m[0] / 24, extent_m[1] / 14),
+        headings_rad=np.arange(4) * np.pi / 2,
+    )
+
+
+MAP = wavy_map()
+FLAT = dataclasses.replace(MAP, values_nt=np.full((4, 15, 25), 41_000.0))
+
+
+def drive(scene: Scene = KNOWN, path: Path = LINE, *, seed: int = 0, **options) -> Run:
+    options.setdefault("anomaly_map", MAP)
+    return simulate(scene, path, rng=np.random.default_rng(seed), **options)
+
+
+def with_robot(scene: Scene, **changes) -> Scene:
+    return dataclasses.replace(scene, robot=dataclasses.replace(scene.robot, **changes))
+
+
+def test_a_run_has_every_column_in_order_and_no_other():
+    run = drive()
+    assert list(run) == list(COLUMNS)
+    for name, values in run.items():
+        assert values.dtype == (bool if COLUMNS[name].unit == "bool" else float), name
+        if name != "b_sd_nt":
+            assert np.all(np.isfinite(values)), name
+    assert np.isnan(run["b_sd_nt"]).all()
+
+
+def test_facts_tell_how_the_run_came_about():
+    run = drive(speed=0.3, duration_s=2.0, lidar="on")
+    assert dict(run.facts) == {
+        "scene": "known",
+        "path": "line",
+        "controller": "follower",
+        "speed_m_s": 0.3,
+        "robot_name": "robot",
+        "sensor_m": "0.05, 0, 0.36",
+        "mocap_offset_m": "0, 0",
+        "mocap_latency_s": 0.015167,  # 10 ms, a mean jitter of 1 ms, half a period at 120 Hz
+        "rate_hz": 135.0,
+        "duration_s": 2.0,
+        "outside": "nan",
+        "lidar": "on",
+        "magnetometer": "physical",
+    }
+
+
+def test_readings_come_at_k_over_rate_for_the_whole_duration():
+    run = drive(duration_s=10.0)
+    assert_array_equal(run["t"], np.arange(1350) / 135.0)
+    assert_array_equal(drive(duration_s=10.0, rate_hz=7.0)["t"], np.arange(70) / 7.0)
+    whole = drive()
+    assert whole["t"][-1] == pytest.approx(whole.facts["duration_s"], abs=1 / 135)
+    assert_allclose(whole["p_world_base"][-1], [0.5, 0.2, 0.0], atol=0.002)
+
+
+def test_a_longer_duration_goes_on_along_the_path():
+    run = drive(duration_s=30.0)
+    assert run["p_world_base"][:, 0].max() == pytest.approx(0.5, abs=0.002)
+    assert run["p_world_base"][-1, 0] < 0.4  # on its way
+    assert np.abs(run["p_world_base"][:, 1] - 0.2).max() < 0.006
+
+
+def test_columns_of_the_truth_agree_with_each_other():
+    run = drive(path=path_named("figure8"), rate_hz=1000.0, duration_s=20.0)
+    assert_allclose(yaw_from_quat(run["q_world_base_xyzw"]), run["yaw"], atol=1e-12)
+    assert run["yaw"].min() >= -np.pi
+    assert run["yaw"].max() < np.pi
+    moved = np.diff(run["p_world_base"], axis=0) * 1000
+    wanted = rotate(run["q_world_base_xyzw"], run["v_base"])[:-1]
+    assert_allclose(moved, wanted, atol=2e-3)  # a reading's turn, and a step of 0.018 m/s shared by two
+    turned = np.diff(np.unwrap(run["yaw"])) * 1000
+    assert np.abs(turned - run["w_base"][:-1, 2]).mean() < 1e-3
+    # The motors lag, the wheels slip, and the drive keeps its limits: in the mean it does what it is told.
+    assert_allclose(run["v_cmd"].mean(), run["v_base"][:, 0].mean(), rtol=0.02)
+    assert_allclose(run["w_cmd"].mean(), run["w_base"][:, 2].mean(), atol=0.01)
+
+
+def test_wheels_have_turned_by_the_path_length():
+    run = drive()
+    off = 4 * ROBOT.drive.wheel_radius_error_std  # of the wheels in this session
+    assert_allclose(run["wheel_angle"][-1] * ROBOT.drive.wheel_radius_m, 1.0, atol=0.002 + off)
+
+
+def test_the_map_is_read_at_base_links_pose():
+    run = drive(path=path_named("figure8"), duration_s=20.0)
+    assert_array_equal(run["b_map_nt"], MAP.lookup(run["p_world_base"][:, :2], run["yaw"]))
+    assert not run["flag_outside_map"].any()
+
+
+def test_the_total_is_map_plus_disturbance_and_by_physics_the_truth():
+    run = drive(path=path_named("figure8"), duration_s=20.0)
+    assert_allclose(run["b_total_nt"], run["b_map_nt"] + run["b_disturbance_nt"], atol=1e-9)
+    assert_allclose(run["b_total_nt"], run["b_truth_nt"], atol=1e-9)
+    assert_allclose(np.linalg.norm(run["b_vector_nt"], axis=1), run["b_truth_nt"], rtol=1e-12)
+
+
+def test_without_sources_or_iron_the_truth_is_the_earths_field_seen_from_the_robot():
+    scene = with_robot(dataclasses.replace(KNOWN, sources=()), platform=PlatformFieldSpec())
+    run = drive(scene, path_named("figure8"), duration_s=20.0, anomaly_map=FLAT)
+    assert_allclose(run["b_truth_nt"], np.linalg.norm(EARTH_NT), rtol=1e-12)
+    assert_allclose(rotate(run["q_world_base_xyzw"], run["b_vector_nt"]), [EARTH_NT] * run.rows, atol=1e-6)
+
+
+def test_hard_iron_makes_a_cosine_of_heading():
+    iron = PlatformFieldSpec(hard_iron_nt=(620.0, -430.0, 250.0))
+    scene = with_robot(dataclasses.replace(KNOWN, sources=()), platform=iron)
+    run = drive(scene, path_named("figure8"), anomaly_map=FLAT)
+    h = rotate(run["q_world_base_xyzw"], np.array(iron.hard_iron_nt))
+    assert_allclose(run["b_truth_nt"], np.linalg.norm(EARTH_NT + h, axis=1), rtol=1e-12)
+    assert np.ptp(run["b_truth_nt"]) > 500
+
+
+def test_the_field_is_that_at_the_magnetometer_not_at_base_link():
+    from magtwin.field.sources.point_dipoles import dipole_field_nt
+
+    lever = np.array([0.1, -0.05, 0.36])
+    parts = {"p_base_magnetometer": tuple(lever.tolist()), "base_height_m": -0.02}
+    scene = with_robot(KNOWN, **parts, platform=PlatformFieldSpec())
+    run = drive(scene, path_named("figure8"), duration_s=20.0)
+    assert_allclose(run["p_world_base"][:, 2], -0.02)
+    p = run["p_world_base"] + rotate(run["q_world_base_xyzw"], lever)
+    places, moments = zip(*((s.p_world, s.m_world) for s in SOURCES), strict=True)
+    field = dipole_field_nt(p, np.array(places), np.array(moments)) + EARTH_NT
+    assert_allclose(run["b_truth_nt"], np.linalg.norm(field, axis=1), rtol=0, atol=1e-3)
+
+
+def test_eddy_currents_see_the_fields_rate_in_turning_axes():
+    # Spin-like circle in the Earth's field alone: db/dt = -w x b, so E = e 1 adds -e w x b.
+    e = 0.01
+    platform = PlatformFieldSpec(eddy_s=(e, 0, 0, 0, e, 0, 0, 0, e))
+    scene = with_robot(dataclasses.replace(KNOWN, sources=()), platform=platform)
+    run = drive(scene, path_named("narrow_figure8"), anomaly_map=FLAT)
+    b = rotate(run["q_world_base_xyzw"] * [-1, -1, -1, 1], np.broadcast_to(EARTH_NT, (run.rows, 3)))
+    assert_allclose(run["b_vector_nt"], b - e * np.cross(run["w_base"], b), atol=1e-6)
+
+
+def test_eddy_currents_see_the_fields_change_along_the_way():
+    e = 1.0
+    platform = PlatformFieldSpec(eddy_s=(e, 0, 0, 0, e, 0, 0, 0, e))
+    still, moving = (
+        drive(with_robot(KNOWN, platform=p))["b_vector_nt"] for p in (PlatformFieldSpec(), platform)
+    )
+    run = drive()
+    cruising = (run["t"] > 1) & (run["t"] < 4)
+    assert_allclose(run["v_cmd"][cruising], 0.2, rtol=1e-6)
+    # On a straight line base_link does not turn: the eddy part is the derivative of the rest.
+    slope = np.gradient(still, run["t"], axis=0)
+    assert_allclose((moving - still)[cruising], slope[cruising], rtol=0, atol=1e-5 * np.abs(slope).max())
+    assert np.abs((moving - still)[cruising]).max() > 10
+
+
+def test_the_truth_at_a_time_does_not_depend_on_how_often_it_is_read():
+    platform = PlatformFieldSpec(eddy_s=(1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0))
+    scene = with_robot(KNOWN, platform=platform)
+    seldom, often = (
+        drive(scene, path_named("figure8"), duration_s=30.0, rate_hz=rate) for rate in (1.0, 100.0)
+    )
+    assert_array_equal(seldom["t"], often["t"][::100])
+    for name in ("b_truth_nt", "b_vector_nt"):
+        assert_allclose(seldom[name], often[name][::100], rtol=0, atol=1e-6)
+
+
+def test_the_vector_is_in_the_sensors_axes_and_the_magnitude_is_not_changed_by_its_mount():
+    q = tuple(quat_from_rpy([0.3, -0.2, 1.0]).tolist())
+    askew = with_robot(KNOWN, magnetometer=MagnetometerSpec(q_link_sensor_xyzw=q))
+    a, b = drive(), drive(askew)
+    assert_allclose(rotate(np.array(q), b["b_vector_nt"]), a["b_vector_nt"], atol=1e-8)
+    assert_array_equal(a["b_truth_nt"], b["b_truth_nt"])
+
+
+def test_columns_turn_with_the_links_that_carry_the_sensors():
+    # imu_link is yawed by a quarter to the left: base_link's x is its -y, base_link's y its x.
+    # magnetometer_link lies on its back: y and z are turned over.
+    none = (0.0, 0.0, 0.0)
+    quiet = ImuSpec(
+        tilt=(0.0, 0.0),
+        level_error=(0.0, 0.0),
+        tilt_std=0.0,
+        orientation_noise_std=0.0,
+        gyro_noise_std=0.0,
+        gyro_bias_walk=0.0,
+        gyro_vibration=none,
+        accel_noise_std=0.0,
+        accel_vibration=none,
+    )
+    plain = with_robot(KNOWN, imu=quiet)
+    turned = with_robot(
+        plain,
+        q_base_imu_link_xyzw=(0.0, 0.0, 0.5**0.5, 0.5**0.5),
+        q_base_magnetometer_link_xyzw=(1.0, 0.0, 0.0, 0.0),
+    )
+    a, b = (drive(scene, path_named("figure8"), duration_s=20.0) for scene in (plain, turned))
+    assert np.abs(a["imu_a"]).max() > 0.02
+    assert_allclose(b["imu_a"], a["imu_a"][:, [1, 0, 2]] * [1, -1, 1], atol=1e-12)
+    assert_allclose(b["imu_w"], a["imu_w"], atol=1e-12)
+    ahead = yaw_from_quat(b["imu_q_xyzw"]) - yaw_from_quat(a["imu_q_xyzw"])
+    assert_allclose(np.sin(ahead), 1, atol=1e-12)
+    assert_allclose(b["b_vector_nt"], a["b_vector_nt"] * [1, -1, -1], atol=1e-8)
+    assert_array_equal(b["b_truth_nt"], a["b_truth_nt"])
+
+
+def test_a_mount_turns_within_its_turned_link():
+    link, mount = quat_from_rpy([0.3, -0.2, 1.0]), quat_from_rpy([-0.7, 0.1, 0.4])
+    robot = dataclasses.replace(
+        ROBOT,
+        q_base_magnetometer_link_xyzw=tuple(link.tolist()),
+        q_base_imu_link_xyzw=tuple(mount.tolist()),
+        magnetometer=MagnetometerSpec(q_link_sensor_xyzw=tuple(mount.tolist())),
+        imu=ImuSpec(q_link_sensor_xyzw=tuple(link.tolist())),
+    )
+    v = np.array([1.0, 2.0, 3.0])
+    for q, outer, inner in (
+        (robot.q_base_magnetometer_xyzw, link, mount),
+        (robot.q_base_imu_xyzw, mount, link),
+    ):
+        assert_allclose(rotate(q, v), rotate(outer, rotate(inner, v)), atol=1e-14)
+    assert ROBOT.q_base_imu_xyzw == ROBOT.imu.q_link_sensor_xyzw
+
+
+def test_the_lidars_current_is_felt_when_it_is_on():
+    iron_free = with_robot(KNOWN, platform=PlatformFieldSpec(lidar_nt=(160.0, -90.0, 130.0)))
+    off, on = drive(iron_free, lidar="off"), drive(iron_free, lidar="on")
+    assert_allclose(on["b_vector_nt"] - off["b_vector_nt"], [[160, -90, 130]] * on.rows, atol=1e-8)
+    assert on["lidar_on"].all()
+    assert not off["lidar_on"].any()
+
+
+def test_a_network_gives_the_disturbance_from_columns_that_are_filled():
+    seen: list[Run] = []
+
+    def network(run: Run) -> np.ndarray:
+        seen.append(run)
+        return 100 + 10 * run["imu_w"][:, 2]
+
+    run = drive(SURVEYED, disturbance_nt=network)
+    assert len(seen) == 1
+    late = {"b_disturbance_nt", "b_total_nt", "b_noise_nt", "b_measured_nt"}
+    late |= {"b_model_error_nt", "flag_lost_lock"}
+    assert set(seen[0]) == set(COLUMNS) - late
+    for name in set(COLUMNS) - late:
+        assert_array_equal(seen[0][name], run[name])
+    assert_array_equal(run["b_disturbance_nt"], 100 + 10 * run["imu_w"][:, 2])
+    assert np.isnan(run["b_truth_nt"]).all()
+    assert np.isnan(run["b_vector_nt"]).all()
+
+
+def test_the_maps_gradient_is_what_a_step_forward_or_to_the_left_changes_it_by():
+    run, h = drive(), 1e-5
+    p, yaw = run["p_world_base"][:, :2], run["yaw"]
+    forward = h * np.column_stack([np.cos(yaw), np.sin(yaw)])
+    left = h * np.column_stack([-np.sin(yaw), np.cos(yaw)])
+    for i, step in enumerate((forward, left)):
+        change = (MAP.lookup(p + step, yaw) - MAP.lookup(p, yaw)) / h
+        inside = np.isfinite(change) & (np.abs(change - run["b_map_gradient_nt_m"][:, i]) < 1)
+        assert inside.mean() > 0.99  # but where a step leads into the next cell
+
+
+def test_a_network_reads_the_vector_axes_as_the_run_will_have_them():
+    loud = dataclasses.replace(ROBOT.magnetometer, vector_noise_density_nt=5.0, dropout_share=0.1)
+    seen: list[Run] = []
+
+    def network(run: Run) -> np.ndarray:
+        seen.append(run)
+        return np.full(run.rows, 100.0)
+
+    run = drive(with_robot(KNOWN, magnetometer=loud), disturbance_nt=network)
+    read = seen[0]["b_vector_measured_nt"]
+    assert np.isnan(read).any()
+    assert np.isfinite(read).any()
+    assert_array_equal(read, run["b_vector_measured_nt"])
+
+
+def test_with_a_network_the_exact_field_is_still_given_where_it_is_known():
+    run = drive(KNOWN, disturbance_nt=lambda run: np.full(run.rows, 7.0))
+    assert_array_equal(run["b_total_nt"], run["b_map_nt"] + 7.0)
+    assert_array_equal(run["b_truth_nt"], drive(KNOWN)["b_truth_nt"])
+
+
+def test_a_reading_is_the_total_with_noise_rounded_to_the_resolution():
+    spec = MagnetometerSpec(noise_density_nt=5.0 / np.sqrt(135 / 2), resolution_nt=0.01)
+    run = drive(with_robot(KNOWN, magnetometer=spec), path_named("figure8"))
+    noise = run["b_measured_nt"] - run["b_total_nt"]
+    assert noise.std() == pytest.approx(5.0, rel=4 / np.sqrt(2 * run.rows))
+    assert noise.mean() == pytest.approx(0.0, abs=4 * 5 / np.sqrt(run.rows))
+    steps = run["b_measured_nt"] / 0.01
+    assert_allclose(steps, np.rint(steps), atol=1e-6)
+
+
+def test_every_error_has_an_address():
+    spec = MagnetometerSpec(
+        noise_density_nt=0.5, bandwidth_hz=20.0, heading_error_nt=3.0, vector_bias_nt=(50, 0, 0)
+    )
+    neural = with_robot(KNOWN, magnetometer=dataclasses.replace(spec, kind="neural"))
+    for scene, predicts in (
+        (with_robot(KNOWN, magnetometer=spec), None),
+        (with_robot(KNOWN, magnetometer=dataclasses.replace(spec, kind="map-only")), None),
+        (neural, lambda run: 30 * run["yaw"]),
+    ):
+        run = drive(scene, path_named("figure8"), disturbance_nt=predicts, duration_s=20.0)
+        assert_allclose(run["b_map_nt"] + run["b_disturbance_nt"], run["b_total_nt"], rtol=0, atol=1e-9)
+        assert_allclose(run["b_total_nt"] + run["b_noise_nt"], run["b_measured_nt"], rtol=0, atol=1e-9)
+        assert_allclose(np.linalg.norm(run["b_vector_nt"], axis=1), run["b_truth_nt"], rtol=1e-12)
+        assert np.abs(run["b_noise_nt"]).max() > 1
+        off = (run["b_vector_measured_nt"] - run["b_vector_nt"]).mean(axis=0)
+        # an axis is held for a reading on average, in which a field of 24,000 nT turns by about 1 mrad
+        assert_allclose(off, [50, 0, 0], atol=25)
+
+
+def test_a_physical_magnetometer_reads_the_exact_field_and_one_of_the_map_alone_the_map():
+    exact, known = drive(), with_robot(KNOWN, magnetometer=MagnetometerSpec(kind="map-only"))
+    alone, surveyed = drive(known), drive(with_robot(SURVEYED, magnetometer=known.robot.magnetometer))
+    assert exact.facts["magnetometer"] == "physical"
+    assert_array_equal(exact["b_total_nt"], exact["b_map_nt"] + (exact["b_truth_nt"] - exact["b_map_nt"]))
+    for run in (alone, surveyed):  # the map is there whether or not the exact field is known
+        assert run.facts["magnetometer"] == "map-only"
+        assert_array_equal(run["b_total_nt"], run["b_map_nt"])
+        assert_array_equal(run["b_disturbance_nt"], 0)
+    assert_array_equal(alone["b_truth_nt"], exact["b_truth_nt"])
+    assert np.isnan(surveyed["b_truth_nt"]).all()
+
+
+STEEP = SourceSpec(name="beam", p_world=(0.0, 0.35, 0.36), m_world=(0.0, 0.0, 3.0))
+"""Beside the middle of LINE, at the magnetometer's height and 15 cm from where it comes by."""
+
+
+def test_lock_is_lost_beside_steel_and_found_again_farther_on():
+    spec = MagnetometerSpec(gradient_max_nt_m=60e3, gradient_relock_nt_m=30e3, latched_std_nt=20.0)
+    scene = with_robot(dataclasses.replace(KNOWN, sources=(STEEP,)), magnetometer=spec)
+    run = drive(scene)
+    lost, b = run["flag_lost_lock"], run["b_measured_nt"]
+    begins = np.flatnonzero(np.diff(lost.astype(int)) == 1)
+    ends = np.flatnonzero(np.diff(lost.astype(int)) == -1)
+    assert len(begins) == len(ends) == 1
+    assert len(np.unique(b[lost])) == 1  # a plateau, exactly repeated
+    assert abs(b[lost][0] - 35_650) < 100
+    # gradients where it is lost and found, of the exact field, within a step of the look-out (4 cm)
+    sensor = run["p_world_base"] + rotate(run["q_world_base_xyzw"], np.array([0.05, 0.0, 0.36]))
+    step = 0.2 / 5.0
+    for k, limit in ((begins[0], 60e3), (ends[0], 30e3)):
+        near = sensor[k] + np.array([[0, 0, 0], [-step, 0, 0]])
+        before, after = np.sort(ambient_gradient_nt_m(scene, near))
+        assert before * 0.99 < limit < after * 1.01
+    distance = np.abs(sensor[:, 0])
+    assert distance[ends[0]] > distance[begins[0]] + 0.03  # hysteresis: found later than lost
+    assert_array_equal(
+        run["b_measured_nt"][~lost],
+        drive(with_robot(scene, magnetometer=MagnetometerSpec()))["b_measured_nt"][~lost],
+    )
+
+
+def test_where_only_the_map_is_known_its_gradient_costs_the_lock():
+    spec = MagnetometerSpec(kind="map-only", gradient_max_nt_m=4e3, gradient_relock_nt_m=3e3)
+    scene = with_robot(SURVEYED, magnetometer=spec)
+    run = drive(scene, rate_hz=5.0)
+    gradient = np.hypot(*MAP.gradient(run["p_world_base"][:, :2], run["yaw"])[:, :2].T)
+    assert run["flag_lost_lock"][gradient > 4e3].all()
+    assert not run["flag_lost_lock"][gradient < 3e3].any()
+    assert 0 < run["flag_lost_lock"].sum() < run.rows
+
+
+def test_lock_does_not_depend_on_how_often_it_is_read():
+    spec = MagnetometerSpec(gradient_max_nt_m=60e3, gradient_relock_nt_m=30e3)
+    scene = with_robot(dataclasses.replace(KNOWN, sources=(STEEP,)), magnetometer=spec)
+    seldom, often = (drive(scene, rate_hz=rate)["flag_lost_lock"] for rate in (5.0, 100.0))
+    assert_array_equal(seldom, often[::20])
+
+
+@pytest.mark.parametrize("outside", ["nan", "clamp"])
+def test_poses_off_the_map_are_flagged_whatever_they_read(outside):
+    small = wavy_map((0.5, 3.5))
+    run = drive(anomaly_map=small, outside=outside)
+    off = np.abs(run["p_world_base"][:, 0]) > 0.25
+    assert_array_equal(run["flag_outside_map"], off)
+    assert_array_equal(np.isnan(run["b_map_nt"]), off if outside == "nan" else np.zeros_like(off))
+    assert_array_equal(np.isnan(run["b_measured_nt"]), np.isnan(run["b_map_nt"]))
+    assert np.isfinite(run["b_truth_nt"]).all()
+
+
+def test_a_path_off_the_map_can_be_refused():
+    with pytest.raises(InputError, match="off the map"):
+        drive(anomaly_map=wavy_map((0.5, 3.5)), outside="raise")
+
+
+def test_masked_nodes_are_flagged():
+    valid = np.ones((4, 15, 25), bool)
+    valid[:, :, 12] = False  # x = 0
+    masked = dataclasses.replace(MAP, valid=valid)
+    run = drive(anomaly_map=masked)
+    near = np.abs(run["p_world_base"][:, 0]) < 0.249
+    assert run["flag_outside_map"][near].all()
+    assert not run["flag_outside_map"][np.abs(run["p_world_base"][:, 0]) > 0.2501].any()
+
+
+def test_no_bump_where_the_path_keeps_clear():
+    assert not drive(path=path_named("lawnmower"))["flag_bump"].any()
+
+
+def test_a_wall_that_a_corner_swings_over_is_a_bump():
+    # A fold at the very edge: turning on the spot after stopping leaves the robot a fraction of a
+    # millimetre over, which a floor that ends there feels.
+    edge = Path("edge", np.array([[-0.5, 0.2], [0.5, 0.2], [0.5, -0.2]]))
+    tight = dataclasses.replace(KNOWN, lab=LabSpec(floor_m=(2 * (0.5 + 0.171), 3.5)))
+    run = drive(tight, edge)
+    reach = np.abs(run["p_world_base"][:, 0]) + 0.171
+    assert_array_equal(run["flag_bump"], reach > 0.671 + 1e-9)
+    assert run["flag_bump"].any()
+
+
+def test_one_seed_gives_identical_arrays_and_another_gives_others():
+    a, b, c = drive(seed=3), drive(seed=3), drive(seed=4)
+    for name in COLUMNS:
+        assert a[name].tobytes() == b[name].tobytes(), name
+    for name in ("odom_v", "imu_w", "imu_a", "imu_q_xyzw", "battery_v", "b_measured_nt"):
+        assert not np.array_equal(a[name], c[name]), name
+
+
+def test_each_sensor_has_noise_of_its_own():
+    louder = with_robot(KNOWN, imu=dataclasses.replace(ROBOT.imu, rate_hz=200.0, gyro_noise_std=1.0))
+    a, b = drive(), drive(louder)
+    for name in ("odom_p", "battery_v", "b_measured_nt", "odom_v"):
+        assert_array_equal(a[name], b[name])
+    assert not np.array_equal(a["imu_w"], b["imu_w"])
+
+
+def test_a_single_reading_is_a_run_too():
+    run = drive(duration_s=0.005)
+    assert run.rows == 1
+    assert np.isfinite(run["b_measured_nt"]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"speed": 0.5}, r"speed must be above 0 and at most 0\.306 m/s"),
+        ({"rate_hz": 0.0}, "rate_hz of the magnetometer must be above 0 Hz"),
+        ({"rate_hz": float("inf")}, "rate_hz of the magnetometer must be above 0 Hz and finite"),
+        ({"duration_s": -1.0}, "duration_s must be above 0 s"),
+        ({"duration_s": float("inf")}, "duration_s must be above 0 s and finite, got inf"),
+        (
+            {"rate_hz": 1e9},
+            r"at 1e\+09 Hz make .*e\+\d+ readings, more than 20,000,000; lower rate_hz to .* Hz",
+        ),
+        (
+            {"duration_s": 3600.0, "rate_hz": 1e4},
+            r"3600 s at 10000 Hz make 3\.6e\+07 readings, more than 20,000,000; lower rate_hz to 5556 Hz, "
+            r"or duration_s to 2000 s",
+        ),
+        ({"lidar": "maybe"}, 'lidar must be "schedule", "on" or "off"'),
+        ({"outside": "guess"}, 'outside must be "nan", "clamp" or "raise"'),
+        (
+            {"scene": SURVEYED, "anomaly_map": FLAT},
+            r"scene 'surveyed' has a constant map and no Earth field.*name a map that was fitted",
+        ),
+        (
+            {"scene": with_robot(KNOWN, magnetometer=MagnetometerSpec(kind="neural"))},
+            "scene 'known' has a neural magnetometer, and no network predicts its disturbance; open it",
+        ),
+        (
+            {"path": Path("far", np.array([[0.0, 0.0], [2.9, 0.0]]))},
+            r"path far leaves the floor at point 2 of 2",
+        ),
+        ({"path": np.array([[0.0, 0.0], [1.0, 0.0]])}, "what to drive must be a Path, Commands, a Run or"),
+        ({"path": "figure8"}, "what to drive must be a Path"),
+        ({"disturbance_nt": lambda run: np.zeros(3)}, r"disturbance_nt must give shape \(\d+,\), got \(3,\)"),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused(options, says):
+    with pytest.raises(InputError, match=says):
+        drive(**options)

@@ -1,0 +1,157 @@
+"""Battery: energy bookkeeping, closed forms of the load, sag, the discharge curve, the linear model."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.sim.motion.drive import Motion
+from magtwin.sim.sensors.battery import (
+    STEP_S,
+    Discharge,
+    current_a,
+    discharge,
+    open_voltage,
+    sense_battery,
+    wheels_energy_j,
+)
+from magtwin.spec.scene import BatterySpec, DriveSpec
+
+DRIVE = DriveSpec()
+STILL = Motion(DRIVE, 0.02, np.zeros(10), np.zeros(10))
+
+
+def discharged(spec: BatterySpec, motion: Motion = STILL, seconds: float = 600.0, on=False) -> Discharge:
+    return discharge(spec, DRIVE, motion, lambda t: np.full(np.shape(t), on), seconds)
+
+
+def ramp(v: float, steps: int = 1000) -> Motion:
+    """Up to a speed in half a second, along, and to a stop again."""
+    speed = np.minimum(np.arange(steps) * v / 25, v)
+    return Motion(DRIVE, 0.02, np.minimum(speed, speed[::-1]), np.zeros(steps))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    resistance=st.floats(0, 0.5),
+    load=st.floats(0, 60),
+    initial=st.floats(0.2, 1),
+    speed=st.floats(0.05, 0.3),
+    on=st.booleans(),
+)
+def test_what_the_pack_loses_is_what_was_drawn_and_its_own_heat(resistance, load, initial, speed, on):
+    spec = BatterySpec(resistance_ohm=resistance, load_w=load, initial_fraction=initial)
+    pack = discharged(spec, ramp(speed), 120.0, on)
+    current = pack.current_a[1:]
+    drawn = np.cumsum(pack.power_w + resistance * current**2) * STEP_S
+    lost = (initial - pack.fraction[1:]) * spec.capacity_wh * 3600
+    assert_allclose(lost, drawn, rtol=1e-9, atol=1e-7)
+    assert_allclose(pack.voltage_v[1:] * current, pack.power_w, rtol=1e-12)
+    rest = open_voltage(spec, pack.fraction[:-1])
+    assert_allclose(pack.voltage_v[1:], rest - resistance * current, rtol=1e-12)
+
+
+def test_the_load_is_that_of_electronics_lidar_and_motors():
+    motion = ramp(0.25)
+    spec = BatterySpec(load_w=15.0, lidar_w=2.3)
+    standing, spinning, driving = (
+        discharged(spec, m, 40.0, on).power_w.sum() * STEP_S
+        for m, on in ((STILL, False), (STILL, True), (motion, False))
+    )
+    steps = len(discharged(spec, seconds=40.0).power_w)
+    assert standing == pytest.approx(15.0 * steps * STEP_S)
+    assert spinning - standing == pytest.approx(2.3 * steps * STEP_S)
+    way = motion.poses[-1, 0]
+    work = (spec.drag_n * way + spec.mass_kg * 0.25**2 / 2) / spec.motor_efficiency
+    assert driving - standing == pytest.approx(work, rel=1e-9)
+
+
+def test_a_turn_on_the_spot_costs_the_way_of_both_wheels():
+    spec = BatterySpec()
+    turning = Motion(DRIVE, 0.02, np.zeros(500), np.full(500, 1.0))
+    times = np.arange(0.0, 10.0, 0.05)
+    rim = 1.0 * DRIVE.wheel_separation_m / 2
+    energy = wheels_energy_j(spec, DRIVE, turning, times)
+    assert_allclose(energy, spec.drag_n * rim * 0.05 / spec.motor_efficiency, rtol=1e-9)
+
+
+def test_without_load_nothing_is_lost_and_nothing_sags():
+    pack = discharged(BatterySpec(load_w=0.0, initial_fraction=0.6))
+    assert_array_equal(pack.fraction, 0.6)
+    assert_array_equal(pack.current_a, 0.0)
+    assert_allclose(pack.voltage_v, open_voltage(BatterySpec(), 0.6))
+
+
+def test_a_pack_without_resistance_falls_by_load_over_capacity_an_hour():
+    spec = BatterySpec(capacity_wh=26.0, load_w=13.0, initial_fraction=0.75, resistance_ohm=0.0)
+    pack = discharged(spec, seconds=3600.0)
+    assert pack.fraction[round(3600 / STEP_S)] == pytest.approx(0.25, abs=1e-12)
+    assert np.all(np.diff(pack.fraction) < 0)
+
+
+@pytest.mark.parametrize("model", ["power", "linear"])
+def test_charge_is_never_below_0_and_an_empty_pack_stays_empty(model):
+    spec = BatterySpec(model=model, capacity_wh=0.1, initial_fraction=0.5)
+    pack = discharged(spec, seconds=60.0)
+    assert pack.fraction.min() == 0
+    assert_array_equal(pack.fraction[round(30 / STEP_S) :], 0)
+    assert np.isfinite(pack.voltage_v).all()
+    assert np.isfinite(pack.current_a).all()
+
+
+def test_the_current_is_the_smaller_root_of_power_through_a_resistance():
+    spec = BatterySpec(resistance_ohm=0.2)
+    u = float(open_voltage(spec, 0.5))
+    power = np.array([0.0, 5.0, 50.0])
+    root = (u - np.sqrt(u * u - 4 * 0.2 * power)) / (2 * 0.2)
+    assert_allclose(current_a(spec, power, np.full(3, 0.5)), root, rtol=1e-12)
+    spec = dataclasses.replace(spec, resistance_ohm=0.0)
+    assert_allclose(current_a(spec, power, np.full(3, 0.5)), power / u)
+
+
+def test_no_more_is_drawn_than_an_empty_pack_can_give():
+    spec = BatterySpec(resistance_ohm=10.0, load_w=15.0)
+    pack = discharged(spec, seconds=10.0)
+    most = spec.voltage_empty_v**2 / 40
+    assert most < 15
+    assert_allclose(pack.power_w, most)
+    assert_allclose(pack.voltage_v * pack.current_a, most)
+
+
+def test_the_discharge_curve_goes_through_its_points_and_from_empty_to_full():
+    spec = BatterySpec(discharge=(0.0, 0.7, 1.0), voltage_empty_v=10.0, voltage_full_v=20.0)
+    assert_allclose(open_voltage(spec, [0.0, 0.25, 0.5, 0.75, 1.0]), [10, 13.5, 17, 18.5, 20])
+
+
+def test_the_linear_model_is_the_papers():
+    spec = BatterySpec(model="linear", load_w=13.0, initial_fraction=0.75, latency_s=0.0, jitter_s=0.0)
+    pack = discharged(spec, ramp(0.3), 7000.0, on=True)
+    times = np.arange(len(pack.fraction)) * STEP_S
+    assert_allclose(pack.fraction, np.maximum(0.75 - 0.5 * times / 3600, 0.0), atol=1e-12)
+    assert_allclose(pack.voltage_v, open_voltage(spec, pack.fraction))
+    assert_allclose(pack.current_a * pack.voltage_v, 13.0)
+    t = np.arange(14_000) / 2.0
+    read = sense_battery(dataclasses.replace(spec, rate_hz=2.0), pack, t, np.random.default_rng(0))
+    noise = read["battery_v"] - open_voltage(spec, read["battery_fraction"])
+    assert noise.std() == pytest.approx(0.02, rel=0.03)  # one sigma: 0.6 %
+    assert noise.mean() == pytest.approx(0.0, abs=4 * 0.02 / np.sqrt(len(t)))
+
+
+def test_voltage_has_gaussian_noise_and_charge_and_current_have_none():
+    spec = BatterySpec(rate_hz=10.0, voltage_noise_std_v=0.05, latency_s=0.0, jitter_s=0.0)
+    pack = discharged(spec, seconds=2000.0)
+    t = np.arange(20_000) / 10.0
+    read = sense_battery(spec, pack, t, np.random.default_rng(0))
+    state = pack.index(t)
+    assert_array_equal(read["battery_fraction"], pack.fraction[state])
+    assert_array_equal(read["battery_a"], pack.current_a[state])
+    noise = read["battery_v"] - pack.voltage_v[state]
+    assert noise.std() == pytest.approx(0.05, rel=0.03)
+
+
+def test_a_state_is_that_of_the_last_step_that_has_ended():
+    pack = discharged(BatterySpec(), seconds=1.0)
+    assert_array_equal(pack.index([-1.0, 0.0, 0.049, 0.05, 0.99, 5.0]), [0, 0, 0, 1, 19, len(pack.power_w)])

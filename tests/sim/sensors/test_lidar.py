@@ -1,0 +1,207 @@
+"""LiDAR: its schedule, and scans against closed forms and a plain ray caster."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.errors import InputError
+from magtwin.frames import quat_from_rpy, quat_from_yaw, rotate
+from magtwin.run.run import Run
+from magtwin.sim.sensors.lidar import lidar_on, ray_angles, scan, scans_of
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.scene import LidarSpec, RobotSpec
+
+QUIET = LidarSpec(range_noise_std_m=0.0, latency_s=0.0, jitter_s=0.0)
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+FACES = ((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6),
+         (0, 6, 4), (1, 5, 7), (1, 7, 3))  # fmt: skip
+
+
+def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> np.ndarray:
+    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1])
+                        for z in (low[2], high[2])])  # fmt: skip
+    return corners[np.array(FACES)]
+
+
+def room(*boxes: np.ndarray) -> Obstacles:
+    return Obstacles(triangles=np.concatenate(boxes))
+
+
+def square(side: float) -> Obstacles:
+    """The inside of a box: its walls, seen from within."""
+    return room(box((-side / 2, -side / 2, 0.0), (side / 2, side / 2, 0.5)))
+
+
+def cast_plainly(triangles: np.ndarray, p: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Each ray against each triangle, after Moeller and Trumbore (1997)."""
+    a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    ranges = np.full(len(directions), np.inf)
+    for i, d in enumerate(directions):
+        h = np.cross(d, v)
+        det = np.sum(u * h, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            s = np.sum((p - a) * h, axis=1) / det
+            q = np.cross(p - a, u)
+            t = q @ d / det
+            r = np.sum(v * q, axis=1) / det
+            hit = (s >= -1e-9) & (t >= -1e-9) & (s + t <= 1 + 1e-9) & (r > 0)
+        ranges[i] = r[hit].min(initial=np.inf)
+    return ranges
+
+
+def directions(spec: LidarSpec, q) -> np.ndarray:
+    angle = ray_angles(spec.rays)
+    return rotate(np.asarray(q), np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))]))
+
+
+def test_the_lidars_schedule_begins_off():
+    spec = LidarSpec(off_s=40.0, on_s=20.0)
+    assert_array_equal(
+        lidar_on(spec, [0.0, 39.9, 40.0, 59.9, 60.0, 99.9, 100.0]),
+        [False, False, True, True, False, False, True],
+    )
+
+
+def test_a_phase_is_where_the_schedule_begins():
+    t = np.linspace(0, 300, 3001)
+    for phase in (0.0, 13.0, 47.0, 60.0, 200.0):
+        shifted = lidar_on(LidarSpec(off_s=40.0, on_s=20.0, phase_s=phase), t)
+        assert_array_equal(shifted, lidar_on(LidarSpec(off_s=40.0, on_s=20.0), t + phase))
+
+
+def test_a_schedule_without_a_part_is_constant_and_modes_override_it():
+    t = np.linspace(0, 200, 1001)
+    assert not lidar_on(LidarSpec(on_s=0.0), t).any()
+    assert lidar_on(LidarSpec(off_s=0.0), t).all()
+    assert not lidar_on(LidarSpec(on_s=0.0, off_s=0.0), t).any()
+    assert lidar_on(LidarSpec(), t, "on").all()
+    assert not lidar_on(LidarSpec(), t, "off").any()
+    with pytest.raises(InputError, match='must be "schedule", "on" or "off", got \'sometimes\''):
+        lidar_on(LidarSpec(), t, "sometimes")  # type: ignore[arg-type]
+
+
+@settings(max_examples=60, deadline=None)
+@given(x=st.floats(-1.9, 1.9), y=st.floats(-1.9, 1.9), yaw=st.floats(-7, 7), rays=st.integers(1, 500))
+def test_ranges_in_a_square_room_are_the_closed_form(x, y, yaw, rays):
+    spec = dataclasses.replace(QUIET, rays=rays, range_min_m=0.0)
+    ranges = scan(square(4.0), ((x, y, 0.2), quat_from_yaw(yaw)), spec)
+    angle = ray_angles(spec.rays) + yaw
+    cos, sin = np.cos(angle), np.sin(angle)
+    with np.errstate(divide="ignore", over="ignore"):
+        wanted = np.minimum((np.copysign(2.0, cos) - x) / cos, (np.copysign(2.0, sin) - y) / sin)
+    assert_allclose(ranges, wanted, rtol=1e-7)
+
+
+def test_rays_go_anticlockwise_from_behind_in_the_lidars_own_axes():
+    spec = dataclasses.replace(QUIET, rays=4)
+    ranges = scan(square(4.0), ((1.0, 0.5, 0.2), LEVEL), spec)
+    assert_allclose(ranges, [3.0, 2.5, 1.0, 1.5])  # behind, right, ahead, left
+    turned = scan(square(4.0), ((1.0, 0.5, 0.2), quat_from_yaw(np.pi / 2)), spec)
+    assert_allclose(turned, [2.5, 1.0, 1.5, 3.0])
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), tilt=st.integers(-300, 300).map(lambda mrad: mrad / 1000))
+def test_a_scan_among_boxes_is_what_a_plain_ray_caster_sees_however_the_lidar_leans(seed, tilt):
+    rng = np.random.default_rng(seed)
+    low = rng.uniform(-3, 2.5, (8, 3)) * (1, 1, 0.02)
+    size = rng.uniform(0.1, 1.0, (8, 3))
+    obstacles = room(*(box(tuple(a), tuple(a + b)) for a, b in zip(low, size, strict=True)))
+    spec = dataclasses.replace(QUIET, rays=90, range_min_m=0.0)
+    p, q = rng.uniform(-1, 1, 3) * (1, 1, 0.1) + (0, 0, 0.3), quat_from_rpy([tilt, -tilt / 2, seed])
+    ranges = scan(obstacles, (p, q), spec)
+    wanted = cast_plainly(obstacles.triangles, p, directions(spec, q))
+    wanted[wanted > spec.range_max_m] = np.inf
+    # A ray that grazes an edge may go either way.
+    agree = np.isclose(ranges, wanted, rtol=1e-6) | (np.isinf(ranges) & np.isinf(wanted))
+    assert np.count_nonzero(~agree) <= 1
+    assert np.isfinite(wanted).any() or not np.isfinite(ranges).any()
+
+
+def test_what_is_above_or_below_the_plane_of_the_rays_is_not_seen():
+    low, high = box((1.0, -0.5, 0.0), (1.2, 0.5, 0.1)), box((2.0, -0.5, 0.0), (2.2, 0.5, 0.4))
+    spec = dataclasses.replace(QUIET, rays=4)
+    over = scan(room(low, high), ((0.0, 0.0, 0.2), LEVEL), spec)
+    assert over[2] == pytest.approx(2.0)
+    under = scan(room(low, high), ((0.0, 0.0, 0.05), LEVEL), spec)
+    assert under[2] == pytest.approx(1.0)
+
+
+def test_too_far_is_inf_and_too_near_is_minus_inf():
+    spec = LidarSpec(rays=4, range_noise_std_m=0.0, range_min_m=0.5, range_max_m=2.0)
+    ranges = scan(square(4.0), ((1.7, 0.5, 0.2), LEVEL), spec)
+    assert_allclose(ranges, [np.inf, np.inf, -np.inf, 1.5])
+    assert_array_equal(scan(Obstacles(), ((0, 0, 0), LEVEL), spec), np.full(4, np.inf))
+
+
+def test_noise_of_a_range_has_the_spread_of_the_spec():
+    spec = LidarSpec(rays=20_000, range_noise_std_m=0.03)
+    pose = ((0.0, 0.0, 0.2), LEVEL)
+    noise = scan(square(4.0), pose, spec, np.random.default_rng(0)) - scan(square(4.0), pose, spec)
+    assert noise.std() == pytest.approx(0.03, rel=0.02)
+    assert noise.mean() == pytest.approx(0.0, abs=4 * 0.03 / np.sqrt(spec.rays))
+
+
+def a_run(lidar: np.ndarray | None = None) -> Run:
+    t = np.arange(1350) / 135.0
+    x, yaw = -0.5 + 0.1 * t, 0.3 * t
+    return Run({
+        "t": t,
+        "p_world_base": np.column_stack([x, np.zeros_like(x), np.zeros_like(x)]),
+        "yaw": (yaw + np.pi) % (2 * np.pi) - np.pi,
+        "lidar_on": np.ones(len(t), bool) if lidar is None else lidar,
+    })  # fmt: skip
+
+
+ROBOT = RobotSpec(
+    name="robot",
+    asset=Path("robot.usda"),
+    lidar=QUIET,
+    p_base_lidar=(-0.04, 0.01, 0.19),
+    q_base_lidar_link_xyzw=(0.0, 0.0, 0.5**0.5, 0.5**0.5),
+)
+
+
+def test_a_runs_scans_are_those_at_its_poses_once_a_turn():
+    run = a_run()
+    scans = scans_of(run, ROBOT, square(4.0), np.random.default_rng(0))
+    assert_allclose(np.diff(scans.t), 1 / 7.5)
+    assert len(scans.t) == 75
+    for i in (0, 17, 74):
+        yaw = 0.3 * scans.t[i]
+        q = quat_from_yaw(yaw + np.pi / 2)
+        p = np.array([-0.5 + 0.1 * scans.t[i], 0, 0]) + rotate(quat_from_yaw(yaw), ROBOT.p_base_lidar)
+        assert_allclose(scans.ranges_m[i], scan(square(4.0), (p, q), QUIET), rtol=1e-6)
+
+
+def test_points_lie_on_the_walls():
+    scans = scans_of(a_run(), ROBOT, square(4.0), np.random.default_rng(0))
+    for points in scans.points_world():
+        assert len(points) == QUIET.rays
+        assert_allclose(np.abs(points[:, :2]).max(axis=1), 2.0, rtol=1e-6)
+        assert_allclose(points[:, 2], 0.19)
+
+
+def test_a_tilted_lidar_is_scanned_at_each_pose_as_a_level_one_is():
+    level = scans_of(a_run(), ROBOT, square(4.0), np.random.default_rng(0))
+    hair = tuple(quat_from_rpy([1e-9, 0, 0]).tolist())
+    leaning = dataclasses.replace(ROBOT, lidar=dataclasses.replace(QUIET, q_link_sensor_xyzw=hair))
+    assert_allclose(scans_of(a_run(), leaning, square(4.0), np.random.default_rng(0)).ranges_m,
+                    level.ranges_m, rtol=1e-6)  # fmt: skip
+
+
+def test_scans_come_while_the_lidar_spins_and_late_in_order():
+    on = np.arange(1350) >= 675
+    spec = dataclasses.replace(QUIET, latency_s=0.14, jitter_s=0.1)
+    scans = scans_of(a_run(on), dataclasses.replace(ROBOT, lidar=spec), square(4.0), np.random.default_rng(0))
+    assert scans.t.min() >= 5.0
+    assert len(scans.t) == 37
+    assert np.all(scans.arrival - scans.t >= 0.14)
+    assert np.all(np.diff(scans.arrival) >= 0)
+    none = scans_of(a_run(np.zeros(1350, bool)), ROBOT, square(4.0), np.random.default_rng(0))
+    assert none.ranges_m.shape == (0, QUIET.rays)

@@ -1,0 +1,182 @@
+"""Model error: readings are off a network's predictions by what the network says, session by session."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+
+import magtwin
+from magtwin import simulate, simulate_many
+from magtwin.errors import MismatchWarning
+from magtwin.io.provenance import repeat
+from magtwin.learn.models.network import FieldNet
+from magtwin.run.run import COLUMNS
+from magtwin.sim.sensors.model_error import ModelError
+from magtwin.sim.sensors.noise import gauss_markov
+from magtwin.twin import Twin, in_session, open_twin
+
+SD, OFFSET, TIME_S = 120.0, 80.0, 2.0
+FACTS = {"residual_offset_sd_nt": OFFSET, "residual_within_sd_nt": 89.4, "residual_time_s": TIME_S}
+SHORT = {"duration_s": 2.0, "rate_hz": 20.0}
+
+
+def weights(folder, **options):
+    torch.manual_seed(0)
+    file = folder / "small.safetensors"
+    FieldNet("full", (8, 8), **options).save(file)
+    return file
+
+
+@pytest.fixture(scope="module")
+def net(tmp_path_factory):
+    return weights(tmp_path_factory.mktemp("net"), residual_sd_nt=SD, facts=FACTS)
+
+
+@pytest.fixture(scope="module")
+def twin(lab_scene, net) -> Twin:
+    return open_twin(lab_scene, net=net)
+
+
+def test_the_variance_is_that_of_the_prediction_whatever_that_is():
+    rng = np.random.default_rng(0)
+    sd = np.array([10.0, 79.0, 80.0, 81.0, 150.0, 900.0])
+    errors = np.array(
+        [
+            ModelError(OFFSET, TIME_S).in_session(rng).error_nt(sd, rng.standard_normal(len(sd)))
+            for _ in range(20_000)
+        ]
+    )
+    assert_allclose(errors.std(axis=0), sd, rtol=0.02)  # 20,000 draws tell it to 0.5 %
+    assert_allclose(errors.mean(axis=0), 0, atol=0.03 * sd.max())
+
+
+def test_the_offset_is_a_constant_where_the_prediction_is_less_sure_than_it():
+    error = ModelError(OFFSET, TIME_S, offset=-1.5).error_nt([80.0, 200.0, 5000.0, 40.0], np.zeros(4))
+    assert_allclose(error, [-120.0, -120.0, -120.0, -60.0])
+
+
+def test_where_no_standard_deviation_is_known_there_is_no_error():
+    assert_array_equal(
+        ModelError(OFFSET, TIME_S, offset=1.0).error_nt([np.nan, 80.0], [3.0, 0.0]), [0.0, 80.0]
+    )
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0, 135.0])
+def test_the_process_forgets_in_its_time_at_any_rate(rate_hz):
+    white = np.random.default_rng(1).standard_normal(round(2000 * rate_hz))
+    process = ModelError(OFFSET, TIME_S).process(white, rate_hz)
+    assert process.std() == pytest.approx(1.0, abs=0.06)  # 500 times of independence
+    lag = round(TIME_S * rate_hz)
+    assert np.mean(process[lag:] * process[:-lag]) == pytest.approx(np.exp(-1), abs=0.1)
+    assert_array_equal(process, gauss_markov(white, TIME_S, rate_hz))
+
+
+def test_readings_lie_in_their_intervals_on_many_sessions(twin):
+    runs = simulate_many(
+        twin, "figure8", range(150), columns=["b_total_nt", "b_measured_nt", "b_sd_nt"], **SHORT
+    )
+    off = np.array([(run["b_measured_nt"] - run["b_total_nt"]) / run["b_sd_nt"] for run in runs])
+    # 150 sessions are 150 draws of a constant that has 44 % of the variance
+    assert np.mean(np.abs(off) <= 1.6449) == pytest.approx(0.9, abs=0.04)
+    assert off.std() == pytest.approx(1.0, abs=0.09)
+    within = off - off.mean(axis=1, keepdims=True)
+    assert off.mean(axis=1).std() > 0.6
+    assert within.std() < 0.7
+
+
+def test_readings_add_up_and_everything_else_is_as_without_the_error(twin):
+    run = simulate(twin, "figure8", seed=3, **SHORT)
+    plain = simulate(twin, "figure8", seed=3, model_error=False, **SHORT)
+    total = run["b_total_nt"] + run["b_model_error_nt"]
+    assert_allclose(run["b_measured_nt"], total + run["b_noise_nt"], rtol=0, atol=1e-9)
+    assert np.abs(run["b_model_error_nt"]).max() > 10
+    assert_array_equal(plain["b_model_error_nt"], 0)
+    for name in COLUMNS.keys() - {"b_model_error_nt", "b_measured_nt"}:
+        assert_array_equal(run[name], plain[name], err_msg=name)
+    assert (run.facts["model_error"], plain.facts["model_error"]) == (True, False)
+
+
+def offsets(lab_scene, tmp_path, of):
+    """The constants of runs whose error is an offset alone."""
+    net = weights(tmp_path, residual_sd_nt=SD, facts=FACTS | {"residual_offset_sd_nt": SD})
+    runs = of(open_twin(lab_scene, net=net))
+    for run in runs:
+        assert np.ptp(run["b_model_error_nt"]) < 1e-9
+    return [float(run["b_model_error_nt"][0]) for run in runs]
+
+
+def test_a_session_has_one_offset_and_another_session_another(lab_scene, tmp_path):
+    def of(twin):
+        first, second = (in_session(twin, k, seed=5) for k in (0, 1))
+        made = [simulate(one, "sine", seed=seed, **SHORT) for seed in (1, 2) for one in (first, second)]
+        many = simulate_many(twin, "sine", [1, 2], robots=[first, second], **SHORT)
+        return [*made, *many]
+
+    a, b, again, other, many_a, many_b = offsets(lab_scene, tmp_path, of)
+    assert a == again == many_a
+    assert b == other == many_b
+    assert abs(a - b) > 1e-3 * SD
+
+
+def test_sessions_that_are_drawn_from_the_seed_have_offsets_of_the_right_size(lab_scene, tmp_path):
+    made = offsets(lab_scene, tmp_path, lambda twin: list(simulate_many(twin, "sine", range(100), **SHORT)))
+    assert np.std(made) == pytest.approx(SD, rel=0.2)  # 7 %
+    assert len(set(made)) == 100
+
+
+def test_a_physical_magnetometer_has_no_model_error(lab_scene):
+    run = simulate(lab_scene, "sine", magnetometer="physical", **SHORT)
+    assert_array_equal(run["b_model_error_nt"], 0)
+    assert "model_error" not in run.facts
+
+
+@pytest.mark.parametrize("options", [{"residual_sd_nt": SD}, {"facts": FACTS}])
+def test_weights_that_do_not_say_how_their_error_varies_draw_none_and_warn(lab_scene, tmp_path, options):
+    with pytest.warns(MismatchWarning, match="does not say how its error varies in time"):
+        twin = open_twin(lab_scene, net=weights(tmp_path, **options))
+    run = simulate(twin, "sine", **SHORT)
+    assert_array_equal(run["b_model_error_nt"], 0)
+    assert run.facts["model_error"] is False
+
+
+def test_figures_that_cannot_be_are_refused(lab_scene, tmp_path):
+    net = weights(tmp_path, residual_sd_nt=SD, facts=FACTS | {"residual_time_s": -1.0})
+    with pytest.raises(magtwin.InputError, match="residual_time_s"):
+        open_twin(lab_scene, net=net)
+
+
+@pytest.mark.parametrize("model_error", [True, False])
+def test_a_run_is_made_once_more_to_the_bit(twin, model_error):
+    run = simulate(twin, "figure8", seed=8, model_error=model_error, **SHORT)
+    assert repeat(run).equal
+
+
+def test_a_vector_of_robots_has_an_error_and_draws_the_rest_as_without(twin):
+    gym = pytest.importorskip("magtwin.gym", reason="needs the extra gym")
+    seen = {}
+    for model_error in (True, False):
+        env = gym.MagNavVectorEnv(
+            200, scene=twin, signals=["b_measured_nt", "b_total_nt"], model_error=model_error
+        )
+        env.reset(seed=1)
+        rows = []
+        for _ in range(3):
+            env.step(np.tile([0.2, 0.0], (200, 1)))
+            rows.append({name: values.copy() for name, values in env.fleet.columns.items()})
+        seen[model_error] = rows
+    for a, b in zip(seen[True], seen[False], strict=True):
+        assert_array_equal(a["b_total_nt"], b["b_total_nt"])
+        assert_array_equal(a["imu_w"], b["imu_w"])
+        assert_array_equal(b["b_model_error_nt"], 0)
+        assert a["b_model_error_nt"].std() == pytest.approx(SD, rel=0.15)
+    first, last = seen[True][0]["b_model_error_nt"], seen[True][-1]["b_model_error_nt"]
+    assert np.corrcoef(first, last)[0, 1] > 0.85  # 0.2 s of 2 s, and the offset
+
+
+def test_the_shipped_network_says_how_its_error_varies(lab_scene):
+    found = open_twin(lab_scene)
+    assert 0 < found.model_error.offset_sd_nt < 300
+    assert 0 < found.model_error.time_s < 60
+    assert dataclasses.replace(found.model_error, offset=1.0).offset == 1.0

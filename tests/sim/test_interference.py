@@ -1,0 +1,296 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.errors import InputError
+from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.sim import interference
+from magtwin.sim.interference import (
+    ambient_field_nt,
+    ambient_gradient_nt_m,
+    draw_platform,
+    field_at_sensor_nt,
+    level_field_nt,
+    level_gradient_nt_m,
+    platform_field_nt,
+    rest_current_a,
+    turning_iron_nt,
+    wheel_torques_nm,
+)
+from magtwin.sim.motion.drive import Motion
+from magtwin.spec.scene import (
+    BatterySpec,
+    DriveSpec,
+    EarthFieldSpec,
+    FurnitureSpec,
+    PlatformFieldSpec,
+    RobotSpec,
+    Scene,
+    SourceSpec,
+)
+
+EARTH = EarthFieldSpec(
+    b_world_nt=(-2_745.6, 24_067.1, -38_418.4),
+    latitude_deg=29.65,
+    longitude_deg=-82.35,
+    height_m=50.0,
+    date="2026-11-21",
+)
+SCENE = Scene(name="hall", map_layer=Path("hall.usdc"), robot=RobotSpec(name="r", asset=Path("r.usda")))
+QUIET = {
+    "b_rate": np.zeros((4, 3)),
+    "motor_nm": np.zeros((4, 2)),
+    "lidar_on": np.zeros(4, bool),
+    "lidar_angle": np.zeros(4),
+    "battery_a": np.zeros(4),
+}
+LAB = replace(
+    SCENE,
+    earth=EARTH,
+    sources=(
+        SourceSpec(name="pipe", p_world=(0.5, 0.0, -0.6), m_world=(1.0, -2.0, 3.0)),
+        SourceSpec(
+            name="block",
+            p_world=(-0.4, 0.3, -0.4),
+            shape="cuboid",
+            size_m=(0.2, 0.1, 0.1),
+            magnetization=(0, 0, 4e3),
+        ),
+    ),
+    furniture=(FurnitureSpec(name="desk", kind="desk", p_world=(0.0, 1.5, 0.0), magnetization=()),),
+)
+B = np.random.default_rng(0).normal(scale=25_000, size=(4, 3))
+
+
+def test_without_sources_the_ambient_field_is_the_earths_everywhere():
+    field = ambient_field_nt(replace(SCENE, earth=EARTH), np.zeros((2, 5, 3)))
+    assert_array_equal(field, np.broadcast_to(EARTH.b_world_nt, (2, 5, 3)))
+
+
+def test_sources_add_their_dipole_fields_to_the_earths():
+    source = SourceSpec(name="pipe", p_world=(0.5, 0.0, -0.6), m_world=(1.0, -2.0, 3.0))
+    scene = replace(SCENE, earth=EARTH, sources=(source, replace(source, name="beam", p_world=(0, 0, -1.0))))
+    p = np.array([[0.0, 0.0, 0.4], [1.0, 1.0, 0.4]])
+    want = dipole_field_nt(p, [[0.5, 0, -0.6], [0, 0, -1.0]], [[1.0, -2.0, 3.0]] * 2) + EARTH.b_world_nt
+    assert_allclose(ambient_field_nt(scene, p), want, rtol=0, atol=1e-9)
+
+
+def test_a_scene_without_the_earths_field_has_no_exact_field():
+    with pytest.raises(InputError, match=r"scene 'hall' has no Earth's field.*\[earth\]"):
+        ambient_field_nt(SCENE, np.zeros(3))
+
+
+def test_the_labs_field_has_neither_sources_nor_curls_where_the_robot_is():
+    p, h = np.random.default_rng(1).uniform((-0.8, -0.8, 0.2), (0.8, 0.8, 0.6), (20, 3)), 1e-4
+    ahead, behind = (ambient_field_nt(LAB, p[:, None] + s * h * np.eye(3)) for s in (1, -1))
+    slope = (ahead - behind) / (2 * h)  # [point, along, component]
+    size = np.abs(slope).max(axis=(1, 2))
+    assert np.all(np.abs(np.trace(slope, axis1=1, axis2=2)) < 1e-4 * size)  # what dipoles for bodies leave
+    assert np.all(np.abs(slope - slope.swapaxes(1, 2)).max(axis=(1, 2)) < 1e-4 * size)
+
+
+def test_the_gradient_is_that_of_the_magnitude():
+    p, h = np.array([[0.1, 0.2, 0.35], [0.45, -0.1, 0.3]]), 1e-4
+    ahead, behind = (
+        np.linalg.norm(ambient_field_nt(LAB, p[:, None] + s * h * np.eye(3)), axis=-1) for s in (1, -1)
+    )
+    want = np.linalg.norm((ahead - behind) / (2 * h), axis=1)
+    assert_allclose(ambient_gradient_nt_m(LAB, p), want, rtol=1e-5)
+    assert ambient_gradient_nt_m(LAB, p[0]).shape == ()
+    assert_array_equal(ambient_gradient_nt_m(replace(SCENE, earth=EARTH), p), 0)
+
+
+def test_what_is_looked_up_at_one_height_is_the_exact_field_and_gradient_there():
+    p = np.column_stack([np.random.default_rng(2).uniform(-0.9, 0.9, (200, 2)), np.full(200, 0.35)])
+    field, slopes = level_field_nt(LAB, p[:, :2], 0.35)
+    assert_allclose(field, ambient_field_nt(LAB, p), rtol=0, atol=0.01)
+    assert slopes.shape == (200, 2, 3)
+    gradient = level_gradient_nt_m(LAB, p[:, :2], 0.35)
+    assert_allclose(gradient, ambient_gradient_nt_m(LAB, p), rtol=1e-4)  # what dipoles for bodies leave
+    assert gradient.max() > 3 * gradient.min() > 0
+
+
+def test_a_floor_full_of_points_is_looked_up(monkeypatch):
+    p = np.column_stack([np.random.default_rng(2).uniform(-0.9, 0.9, (200, 2)), np.full(200, 0.35)])
+    exact = ambient_field_nt(LAB, p)
+    monkeypatch.setattr(interference, "MANY", 200)
+    many = ambient_field_nt(LAB, p.reshape(10, 20, 3))
+    assert_array_equal(many.reshape(-1, 3), level_field_nt(LAB, p[:, :2], 0.35)[0])
+    assert 0 < np.abs(many.reshape(-1, 3) - exact).max() < 0.01
+    p[0, 2] = 0.36  # not at one height
+    assert_array_equal(ambient_field_nt(LAB, p)[1:], exact[1:])
+
+
+def test_a_robot_without_magnetism_adds_nothing():
+    moving = {"b_rate": B, "motor_nm": B[:, :2], "lidar_on": np.ones(4), "battery_a": np.ones(4)}
+    assert_array_equal(platform_field_nt(PlatformFieldSpec(), B, **moving), B)
+
+
+def test_each_part_of_the_robots_field_enters_by_its_own_law():
+    matrix = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+    square, v = np.reshape(matrix, (3, 3)), np.array([30.0, -20.0, 10.0])
+    rate, torque, on = B / 7, B[:, :2] / 1e4, np.array([1, 0, 1, 0])
+    amperes, angle = np.array([0.1, 0.2, 0.0, 0.3]), np.array([0.3, 1.0, 4.0, 2.0])
+    spins = {"lidar_on": on, "lidar_angle": angle}
+    parts = {
+        "hard_iron_nt": (tuple(v), {}, np.broadcast_to(v, (4, 3))),
+        "soft_iron": (matrix, {}, np.array([square @ b for b in B])),
+        "eddy_s": (matrix, {"b_rate": rate}, np.array([square @ r for r in rate])),
+        "left_motor_nt_nm": (tuple(v), {"motor_nm": torque}, np.outer(torque[:, 0], v)),
+        "right_motor_nt_nm": (tuple(v), {"motor_nm": torque}, np.outer(torque[:, 1], v)),
+        "lidar_nt": (tuple(v), spins, np.outer(on, v)),
+        "lidar_cos_nt": (tuple(v), spins, np.outer(on * np.cos(angle), v)),
+        "lidar_sin_nt": (tuple(v), spins, np.outer(on * np.sin(angle), v)),
+        "battery_nt": (tuple(v), {"battery_a": amperes}, np.outer(amperes, v)),
+    }
+    everything, state, total = PlatformFieldSpec(), dict(QUIET), np.array(B)
+    for name, (value, changed, added) in parts.items():
+        platform = replace(PlatformFieldSpec(), **{name: value})
+        got = platform_field_nt(platform, B, **{**QUIET, **changed})
+        assert_allclose(got - B, added, rtol=1e-12, atol=1e-7, err_msg=name)
+        everything = replace(everything, **{name: value})
+        state |= changed
+        total = total + added
+    assert_allclose(platform_field_nt(everything, B, **state), total, rtol=1e-12)
+
+
+def test_at_rest_only_iron_counts():
+    everything = PlatformFieldSpec(
+        hard_iron_nt=(1.0, 2.0, 3.0),
+        eddy_s=(1.0,) * 9,
+        left_motor_nt_nm=(9.0, 9.0, 9.0),
+        lidar_nt=(9.0, 9.0, 9.0),
+        lidar_cos_nt=(9.0, 9.0, 9.0),
+        battery_nt=(9.0, 9.0, 9.0),
+    )
+    assert_array_equal(platform_field_nt(everything, B), B + np.array([1.0, 2.0, 3.0]))
+
+
+def test_a_sphere_of_soft_iron_alone_does_not_make_the_magnitude_depend_on_heading():
+    platform = PlatformFieldSpec(soft_iron=(0.01, 0, 0, 0, 0.01, 0, 0, 0, 0.01))
+    yaw = np.linspace(0, 2 * np.pi, 4, endpoint=False)
+    b = np.column_stack([24_000 * np.cos(yaw), -24_000 * np.sin(yaw), np.full(4, -38_000.0)])
+    size = np.linalg.norm(platform_field_nt(platform, b, **QUIET), axis=1)
+    assert_allclose(size, 1.01 * np.linalg.norm(b, axis=1), rtol=1e-12)
+
+
+def test_hard_iron_makes_one_wave_a_turn_of_the_expected_amplitude():
+    platform = PlatformFieldSpec(hard_iron_nt=(300.0, 400.0, 0.0))
+    yaw = np.linspace(0, 2 * np.pi, 360, endpoint=False)
+    b = np.column_stack([24_000 * np.cos(yaw), -24_000 * np.sin(yaw), np.full(360, -38_000.0)])
+    still = {k: np.zeros((360, *v.shape[1:])) for k, v in QUIET.items()}
+    size = np.linalg.norm(platform_field_nt(platform, b, **still), axis=1)
+    wave = np.abs(np.fft.rfft(size)) / 180
+    # |b + h| = |b| + h . b / |b| + O(h^2 / |b|); the last is 500^2 / 45,000 = 6 nT
+    assert wave[1] == pytest.approx(500 * 24_000 / np.hypot(24_000, 38_000), abs=6)
+    assert np.all(wave[2:] < 6)
+
+
+def test_two_equal_and_opposite_torques_cancel_where_the_motors_are_alike():
+    platform = PlatformFieldSpec(left_motor_nt_nm=(5.0, 3.0, 1.0), right_motor_nt_nm=(5.0, 3.0, 1.0))
+    turning = {**QUIET, "motor_nm": np.tile([4.0, -4.0], (4, 1))}
+    assert_allclose(platform_field_nt(platform, B, **turning), B, rtol=0, atol=1e-9)
+
+
+def test_wheels_work_against_drag_and_inertia():
+    battery, drive = BatterySpec(drag_n=3.0, mass_kg=4.0), DriveSpec(wheel_radius_m=0.05)
+    steady = wheel_torques_nm(battery, drive, [[2.0, -2.0], [0.0, 1e-9]], np.zeros((2, 2)))
+    assert_allclose(steady, [[0.075, -0.075], [0.0, 0.0]], atol=1e-8)
+    # F = m a: 4 kg, of which each wheel has half, at 0.05 m x 10 rad/s2
+    assert_allclose(wheel_torques_nm(battery, drive, [0.0, 0.0], [10.0, -10.0]), [0.05, -0.05])
+
+
+def test_at_rest_with_a_full_pack_the_supply_adds_nothing():
+    # (U - R I) I = P, and without sag I = P / U
+    sagging, linear = BatterySpec(resistance_ohm=0.5), BatterySpec(model="linear")
+    i = rest_current_a(sagging)
+    assert (sagging.voltage_full_v - 0.5 * i) * i == pytest.approx(sagging.load_w, rel=1e-12)
+    assert rest_current_a(linear) == linear.load_w / linear.voltage_full_v
+
+
+ROLLING = RobotSpec(
+    name="r",
+    asset=Path("r.usda"),
+    base_height_m=-0.004,
+    p_base_magnetometer=(-0.02, 0.01, 0.35),
+    drive=DriveSpec(wheel_radius_m=0.036, wheel_separation_m=0.23),
+    platform=PlatformFieldSpec(p_base_caster=(0.125, 0.0, 0.014), caster_radius_m=0.012),
+)
+
+
+@pytest.mark.parametrize(
+    ("part", "place", "share"),
+    [
+        ("left_wheel", (0.0, 0.115, 0.04), (1.0, 0.0)),
+        ("right_wheel", (0.0, -0.115, 0.04), (0.0, 1.0)),
+        ("caster", (0.125, 0.0, 0.014), (1.5, 1.5)),  # half of each wheel's way, on a third of the radius
+    ],
+)
+def test_iron_turns_with_its_wheel_as_a_dipole_there(part, place, share):
+    figures = {f"{part}_moment": 0.01, f"{part}_phase": 0.4}
+    robot = replace(ROLLING, platform=replace(ROLLING.platform, **figures))
+    angle = np.random.default_rng(2).uniform(-20, 20, (9, 2))
+    field = turning_iron_nt(robot, angle)
+    for row, b in zip(angle @ share + 0.4, field, strict=True):
+        moment = 0.01 * np.array([[np.sin(row), 0.0, np.cos(row)]])  # turns about y from up to forwards
+        assert_allclose(b, dipole_field_nt(robot.p_base_magnetometer, [place], moment), rtol=1e-12)
+
+
+def test_iron_that_turns_leaves_no_mean_over_whole_turns():
+    robot = replace(ROLLING, platform=replace(ROLLING.platform, left_wheel_moment=0.02))
+    angle = np.linspace(0, 4 * np.pi, 400, endpoint=False)
+    field = turning_iron_nt(robot, np.column_stack([angle, angle]))
+    assert_allclose(field.mean(axis=0), 0, atol=1e-9)
+    assert np.ptp(field, axis=0).max() > 50
+
+
+def test_a_magnetometer_in_a_wheel_is_refused():
+    robot = replace(
+        ROLLING, p_base_magnetometer=(0.0, 0.115, 0.04), platform=PlatformFieldSpec(left_wheel_moment=0.01)
+    )
+    with pytest.raises(InputError, match=r"robot 'r': its magnetometer, at .* is in the middle of a wheel"):
+        turning_iron_nt(robot, np.zeros((1, 2)))
+
+
+def test_a_robot_that_speeds_up_draws_more_torque_than_one_that_cruises():
+    platform = PlatformFieldSpec(left_motor_nt_nm=(1e4, 0.0, 0.0), right_motor_nt_nm=(0.0, 1e4, 0.0))
+    battery = BatterySpec(drag_n=2.0, mass_kg=4.0)
+    scene = replace(SCENE, earth=EARTH, robot=replace(SCENE.robot, platform=platform, battery=battery))
+    drive = scene.robot.drive
+    motion = Motion(
+        drive, 0.01, np.concatenate([np.arange(1, 101) * 0.003, np.full(100, 0.3)]), np.zeros(200)
+    )
+    t = np.array([0.5, 1.5])
+    true = motion.at(t)
+    rest = rest_current_a(battery)
+    b = field_at_sensor_nt(scene, motion, t, true=true, lidar_on=np.zeros(2), supply_a=np.full(2, rest))
+    # r (F / 2 + m a / 2) = 0.03575 x (1 + 2 x 0.3) while it speeds up at 0.3 m/s2, then 0.03575 x 1
+    added = (b - EARTH.b_world_nt)[:, :2] / 1e4
+    assert_allclose(added, drive.wheel_radius_m * np.array([[1.6, 1.6], [1.0, 1.0]]), rtol=1e-9)
+
+
+def test_days_differ_by_the_platforms_own_spreads_and_the_day_itself_by_none():
+    platform = PlatformFieldSpec(
+        hard_iron_nt=(100.0, 200.0, 300.0),
+        lidar_nt=(10.0, 20.0, 30.0),
+        battery_nt=(1.0, 0.0, 0.0),
+        hard_iron_drift_nt=(0.0, 50.0, -500.0),
+        hard_iron_std_nt=40.0,
+        current_std=0.2,
+    )
+    rng = np.random.default_rng(3)
+    days = [draw_platform(platform, rng) for _ in range(2000)]
+    iron = np.array([day.hard_iron_nt for day in days])
+    assert_allclose(iron.mean(axis=0), [100, 250, -200], atol=4 * 40 / np.sqrt(2000))
+    assert_allclose(iron.std(axis=0), 40, rtol=4 / np.sqrt(4000))
+    lidar = np.array([day.lidar_nt for day in days])
+    assert_allclose(lidar / lidar[:, :1], np.tile([1.0, 2.0, 3.0], (2000, 1)))  # its direction stays
+    assert lidar[:, 0].std() == pytest.approx(2.0, rel=4 / np.sqrt(4000))
+    phases = np.array([[day.left_wheel_phase, day.right_wheel_phase, day.lidar_phase] for day in days])
+    assert_allclose(phases.mean(axis=0), np.pi, atol=4 * 2 * np.pi / np.sqrt(12 * 2000))
+    again = draw_platform(days[0], np.random.default_rng(4))
+    assert again.hard_iron_nt == days[0].hard_iron_nt
+    assert draw_platform(platform, np.random.default_rng(3)) == days[0]

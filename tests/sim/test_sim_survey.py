@@ -1,0 +1,374 @@
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.errors import InputError
+from magtwin.field.maps.difference import difference
+from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.frames import quat_from_yaw, rotate
+from magtwin.sim.interference import ambient_gradient_nt_m
+from magtwin.sim.survey import field_at_rest_nt, pose_error_nt2, survey, survey_readings
+from magtwin.spec.scene import (
+    EarthFieldSpec,
+    LabSpec,
+    MagnetometerSpec,
+    PlatformFieldSpec,
+    RobotSpec,
+    Scene,
+    SourceSpec,
+)
+
+EARTH = EarthFieldSpec(
+    b_world_nt=(-2_745.6, 24_067.1, -38_418.4),
+    latitude_deg=29.65,
+    longitude_deg=-82.35,
+    height_m=50.0,
+    date="2026-11-21",
+)
+SOURCE = SourceSpec(name="pipe", p_world=(0.4, -0.2, -0.5), m_world=(2.0, 5.0, -4.0))
+
+
+def scene(**robot):
+    sensor = MagnetometerSpec(noise_density_nt=0.0, resolution_nt=0.0)
+    parts = {"p_base_magnetometer": (0.05, -0.02, 0.4), "magnetometer": sensor, **robot}
+    return Scene(
+        name="hall",
+        map_layer=Path("hall.usdc"),
+        robot=RobotSpec(name="r", asset=Path("r.usda"), **parts),
+        earth=EARTH,
+        sources=(SOURCE,),
+    )
+
+
+def rng():
+    return np.random.default_rng(0)
+
+
+def test_the_map_of_a_robot_without_magnetism_is_the_field_at_its_magnetometer():
+    field = survey(scene(), rng=rng())
+    assert field.values_nt.shape == (4, 15, 25)
+    assert field.extent == (-3.0, 3.0, -1.75, 1.75)
+    for layer, (dx, dy) in enumerate([(0.05, -0.02), (0.02, 0.05), (-0.05, 0.02), (-0.02, -0.05)]):
+        x, y = np.meshgrid(field.x_m + dx, field.y_m + dy)
+        p = np.stack([x, y, np.full_like(x, 0.4)], axis=-1)
+        want = dipole_field_nt(p, [SOURCE.p_world], [SOURCE.m_world]) + EARTH.b_world_nt
+        assert_allclose(field.values_nt[layer], np.linalg.norm(want, axis=-1), rtol=0, atol=1e-6)
+
+
+def test_hard_iron_turns_with_the_robot():
+    h = np.array([400.0, -250.0, 900.0])
+    magnetic = scene(p_base_magnetometer=(0.0, 0.0, 0.4), platform=PlatformFieldSpec(hard_iron_nt=tuple(h)))
+    field = survey(magnetic, rng=rng())
+    x, y = np.meshgrid(field.x_m, field.y_m)
+    b = dipole_field_nt(np.stack([x, y, 0 * x + 0.4], axis=-1), [SOURCE.p_world], [SOURCE.m_world])
+    for layer, turned in enumerate([(400, -250), (250, 400), (-400, 250), (-250, -400)]):
+        want = np.linalg.norm(b + EARTH.b_world_nt + [*turned, 900], axis=-1)
+        assert_allclose(field.values_nt[layer], want, rtol=0, atol=1e-6)
+
+
+def test_motors_lidar_battery_and_eddy_currents_are_not_in_the_map():
+    moving = PlatformFieldSpec(
+        eddy_s=(0.01,) * 9,
+        left_motor_nt_nm=(50, 50, 50),
+        right_motor_nt_nm=(50, 50, 50),
+        lidar_nt=(500, 500, 500),
+        battery_nt=(90, 90, 90),
+    )
+    assert_array_equal(
+        survey(scene(platform=moving), rng=rng()).values_nt, survey(scene(), rng=rng()).values_nt
+    )
+
+
+def test_lookup_of_the_map_at_its_nodes_is_the_field_at_rest():
+    field = survey(scene(), rng=rng(), headings_rad=(0.3, 2.0, 4.0))
+    x, y = np.meshgrid(field.x_m, field.y_m)
+    p = np.stack([x, y], axis=-1)
+    assert_allclose(field.lookup(p, 2.0), field_at_rest_nt(scene(), p, 2.0), rtol=0, atol=1e-9)
+
+
+def test_a_finer_map_comes_nearer_to_the_field_by_the_square_of_its_spacing():
+    coarse, fine = (survey(scene(), rng=rng(), spacing_m=s) for s in (0.25, 0.125))
+    p = np.random.default_rng(1).uniform((-2.8, -1.6), (2.8, 1.6), (2_000, 2))
+    exact = field_at_rest_nt(scene(), p, 0.0)
+    off_coarse, off_fine = (np.sqrt(np.mean((m.lookup(p, 0.0) - exact) ** 2)) for m in (coarse, fine))
+    assert off_coarse / off_fine == pytest.approx(4, rel=0.15)
+
+
+def test_readings_have_the_sensors_noise_and_resolution_and_the_map_its_variance():
+    noisy = scene(magnetometer=MagnetometerSpec(noise_density_nt=5.0 / np.sqrt(135 / 2), resolution_nt=0.5))
+    exact = survey(scene(), rng=rng()).values_nt
+    one = survey(noisy, rng=rng())
+    assert_array_equal(one.values_nt, np.rint(one.values_nt / 0.5) * 0.5)
+    for field, want in ((one, 25 + 0.25 / 12), (survey(noisy, rng=rng(), readings=9), (25 + 0.25 / 12) / 9)):
+        assert_allclose(field.variance_nt2, want, rtol=1e-12)
+        # the variance of 1,500 samples is known to sqrt(2 / 1500) = 3.7 %; 4 sigma
+        assert np.mean((field.values_nt - exact) ** 2) == pytest.approx(want, rel=0.15)
+
+
+def test_one_generator_gives_one_map():
+    noisy = scene(magnetometer=MagnetometerSpec(noise_density_nt=5.0 / np.sqrt(135 / 2)))
+    assert survey(noisy, rng=rng()) == survey(noisy, rng=rng())
+    assert survey(noisy, rng=rng()) != survey(noisy, rng=np.random.default_rng(1))
+
+
+def test_the_map_says_what_it_is():
+    field = survey(
+        scene(), rng=rng(), readings=3, licence="Apache-2.0", source="a test", created="2026-11-21"
+    )
+    assert (field.name, field.licence, field.source) == ("hall", "Apache-2.0", "a test")
+    assert field.created == "2026-11-21"
+    assert field.method == "survey of the twin, 3 readings a node and heading, at rest"
+
+
+def test_a_grid_that_does_not_divide_the_floor_stays_on_it_and_amid_it():
+    field = survey(replace(scene(), lab=LabSpec(floor_m=(2.0, 1.1))), rng=rng(), spacing_m=0.3)
+    assert_allclose(field.extent, (-0.9, 0.9, -0.45, 0.45), atol=1e-12)
+
+
+def test_heights_and_shapes_are_broadcast():
+    p = np.zeros((3, 1, 3))
+    p[..., 2] = [[0.0], [0.1], [0.2]]
+    got = field_at_rest_nt(scene(), p, np.zeros(4))
+    assert got.shape == (3, 4)
+    assert_allclose(got[0], field_at_rest_nt(scene(), (0.0, 0.0), 0.0))
+    assert abs(got[1, 0] - got[0, 0]) > 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"spacing_m": 0.0}, "spacing_m must be above 0 m"),
+        ({"spacing_m": np.nan}, "spacing_m must be above 0 m"),
+        ({"readings": 0}, "readings must be at least 1, got 0"),
+        ({"spacing_m": 4.0}, r"spacing_m 4 leaves no cell on 6 x 3\.5 m"),
+        ({"headings_rad": (0.0, 7.0)}, "headings_rad of Grid must ascend"),
+    ],
+)
+def test_a_survey_that_cannot_be_made_is_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        survey(scene(), rng=rng(), **options)
+
+
+def test_a_lab_without_the_earths_field_cannot_be_surveyed():
+    with pytest.raises(InputError, match="has no Earth's field"):
+        survey(replace(scene(), earth=None), rng=rng())
+
+
+# Readings, and the twin as it stands
+
+
+def test_readings_stand_on_their_nodes_and_are_the_maps_values():
+    read = survey_readings(scene(), rng=rng(), spacing_m=0.5)
+    field = survey(scene(), rng=rng(), spacing_m=0.5)
+    assert read.grid == field.grid
+    p, yaw = read.grid.poses()
+    assert_array_equal(read.p_xy, p.reshape(-1, 2))
+    assert_array_equal(read.yaw, yaw.ravel())
+    assert_array_equal(read.b_nt, field.values_nt.ravel())
+    assert read.height_m == field.height_m == 0.4
+
+
+def test_headings_that_deviate_are_recorded_and_read_as_they_are():
+    read = survey_readings(scene(), rng=rng(), spacing_m=0.5, heading_error_rad=0.1)
+    nominal = np.asarray(read.grid.headings_rad)[read.node[:, 0]]
+    assert np.std(read.yaw - nominal) == pytest.approx(0.1, rel=0.15)
+    assert_allclose(read.b_nt, field_at_rest_nt(scene(), read.p_xy, read.yaw), rtol=0, atol=1e-9)
+
+
+def test_places_that_deviate_are_not_recorded():
+    read = survey_readings(scene(), rng=rng(), spacing_m=0.5, position_error_m=0.02)
+    assert_array_equal(read.p_xy, read.grid.poses()[0].reshape(-1, 2))
+    off = read.b_nt - field_at_rest_nt(scene(), read.p_xy, read.yaw)
+    step = 1e-4
+    slope = [
+        (
+            field_at_rest_nt(scene(), read.p_xy + d, read.yaw)
+            - field_at_rest_nt(scene(), read.p_xy - d, read.yaw)
+        )
+        / (2 * step)
+        for d in step * np.eye(2)
+    ]
+    want = 0.02 * np.sqrt(np.mean(np.square(slope[0]) + np.square(slope[1])))
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(want, rel=0.2)
+
+
+def test_a_survey_at_another_height_is_the_field_there():
+    low, high = (
+        survey(scene(), rng=rng(), spacing_m=0.5, height_m=0.1),
+        survey(scene(), rng=rng(), spacing_m=0.5),
+    )
+    p, yaw = low.grid.poses()
+    assert_allclose(low.values_nt, field_at_rest_nt(scene(), p, yaw, height_m=0.1), rtol=0, atol=1e-9)
+    assert low.height_m == 0.1
+    assert np.ptp(low.values_nt) > 1.5 * np.ptp(high.values_nt)
+
+
+def test_a_survey_tells_frame_datum_and_figures():
+    field = survey(scene(), rng=rng(), spacing_m=0.5, readings=3)
+    assert field.frame == "world: x east, y north, z up"
+    assert "29.65 deg N, -82.35 deg E, 50 m" in field.datum
+    assert field.parameters == {"readings": 3, "noise_std_nt": 0.0, "resolution_nt": 0.0}
+    turned = replace(scene(), earth=replace(EARTH, north_deg=30.0))
+    assert "true north 30 deg" in survey(turned, rng=rng(), spacing_m=0.5).frame
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"heading_error_rad": -1.0}, "heading_error_rad must not be below 0, got -1"),
+        ({"position_error_m": 1e9}, "position_error_m 1000000000.0 is beyond the spacing of 0.25 m"),
+        ({"heading_error_rad": 2.0}, "heading_error_rad must not be above pi/2, got 2.0"),
+        ({"position_error_m": np.nan}, "position_error_m must not be below 0, got nan"),
+        ({"height_m": np.inf}, "height_m is a height above the floor, 0 m or more, got inf"),
+    ],
+)
+def test_errors_and_heights_that_are_none_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        survey_readings(scene(), rng=rng(), **options)
+
+
+def test_a_desk_moved_in_the_stage_changes_the_next_survey_by_what_its_steel_says(tmp_path, lab_scene):
+    from pxr import Gf, Usd
+
+    from magtwin.author.scene import read_scene
+    from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
+    from magtwin.sim.interference import ambient_field_nt
+
+    folder = Path(shutil.copytree(lab_scene.parent, tmp_path / "lab"))
+    before = read_scene(folder / lab_scene.name)
+    stage = Usd.Stage.Open(str(folder / lab_scene.name))  # plain usd-core from here
+    stage.GetPrimAtPath("/World/Furniture/desk_0").GetAttribute("xformOp:translate").Set(
+        Gf.Vec3d(0.3, -2.3, 0)
+    )
+    stage.Save()
+    after = read_scene(folder / lab_scene.name)
+    desk, moved = (next(piece for piece in s.furniture if piece.name == "desk_0") for s in (before, after))
+    assert moved == replace(desk, p_world=(0.3, -2.3, 0.0))
+
+    maps = [survey(s, rng=rng(), spacing_m=0.5) for s in (before, after)]
+    p, yaw = maps[0].grid.poses()
+    robot, turn = before.robot, quat_from_yaw(yaw)
+    place = np.concatenate([p, np.full((*yaw.shape, 1), robot.base_height_m)], axis=-1)
+    place += rotate(turn, np.broadcast_to(robot.p_base_magnetometer, place.shape))
+    flat = place.reshape(-1, 3)
+    steel = [sum(s.body().exact_field_nt(flat) for s in piece.sources()) for piece in (desk, moved)]
+    world = ambient_field_nt(before, flat) - steel[0] + steel[1]
+    body = rotate(quat_conjugate(turn.reshape(-1, 4)), world)
+    platform = robot.platform
+    want = np.linalg.norm(
+        body + body @ np.reshape(platform.soft_iron, (3, 3)).T + platform.hard_iron_nt, axis=-1
+    ).reshape(yaw.shape)
+    noise = 6 * np.hypot(robot.magnetometer.noise_std_nt, robot.magnetometer.resolution_nt)
+    assert np.abs(maps[1].values_nt - want).max() < noise + 0.2  # 1e-4 of 2,000 nT stands in for the steel
+    assert np.abs(maps[1].values_nt - maps[0].values_nt).max() > 200
+
+
+def test_a_sensor_that_loses_lock_latches_along_its_rows():
+    sensor = MagnetometerSpec(
+        noise_density_nt=0.0, resolution_nt=0.0, gradient_max_nt_m=4e3, gradient_relock_nt_m=3e3
+    )
+    fine = survey(scene(), rng=rng())
+    field = survey(scene(magnetometer=sensor), rng=rng())
+    x, y = np.meshgrid(field.x_m, field.y_m)
+    height = scene().robot.base_height_m + scene().robot.p_base_magnetometer[2]
+    latched = np.abs(field.values_nt - fine.values_nt) > 1
+    assert 0 < latched.mean() < 0.2
+    plateaus = np.unique(field.values_nt[latched])
+    assert len(plateaus) < 0.7 * latched.sum()  # read over and over
+    assert np.abs(plateaus - 35_650).max() < 5 * 50
+    for layer, yaw in enumerate(field.headings_rad):
+        turn = quat_from_yaw(yaw)
+        lever = rotate(turn, np.array(scene().robot.p_base_magnetometer))[:2]
+        p = np.stack([x + lever[0], y + lever[1], 0 * x + height], axis=-1)
+        steep = ambient_gradient_nt_m(scene(), p)
+        assert latched[layer][steep > 4e3].all()
+        assert not latched[layer][steep < 3e3].any()
+
+
+# Variance, and what a difference makes of it
+
+ERRORS = {"position_error_m": 0.01, "heading_error_rad": np.radians(2)}
+TWO = (0.0, np.pi)
+
+
+def test_the_variance_of_a_node_is_the_mean_square_of_what_errors_of_the_pose_do_there():
+    errors = {"position_error_m": 0.03, "heading_error_rad": np.radians(8)}
+    iron = PlatformFieldSpec(hard_iron_nt=(400.0, -250.0, 900.0))
+    grid = survey(scene(), rng=rng(), spacing_m=0.8).grid
+    got = pose_error_nt2(scene(platform=iron), grid, 0.4, **errors)
+    p, yaw = grid.poses()
+    draw, times = np.random.default_rng(1), 1000
+    stands = p + errors["position_error_m"] * draw.standard_normal((times, *p.shape))
+    looks = yaw + errors["heading_error_rad"] * draw.standard_normal((times, *yaw.shape))
+    off = field_at_rest_nt(scene(platform=iron), stands, looks) - field_at_rest_nt(
+        scene(platform=iron), p, yaw
+    )
+    ratio = np.mean(off**2, axis=0) / got
+    assert ratio.mean() == pytest.approx(1, abs=0.03)
+    assert np.abs(ratio - 1).max() < 5 * np.sqrt(2 / times)  # as known as a mean of squares of normals
+
+
+def test_errors_of_the_pose_are_in_the_maps_variance_and_none_where_there_are_none():
+    noise = MagnetometerSpec(noise_density_nt=5.0 / np.sqrt(135 / 2), resolution_nt=0.0)
+    plain, wandering = (survey(scene(magnetometer=noise), rng=rng(), **e) for e in ({}, ERRORS))
+    assert_allclose(plain.variance_nt2, 25, rtol=1e-12)
+    want = pose_error_nt2(scene(), wandering.grid, 0.4, **ERRORS) + 25
+    assert_allclose(wandering.variance_nt2, want, rtol=1e-12)
+    assert wandering.parameters["position_error_m"] == 0.01
+
+
+def test_nodes_where_the_sensor_lost_lock_are_masked():
+    sensor = MagnetometerSpec(gradient_max_nt_m=4e3, gradient_relock_nt_m=3e3)
+    field = survey(scene(magnetometer=sensor), rng=rng())
+    read = survey_readings(scene(magnetometer=sensor), rng=rng())
+    assert 0 < np.count_nonzero(~field.valid) < 0.2 * field.valid.size
+    assert np.abs(field.values_nt[~field.valid] - 35_650).max() < 5 * 50
+    assert read.good.all()  # nobody tells a robot; magtwin.field.survey.stuck finds them
+
+
+@pytest.fixture(scope="module")
+def lab(lab_scene):
+    from magtwin.author.scene import read_scene
+
+    return read_scene(lab_scene, check_network=False)
+
+
+@pytest.fixture(scope="module")
+def surveys(lab):
+    return [survey(lab, rng=np.random.default_rng(seed), headings_rad=TWO, **ERRORS) for seed in range(5)]
+
+
+def test_two_surveys_of_one_lab_differ_by_their_variance_and_raise_no_more_false_alarms_than_said(surveys):
+    found = [difference(a, b) for k, b in enumerate(surveys) for a in surveys[:k]]
+    spread = [np.sqrt(np.nanmean(d.z**2)) for d in found]
+    assert np.mean(spread) == pytest.approx(1, abs=0.05)
+    # with no change at all, the false-discovery rate is how often a node is called changed: 5 % of 10 pairs
+    assert sum(d.changed.any() for d in found) <= 2
+
+
+def test_a_desk_that_was_moved_is_marked_and_the_rest_of_the_lab_is_not(lab, surveys):
+    moved = replace(
+        lab,
+        furniture=tuple(
+            replace(f, p_world=(f.p_world[0] + 0.6, *f.p_world[1:])) if f.name == "desk_0" else f
+            for f in lab.furniture
+        ),
+    )
+    found = difference(surveys[0], survey(moved, rng=np.random.default_rng(99), headings_rad=TWO, **ERRORS))
+    desk = np.array([-1.9, 2.3])  # beyond the floor's edge at y = 1.75, 1.5 m wide before and after
+    p, _ = found.grid.poses()
+    near = np.linalg.norm(np.maximum(np.abs(p - desk - [0.3, 0]) - [1.05, 0.4], 0), axis=-1) < 1.5
+    assert found.changed[near].sum() >= 10
+    assert found.changed[~near].sum() <= 0.1 * found.changed.sum() + 3
+    assert max(abs(r.peak_m[0] - desk[0]) for r in found.regions[:2]) < 1.0
+    assert min(r.peak_m[1] for r in found.regions[:2]) > 1.0
+
+
+def test_readings_where_the_robot_cannot_stand_are_not_good():
+    read = survey_readings(scene(), rng=rng(), spacing_m=0.5, blocked=lambda p: p[..., 0] > 1.0)
+    assert 0 < read.good.sum() < len(read)
+    assert np.array_equal(read.good, read.p_xy[:, 0] <= 1.0)

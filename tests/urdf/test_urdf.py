@@ -1,0 +1,589 @@
+import textwrap
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
+from validators import assert_valid
+
+from magtwin.errors import InputError
+from magtwin.frames import matrix_from_quat, quat_from_rpy
+from magtwin.urdf import convert_urdf, read_notes
+from magtwin.urdf.description.description import read_description
+from magtwin.urdf.inertia import principal_axes, quaternion
+from magtwin.urdf.meshes.mesh import corner_normals, read_mesh
+from magtwin.usd.geometry import read_links, read_shapes
+
+INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+BALL = '<geometry><sphere radius="0.1"/></geometry>'
+BODY = f"{INERTIAL}<visual>{BALL}</visual><collision>{BALL}</collision>"
+
+
+def urdf(tmp_path, body, name="arm"):
+    """A URDF file around `body`; {INERTIAL} and {BODY} stand for usual contents of a link."""
+    text = textwrap.dedent(body).replace("{INERTIAL}", INERTIAL).replace("{BODY}", BODY)
+    path = tmp_path / f"{name}.urdf"
+    path.write_text(f'<?xml version="1.0"?>\n<robot name="{name}">\n{text}\n</robot>\n')
+    return path
+
+
+def arm(tmp_path, joint, child="{BODY}"):
+    """Two links held by a joint called j, whose inner XML is given."""
+    kind, _, inner = joint.partition("|")
+    return urdf(
+        tmp_path,
+        f"""<link name="base_link">{{BODY}}</link>
+        <link name="hand">{child}</link>
+        <joint name="j" type="{kind}"><parent link="base_link"/><child link="hand"/>{inner}</joint>""",
+    )
+
+
+def convert(path):
+    """The stage of a converted URDF, and the robot's prim."""
+    out = convert_urdf(path, path.with_suffix(".usda"), force=True)
+    stage = Usd.Stage.Open(str(out))
+    stage.Reload()
+    return stage, stage.GetDefaultPrim()
+
+
+def joint_of(stage):
+    return UsdPhysics.Joint(next(p for p in stage.Traverse() if p.IsA(UsdPhysics.Joint)))
+
+
+# --- what arrives ---------------------------------------------------------------------------------
+
+
+def test_a_continuous_joint_gets_a_velocity_drive_in_degrees_and_a_finite_force(tmp_path):
+    stage, _ = convert(arm(tmp_path, 'continuous|<axis xyz="0 0 1"/><limit effort="2" velocity="10"/>'))
+    joint = UsdPhysics.RevoluteJoint(joint_of(stage))
+    drive = UsdPhysics.DriveAPI(joint, "angular")
+    assert joint.GetAxisAttr().Get() == "Z"
+    assert (drive.GetStiffnessAttr().Get(), drive.GetMaxForceAttr().Get()) == (0, 2)
+    assert_allclose(drive.GetDampingAttr().Get(), 5 * np.pi / 180, rtol=1e-6)  # N m s per degree
+    assert not joint.GetLowerLimitAttr().HasAuthoredValue()
+    assert_allclose(joint.GetPrim().GetAttribute("newton:velocityLimit").Get(), np.degrees(10), rtol=1e-6)
+
+
+def test_a_revolute_joint_keeps_its_limits_and_friction_in_degrees(tmp_path):
+    inner = '<axis xyz="1 0 0"/><limit effort="3" velocity="2" lower="-1" upper="0.5"/>'
+    stage, _ = convert(arm(tmp_path, f'revolute|{inner}<dynamics damping="0.2" friction="0.1"/>'))
+    joint = UsdPhysics.RevoluteJoint(joint_of(stage))
+    assert_allclose(
+        [joint.GetLowerLimitAttr().Get(), joint.GetUpperLimitAttr().Get()], np.degrees([-1, 0.5]), rtol=1e-6
+    )
+    assert UsdPhysics.DriveAPI(joint, "angular").GetStiffnessAttr().Get() > 0
+    assert_allclose(joint.GetPrim().GetAttribute("newton:damping").Get(), 0.2 * np.pi / 180, rtol=1e-6)
+    assert_allclose(joint.GetPrim().GetAttribute("newton:friction").Get(), 0.1, rtol=1e-6)
+
+
+def test_a_prismatic_joint_keeps_its_limits_in_metres(tmp_path):
+    inner = '<axis xyz="0 1 0"/><limit effort="3" velocity="2" lower="0" upper="0.3"/>'
+    stage, _ = convert(arm(tmp_path, f"prismatic|{inner}"))
+    joint = UsdPhysics.PrismaticJoint(joint_of(stage))
+    assert joint.GetAxisAttr().Get() == "Y"
+    assert_allclose([joint.GetLowerLimitAttr().Get(), joint.GetUpperLimitAttr().Get()], [0, 0.3], atol=1e-7)
+    assert UsdPhysics.DriveAPI(joint, "linear").GetMaxForceAttr().Get() == 3
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    axis=st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 1e-3),
+    xyz=st.lists(st.floats(-2, 2), min_size=3, max_size=3),
+    rpy=st.lists(st.floats(-3, 3), min_size=3, max_size=3),
+)
+def test_both_frames_of_a_joint_meet_and_its_axis_is_the_urdfs(tmp_path_factory, axis, xyz, rpy):
+    tmp_path = tmp_path_factory.mktemp("joint")
+    words = [" ".join(f"{v:.9f}" for v in vector) for vector in (axis, xyz, rpy)]
+    stage, robot = convert(
+        arm(tmp_path, f'continuous|<axis xyz="{words[0]}"/><origin xyz="{words[1]}" rpy="{words[2]}"/>')
+    )
+    links = read_links(stage)
+    assert_allclose(links["hand"].axis_link, axis / np.linalg.norm(axis), atol=2e-6)
+    assert_allclose(links["hand"].p_base_link, xyz, atol=1e-8)
+    turned = matrix_from_quat(links["hand"].q_base_link_xyzw)
+    assert_allclose(turned, matrix_from_quat(quat_from_rpy(rpy)), atol=1e-8)
+    joint = joint_of(stage)
+    first = matrix_from_quat([*joint.GetLocalRot0Attr().Get().imaginary, joint.GetLocalRot0Attr().Get().real])
+    second = matrix_from_quat(
+        [*joint.GetLocalRot1Attr().Get().imaginary, joint.GetLocalRot1Attr().Get().real]
+    )
+    assert_allclose(first, turned @ second, atol=1e-6)  # single precision quaternions
+    assert robot.HasAPI(UsdPhysics.ArticulationRootAPI)
+
+
+def test_the_base_floats_and_nothing_is_bolted_to_the_world(tmp_path):
+    stage, robot = convert(arm(tmp_path, "fixed|"))
+    for prim in stage.Traverse():
+        if prim.IsA(UsdPhysics.Joint):
+            joint = UsdPhysics.Joint(prim)
+            assert len(joint.GetBody0Rel().GetTargets()) == len(joint.GetBody1Rel().GetTargets()) == 1
+    roots = [p for p in stage.Traverse() if p.HasAPI(UsdPhysics.ArticulationRootAPI)]
+    assert roots == [robot]
+    assert robot.GetAttribute("newton:selfCollisionEnabled").Get() is False
+
+
+def test_links_that_only_name_a_place_become_sites_on_the_body_they_ride_on(tmp_path):
+    path = urdf(
+        tmp_path,
+        """<link name="base_footprint"/><link name="base_link">{BODY}</link>
+        <link name="cam"/><link name="eye"/>
+        <joint name="a" type="fixed"><parent link="base_footprint"/><child link="base_link"/>
+          <origin xyz="0 0 0.1"/></joint>
+        <joint name="b" type="fixed"><parent link="base_link"/><child link="cam"/>
+          <origin xyz="1 0 0"/></joint>
+        <joint name="c" type="fixed"><parent link="cam"/><child link="eye"/>
+          <origin xyz="0 1 0" rpy="0 0 1.57079632679"/></joint>""",
+    )
+    _, robot = convert(path)
+    assert [c.GetName() for c in robot.GetChildren()] == ["base_link", "Looks", "joints"]
+    cache = UsdGeom.XformCache()
+    places = {
+        name: cache.GetLocalToWorldTransform(robot.GetPrimAtPath(f"base_link/{name}")).ExtractTranslation()
+        for name in ("base_footprint", "cam", "eye")
+    }
+    assert_allclose(places["base_footprint"], [0, 0, 0], atol=1e-12)
+    assert_allclose(places["cam"], [1, 0, 0.1], atol=1e-12)
+    assert_allclose(places["eye"], [1, 1, 0.1], atol=1e-12)
+    assert not list(robot.GetPrimAtPath("joints").GetChildren())
+
+
+def test_a_wheel_without_effort_is_noted_and_a_dead_suspension_is_welded(tmp_path):
+    stage, _ = convert(arm(tmp_path, 'continuous|<axis xyz="0 1 0"/>'))
+    assert UsdPhysics.DriveAPI(joint_of(stage), "angular").GetMaxForceAttr().Get() == 10
+    assert any("gives no effort" in note for note in read_notes(tmp_path / "arm.usda"))
+    inner = '<axis xyz="0 1 0"/><limit effort="0" velocity="0" lower="0" upper="0.03"/>'
+    stage, _ = convert(arm(tmp_path, f"prismatic|{inner}"))
+    assert joint_of(stage).GetPrim().IsA(UsdPhysics.FixedJoint)
+    assert any("cannot move by its own limits: welded" in note for note in read_notes(tmp_path / "arm.usda"))
+
+
+def test_friction_of_gazebo_tags_reaches_the_collider(tmp_path):
+    path = arm(tmp_path, "fixed|")
+    tag = '<gazebo reference="hand"><mu1>0.05</mu1><maxVel>1</maxVel></gazebo></robot>'
+    path.write_text(path.read_text().replace("</robot>", tag))
+    _, robot = convert(path)
+    collider = robot.GetPrimAtPath("hand/collisions").GetChildren()[0]
+    grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0]
+    assert_allclose(UsdPhysics.MaterialAPI(grip).GetDynamicFrictionAttr().Get(), 0.05, rtol=1e-6)
+    assert collider.GetAttribute("purpose").Get() == "guide"
+    (note,) = read_notes(tmp_path / "arm.usda")
+    assert note == "1 tags without a meaning here are kept as text, such as gazebo/maxVel"
+
+
+def test_colours_of_materials_arrive_linear_and_one_name_with_two_colours_stays_two(tmp_path):
+    colour = '<material name="paint"><color rgba="{} 0 0 0.5"/></material>'
+    path = urdf(
+        tmp_path,
+        f"""<link name="base_link">{{INERTIAL}}
+        <visual>{BALL}{colour.format(1.0)}</visual><visual>{BALL}{colour.format(0.5)}</visual></link>""",
+    )
+    stage, _ = convert(path)
+    one, two = read_shapes(stage)
+    assert_allclose(one.colour, [1, 0, 0, 0.5], atol=1e-6)
+    assert_allclose(two.colour, [0.21404, 0, 0, 0.5], atol=1e-4)  # ((0.5 + 0.055) / 1.055) ** 2.4
+
+
+def tetrahedron(path):
+    points = [[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]
+    trimesh.Trimesh(points, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]).export(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb"])
+@pytest.mark.parametrize("scale", [(1, 1, 1), (0.5, 0.5, 0.5), (-1, 1, 1)])
+def test_meshes_of_every_format_arrive_scaled_and_facing_outwards(tmp_path, suffix, scale):
+    tetrahedron(tmp_path / f"t.{suffix}")
+    words = " ".join(map(str, scale))
+    shape = f'<geometry><mesh filename="t.{suffix}" scale="{words}"/></geometry>'
+    path = urdf(
+        tmp_path,
+        f"<link name='base_link'>{{INERTIAL}}<visual>{shape}</visual><collision>{shape}</collision></link>",
+    )
+    stage, robot = convert(path)
+    (seen,) = read_shapes(stage)
+    corners = np.array([[0, -3, 0], [1, 0, 2]] if suffix == "glb" else [[0, 0, 0], [1, 2, 3]]) * scale
+    corners = np.sort(corners, axis=0)  # glTF's Y is up: (x, y, z) lies at (x, -z, y)
+    assert_allclose([seen.vertices.min(0), seen.vertices.max(0)], corners, atol=1e-6)
+    a, b, c = np.moveaxis(seen.vertices[seen.faces].astype(float), 1, 0)
+    assert_allclose(np.sum(a * np.cross(b, c)) / 6, np.prod(np.abs(scale)), rtol=1e-5)
+    collider = robot.GetPrimAtPath("base_link/collisions").GetChildren()[0]
+    assert len(UsdGeom.Mesh(collider).GetPointsAttr().Get()) == 4
+    assert_valid(path.with_suffix(".usda"), tmp_path)
+
+
+def test_big_arrays_stay_out_of_the_text(tmp_path):
+    trimesh.creation.icosphere().export(tmp_path / "ball.stl")
+    mesh = '<visual><geometry><mesh filename="ball.stl"/></geometry></visual>'
+    path = urdf(tmp_path, f"<link name='base_link'>{{INERTIAL}}{mesh}</link>")
+    convert(path)
+    assert (tmp_path / "payloads" / "geometries.usdc").read_bytes().startswith(b"PXR-USDC")
+    text = [file.read_text() for file in tmp_path.rglob("*.usda")]
+    assert len(text) == 8
+    assert not [layer for layer in text if "points" in layer]
+
+
+def test_two_conversions_give_the_same_bytes(tmp_path):
+    trimesh.creation.icosphere().export(tmp_path / "ball.stl")
+    mesh = '<visual><geometry><mesh filename="ball.stl"/></geometry></visual>'
+    path = urdf(tmp_path, f"<link name='base_link'>{{INERTIAL}}{mesh}</link>")
+    first = convert_urdf(path, tmp_path / "one" / "arm.usda")
+    second = convert_urdf(path, tmp_path / "two" / "arm.usda")
+    made = sorted(p.relative_to(first.parent) for p in first.parent.rglob("*.usd*"))
+    assert len(made) == 9
+    for name in made:
+        assert (first.parent / name).read_bytes() == (second.parent / name).read_bytes()
+
+
+# --- inertia and normals --------------------------------------------------------------------------
+
+
+@given(
+    sizes=st.lists(st.floats(0.1, 2), min_size=3, max_size=3),
+    rpy=st.lists(st.floats(-3, 3), min_size=3, max_size=3),
+)
+def test_principal_axes_give_back_the_tensor_of_a_turned_box(sizes, rpy):
+    a, b, c = np.square(sizes)
+    R = matrix_from_quat(quat_from_rpy(rpy))
+    tensor = R @ np.diag([b + c, a + c, a + b]) @ R.T / 12
+    moments, q, repaired = principal_axes(tensor)
+    axes = matrix_from_quat(q)
+    assert_allclose(axes @ np.diag(moments) @ axes.T, tensor, atol=1e-9)
+    assert not repaired
+
+
+def test_a_diagonal_tensor_keeps_its_axes():
+    moments, q, _ = principal_axes(np.diag([3.0, 2.0, 2.5]))
+    assert_allclose(moments, [3, 2, 2.5])
+    assert_allclose(q, [0, 0, 0, 1])
+
+
+def test_a_near_miss_of_the_triangle_inequality_is_repaired_and_a_far_one_refused():
+    moments, _, repaired = principal_axes(np.diag([1.0, 1.0, 2.01]))
+    assert repaired
+    assert_allclose(moments, [1, 1, 2])
+    with pytest.raises(InputError, match="none may exceed the sum of the others"):
+        principal_axes(np.diag([1.0, 1.0, 3.0]))
+    with pytest.raises(InputError, match="all must be above 0"):
+        principal_axes(np.diag([1.0, -1.0, 1.0]))
+
+
+@given(st.lists(st.floats(-3.1, 3.1), min_size=3, max_size=3))
+def test_the_quaternion_of_a_rotation_gives_it_back(rpy):
+    R = matrix_from_quat(quat_from_rpy(rpy))
+    assert_allclose(matrix_from_quat(quaternion(R)), R, atol=1e-12)
+
+
+def test_a_ball_is_shaded_smooth_and_a_box_sharp():
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    assert_allclose(corner_normals(ball.vertices, ball.faces), ball.vertices[ball.faces], atol=0.02)
+    box = trimesh.creation.box()
+    corners = np.repeat(box.face_normals[:, None], 3, axis=1)
+    assert_allclose(corner_normals(box.vertices, box.faces), corners, atol=1e-6)
+
+
+# --- COLLADA --------------------------------------------------------------------------------------
+
+DAE = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="{unit}"/><up_axis>Z_UP</up_axis></asset>
+<library_effects><effect id="e"><profile_COMMON><technique sid="t"><lambert>
+<diffuse><color>{colour}</color></diffuse></lambert></technique></profile_COMMON></effect></library_effects>
+<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="pa" count="9">0 0 0 1 0 0 0 1 0</float_array><technique_common>
+<accessor source="#pa" count="3" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="1" material="s"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="scene"><node><rotate>0 0 1 90</rotate><node>
+<translate>10 0 0</translate><instance_geometry url="#g"><bind_material><technique_common>
+<instance_material symbol="s" target="#m"/></technique_common></bind_material></instance_geometry>
+</node></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#scene"/></scene></COLLADA>
+"""
+
+
+def test_nested_nodes_of_collada_compose_outside_in_and_its_unit_applies(tmp_path):
+    path = tmp_path / "t.dae"
+    path.write_text(DAE.format(unit=0.1, colour="0.2 0.4 0.6 1"))
+    mesh = read_mesh(path)  # moved by 10 along x, then turned by 90 degrees: to +y
+    assert_allclose([mesh.points.min(0), mesh.points.max(0)], [[-0.1, 1.0, 0], [0, 1.1, 0]], atol=1e-6)
+    assert_allclose(mesh.paints[0].rgba, (0.2, 0.4, 0.6, 1))
+
+
+@pytest.mark.parametrize(
+    ("colour", "read"),
+    [("0.5 0.0 0.01.0", (0.5, 0, 0, 1)), ("0.2 0.4 0.6", (0.2, 0.4, 0.6, 1)), ("red", (0.5, 0.5, 0.5, 1))],
+)
+def test_a_malformed_colour_is_mended_with_a_note_and_its_geometry_kept(tmp_path, colour, read):
+    path = tmp_path / "t.dae"
+    path.write_text(DAE.format(unit=1, colour=colour))
+    mesh = read_mesh(path)
+    assert_allclose(mesh.paints[0].rgba, read)
+    words = " ".join(f"{c:g}" for c in read)
+    assert [note.text for note in mesh.notes] == [f"t.dae: malformed colour {colour!r} read as {words!r}"]
+
+
+# --- refusals -------------------------------------------------------------------------------------
+
+LINK = '<link name="base_link">{BODY}</link>'
+
+
+def mesh_link(filename):
+    return f'<link name="b"><visual><geometry><mesh filename="{filename}"/></geometry></visual></link>'
+
+
+FLAT = INERTIAL.replace('izz="1"', 'izz="9"')
+NO_MASS = '<link name="b"><inertial><origin xyz="0 0 1"/></inertial></link>'
+NO_NUMBER = '<link name="b"><visual><geometry><sphere radius="big"/></geometry></visual></link>'
+NEGATIVE = '<gazebo reference="base_link"><mu1>-1</mu1></gazebo>'
+
+REFUSED = {
+    "twice": (LINK + "\n" + LINK, r"arm\.urdf:4: link 'base_link' is there twice, first on line 3; rename"),
+    "no name": ("<link/>", r"arm\.urdf:3: a <link> has no name"),
+    "no link": ("", r"arm\.urdf:2: the robot has no <link>"),
+    "two roots": (LINK + '<link name="b"/>', "link 'b' hangs in the air: a robot has one root, this has"),
+    "mesh missing": (mesh_link("no.stl"), r"arm\.urdf:3: mesh 'no\.stl' is missing; looked for .*no\.stl"),
+    "mesh above": (mesh_link("../up.stl"), r"mesh '\.\./up\.stl' lies outside .*; files are read from there"),
+    "mesh absolute": (mesh_link("/etc/x.stl"), r"mesh '/etc/x\.stl' lies outside"),
+    "mesh format": (mesh_link("a.blend"), r"mesh 'a\.blend' is of no known format \(\.dae, \.glb"),
+    "mesh scale": (mesh_link('t.stl" scale="1 0 1'), r"mesh 't\.stl' has scale \[1\.0, 0\.0, 1\.0\]; give"),
+    "package": (
+        mesh_link("package://nowhere/a.stl"),
+        "is in a package: no package 'nowhere' around it; give",
+    ),
+    "package above": (mesh_link("package://arms/../../a.stl"), r"mesh .* lies outside .*arms"),
+    "no mass": (NO_MASS, r":3: link 'b' has a mass of None"),
+    "inertia": (f'<link name="b">{FLAT}</link>', r":3: link 'b' has an impossible inertia: no body has"),
+    "friction": (LINK + NEGATIVE, r"arm\.urdf:3: mu1 must be a finite number not below 0, got '-1'"),
+    "too large": (
+        NO_NUMBER.replace("big", "1e200"),
+        r":3: link 'b': radius of <sphere> must be a finite number, got '1e200'",
+    ),
+    "no number": (NO_NUMBER, r":3: link 'b': radius of <sphere> must be a finite number, got 'big'"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_bad_description_is_refused_in_one_line_and_nothing_is_written(tmp_path, case):
+    body, message = REFUSED[case]
+    path = urdf(tmp_path, body)
+    (tmp_path / "arms" / "meshes").mkdir(parents=True)
+    tetrahedron(tmp_path / "t.stl")
+    with pytest.raises(InputError, match=message) as refusal:
+        convert_urdf(path, tmp_path / "out" / "arm.usda")
+    assert "\n" not in str(refusal.value)
+    assert not list(tmp_path.glob("out/**/*"))
+
+
+NAMED = """
+<link name="底座">{BODY}</link> <link name="a-b">{BODY}</link> <link name="a_b">{BODY}</link>
+<link name="visuals"/> <link name="joints">{BODY}</link> <link name="1st wheel">{BODY}</link>
+<joint name="右" type="fixed"><parent link="底座"/><child link="a-b"/></joint>
+<joint name="j.1" type="fixed"><parent link="底座"/><child link="a_b"/></joint>
+<joint name="j_1" type="fixed"><parent link="a-b"/><child link="visuals"/><origin xyz="0 0 1"/></joint>
+<joint name="joints" type="continuous"><parent link="底座"/><child link="joints"/></joint>
+<joint name="w 1" type="continuous"><parent link="底座"/><child link="1st wheel"/></joint>"""
+
+
+def test_no_name_is_refused_and_one_that_usd_has_no_place_for_is_shown(tmp_path):
+    stage, robot = convert(urdf(tmp_path, NAMED, "my robot"))
+    notes = read_notes(tmp_path / "my robot.usda")
+    renamed = {
+        "my_robot": "my robot",
+        "a_b_2": "a-b",
+        "visuals_2": "visuals",
+        "joints_2": "joints",
+        "_1st_wheel": "1st wheel",
+        "j_1_2": "j.1",
+        "w_1": "w 1",
+    }
+    shown = {p.GetName(): p.GetDisplayName() for p in stage.Traverse() if p.GetDisplayName()}
+    assert shown == renamed
+    for name, was in renamed.items():
+        assert any(note.endswith(f"{was!r} is called {name!r} in USD") for note in notes)
+    assert {p.GetName() for p in robot.GetChild("joints").GetChildren()} == {"右", "j_1_2", "joints", "w_1"}
+    for link in ("底座", "a_b", "a_b_2", "a_b_2/visuals_2", "joints_2", "_1st_wheel"):
+        assert robot.GetPrimAtPath(link), link
+    height = UsdGeom.BBoxCache(0, ["default"]).ComputeWorldBound(robot).ComputeAlignedRange().GetMax()[2]
+    assert_allclose(height, 0.1, rtol=1e-6)  # no frame moves the shapes beside it
+    assert_valid(tmp_path / "my robot.usda", tmp_path)
+
+
+JOINTS = {
+    "type": ("ball|", "joint 'j' is of type 'ball'; known: fixed, revolute, continuous, prismatic, planar"),
+    "axis": ('continuous|<axis xyz="0 0 0"/>', "joint 'j' moves about an axis of length 0"),
+    "no limit": ("revolute|", "joint 'j' is revolute and needs <limit lower= upper=>"),
+    "limits": (
+        'revolute|<limit effort="1" velocity="1" lower="1" upper="-1"/>',
+        "joint 'j' has its lower limit 1 above its upper -1",
+    ),
+    "effort": (
+        'continuous|<limit effort="-1" velocity="1"/>',
+        "joint 'j' has an effort of -1; give one above 0",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", JOINTS)
+def test_a_bad_joint_is_refused_with_its_line(tmp_path, case):
+    inner, message = JOINTS[case]
+    with pytest.raises(InputError, match=r"arm\.urdf:5: " + message):
+        convert_urdf(arm(tmp_path, inner), tmp_path / "arm.usda")
+
+
+def test_a_joint_to_a_link_that_is_not_there_names_the_near_one(tmp_path):
+    path = arm(tmp_path, "fixed|")
+    path.write_text(path.read_text().replace('child link="hand"', 'child link="hnad"'))
+    with pytest.raises(InputError, match=r":5: joint 'j' names no link 'hnad'; did you mean 'hand'"):
+        read_description(path)
+
+
+def test_links_in_a_circle_are_refused(tmp_path):
+    path = arm(tmp_path, "fixed|")
+    back = '<joint name="k" type="fixed"><parent link="hand"/><child link="base_link"/></joint></robot>'
+    path.write_text(path.read_text().replace("</robot>", back))
+    with pytest.raises(InputError, match="joint 'j' closes a circle: no link is the root; remove one joint"):
+        read_description(path)
+
+
+def test_a_link_held_twice_is_refused(tmp_path):
+    path = arm(tmp_path, "fixed|")
+    twice = '<joint name="k" type="fixed"><parent link="base_link"/><child link="hand"/></joint></robot>'
+    path.write_text(path.read_text().replace("</robot>", twice))
+    with pytest.raises(InputError, match=r"joint 'k' holds 'hand', which 'j' holds already"):
+        read_description(path)
+
+
+def test_broken_xml_is_refused_with_its_line(tmp_path):
+    path = urdf(tmp_path, "<link name='a'>\n</lnik>")
+    with pytest.raises(InputError, match=r"arm\.urdf:4: not XML: mismatched tag \(column \d+\)"):
+        read_description(path)
+
+
+def test_entity_bombs_and_outer_entities_are_refused_before_they_unfold(tmp_path):
+    path = tmp_path / "bomb.urdf"
+    laughs = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 12))
+    path.write_text(f'<?xml version="1.0"?>\n<!DOCTYPE r [<!ENTITY l0 "ha">{laughs}]>\n<robot name="&l11;"/>')
+    with pytest.raises(InputError, match=r"bomb\.urdf:2: has a DOCTYPE, whose entities are not followed"):
+        read_description(path)
+    path.write_text('<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/passwd">]>\n<robot name="&x;"/>')
+    with pytest.raises(InputError, match="has a DOCTYPE"):
+        read_description(path)
+
+
+def test_what_is_no_urdf_is_refused(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text("<sdf/>")
+    with pytest.raises(InputError, match=r"arm\.urdf:1: a URDF begins with <robot>, this file with <sdf>"):
+        read_description(path)
+    with pytest.raises(InputError, match=r"amr\.urdf: no such URDF file; did you mean 'arm\.urdf'"):
+        read_description(tmp_path / "amr.urdf")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_description(tmp_path)
+
+
+def test_a_mesh_that_is_broken_empty_or_flat_is_refused(tmp_path):
+    mesh = '<geometry><mesh filename="m.stl"/></geometry>'
+    path = urdf(tmp_path, f'<link name="b">{{INERTIAL}}<collision>{mesh}</collision></link>')
+    (tmp_path / "m.stl").write_text("nonsense")
+    with pytest.raises(InputError, match=r"m\.stl: (cannot be read as a mesh|holds no triangle)"):
+        convert_urdf(path, tmp_path / "arm.usda")
+    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).export(tmp_path / "m.stl")
+    with pytest.raises(InputError, match=r"m\.stl: is flat and has no convex hull to collide with"):
+        convert_urdf(path, tmp_path / "arm.usda")
+
+
+def test_an_output_that_exists_is_kept_unless_forced(tmp_path):
+    path = arm(tmp_path, "fixed|")
+    out = convert_urdf(path, tmp_path / "out.usda")
+    with pytest.raises(InputError, match=r"out\.usda: exists already; give --force"):
+        convert_urdf(path, out)
+    convert_urdf(path, out, force=True)
+    with pytest.raises(InputError, match=r"out\.usdc: the robot's root layer is text; give it the suffix"):
+        convert_urdf(path, tmp_path / "out.usdc")
+
+
+# --- the real robot -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def real_robot(tmp_path_factory):
+    from conftest import REAL
+
+    path = REAL / "turtlebot4" / "turtlebot4.urdf"
+    if not path.is_file():
+        pytest.skip(f"the real robot is not at {path}")
+    return path, convert_urdf(path, tmp_path_factory.mktemp("real") / "turtlebot4.usda")
+
+
+def reference_box(path, T):
+    """Bounding box of a COLLADA file under a transform, read by pycollada alone, nothing repaired."""
+    import collada
+
+    text = path.read_bytes().replace(b"0.0 0.0 0.01.0", b"0.0 0.0 0.0 1.0")
+    file = collada.Collada(__import__("io").BytesIO(text))
+    points = [
+        p.vertex[p.vertex_index.ravel()] for g in file.scene.objects("geometry") for p in g.primitives()
+    ]
+    points = np.vstack(points) @ T[:3, :3].T + T[:3, 3]
+    return points.min(0), points.max(0)
+
+
+def primitive_box(geometry):
+    """Lower and upper corner of a primitive about its origin, shape (2, 3)."""
+    if geometry.box is not None:
+        half = geometry.box.size / 2
+    elif geometry.cylinder is not None:
+        half = np.array([geometry.cylinder.radius, geometry.cylinder.radius, geometry.cylinder.length / 2])
+    else:
+        half = np.full(3, geometry.sphere.radius)
+    return np.stack([-half, half])
+
+
+def test_every_visual_of_the_real_robot_arrives_with_its_bounding_box(real_robot):
+    import yourdfpy
+
+    path, out = real_robot
+    peer = yourdfpy.URDF.load(str(path), load_meshes=False)  # its forward kinematics, not ours
+    links, shapes = read_links(out), read_shapes(out)
+    checked = 0
+    for link in peer.robot.links:
+        for visual in link.visuals:
+            origin = np.eye(4) if visual.origin is None else visual.origin
+            if visual.geometry.mesh is None:
+                low, high = primitive_box(visual.geometry) + origin[:3, 3]
+                stem = ""
+            else:
+                low, high = reference_box(path.parent / visual.geometry.mesh.filename, origin)
+                stem = visual.geometry.mesh.filename.split("/")[-1].removesuffix(".dae")
+            mine = np.vstack([s.vertices for s in shapes if s.link == link.name and stem in s.prim])
+            assert_allclose([mine.min(0), mine.max(0)], [low, high], atol=1e-6, err_msg=link.name)
+            checked += 1
+    assert checked == 18
+    for name, link in links.items():
+        T = peer.get_transform(name, "base_link")
+        assert_allclose(link.p_base_link, T[:3, 3], atol=1e-9)
+        assert_allclose(matrix_from_quat(link.q_base_link_xyzw), T[:3, :3], atol=1e-9)
+
+
+def test_the_mass_of_the_real_robot_is_its_urdfs_and_nothing_is_silent(real_robot):
+    path, out = real_robot
+    stage = Usd.Stage.Open(str(out))
+    masses = [
+        UsdPhysics.MassAPI(p).GetMassAttr().Get() for p in stage.Traverse() if p.HasAPI(UsdPhysics.MassAPI)
+    ]
+    xml = read_description(path).xml
+    assert_allclose(sum(masses), sum(float(m.get("value")) for m in xml.iter("mass")), rtol=1e-6)
+    notes = read_notes(out)
+    assert "rplidar.dae: malformed colour '0.0 0.0 0.01.0' read as '0 0 0 1'" in notes
+    assert "joint 'wheel_drop_left_joint' (prismatic) cannot move by its own limits: welded" in notes
+    assert any(s.link == "rplidar_link" and len(s.faces) > 5000 for s in read_shapes(stage))
+
+
+def test_the_real_robot_passes_the_validators(real_robot, tmp_path):
+    assert_valid(real_robot[1], tmp_path)

@@ -1,0 +1,1039 @@
+"""Meshes, materials and colliders of a URDF: each format and feature from a tiny file made here."""
+
+import base64
+import io
+import json
+import struct
+import sys
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.testing import assert_allclose, assert_array_equal
+from PIL import Image
+from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
+from validators import assert_valid
+
+from magtwin.errors import InputError
+from magtwin.urdf import convert_urdf, read_notes
+from magtwin.urdf.meshes.mesh import Piece, distinct, read_mesh
+from magtwin.urdf.meshes.polygon import cut_polygons
+from magtwin.urdf.options import Options
+from magtwin.usd.geometry import linear_from_srgb, read_links, read_shapes
+
+GREEN = '<material name="green"><color rgba="0 1 0 1"/></material>'
+
+INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+
+POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], float)
+FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+"""A tetrahedron of volume 1, facing outwards."""
+
+
+def robot(tmp_path, body, head="", options=Options(), name="arm"):  # noqa: B008
+    """The stage of a robot of one link whose visuals and colliders are given as XML."""
+    path = tmp_path / f"{name}.urdf"
+    path.write_text(f'<robot name="{name}">{head}<link name="base_link">{INERTIAL}{body}</link></robot>')
+    out = convert_urdf(path, tmp_path / "out" / f"{name}.usda", options=options, force=True)
+    stage = Usd.Stage.Open(str(out))
+    stage.Reload()
+    return stage
+
+
+def visual(file, material="", scale="1 1 1"):
+    return f'<visual><geometry><mesh filename="{file}" scale="{scale}"/></geometry>{material}</visual>'
+
+
+def collision(file):
+    return f'<collision><geometry><mesh filename="{file}"/></geometry></collision>'
+
+
+def notes_of(stage):
+    return read_notes(stage.GetRootLayer().realPath)
+
+
+def meshes_of(stage, purpose="default"):
+    """Meshes of a purpose, those in instances included."""
+    prims = stage.Traverse(Usd.TraverseInstanceProxies())
+    found = [UsdGeom.Mesh(p) for p in prims if p.IsA(UsdGeom.Mesh)]
+    return [m for m in found if m.ComputePurpose() == purpose]
+
+
+def surface_of(prim):
+    """The UsdPreviewSurface that a prim wears."""
+    return UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0].ComputeSurfaceSource()[0]
+
+
+def corners_of(mesh, name):
+    """A primvar's values at the corners, shape (F, 3, K), and the corners' points."""
+    values = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar(name).ComputeFlattened())
+    points = np.array(mesh.GetPointsAttr().Get())[np.array(mesh.GetFaceVertexIndicesAttr().Get())]
+    return values.reshape(-1, 3, values.shape[-1]), points.reshape(-1, 3, 3)
+
+
+def assert_faces_outwards(mesh, volume):
+    """Winding encloses the volume, and every normal points the way its face does."""
+    normals, corners = corners_of(mesh, "normals")
+    a, b, c = np.moveaxis(corners.astype(float), 1, 0)
+    assert_allclose(np.sum(a * np.cross(b, c)) / 6, volume, rtol=1e-5)
+    assert (np.einsum("fi,fci->fc", np.cross(b - a, c - a), normals) > 0).all()
+    assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-3)
+
+
+def bounds(points):
+    return np.array([points.min(0), points.max(0)])
+
+
+def picture(path, colours=((255, 0, 0), (0, 0, 255))):
+    """A PNG of as many pixels as colours, side by side."""
+    image = Image.new("RGB", (len(colours), 1))
+    image.putdata(colours)
+    image.save(path)
+    return path
+
+
+# --- Wavefront ------------------------------------------------------------------------------------
+
+SQUARES = """mtllib paint.mtl
+v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+v 2 0 0
+v 2 1 0
+vt 0 0
+vt 1 0
+vt 1 1
+vt 0 1
+usemtl red
+f 1/1 2/2 3/3 4/4
+usemtl blue
+f -5/1 -2/2 -1/3 -4/4
+"""
+"""Two squares side by side, the second by indices from the end."""
+
+MTL = "newmtl red\nKd 1 0 0\nnewmtl blue\nKd 0 0 0.5\nd 0.25\n"
+
+
+def squares(tmp_path, mtl=MTL):
+    (tmp_path / "squares.obj").write_text(SQUARES)
+    (tmp_path / "paint.mtl").write_text(mtl)
+    return "squares.obj"
+
+
+def test_two_materials_of_a_wavefront_file_become_two_subsets_of_one_mesh(tmp_path):
+    stage = robot(tmp_path, visual(squares(tmp_path)))
+    (mesh,) = meshes_of(stage)
+    subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
+    assert [s.GetPrim().GetName() for s in subsets] == ["red", "blue"]
+    assert [list(s.GetIndicesAttr().Get()) for s in subsets] == [[0, 1], [2, 3]]
+    kind = UsdGeom.Subset.GetFamilyType(mesh, UsdShade.Tokens.materialBind)
+    assert kind == UsdGeom.Tokens.partition
+    red, blue = read_shapes(stage)
+    assert_allclose(red.colour, [1, 0, 0, 1], atol=1e-5)
+    assert_allclose(blue.colour, [0, 0, 0.21404, 0.25], atol=1e-5)
+    assert_allclose(bounds(red.vertices), [[0, 0, 0], [1, 1, 0]])
+    assert_allclose(bounds(blue.vertices), [[1, 0, 0], [2, 1, 0]])
+    colours = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displayColor").ComputeFlattened()
+    assert_allclose(colours, [[1, 0, 0]] * 2 + [[0, 0, 0.21404]] * 2, atol=1e-5)
+    assert_valid(stage.GetRootLayer().realPath, tmp_path)
+
+
+def test_a_texture_lies_beside_the_asset_and_colours_the_mesh_where_it_did(tmp_path):
+    bytes_in = picture(tmp_path / "tiles.png").read_bytes()
+    file = squares(tmp_path, MTL + "map_Kd -s 1 1 1 tiles.png\n")
+    stage = robot(tmp_path, visual(file))
+    (mesh,) = meshes_of(stage)
+    uvs, points = corners_of(mesh, "st")
+    assert_allclose(uvs[2:], points[2:, :, :2] - [1, 0], atol=1e-6)  # each square wears the whole picture
+    surface = surface_of(mesh.GetPrim().GetChild("blue"))
+    texture = UsdShade.Shader(surface.GetInput("diffuseColor").GetConnectedSources()[0][0].source)
+    asset = texture.GetInput("file").Get()
+    assert asset.path == "./textures/tiles.png"
+    assert (tmp_path / "out/payloads/textures/tiles.png").read_bytes() == bytes_in
+    assert asset.resolvedPath == str(tmp_path / "out/payloads/textures/tiles.png")
+    reader = UsdShade.Shader(texture.GetInput("st").GetConnectedSources()[0][0].source)
+    assert (reader.GetIdAttr().Get(), reader.GetInput("varname").Get()) == ("UsdPrimvarReader_float2", "st")
+    assert_valid(stage.GetRootLayer().realPath, tmp_path)
+
+
+def test_a_single_file_has_its_textures_beside_it_too(tmp_path):
+    picture(tmp_path / "tiles.png")
+    file = squares(tmp_path, "newmtl red\nmap_Kd tiles.png\nnewmtl blue\nmap_Kd tiles.png\n")
+    stage = robot(tmp_path, visual(file), options=Options(single_file=True))
+    assert [p.name for p in (tmp_path / "out/arm_textures").iterdir()] == ["tiles.png"]
+    assert "@./arm_textures/tiles.png@" in (tmp_path / "out/arm.usda").read_text()
+    for shape in read_shapes(stage):  # a viewer without textures shows their mean
+        assert_allclose(shape.colour[:3], linear_from_srgb([0.5, 0, 0.5]), atol=0.01)
+    assert_valid(stage.GetRootLayer().realPath, tmp_path)
+
+
+def test_two_pictures_of_one_name_stay_two_and_one_in_two_places_becomes_one(tmp_path):
+    (tmp_path / "a").mkdir()
+    picture(tmp_path / "t.png")
+    picture(tmp_path / "copy.png")
+    picture(tmp_path / "a" / "T.png", [(0, 255, 0)])
+    (tmp_path / "a" / "paint.mtl").write_text("newmtl red\nmap_Kd T.png\n")
+    (tmp_path / "a" / "o.obj").write_text(SQUARES)
+    file = squares(tmp_path, "newmtl red\nmap_Kd t.png\nnewmtl blue\nmap_Kd copy.png\n")
+    robot(tmp_path, visual(file) + visual("a/o.obj"))
+    assert sorted(p.name for p in (tmp_path / "out/payloads/textures").iterdir()) == ["T_2.png", "t.png"]
+
+
+def test_a_bitmap_becomes_png_with_a_note(tmp_path):
+    Image.new("RGB", (2, 2), (10, 20, 30)).save(tmp_path / "t.bmp")
+    stage = robot(tmp_path, visual(squares(tmp_path, "newmtl red\nmap_Kd t.bmp\nnewmtl blue\n")))
+    with Image.open(tmp_path / "out/payloads/textures/t.png") as image:
+        assert image.getpixel((0, 0))[:3] == (10, 20, 30)
+    note = "squares.obj: texture 't.bmp' is BMP, which not every USD viewer reads; written as PNG"
+    assert note in notes_of(stage)
+
+
+LOST = {
+    "missing": ("map_Kd no.png", "squares.obj: texture 'no.png' is missing and is left out; looked for"),
+    "outside": ("map_Kd ../up.png", "texture '../up.png' lies outside the robot's packages and is left out"),
+    "absolute": ("map_Kd /etc/passwd", "texture '/etc/passwd' lies outside the robot's packages"),
+    "linked": ("map_Kd link.png", "texture 'link.png' lies outside the robot's packages and is left out"),
+    "no picture": ("map_Kd bad.png", "texture 'bad.png' is no picture that can be read and is left out"),
+    "colour": ("Kd red", "squares.obj: material 'blue' has a malformed colour; taken as grey"),
+    "invisible": ("d 0", "squares.obj: material 'blue' would be invisible; taken as opaque"),
+}
+
+
+@pytest.mark.parametrize("case", LOST)
+def test_what_is_wrong_with_a_material_is_noted_and_the_mesh_arrives(tmp_path, case):
+    line, note = LOST[case]
+    inside = tmp_path / "robot"
+    inside.mkdir()
+    picture(tmp_path / "up.png")
+    (inside / "link.png").symlink_to(tmp_path / "up.png")
+    (inside / "bad.png").write_bytes(b"\x89PNG\r\n\x1a\nnothing")
+    stage = robot(inside, visual(squares(inside, f"newmtl red\nKd 1 0 0\nnewmtl blue\n{line}\n")))
+    assert any(note in each for each in notes_of(stage)), notes_of(stage)
+    assert len(read_shapes(stage)) == 2
+    assert not list((inside / "out").rglob("*.png"))
+
+
+def test_a_library_or_material_that_is_not_there_is_noted(tmp_path):
+    (tmp_path / "o.obj").write_text(SQUARES.replace("paint.mtl", "no.mtl") + "l 1 2\n")
+    notes = notes_of(robot(tmp_path, visual("o.obj")))
+    assert "o.obj: material library 'no.mtl' is missing; shown without it" in notes
+    assert "o.obj: material 'red' is in none of its libraries; shown without it" in notes
+    assert "o.obj: lines, points and curves (l) are left out" in notes
+
+
+# --- COLLADA --------------------------------------------------------------------------------------
+
+
+def dae(path, nodes, *, up="Z_UP", unit=1.0, diffuse="<color>1 1 1 1</color>", images="", extra=""):
+    """A COLLADA file of the tetrahedron, in nodes that are given as XML; {mesh} stands for it."""
+    numbers = " ".join(map(str, POINTS.ravel()))
+    index = " ".join(map(str, FACES.ravel()))
+    shown = """<instance_geometry url="#g"><bind_material><technique_common>
+        <instance_material symbol="s" target="#m"/></technique_common></bind_material></instance_geometry>"""
+    path.write_text(f"""<?xml version="1.0"?>
+    <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+    <asset><unit meter="{unit}"/><up_axis>{up}</up_axis></asset><library_images>{images}</library_images>
+    <library_effects><effect id="e"><profile_COMMON>{extra}<technique sid="t"><lambert>
+    <diffuse>{diffuse}</diffuse></lambert></technique></profile_COMMON></effect></library_effects>
+    <library_materials><material id="m" name="skin"><instance_effect url="#e"/></material></library_materials>
+    <library_geometries><geometry id="g"><mesh><source id="p"><float_array id="pa" count="12">{numbers}
+    </float_array><technique_common><accessor source="#pa" count="4" stride="3"><param name="X" type="float"/>
+    <param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+    <source id="u"><float_array id="ua" count="8">0 0 1 0 0 1 1 1</float_array><technique_common>
+    <accessor source="#ua" count="4" stride="2"><param name="S" type="float"/><param name="T" type="float"/>
+    </accessor></technique_common></source>
+    <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+    <triangles count="4" material="s"><input semantic="VERTEX" source="#v" offset="0"/>
+    <input semantic="TEXCOORD" source="#u" offset="0"/><p>{index}</p></triangles></mesh></geometry>
+    </library_geometries><library_visual_scenes><visual_scene id="scene">{nodes.format(mesh=shown)}
+    </visual_scene></library_visual_scenes><scene><instance_visual_scene url="#scene"/></scene></COLLADA>""")
+    return path
+
+
+NESTED = """<node><translate>0 0 5</translate><rotate>0 0 1 90</rotate><node><scale>2 2 2</scale>
+<translate>10 0 0</translate>{mesh}</node></node>"""
+
+
+def test_nested_collada_nodes_compose_outside_in(tmp_path):
+    mesh = read_mesh(dae(tmp_path / "n.dae", NESTED))
+    turned = np.add(POINTS, [10, 0, 0]) * 2 @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    assert_allclose(bounds(mesh.points), np.add(bounds(turned), [0, 0, 5]), atol=1e-5)
+
+
+def test_a_mirroring_collada_node_still_faces_outwards(tmp_path):
+    dae(tmp_path / "n.dae", "<node><scale>-1 1 1</scale>{mesh}</node>")
+    stage = robot(tmp_path, visual("n.dae"))
+    (mesh,) = meshes_of(stage)
+    assert_faces_outwards(mesh, 1.0)
+
+
+def test_inches_become_metres_and_an_up_axis_is_left_alone_as_in_rviz(tmp_path):
+    dae(tmp_path / "n.dae", "<node>{mesh}</node>", up="Y_UP", unit=0.0254)
+    stage = robot(tmp_path, visual("n.dae"))
+    (seen,) = read_shapes(stage)
+    assert_allclose(bounds(seen.vertices), np.array([[0, 0, 0], [1, 2, 3]]) * 0.0254, atol=1e-7)
+    note = "n.dae: its up axis Y_UP is not applied, as in RViz; turn the visual instead"
+    assert note in notes_of(stage)
+
+
+SAMPLER = """<newparam sid="f"><surface type="2D"><init_from>i</init_from></surface></newparam>
+<newparam sid="w"><sampler2D><source>f</source></sampler2D></newparam>"""
+
+
+def test_a_collada_texture_arrives_even_under_a_percent_encoded_name(tmp_path):
+    picture(tmp_path / "my skin.png")
+    dae(
+        tmp_path / "n.dae",
+        "<node>{mesh}</node>",
+        images='<image id="i"><init_from>my%20skin.png</init_from></image>',
+        extra=SAMPLER,
+        diffuse='<texture texture="w" texcoord="UV"/>',
+    )
+    stage = robot(tmp_path, visual("n.dae"))
+    (mesh,) = meshes_of(stage)
+    assert surface_of(mesh).GetInput("diffuseColor").HasConnectedSource()
+    assert (tmp_path / "out/payloads/textures/my_skin.png").is_file()
+    assert len(corners_of(mesh, "st")[0]) == 4
+    assert not [note for note in notes_of(stage) if "n.dae" in note]
+    (tmp_path / "my skin.png").unlink()
+    stage = robot(tmp_path, visual("n.dae"))
+    assert any("texture 'my%20skin.png' is missing" in note for note in notes_of(stage))
+    assert_allclose(read_shapes(stage)[0].colour[:3], linear_from_srgb([0.5] * 3), atol=1e-4)
+
+
+def test_a_geometry_stays_although_its_material_or_texture_cannot_be_read(tmp_path):
+    dae(tmp_path / "n.dae", "<node>{mesh}</node>", diffuse='<texture texture="nowhere" texcoord="UV"/>')
+    stage = robot(tmp_path, visual("n.dae"))
+    assert "n.dae: texture 'nowhere' names no image and is left out" in notes_of(stage)
+    assert len(read_shapes(stage)[0].faces) == 4
+    path = tmp_path / "n.dae"
+    path.write_text(path.read_text().replace('url="#e"', 'url="#gone"'))
+    stage = robot(tmp_path, visual("n.dae", GREEN))
+    assert "n.dae: material 'skin' has no effect that can be read; shown without it" in notes_of(stage)
+    assert_allclose(read_shapes(stage)[0].colour, [0, 1, 0, 1], atol=1e-5)
+    with pytest.raises(InputError, match="has no effect that can be read"):
+        robot(tmp_path, visual("n.dae"), options=Options(strict=True))
+
+
+def test_collada_nodes_may_refer_to_others_but_not_to_themselves(tmp_path):
+    path = dae(tmp_path / "n.dae", '<node><translate>0 0 1</translate><instance_node url="#part"/></node>')
+    shape = '<instance_geometry url="#g"/>'
+    library = '<library_nodes><node id="part"><scale>2 2 2</scale>{}</node></library_nodes><library_images>'
+    text = path.read_text()
+    path.write_text(text.replace("<library_images>", library.format(shape)))
+    assert_allclose(bounds(read_mesh(path).points), [[0, 0, 1], [2, 4, 7]])
+    path.write_text(text.replace("<library_images>", library.format('<instance_node url="#part"/>')))
+    with pytest.raises(InputError, match=r"n\.dae:\d+: node 'part' is within itself; export it again"):
+        read_mesh(path)
+
+
+def test_a_collada_file_whose_author_has_an_accent_in_latin_1_is_read(tmp_path):
+    path = dae(tmp_path / "n.dae", "<node>{mesh}</node>")
+    text = path.read_text().replace("<asset>", "<asset><contributor><author>José</author></contributor>")
+    path.write_bytes(text.encode("latin-1"))
+    assert len(read_mesh(path).faces) == 4
+
+
+def test_collada_polygons_strips_and_fans_are_read_as_pycollada_reads_lists_of_polygons(tmp_path):
+    import collada
+
+    path = dae(tmp_path / "n.dae", "<node>{mesh}</node>")
+    index = " ".join(map(str, FACES.ravel()))
+    before = '<triangles count="4" material="s">'
+    text = (
+        path.read_text()
+        .replace(before, '<polylist count="2" material="s">')
+        .replace("</triangles>", "</polylist>")
+    )
+    path.write_text(text.replace(f"<p>{index}</p>", "<vcount>4 3</vcount><p>0 1 3 2 0 2 1</p>"))
+    peer = collada.Collada(str(path)).geometries[0].primitives[0].triangleset()
+    mine = read_mesh(path)
+    assert_allclose(mine.points[mine.faces], peer.vertex[peer.vertex_index])
+    for tag, want in (("tristrips", [[0, 1, 3], [1, 2, 3]]), ("trifans", [[0, 1, 3], [0, 3, 2]])):
+        path.write_text(text.replace(f"<p>{index}</p>", "<p>0 1 3 2</p>").replace("polylist", tag))
+        mine = read_mesh(path)
+        assert_allclose(mine.points[mine.faces], POINTS[want])
+
+
+DAE_REFUSED = {
+    "entities": ("<COLLADA", '<!DOCTYPE x [<!ENTITY a "b">]><COLLADA', r"n\.dae:2: has a DOCTYPE"),
+    "points": (
+        'count="4" stride="3"',
+        'count="5" stride="3"',
+        r"12 numbers are too few for 5 rows of 3; export",
+    ),
+    "index": ("<p>0 2 1", "<p>0 2 x", r"its indices are not whole numbers in rows of 1; export it again"),
+    "vertex": ("<p>0 2 1", "<p>0 2 9", r"n\.dae:\d+: a face names vertex 9 of 4; export it again"),
+    "matrix": (
+        "<node>",
+        "<node><matrix>1 2</matrix>",
+        r"n\.dae:\d+: <matrix> needs 16 finite numbers; export",
+    ),
+    "flat": (
+        "<node>",
+        "<node><scale>1 1 0</scale>",
+        r"a node's transform flattens the mesh; export it again",
+    ),
+    "scene": (
+        "<instance_visual_scene",
+        "<instance_nothing",
+        r"n\.dae: has no scene to show; export it again",
+    ),
+    "other": ("COLLADA", "KOLLADA", r"n\.dae: begins with <KOLLADA>, a COLLADA file with <COLLADA>"),
+}
+
+
+@pytest.mark.parametrize("case", DAE_REFUSED)
+def test_a_malformed_collada_file_is_refused_with_its_line(tmp_path, case):
+    old, new, message = DAE_REFUSED[case]
+    path = dae(tmp_path / "n.dae", "<node>{mesh}</node>")
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputError, match=message):
+        read_mesh(path)
+
+
+def test_a_geometry_that_no_node_shows_is_noted(tmp_path):
+    dae(tmp_path / "n.dae", "<node/>")
+    with pytest.raises(InputError, match=r"n\.dae: holds no triangle"):
+        robot(tmp_path, visual("n.dae"))
+
+
+# --- polygons -------------------------------------------------------------------------------------
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    radii=st.lists(st.floats(0.2, 1), min_size=3, max_size=12),
+    normal=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda n: np.linalg.norm(n) > 0.1),
+    first=st.integers(0, 11),
+)
+def test_any_star_of_a_polygon_is_cut_into_triangles_that_fill_it_and_do_not_overlap(radii, normal, first):
+    angles = 2 * np.pi * np.arange(len(radii)) / len(radii)
+    flat = np.roll(
+        np.column_stack([np.cos(angles), np.sin(angles)]) * np.array(radii)[:, None], first, axis=0
+    )
+    n = np.array(normal) / np.linalg.norm(normal)
+    u = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
+    u /= np.linalg.norm(u)
+    points = flat @ [u, np.cross(n, u)]
+    triangles = cut_polygons(points, np.arange(len(points)), np.array([len(points)]))
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    areas = np.cross(b - a, c - a) @ n / 2
+    x, y = flat.T
+    assert areas.min() > -1e-9  # the first of equals counts as an ear
+    assert_allclose(areas.sum(), np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2, rtol=1e-9)
+
+
+def test_a_concave_face_of_a_wavefront_file_keeps_its_hollow(tmp_path):
+    (tmp_path / "l.obj").write_text(
+        "v 1 1 0\nv 2 1 0\nv 2 2 0\nv 0 2 0\nv 0 0 0\nv 1 0 0\nf 1 2 3 4 5 6\nf 1 6 5\n"
+    )
+    mesh = read_mesh(tmp_path / "l.obj")
+    a, b, c = np.moveaxis(mesh.points[mesh.faces[:4]].astype(float), 1, 0)
+    areas = np.cross(b - a, c - a)[:, 2] / 2
+    assert (areas > 0).all()
+    assert_allclose(areas.sum(), 3)
+
+
+# --- glTF -----------------------------------------------------------------------------------------
+
+
+def gltf(
+    path, *, nodes=None, material=None, pictures=(), colours=None, mode=4, index=None, binary=True, **more
+):
+    """A glTF file of the tetrahedron, binary or with its buffer in a file of its own."""
+    chunks, views, accessors = [], [], []
+
+    def add(values, dtype, kind):
+        data = np.asarray(values, dtype).tobytes()
+        views.append({"buffer": 0, "byteOffset": sum(map(len, chunks)), "byteLength": len(data)})
+        chunks.append(data + b"\0" * (-len(data) % 4))
+        code = {"<f4": 5126, "<u2": 5123, "<u1": 5121}[dtype]
+        accessor = {"bufferView": len(views) - 1, "componentType": code, "type": kind, "count": len(values)}
+        accessors.append(accessor)
+        return len(accessors) - 1
+
+    at = {
+        "POSITION": add(POINTS, "<f4", "VEC3"),
+        "TEXCOORD_0": add([[0, 0], [1, 0], [0, 1], [1, 1]], "<f4", "VEC2"),
+    }
+    if colours is not None:
+        at["COLOR_0"] = add(colours, "<u1", "VEC4")
+        accessors[-1]["normalized"] = True
+    primitive = {
+        "attributes": at,
+        "mode": mode,
+        "indices": add(FACES.ravel() if index is None else index, "<u2", "SCALAR"),
+    }
+    table = {"asset": {"version": "2.0"}, "meshes": [{"primitives": [primitive]}], **more}
+    for image in pictures:
+        views.append({"buffer": 0, "byteOffset": sum(map(len, chunks)), "byteLength": len(image)})
+        chunks.append(image + b"\0" * (-len(image) % 4))
+        table["images"] = [{"bufferView": len(views) - 1, "mimeType": "image/png", "name": "skin"}]
+        table["textures"] = [{"source": 0}]
+    if material is not None:
+        table["materials"], primitive["material"] = [material], 0
+    table["nodes"] = nodes or [{"mesh": 0}]
+    table["scenes"], table["scene"] = [{"nodes": [0]}], 0
+    body = b"".join(chunks)
+    table |= {"buffers": [{"byteLength": len(body)}], "bufferViews": views, "accessors": accessors}
+    if not binary:
+        table["buffers"][0]["uri"] = "shape.bin"
+        (path.parent / "shape.bin").write_bytes(body)
+        path.write_text(json.dumps(table))
+        return path
+    text = json.dumps(table).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(body))
+    head += struct.pack("<II", len(text), 0x4E4F534A) + text
+    path.write_bytes(head + struct.pack("<II", len(body), 0x004E4942) + body)
+    return path
+
+
+HALF = float(np.sqrt(0.5))
+
+TREE = [
+    {"children": [1], "translation": [1, 2, 3], "rotation": [0, 0, HALF, HALF]},
+    {"mesh": 0, "matrix": [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1]},
+]
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_gltf_nodes_are_where_trimesh_has_them_turned_to_z_up(tmp_path, binary):
+    path = gltf(tmp_path / f"t.{'glb' if binary else 'gltf'}", nodes=TREE, binary=binary)
+    x, y, z = np.moveaxis(trimesh.load_scene(path).to_geometry().vertices, -1, 0)
+    (seen,) = read_shapes(robot(tmp_path, visual(path.name)))
+    assert_allclose(bounds(seen.vertices), bounds(np.column_stack([x, -z, y])), atol=1e-5)
+
+
+def test_gltf_colours_are_linear_and_its_picture_is_kept_byte_by_byte(tmp_path):
+    data = io.BytesIO()
+    Image.new("RGBA", (1, 1), (255, 255, 255, 128)).save(data, "PNG")
+    surface = {
+        "baseColorFactor": [0.25, 0.5, 1, 0.5],
+        "baseColorTexture": {"index": 0},
+        "metallicFactor": 0.75,
+        "roughnessFactor": 0.125,
+    }
+    material = {"name": "skin", "alphaMode": "BLEND", "doubleSided": True, "pbrMetallicRoughness": surface}
+    gltf(tmp_path / "t.glb", material=material, pictures=[data.getvalue()])
+    stage = robot(tmp_path, visual("t.glb"))
+    (mesh,) = meshes_of(stage)
+    look = surface_of(mesh)
+    assert_allclose([look.GetInput(n).Get() for n in ("metallic", "roughness")], [0.75, 0.125])
+    texture = UsdShade.Shader(look.GetInput("diffuseColor").GetConnectedSources()[0][0].source)
+    assert_allclose(texture.GetInput("scale").Get(), [0.25, 0.5, 1, 0.5], atol=1e-5)
+    assert look.GetInput("opacity").GetConnectedSources()[0][0].sourceName == "a"
+    assert (tmp_path / "out/payloads/textures/skin.png").read_bytes() == data.getvalue()
+    uvs, corners = corners_of(mesh, "st")
+    assert_allclose(uvs[np.all(np.isclose(corners, 0), axis=-1)], [[0, 1]] * 3)  # glTF counts v downwards
+    assert mesh.GetDoubleSidedAttr().Get()
+    assert_valid(stage.GetRootLayer().realPath, tmp_path)
+
+
+def test_gltf_vertex_colours_multiply_the_factor(tmp_path):
+    material = {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 1, 1, 1]}}
+    gltf(tmp_path / "t.glb", material=material, colours=[[255, 0, 0, 255], [0, 255, 0, 255]] * 2)
+    stage = robot(tmp_path, visual("t.glb"))
+    (seen,) = read_shapes(stage)
+    assert_allclose(seen.vertex_colours[np.isclose(seen.vertices[:, 0], 1)], [[0, 1, 0]] * 3, atol=1e-4)
+    assert_allclose(seen.vertex_colours[np.isclose(seen.vertices[:, 1], -3)], [[0, 1, 0]] * 3, atol=1e-4)
+    assert_allclose(seen.vertex_colours[np.isclose(seen.vertices[:, 2], 2)], [[0.5, 0, 0]] * 3, atol=1e-4)
+
+
+@pytest.mark.parametrize(("mode", "index"), [(5, [0, 2, 1, 3]), (6, [0, 2, 1, 3])])
+def test_gltf_strips_and_fans_are_cut_as_the_specification_says(tmp_path, mode, index):
+    mesh = read_mesh(gltf(tmp_path / "t.glb", mode=mode, index=index))
+    want = [[0, 2, 1], [2, 3, 1]] if mode == 5 else [[2, 1, 0], [1, 3, 0]]
+    y_up = mesh.points[mesh.faces] @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    assert_allclose(y_up, POINTS[want], atol=1e-6)
+
+
+def test_a_picture_inside_a_gltf_text_is_written_out(tmp_path):
+    data = picture(tmp_path / "p.png").read_bytes()
+    uri = "data:image/png;base64," + base64.b64encode(data).decode()
+    material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    more = {"images": [{"uri": uri}], "textures": [{"source": 0}]}
+    gltf(tmp_path / "t.gltf", material=material, binary=False, **more)
+    robot(tmp_path, visual("t.gltf"))
+    assert (tmp_path / "out/payloads/textures/t_0.png").read_bytes() == data
+
+
+# --- PLY and STL ----------------------------------------------------------------------------------
+
+
+def test_ply_colours_of_vertices_are_shown_by_the_material(tmp_path):
+    rgb = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 128, 128]], np.uint8)
+    rows = "\n".join(" ".join(map(str, (*p, *c))) for p, c in zip(POINTS, rgb, strict=True))
+    faces = "\n".join("3 " + " ".join(map(str, f)) for f in FACES)
+    properties = [f"property float {a}" for a in "xyz"] + [
+        f"property uchar {c}" for c in ("red", "green", "blue")
+    ]
+    head = ["ply", "format ascii 1.0", "element vertex 4", *properties, "element face 4"]
+    head += ["property list uchar int vertex_indices", "end_header", rows, faces]
+    (tmp_path / "t.ply").write_text("\n".join(head) + "\n")
+    stage = robot(tmp_path, visual("t.ply", '<material name="m"><color rgba="1 1 1 1"/></material>'))
+    (seen,) = read_shapes(stage)
+    for point, colour in zip(POINTS, linear_from_srgb(rgb / 255), strict=True):
+        own = np.all(np.isclose(seen.vertices, point), axis=1)
+        assert_allclose(seen.vertex_colours[own], np.tile(colour, (3, 1)), atol=1e-4)
+    (mesh,) = meshes_of(stage)
+    reader = surface_of(mesh).GetInput("diffuseColor").GetConnectedSources()[0][0].source
+    assert UsdShade.Shader(reader.GetPrim()).GetInput("varname").Get() == "displayColor"
+    assert_valid(stage.GetRootLayer().realPath, tmp_path)
+
+
+def test_ascii_and_binary_stl_give_the_same_mesh(tmp_path):
+    solid = trimesh.Trimesh(POINTS, FACES, process=False)
+    (tmp_path / "a.stl").write_text(trimesh.exchange.stl.export_stl_ascii(solid))
+    (tmp_path / "b.stl").write_bytes(trimesh.exchange.stl.export_stl(solid))
+    a, b = (read_mesh(tmp_path / f"{name}.stl") for name in "ab")
+    assert_array_equal(a.points, b.points)
+    assert_array_equal(a.faces, b.faces)
+    assert_allclose(bounds(a.points), [[0, 0, 0], [1, 2, 3]])
+
+
+# --- scale, normals, sharing ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [(-1, 1, 1), (-2, -1, -1), (-1, -1, 1), (3, 1, 0.5)])
+def test_a_scaled_or_mirrored_mesh_keeps_its_pictures_and_colours_and_faces_outwards(tmp_path, scale):
+    picture(tmp_path / "t.png")
+    obj = "".join(f"v {x} {y} {z}\n" for x, y, z in POINTS) + "vt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\n"
+    obj += (
+        "mtllib p.mtl\nusemtl red\nf 1/1 3/3 2/2\nf 1/1 2/2 4/4\nusemtl skin\nf 2/2 3/3 4/4\nf 1/1 4/4 3/3\n"
+    )
+    (tmp_path / "t.obj").write_text(obj)
+    (tmp_path / "p.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl skin\nmap_Kd t.png\n")
+    stage = robot(tmp_path, visual("t.obj", scale=" ".join(map(str, scale))))
+    (mesh,) = meshes_of(stage)
+    assert_faces_outwards(mesh, np.prod(np.abs(scale)))
+    uvs, corners = corners_of(mesh, "st")
+    for point, uv in zip(POINTS * scale, [[0, 0], [1, 0], [0, 1], [1, 1]], strict=True):
+        assert_allclose(uvs[np.all(np.isclose(corners, point), axis=-1)], np.tile(uv, (3, 1)), atol=1e-6)
+    red = mesh.GetPrim().GetChild("red")
+    assert list(UsdGeom.Subset(red).GetIndicesAttr().Get()) == [0, 1]
+
+
+def test_normals_of_a_file_are_kept_and_turn_by_the_inverse_transpose(tmp_path):
+    root = np.sqrt(0.5)  # a slope of 45 degrees
+    (tmp_path / "t.obj").write_text(
+        f"v 0 0 0\nv 1 0 1\nv 1 1 1\nv 0 1 0\nvn {-root} 0 {root}\nf 1//1 2//1 3//1 4//1\n"
+    )
+    stage = robot(tmp_path, visual("t.obj", scale="2 1 1"))
+    (mesh,) = meshes_of(stage)
+    normals, _ = corners_of(mesh, "normals")
+    assert_allclose(normals, np.broadcast_to(np.array([-1, 0, 2]) / np.sqrt(5), (2, 3, 3)), atol=1e-4)
+
+
+def test_smooth_normals_of_a_file_survive_although_its_faces_would_be_flat(tmp_path):
+    box = trimesh.creation.box()
+    away = box.vertices / np.linalg.norm(box.vertices, axis=1, keepdims=True)
+    rows = "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices)
+    rows += "".join(f"vn {x} {y} {z}\n" for x, y, z in away)
+    rows += "".join("f " + " ".join(f"{i + 1}//{i + 1}" for i in face) + "\n" for face in box.faces)
+    (tmp_path / "t.obj").write_text(rows)
+    stage = robot(tmp_path, visual("t.obj"))
+    (mesh,) = meshes_of(stage)
+    normals, corners = corners_of(mesh, "normals")
+    assert_allclose(normals, corners / np.linalg.norm(corners, axis=-1, keepdims=True), atol=1e-4)
+
+
+def test_visuals_of_one_mesh_are_instances_of_one_prototype(tmp_path):
+    trimesh.creation.icosphere().export(tmp_path / "ball.stl")
+    look = '<material name="{}"><color rgba="{} 0 0 1"/></material>'
+    body = visual("ball.stl", look.format("a", 1)) + visual("ball.stl", look.format("b", 0.5))
+    stage = robot(tmp_path, body + visual("ball.stl", scale="2 2 2"))
+    instances = [p for p in stage.Traverse() if p.IsInstance()]
+    assert len(instances) == 3
+    assert instances[0].GetPrototype() == instances[1].GetPrototype() != instances[2].GetPrototype()
+    assert_allclose([s.colour[0] for s in read_shapes(stage)], [1, 0.21404, 0.21404], atol=1e-4)
+    layer = Usd.Stage.Open(str(tmp_path / "out/payloads/geometries.usdc"))
+    assert len([p for p in layer.Traverse() if p.IsA(UsdGeom.Mesh)]) == 2
+    assert_valid(stage.GetRootLayer().realPath, tmp_path)
+
+
+def test_two_files_of_one_name_stay_two_meshes(tmp_path):
+    for name, size in (("a", 1), ("b", 2)):
+        (tmp_path / name).mkdir()
+        trimesh.creation.box((size,) * 3).export(tmp_path / name / "part.stl")
+    stage = robot(tmp_path, visual("a/part.stl") + visual("b/part.stl"))
+    assert [float(s.vertices.max()) for s in read_shapes(stage)] == [0.5, 1]
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    arrays(
+        np.float32, st.tuples(st.integers(1, 30), st.just(3)), elements=st.sampled_from([0.0, -0.0, 1.5, 2.0])
+    )
+)
+def test_distinct_rows_are_those_that_numpy_finds_in_order_of_appearance(rows):
+    first, kind = distinct(rows)
+    assert_array_equal(rows[first][kind], rows)
+    assert len(first) == len(np.unique(rows + 0.0, axis=0))
+    assert (np.diff(first) > 0).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    arrays(float, (3, 3), elements=st.sampled_from(np.linspace(-2, 2, 41))).filter(
+        lambda A: abs(np.linalg.det(A)) > 0.05
+    )
+)
+def test_a_piece_under_any_map_encloses_its_volume_and_its_normals_stand_on_its_faces(A):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = A, [1, 2, 3]
+    flat = trimesh.Trimesh(POINTS, FACES, process=False).face_normals
+    piece = Piece(POINTS, FACES, normals=np.repeat(flat[:, None], 3, axis=1)).moved(T)
+    a, b, c = np.moveaxis(piece.points[piece.faces], 1, 0)
+    assert_allclose(np.sum(a * np.cross(b, c)) / 6, abs(np.linalg.det(A)), rtol=1e-7)
+    outwards = np.cross(b - a, c - a)
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    made = piece.normals / np.linalg.norm(piece.normals, axis=-1, keepdims=True)
+    assert_allclose(made, np.repeat(outwards[:, None], 3, axis=1), atol=1e-8)
+
+
+# --- materials of the URDF ------------------------------------------------------------------------
+
+
+def test_a_urdf_material_dresses_what_its_mesh_file_leaves_bare(tmp_path):
+    trimesh.Trimesh(POINTS, FACES, process=False).export(tmp_path / "t.stl")
+    (tmp_path / "half.obj").write_text(SQUARES.replace("usemtl blue\n", "").replace("usemtl red\n", ""))
+    (tmp_path / "paint.mtl").write_text(MTL)
+    mixed = SQUARES.replace("usemtl red\n", "").replace("mtllib", "mtllib")
+    (tmp_path / "mixed.obj").write_text(mixed)
+    stage = robot(
+        tmp_path,
+        visual("t.stl", GREEN) + visual("half.obj", GREEN) + visual("mixed.obj", GREEN) + visual("t.stl"),
+    )
+    stl, bare, plain, blue, none = read_shapes(stage)
+    for shape in (stl, bare, plain):
+        assert_allclose(shape.colour, [0, 1, 0, 1], atol=1e-5)
+    assert_allclose(blue.colour, [0, 0, 0.21404, 0.25], atol=1e-5)
+    assert_allclose(none.colour[:3], [0.21404] * 3, atol=1e-5)
+    mesh = next(m for m in meshes_of(stage) if m.GetPrim().GetChild("blue"))
+    colours = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displayColor").ComputeFlattened()
+    assert_allclose(colours, [[0, 1, 0]] * 2 + [[0, 0, 0.21404]] * 2, atol=1e-5)
+
+
+def test_a_mesh_files_own_material_wins_over_the_urdfs_as_in_rviz(tmp_path):
+    stage = robot(tmp_path, visual(squares(tmp_path), GREEN))
+    assert_allclose([s.colour[1] for s in read_shapes(stage)], [0, 0])
+
+
+def test_a_robot_wide_material_is_found_by_its_name(tmp_path):
+    trimesh.Trimesh(POINTS, FACES, process=False).export(tmp_path / "t.stl")
+    stage = robot(tmp_path, visual("t.stl", '<material name="green"/>'), head=GREEN)
+    assert_allclose(read_shapes(stage)[0].colour, [0, 1, 0, 1], atol=1e-5)
+
+
+def test_a_material_that_one_visual_tells_of_holds_for_others_that_name_it_and_else_is_noted(tmp_path):
+    trimesh.Trimesh(POINTS, FACES, process=False).export(tmp_path / "t.stl")
+    told = '<material name="green"><color rgba="0 1 0 1"/></material>'
+    looks = (told, '<material name="green"/>', '<material name="geren"/>')
+    stage = robot(tmp_path, "".join(visual("t.stl", look) for look in looks))
+    colours = [shape.colour for shape in read_shapes(stage)]
+    assert_allclose(colours[:2], [[0, 1, 0, 1]] * 2, atol=1e-5)
+    assert_allclose(colours[2][:3], np.full(3, colours[2][0]))
+    notes = read_notes(stage.GetRootLayer().realPath)
+    assert "material 'geren' is named, but nothing says its colour: shown without it" in notes
+
+
+SKIN = '<material name="skin"><texture filename="{}"/></material>'
+
+
+def test_a_urdf_texture_lies_on_a_mesh_with_coordinates_and_gives_others_its_mean(tmp_path):
+    picture(tmp_path / "t.png")
+    (tmp_path / "bare.obj").write_text(SQUARES.replace("mtllib paint.mtl\n", "").replace("usemtl", "#"))
+    box = f'<visual><geometry><box size="1 1 1"/></geometry>{SKIN.format("t.png")}</visual>'
+    stage = robot(tmp_path, visual("bare.obj", SKIN.format("t.png")) + box)
+    (mesh,) = meshes_of(stage)
+    assert surface_of(mesh).GetInput("diffuseColor").HasConnectedSource()
+    cube = next(p for p in stage.Traverse() if p.IsA(UsdGeom.Cube))
+    assert_allclose(
+        surface_of(cube).GetInput("diffuseColor").Get(), linear_from_srgb([0.5, 0, 0.5]), atol=0.01
+    )
+    assert "material 'skin': a primitive shows the mean colour of its texture" in notes_of(stage)
+
+
+def test_a_urdf_texture_that_is_missing_is_noted_and_the_colour_stands_in(tmp_path):
+    skin = '<material name="skin"><color rgba="0 1 0 1"/><texture filename="no.png"/></material>'
+    stage = robot(tmp_path, f'<visual><geometry><box size="1 1 1"/></geometry>{skin}</visual>')
+    assert_allclose(read_shapes(stage)[0].colour, [0, 1, 0, 1], atol=1e-5)
+    assert any("texture 'no.png' of material 'skin' is missing" in note for note in notes_of(stage))
+
+
+# --- primitives and colliders ---------------------------------------------------------------------
+
+
+def test_a_capsule_is_a_capsule_its_length_without_its_ends(tmp_path):
+    capsule = '<geometry><capsule radius="0.1" length="0.5"/></geometry>'
+    stage = robot(tmp_path, f"<visual>{capsule}</visual><collision>{capsule}</collision>")
+    (seen,) = read_shapes(stage)
+    assert_allclose(bounds(seen.vertices)[:, 2], [-0.35, 0.35], atol=1e-6)
+    collider = next(p for p in stage.Traverse() if p.HasAPI(UsdPhysics.CollisionAPI))
+    assert (collider.GetTypeName(), collider.GetAttribute("height").Get()) == ("Capsule", 0.5)
+
+
+def horseshoe(path):
+    """A block with a slot, which its hull fills."""
+    parts = [
+        trimesh.creation.box((3, 1, 1)),
+        trimesh.creation.box((1, 1, 2)),
+        trimesh.creation.box((1, 1, 2)),
+    ]
+    parts[1].apply_translation([-1, 0, 1.5])
+    parts[2].apply_translation([1, 0, 1.5])
+    solid = trimesh.boolean.union(parts, engine="manifold")
+    solid.export(path)
+    return solid
+
+
+def volume(mesh):
+    points = np.array(mesh.GetPointsAttr().Get(), float)
+    a, b, c = np.moveaxis(points[np.array(mesh.GetFaceVertexIndicesAttr().Get())].reshape(-1, 3, 3), 1, 0)
+    return np.sum(a * np.cross(b, c)) / 6
+
+
+def test_a_mesh_collides_as_its_hull_as_convex_parts_or_as_itself(tmp_path):
+    pytest.importorskip("coacd")
+    solid = horseshoe(tmp_path / "u.stl")
+    made = {}
+    for kind in ("hull", "decomposition", "mesh"):
+        stage = robot(tmp_path, collision("u.stl"), options=Options(collision=kind))
+        made[kind] = meshes_of(stage, "guide")
+        points = np.vstack([np.array(m.GetPointsAttr().Get()) for m in made[kind]])
+        assert_allclose(bounds(points), solid.bounds, atol=0.05)
+        volumes = [volume(m) for m in made[kind]]
+        tokens = {UsdPhysics.MeshCollisionAPI(m).GetApproximationAttr().Get() for m in made[kind]}
+        want = solid.convex_hull.volume if kind == "hull" else solid.volume
+        assert_allclose(sum(volumes), want, rtol=0.05)
+        assert tokens == {"none" if kind == "mesh" else "convexHull"}
+        assert any("meshes collide as they are" in note for note in notes_of(stage)) == (kind == "mesh")
+        assert_valid(stage.GetRootLayer().realPath, tmp_path)
+    assert [len(made[k]) for k in ("hull", "mesh")] == [1, 1]
+    assert len(made["decomposition"]) >= 3
+
+
+def test_a_decomposition_without_coacd_is_refused_with_the_line_that_installs_it(tmp_path, monkeypatch):
+    horseshoe(tmp_path / "u.stl")
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    with pytest.raises(InputError, match=r'needs coacd, .*: pip install "magtwin\[decomposition\]"'):
+        robot(tmp_path, collision("u.stl"), options=Options(collision="decomposition"))
+
+
+# --- what is missing or damaged -------------------------------------------------------------------
+
+
+def test_a_missing_mesh_is_refused_or_left_out_with_a_note_that_names_link_and_file(tmp_path):
+    body = visual("no.stl") + collision("no.stl")
+    with pytest.raises(InputError, match=r"mesh 'no\.stl' is missing"):
+        robot(tmp_path, body)
+    stage = robot(tmp_path, body, options=Options(missing_meshes="note"))
+    assert "link 'base_link': visual is left out: its mesh 'no.stl' is missing" in notes_of(stage)
+    assert "link 'base_link': collision is left out: its mesh 'no.stl' is missing" in notes_of(stage)
+    with pytest.raises(InputError, match="is missing"):
+        robot(tmp_path, body, options=Options(missing_meshes="note", strict=True))
+
+
+def nan_stl(path):
+    solid = trimesh.Trimesh(POINTS, FACES, process=False)
+    data = bytearray(trimesh.exchange.stl.export_stl(solid))
+    data[96:100] = struct.pack("<f", np.nan)
+    path.write_bytes(data)
+
+
+def cut(path, write, part=0.5):
+    write(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * part)])
+
+
+def stl(path):
+    trimesh.Trimesh(POINTS, FACES, process=False).export(path)
+
+
+ZEROS = json.dumps(
+    {
+        "asset": {"version": "2.0"},
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"componentType": 5126, "type": "VEC3", "count": 10**12}],
+    }
+)
+DOUBLES = "".join(
+    f'<node id="n{i}"><instance_node url="#n{i + 1}"/><instance_node url="#n{i + 1}"/></node>'
+    for i in range(60)
+)
+
+DAMAGED = {
+    "m.stl": (nan_stl, r"m\.stl: has vertices that are not finite numbers; export it again"),
+    "cut.stl": (
+        lambda p: cut(p, stl),
+        r"cut\.stl: is of \d+ bytes, though its \d+ triangles need \d+; export it again",
+    ),
+    "cut_text.stl": (
+        lambda p: p.write_text("solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1"),
+        r"cut_text\.stl: (holds no triangle, or is cut short|cannot be read as a mesh)",
+    ),
+    "empty.stl": (lambda p: p.write_bytes(b""), r"empty\.stl: holds no triangle, or is cut short"),
+    "none.obj": (
+        lambda p: p.write_text("v 0 0 0\n"),
+        r"none\.obj: holds no triangle; export it again, or use",
+    ),
+    "line.obj": (lambda p: p.write_text("v 0 0 0\nv 1 1 1\nf 1 2 1\n"), r"holds no triangle with an area"),
+    "face.obj": (
+        lambda p: p.write_text("v 0 0 0\nf 1 2 3\n"),
+        r"face\.obj: a face names vertex 3 of 1; export",
+    ),
+    "word.obj": (
+        lambda p: p.write_text("v 0 0 0\nf 1 x 3\n"),
+        r"word\.obj:2: face '1 x 3' is malformed; export",
+    ),
+    "rows.obj": (
+        lambda p: p.write_text("v 0 0\nf 1 1 1\n"),
+        r"rows\.obj: its v are not 3 numbers each; export",
+    ),
+    "cut.glb": (lambda p: cut(p, gltf), r"cut\.glb: is cut short; export it again"),
+    "old.glb": (lambda p: gltf(p, asset={"version": "1.0"}), r"old\.glb: is glTF of version 1\.0; only 2\.0"),
+    "small.glb": (
+        lambda p: gltf(p, extensionsRequired=["KHR_draco_mesh_compression"]),
+        r"small\.glb: cannot be read without KHR_draco_mesh_compression; export it without compression",
+    ),
+    "ring.glb": (
+        lambda p: gltf(p, nodes=[{"children": [1]}, {"mesh": 0, "children": [0]}]),
+        r"ring\.glb: node 0 has two parents; export it again",
+    ),
+    "index.glb": (
+        lambda p: gltf(p, index=[0, 1, 9]),
+        r"index\.glb: a face names vertex 9 of 4; export it again",
+    ),
+    "zeros.gltf": (
+        lambda p: p.write_text(ZEROS),
+        r"zeros\.gltf: accessor 0 is of 10+ zeros, over \d+; export anew",
+    ),
+    "json.gltf": (lambda p: p.write_text("{"), r"json\.gltf: cannot be read as a mesh: .+; export it again"),
+    "doubles.dae": (
+        lambda p: dae(p, DOUBLES),
+        r"doubles\.dae:\d+: shows over 50000 nodes; export it again",
+    ),
+    "cut.dae": (
+        lambda p: cut(dae(p, "<node>{mesh}</node>"), lambda _: None),
+        r"cut\.dae:\d+: not XML: .+",
+    ),
+    "head.ply": (
+        lambda p: p.write_text("plx\n"),
+        r"head\.ply: cannot be read as a mesh: .+; export it again",
+    ),
+    "m.blend": (
+        lambda p: p.write_bytes(b"BLENDER"),
+        r"mesh 'm\.blend' is of no known format \(\.dae, \.glb, \.gl",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_damaged_mesh_is_refused_in_one_line(tmp_path, name):
+    write, message = DAMAGED[name]
+    write(tmp_path / name)
+    with pytest.raises(InputError, match=message) as refusal:
+        robot(tmp_path, visual(name))
+    assert "\n" not in str(refusal.value)
+    assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
+
+
+def test_a_buffer_outside_the_package_is_refused(tmp_path):
+    inside = tmp_path / "robot"
+    inside.mkdir()
+    path = gltf(inside / "t.gltf", binary=False)
+    (inside / "shape.bin").rename(tmp_path / "shape.bin")
+    path.write_text(path.read_text().replace("shape.bin", "../shape.bin"))
+    with pytest.raises(InputError, match=r"buffer '\.\./shape\.bin' lies outside the robot's packages; move"):
+        robot(inside, visual("t.gltf"))
+
+
+def test_bytes_are_the_same_each_time(tmp_path):
+    picture(tmp_path / "tiles.png")
+    file = squares(tmp_path, MTL + "map_Kd tiles.png\n")
+    once = {}
+    for _ in range(2):
+        robot(tmp_path, visual(file) + collision(gltf(tmp_path / "t.glb").name))
+        files = {p.name: p.read_bytes() for p in sorted((tmp_path / "out").rglob("*")) if p.is_file()}
+        assert files == (once or files)
+        once = files
+
+
+# --- the real robot -------------------------------------------------------------------------------
+
+NAMESPACE = {"c": "http://www.collada.org/2005/11/COLLADASchema"}
+
+
+def collada_points(path):
+    """Points of a COLLADA file of plain nodes, read here by ElementTree alone, metres."""
+    root = ElementTree.fromstring(path.read_bytes())
+    unit = float(root.find("c:asset/c:unit", NAMESPACE).get("meter"))
+    arrays_ = {
+        geometry.get("id"): np.array(
+            geometry.find("c:mesh/c:source/c:float_array", NAMESPACE).text.split(), float
+        ).reshape(-1, 3)
+        for geometry in root.iterfind(".//c:geometry", NAMESPACE)
+    }
+    shown = []
+
+    def walk(node, T):
+        for child in node:
+            tag = child.tag.partition("}")[2]
+            if tag == "matrix":
+                T = T @ np.array(child.text.split(), float).reshape(4, 4)
+            elif tag in ("translate", "rotate", "scale"):
+                raise AssertionError(f"{path}: this reading knows matrices only")
+            elif tag == "instance_geometry":
+                shown.append(arrays_[child.get("url")[1:]] @ T[:3, :3].T + T[:3, 3])
+            elif tag == "node":
+                walk(child, T)
+
+    for scene in root.iterfind(".//c:visual_scene", NAMESPACE):
+        walk(scene, np.eye(4))
+    return np.vstack(shown) * unit
+
+
+@pytest.mark.parametrize("name", ["turtlebot4", "turtlebot4_gazebo_tags"])
+def test_every_mesh_of_the_real_robot_arrives_in_its_place_or_is_named_as_missing(real_data, tmp_path, name):
+    import yourdfpy
+
+    folder = real_data / "turtlebot4"
+    packages = {
+        "irobot_create_description": folder / "xacro/irobot_create_common/irobot_create_description",
+        "turtlebot4_description": folder / "xacro/turtlebot4_description",
+    }
+    urdf = folder / f"{name}.urdf"
+    options = Options(packages=packages, missing_meshes="note", single_file=True)
+    out = convert_urdf(urdf, tmp_path / "tb4.usda", options=options)
+    peer = yourdfpy.URDF.load(str(urdf), load_meshes=False, build_scene_graph=False)
+    shapes, links, notes = read_shapes(out), read_links(out), read_notes(out)
+    checked, missing = 0, []
+    for link in peer.robot.links:
+        for shown in link.visuals:
+            if shown.geometry.mesh is None:
+                continue
+            file = shown.geometry.mesh.filename
+            package, _, rest = file.removeprefix("package://").partition("/")
+            path = packages[package] / rest if file.startswith("package://") else folder / file
+            if not path.is_file():
+                missing.append(path.name)
+                assert f"link {link.name!r}: visual is left out: its mesh {file!r} is missing" in notes
+                continue
+            T = np.eye(4) if shown.origin is None else shown.origin
+            want = collada_points(path) @ T[:3, :3].T + T[:3, 3]
+            mine = [s.vertices for s in shapes if s.link == link.name and f"/{path.stem}" in s.prim]
+            assert_allclose(bounds(np.vstack(mine)), bounds(want), atol=2e-6, err_msg=link.name)
+            checked += 1
+    assert (checked, missing) == ((14, []) if name == "turtlebot4" else (13, ["shell.dae", "oakd_pro.dae"]))
+    lidar = [s for s in shapes if s.link == "rplidar_link"]
+    assert sum(len(s.faces) for s in lidar) > 5000
+    assert "rplidar_link" in links

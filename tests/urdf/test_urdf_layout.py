@@ -1,0 +1,325 @@
+"""The layered form of an asset: Isaac Sim's structure, equal to the single file, movable, past the gates."""
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
+from test_urdf import BALL, BODY, INERTIAL
+from validators import assert_valid
+
+from magtwin.errors import InputError
+from magtwin.files import shipped
+from magtwin.urdf import convert_urdf
+from magtwin.urdf.layout import VARIANTS
+from magtwin.urdf.options import Options
+
+SIMREADY = "MAGTWIN_SIMREADY"
+"""Variable that names the `simready-validate` of an environment of its own, as `make simready` makes it: its
+rules would join those of `nvidia_usd_validate` in ours."""
+
+TAGS = """<gazebo reference="hand"><mu1>0.3</mu1><kp>1e6</kp><sensor name="imu" type="imu"><imu/></sensor>
+<maxVel>1</maxVel></gazebo>"""
+
+
+def arm(tmp_path, name="arm", extra=TAGS):
+    """A URDF with every kind of thing: meshes, primitives, a moving joint, a site, looks, grips, a sensor."""
+    tmp_path.mkdir(exist_ok=True)
+    ball = trimesh.creation.icosphere(radius=0.1)
+    ball.visual.vertex_colors = np.tile([200, 30, 30, 255], (len(ball.vertices), 1))
+    ball.export(tmp_path / "ball.ply")
+    mesh = '<geometry><mesh filename="ball.ply"/></geometry>'
+    path = tmp_path / f"{name}.urdf"
+    path.write_text(
+        f"""<robot name="{name}"><link name="base_link">{BODY}<visual>{mesh}</visual></link>
+        <link name="hand">{INERTIAL}<visual><origin xyz="0 0 1"/>{mesh}</visual><collision>{mesh}</collision>
+        <visual>{BALL}<material name="red"><color rgba="1 0 0 1"/></material></visual></link>
+        <link name="tip"/>
+        <joint name="j" type="revolute"><parent link="base_link"/><child link="hand"/>
+          <origin xyz="0.3 0 0" rpy="0 0.5 0"/><axis xyz="0 1 0"/>
+          <limit lower="-1" upper="1" effort="3" velocity="2"/></joint>
+        <joint name="t" type="fixed"><parent link="hand"/><child link="tip"/><origin xyz="0 0 0.2"/></joint>
+        {extra}</robot>"""
+    )
+    return path
+
+
+def composed(path):
+    """All that a stage composes to, by prim: type, schemas, values, targets and place in world."""
+    stage = Usd.Stage.Open(str(path))
+    assert not stage.GetCompositionErrors()
+    cache, prims = UsdGeom.XformCache(), {}
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        facts = {
+            "type": prim.GetTypeName(),
+            "schemas": sorted(prim.GetPrimTypeInfo().GetAppliedAPISchemas()),
+            "kind": Usd.ModelAPI(prim).GetKind(),
+            "instance": prim.IsInstance(),
+            "custom": prim.GetCustomData(),
+            "world": cache.GetLocalToWorldTransform(prim),
+        }
+        for prop in prim.GetAuthoredProperties():
+            if isinstance(prop, Usd.Relationship):
+                facts[prop.GetName()] = tuple(map(str, prop.GetTargets()))
+                continue
+            value = prop.Get()
+            if isinstance(value, Sdf.AssetPath):
+                assert value.resolvedPath
+                value = Path(value.resolvedPath).read_bytes()
+            facts[prop.GetName()] = (str(prop.GetTypeName()), value, tuple(map(str, prop.GetConnections())))
+        prims[str(prim.GetPath())] = facts
+    return prims
+
+
+def both(urdf, folder, **choices):
+    """What the single file and the layered form of a URDF compose to."""
+    one = convert_urdf(urdf, folder / "one" / "a.usda", options=Options(single_file=True, **choices))
+    two = convert_urdf(urdf, folder / "two" / "a.usda", options=Options(**choices))
+    return composed(one), composed(two)
+
+
+def assert_equal(one, two):
+    assert one.keys() == two.keys()
+    for path, facts in one.items():
+        assert facts == two[path], path
+
+
+def test_the_layers_compose_to_the_single_file_prim_by_prim(tmp_path):
+    one, two = both(arm(tmp_path), tmp_path)
+    assert len(one) >= 30
+    assert_equal(one, two)
+
+
+@pytest.mark.parametrize("name", ["turtlebot4", "turtlebot4_gazebo_tags"])
+def test_the_real_robots_layers_compose_to_its_single_file(real_data, tmp_path, name):
+    urdf = real_data / "turtlebot4" / f"{name}.urdf"
+    assert_equal(*both(urdf, tmp_path, missing_meshes="note"))
+
+
+def test_textures_come_along(tmp_path):
+    mesh = trimesh.creation.box()
+    picture = trimesh.visual.texture.SimpleMaterial(image=_picture())
+    mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=picture)
+    mesh.export(tmp_path / "box.obj")
+    shape = '<visual><geometry><mesh filename="box.obj"/></geometry></visual>'
+    path = tmp_path / "arm.urdf"
+    path.write_text(f'<robot name="arm"><link name="base_link">{INERTIAL}{shape}</link></robot>')
+    one, two = both(path, tmp_path)
+    assert any("inputs:file" in facts for facts in one.values())
+    assert_equal(one, two)
+
+
+def _picture():
+    from PIL import Image
+
+    return Image.new("RGB", (4, 4), (250, 0, 0))
+
+
+def test_the_files_are_those_of_isaac_sims_structure(tmp_path):
+    out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda")
+    files = sorted(p.relative_to(out.parent).as_posix() for p in out.parent.rglob("*") if p.is_file())
+    names = ("base.usda", "geometries.usdc", "instances.usda", "materials.usda", "robot.usda")
+    physics = ("mujoco.usda", "physics.usda", "physx.usda")
+    wanted = [f"payloads/{n}" for n in names] + [f"payloads/Physics/{n}" for n in physics]
+    assert files == sorted(["arm.usda", *wanted])
+    layer = Sdf.Layer.FindOrOpen(str(out))  # held in a name: a spec does not keep its layer alive
+    interface = layer.GetPrimAtPath("/arm")
+    assert [r.assetPath for r in interface.referenceList.prependedItems] == ["./payloads/base.usda"]
+    assert set(interface.variantSets["Physics"].variants.keys()) == {"none", "physics", "physx", "mujoco"}
+    assert not interface.nameChildren  # the interface holds arcs, no opinions
+
+
+def test_each_layer_holds_what_it_is_for(tmp_path):
+    out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda")
+    folder = out.parent / "payloads"
+    physical = ("physics:", "drive:", "newton:", "physx", "isaac:")
+
+    def properties(name):
+        found = []
+        layer = Sdf.Layer.FindOrOpen(str(folder / name))
+        layer.Traverse("/", lambda path: found.append(path.name) if path.IsPropertyPath() else None)
+        return found
+
+    for name in ("base.usda", "instances.usda", "materials.usda"):
+        assert not [p for p in properties(name) if p.startswith(physical)], name
+    assert all(p.startswith(("isaac:", "magtwin:")) for p in properties("robot.usda"))
+    assert all(p.startswith("physx") for p in properties("Physics/physx.usda"))
+    assert not properties("Physics/mujoco.usda")
+
+
+def test_variants_switch_the_physics_and_leave_the_looks(tmp_path):
+    out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda")
+    stage = Usd.Stage.Open(str(out))
+    robot = stage.GetDefaultPrim()
+    variants = robot.GetVariantSets().GetVariantSet("Physics")
+    assert variants.GetVariantSelection() == "physx"
+
+    def seen():
+        prims = list(stage.Traverse(Usd.TraverseInstanceProxies()))
+        return (
+            sum(p.HasAPI(UsdPhysics.RigidBodyAPI) for p in prims),
+            sum(p.HasAPI(UsdPhysics.CollisionAPI) for p in prims),
+            sum(p.IsA(UsdPhysics.Joint) for p in prims),
+            any(p.GetAttribute("physxArticulation:enabledSelfCollisions") for p in prims),
+            sum(p.IsA(UsdGeom.Gprim) for p in prims),
+        )
+
+    found = {}
+    for variant in VARIANTS:
+        variants.SetVariantSelection(variant)
+        found[variant] = seen()
+    gprims = found["none"][-1]
+    assert found["none"] == (0, 0, 0, False, gprims)
+    assert found["physics"] == found["mujoco"] == (2, 2, 1, False, gprims)
+    assert found["physx"] == (2, 2, 1, True, gprims)
+
+
+@pytest.mark.parametrize("single", [True, False])
+def test_the_folder_of_an_asset_can_be_moved(tmp_path, single):
+    urdf = arm(tmp_path / "source")
+    out = convert_urdf(urdf, tmp_path / "made" / "arm.usda", options=Options(single_file=single))
+    before = composed(out)
+    shutil.rmtree(tmp_path / "source")
+    (tmp_path / "made").rename(tmp_path / "elsewhere")
+    layers, _, unresolved = UsdUtils.ComputeAllDependencies(str(tmp_path / "elsewhere" / "arm.usda"))
+    assert not unresolved
+    for layer in layers:
+        assert all(not os.path.isabs(path) for path in layer.GetCompositionAssetDependencies())  # noqa: PTH117
+    assert_equal(before, composed(tmp_path / "elsewhere" / "arm.usda"))
+
+
+def test_the_layers_of_another_robot_are_never_overwritten(tmp_path):
+    out = tmp_path / "made"
+    convert_urdf(arm(tmp_path), out / "arm.usda")
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    other = arm(tmp_path, name="leg")
+    with pytest.raises(InputError, match="exists already"):
+        convert_urdf(other, out / "leg.usda")
+    with pytest.raises(InputError, match=r"is of arm\.usda; give each robot a folder of its own"):
+        convert_urdf(other, out / "leg.usda", force=True)
+    assert before == {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+
+
+def test_a_folder_called_payloads_that_is_not_ours_is_left_alone(tmp_path):
+    (tmp_path / "made" / "payloads").mkdir(parents=True)
+    (tmp_path / "made" / "payloads" / "thesis.txt").write_text("years of work")
+    with pytest.raises(InputError, match="was not made by a conversion"):
+        convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda", force=True)
+    assert (tmp_path / "made" / "payloads" / "thesis.txt").read_text() == "years of work"
+
+
+def test_a_conversion_that_fails_leaves_nothing(tmp_path):
+    urdf = arm(tmp_path)
+
+    def fail(_):
+        raise InputError("no")
+
+    with pytest.raises(InputError, match="no"):
+        convert_urdf(urdf, tmp_path / "made" / "arm.usda", finish=fail)
+    assert not list((tmp_path / "made").iterdir())
+
+
+def test_what_the_asset_says_of_itself_is_from_its_package_unless_given(tmp_path, monkeypatch):
+    (tmp_path / "package.xml").write_text(
+        "<package><name>arms</name><author>A. Maker</author><license>BSD-3-Clause</license></package>"
+    )
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
+    choices = Options(metadata={"category": "toy", "asset_license": "MIT"})
+    out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda", options=choices)
+    said = Sdf.Layer.FindOrOpen(str(out)).customLayerData["SimReady_Metadata"]
+    names = ("author", "asset_license", "category", "usd_date_generated", "asset_name", "rigid_body_count")
+    assert [said[name] for name in names] == ["A. Maker", "MIT", "toy", "1970-01-02", "arm", 2]
+    assert said["mass"] == 2
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"autor": "me"}, "metadata 'autor' is unknown; did you mean 'author'"),
+        ({"author": " "}, "metadata 'author' is empty"),
+        ({"qcode": "robot"}, "metadata 'qcode' must be Wikidata's, such as Q11012, got 'robot'"),
+    ],
+)
+def test_metadata_that_is_none_is_refused(tmp_path, given, message):
+    with pytest.raises(InputError, match=message):
+        convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda", options=Options(metadata=given))
+
+
+# --- gates ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_variant_passes_the_validators(tmp_path, variant):
+    out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda")
+    text = out.read_text()
+    assert text.count('string Physics = "physx"') == 1
+    out.write_text(text.replace('string Physics = "physx"', f'string Physics = "{variant}"'))
+    assert_valid(out, tmp_path)
+
+
+@pytest.fixture(scope="session")
+def simready():
+    """The command `simready-validate`, of the environment that MAGTWIN_SIMREADY names."""
+    command = os.environ.get(SIMREADY) or shutil.which("simready-validate")
+    if not command or not Path(command).is_file():
+        pytest.skip(f"simready-validate is not here; {SIMREADY} names that of an environment of its own")
+    return command
+
+
+def failures(simready, asset, profile, version, scratch):
+    """Features that a profile demands and the asset fails."""
+    report = scratch / "simready.json"
+    command = [simready, "--profile", profile, "--version", version, "--output", report, asset]
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    ran = subprocess.run(command, capture_output=True, check=False, text=True, env=clean)
+    assert report.exists(), ran.stdout + ran.stderr
+    (facts,) = json.loads(report.read_text()).values()
+    assert facts["features_summary"], "no feature was looked at"
+    return {name for name, feature in facts["features_summary"].items() if feature["blocking_failure"]}
+
+
+def thumbnail(asset, png):
+    from magtwin.figures.pictures import picture_of_stage
+
+    picture_of_stage(asset, png, size=(256, 256))
+
+
+@pytest.mark.parametrize("name", ["turtlebot4", "turtlebot4_gazebo_tags"])
+def test_the_real_robot_is_simready(simready, real_data, tmp_path, name):
+    from magtwin.urdf.convert import convert_with_report
+
+    out = tmp_path / "turtlebot4" / "turtlebot4" / "turtlebot4.usda"
+    convert_with_report(
+        real_data / "turtlebot4" / f"{name}.urdf",
+        out,
+        options=Options(missing_meshes="note", profile="diff-drive"),
+        thumbnail=thumbnail,
+    )
+    assert not failures(simready, out, "Robot-Body", "3.0.0", tmp_path)
+    if name == "turtlebot4_gazebo_tags":
+        for profile in ("Sensor-IMU", "Sensor-Camera"):
+            assert not failures(simready, out, profile, "1.0.0", tmp_path)
+
+
+def test_our_robot_is_simready(simready, tmp_path):
+    asset = shipped("robots", "turtlebot4", "turtlebot4.usda")
+    assert not failures(simready, asset, "Robot-Body", "3.0.0", tmp_path)
+
+
+def test_without_its_picture_it_is_not(simready, tmp_path):
+    out = tmp_path / "turtlebot4" / "turtlebot4.usda"
+    shutil.copytree(shipped("robots", "turtlebot4"), out.parent, ignore=shutil.ignore_patterns(".thumbs"))
+    assert failures(simready, out, "Robot-Body", "3.0.0", tmp_path) == {"FET_033_STANDARD"}
+
+
+def test_a_lidar_is_simready(simready, tmp_path):
+    tags = """<gazebo reference="hand"><sensor name="scan" type="gpu_lidar"><update_rate>8</update_rate>
+    <lidar><scan><horizontal><samples>360</samples><min_angle>-3.14159</min_angle><max_angle>3.14159</max_angle>
+    </horizontal></scan><range><min>0.1</min><max>10</max></range></lidar></sensor></gazebo>"""
+    out = convert_urdf(arm(tmp_path, extra=tags), tmp_path / "made" / "arm.usda")
+    assert not failures(simready, out, "Sensor-LiDAR", "1.0.0", tmp_path)

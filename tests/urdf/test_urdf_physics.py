@@ -1,0 +1,610 @@
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
+from test_urdf import BALL, INERTIAL, arm, urdf
+from validators import assert_valid
+
+from magtwin.errors import InputError
+from magtwin.frames import matrix_from_quat, quat_from_rpy
+from magtwin.urdf import convert_urdf, read_notes
+from magtwin.urdf.inertia import MassProperties, combined
+from magtwin.urdf.meshes import solid as solids
+from magtwin.urdf.options import DriveRule, Options
+
+LIMIT = '<limit effort="3" velocity="2" lower="-1" upper="0.5"/>'
+
+
+def convert(path, **options):
+    """The stage of a converted URDF, the robot's prim, and the notes."""
+    out = convert_urdf(
+        path, path.with_suffix(".usda"), options=Options(single_file=True, **options), force=True
+    )
+    stage = Usd.Stage.Open(str(out))
+    stage.Reload()
+    return stage, stage.GetDefaultPrim(), read_notes(out)
+
+
+def prim(robot, name):
+    return next(p for p in Usd.PrimRange(robot) if p.GetName() == name)
+
+
+def mass_of(body):
+    """Mass, centre and tensor of a body in its own axes, as an engine reads them."""
+    mass = UsdPhysics.MassAPI(body)
+    q = mass.GetPrincipalAxesAttr().Get()
+    R = matrix_from_quat(np.array([*q.imaginary, q.real]) / q.GetLength())
+    tensor = R @ np.diag(mass.GetDiagonalInertiaAttr().Get()) @ R.T
+    return mass.GetMassAttr().Get(), np.array(mass.GetCenterOfMassAttr().Get()), tensor
+
+
+def drive_of(robot, name, axis="angular"):
+    drive = UsdPhysics.DriveAPI(prim(robot, name), axis)
+    unit = 180 / np.pi if axis == "angular" else 1.0
+    return drive, drive.GetStiffnessAttr().Get() * unit, drive.GetDampingAttr().Get() * unit
+
+
+# --- solids and inertia ---------------------------------------------------------------------------
+
+SHAPES = {
+    "box": (solids.box([0.2, 0.3, 0.5]), trimesh.creation.box([0.2, 0.3, 0.5]), 1e-9),
+    "ball": (solids.sphere(0.3), trimesh.creation.icosphere(5, 0.3), 2e-3),
+    "cylinder": (solids.cylinder(0.3, 0.8), trimesh.creation.cylinder(0.3, 0.8, sections=400), 2e-4),
+    "capsule": (
+        solids.capsule(0.3, 0.8),
+        trimesh.creation.capsule(height=0.8, radius=0.3, count=[200, 200]),
+        1e-3,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_closed_forms_of_solids_are_what_their_fine_meshes_enclose(name):
+    form, mesh, tolerance = SHAPES[name]  # a polygon has less than its circle, by 1 part in sections^2
+    mesh.apply_translation(-mesh.center_mass)
+    enclosed = solids.polyhedron(mesh.vertices, mesh.faces)
+    assert_allclose(form.volume, enclosed.volume, rtol=tolerance)
+    assert_allclose(form.second, enclosed.second, rtol=2 * tolerance, atol=1e-4 * form.second.max())
+    assert_allclose(enclosed.mass_properties(1.0).inertia, mesh.moment_inertia, rtol=1e-6, atol=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    rpy=st.lists(st.floats(-3, 3), min_size=3, max_size=3),
+    t=st.lists(st.floats(-2, 2), min_size=3, max_size=3),
+    size=st.lists(st.floats(0.1, 2), min_size=3, max_size=3),
+)
+def test_a_solid_that_is_moved_and_stretched_is_that_of_its_moved_corners(rpy, t, size):
+    mesh = trimesh.creation.box()
+    A = matrix_from_quat(quat_from_rpy(rpy)) @ np.diag(size)
+    moved = solids.box([1, 1, 1]).mapped(A, t)
+    enclosed = solids.polyhedron(mesh.vertices @ A.T + t, mesh.faces)
+    assert_allclose(moved.volume, enclosed.volume, rtol=1e-9)
+    assert_allclose(moved.centre, enclosed.centre, atol=1e-9)
+    assert_allclose(moved.second, enclosed.second, atol=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    cut=st.floats(0.1, 0.9),
+    rpy=st.lists(st.floats(-3, 3), min_size=3, max_size=3),
+    t=st.lists(st.floats(-2, 2), min_size=3, max_size=3),
+)
+def test_two_parts_of_a_box_together_weigh_and_turn_as_the_box(cut, rpy, t):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = matrix_from_quat(quat_from_rpy(rpy)), t
+    left = solids.box([cut, 0.5, 0.3]).mapped(np.eye(3), [cut / 2, 0, 0]).mass_properties(700)
+    right = solids.box([1 - cut, 0.5, 0.3]).mapped(np.eye(3), [(1 + cut) / 2, 0, 0]).mass_properties(700)
+    whole = solids.box([1, 0.5, 0.3]).mapped(np.eye(3), [0.5, 0, 0]).mass_properties(700).moved(T)
+    both = combined([left.moved(T), right.moved(T)])
+    assert_allclose(both.mass, whole.mass, rtol=1e-12)
+    assert_allclose(both.centre, whole.centre, atol=1e-12)
+    assert_allclose(both.inertia, whole.inertia, atol=1e-9)
+
+
+def test_two_point_masses_turn_by_the_parallel_axis_theorem():
+    points = [MassProperties(2.0, np.array([x, 0.0, 0.0]), np.zeros((3, 3))) for x in (-0.5, 0.5)]
+    assert_allclose(combined(points).inertia, np.diag([0, 1, 1]), atol=1e-15)  # 2 m d^2
+
+
+# --- masses of links ------------------------------------------------------------------------------
+
+
+def test_links_without_inertial_get_a_mass_from_their_colliders_and_else_from_their_visuals(tmp_path):
+    shape = (
+        '<origin xyz="0 0 1" rpy="0 1.57079632679 0"/>'
+        '<geometry><cylinder radius="0.1" length="0.5"/></geometry>'
+    )
+    visual = '<visual><geometry><box size="1 1 1"/></geometry></visual>'
+    expected = solids.cylinder(0.1, 0.5).mass_properties(500)
+    turned = np.diag(np.diag(expected.inertia)[[2, 1, 0]])  # its axis lies along x
+    for child in (f"<collision>{shape}</collision>{visual}", f"<visual>{shape}</visual>"):
+        _stage, robot, notes = convert(arm(tmp_path, "fixed|", child), density=500.0)
+        mass, centre, tensor = mass_of(robot.GetPrimAtPath("hand"))
+        assert_allclose(mass, 500 * np.pi * 0.01 * 0.5, rtol=1e-6)
+        assert_allclose(centre, [0, 0, 1], atol=1e-6)
+        assert_allclose(tensor, turned, rtol=1e-5, atol=1e-6)
+        used = "colliders" if "collision" in child else "visuals"
+        assert f"link 'hand' has no <inertial>: 7.85 kg, its {used} at 500 kg/m3" in notes
+
+
+def test_a_mesh_weighs_what_it_encloses_and_an_open_one_what_its_hull_does(tmp_path):
+    mesh = trimesh.creation.icosphere(2, 0.2)
+    hollow = trimesh.Trimesh(mesh.vertices, mesh.faces[1:])
+    for name, what in (("whole", mesh), ("open", hollow)):
+        what.export(tmp_path / f"{name}.stl")
+        child = f'<visual><geometry><mesh filename="{name}.stl" scale="1 1 2"/></geometry></visual>'
+        _stage, robot, _ = convert(arm(tmp_path, "fixed|", child), density=1000.0)
+        assert_allclose(mass_of(robot.GetPrimAtPath("hand"))[0], 2000 * mesh.volume, rtol=1e-4)
+
+
+def test_without_a_density_a_link_without_inertial_is_left_to_the_engine_and_noted(tmp_path):
+    _stage, robot, notes = convert(arm(tmp_path, "fixed|", f"<collision>{BALL}</collision>"))
+    assert not robot.GetPrimAtPath("hand").HasAPI(UsdPhysics.MassAPI)
+    assert "link 'hand' has no <inertial>: engines take its mass from its colliders" in notes
+    _stage, robot, notes = convert(arm(tmp_path, "fixed|", f"<visual>{BALL}</visual>"))
+    assert any("with no collider either, it has no mass" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("child", "message"),
+    [
+        ("<inertial/>", ":4: link 'hand' has a mass of None kg"),
+        (
+            '<inertial><mass value="1"/>'
+            '<inertia ixx="1" iyy="1" izz="9" ixy="0" ixz="0" iyz="0"/></inertial>',
+            r":4: link 'hand' has an impossible inertia: .* none may exceed the sum of the others",
+        ),
+    ],
+)
+def test_impossible_masses_are_refused_with_their_line_merged_or_not(tmp_path, child, message):
+    for merge in (False, True):
+        with pytest.raises(InputError, match=message):
+            convert(arm(tmp_path, "fixed|", child), merge_fixed=merge)
+
+
+ZEROS = '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/>'
+
+
+def test_masses_and_tensors_that_are_filled_in_with_zeros_count_as_none(tmp_path):
+    text = f"""<link name="foot"><inertial><mass value="0"/>{ZEROS}</inertial></link>
+    <link name="base">{{BODY}}</link>
+    <link name="eye"><inertial><mass value="0.5"/>{ZEROS}</inertial><collision>{BALL}</collision></link>
+    <joint name="up" type="fixed"><parent link="foot"/><child link="base"/></joint>
+    <joint name="on" type="fixed"><parent link="base"/><child link="eye"/></joint>"""
+    _, robot, notes = convert(urdf(tmp_path, text))
+    assert not robot.GetPrimAtPath("foot")  # it has neither mass nor shape: a frame on the base
+    assert robot.GetPrimAtPath("base/foot")
+    eye = UsdPhysics.MassAPI(robot.GetPrimAtPath("eye"))
+    assert eye.GetMassAttr().Get() == 0.5
+    assert not eye.GetDiagonalInertiaAttr().HasAuthoredValue()  # engines take it from its collider
+    assert notes[:2] == (
+        "link 'foot': a mass of 0 counts as none",
+        "link 'eye': an <inertia> of zeros counts as none",
+    )
+
+
+def test_the_zeros_that_an_exporter_fills_in_weld_no_wheel(tmp_path):
+    zeros = '<limit lower="0" upper="0" effort="0" velocity="0"/>'
+    look = (
+        '<visual><geometry><sphere radius="1"/></geometry><material name=""><texture filename=""/></material>'
+    )
+    stage, _, notes = convert(arm(tmp_path, f"continuous|{zeros}", f"{{BODY}}{look}</visual>"))
+    drive = UsdPhysics.DriveAPI(stage.GetPrimAtPath("/arm/joints/j"), "angular")
+    assert drive.GetMaxForceAttr().Get() == 10
+    assert "joint 'j' gives an effort of 0: its drive may use 10 N m" in notes
+    assert "link 'hand': a <texture> of no file is left out" in notes
+
+
+def test_a_range_that_is_half_told_ends_at_0_and_one_of_an_endless_joint_is_noted(tmp_path):
+    limit = '<limit upper="1" effort="inf" velocity="2"/>'
+    stage, _, notes = convert(arm(tmp_path, f"revolute|{limit}"))
+    joint = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath("/arm/joints/j"))
+    assert (joint.GetLowerLimitAttr().Get(), joint.GetUpperLimitAttr().Get()) == (0, pytest.approx(57.29578))
+    assert UsdPhysics.DriveAPI(joint, "angular").GetMaxForceAttr().Get() == np.inf
+    assert "joint 'j' gives no lower limit: 0, as URDF has it" in notes
+    _, _, notes = convert(arm(tmp_path, f"continuous|{limit}"))
+    assert any("is continuous, which has no range: upper 1 of its <limit>" in n for n in notes)
+
+
+# --- merging --------------------------------------------------------------------------------------
+
+BOXES = """<link name="base">{box_a}</link><link name="lid">{box_b}</link><link name="eye"/>
+<joint name="screw" type="fixed"><parent link="base"/><child link="lid"/>
+  <origin xyz="0.3 -0.2 0.4" rpy="0.3 0.5 -0.7"/></joint>
+<joint name="glue" type="fixed"><parent link="lid"/><child link="eye"/><origin xyz="0 0 0.1"/></joint>"""
+
+
+def box_link(size, mass, origin):
+    """A link that is an even box, described by its own inertial."""
+    x, y, z = np.square(size) * mass / 12
+    words = " ".join(map(str, size))
+    return (
+        f'<inertial>{origin}<mass value="{mass}"/><inertia ixx="{y + z}" iyy="{x + z}" izz="{x + y}" '
+        'ixy="0" ixz="0" iyz="0"/></inertial>'
+        f'<visual>{origin}<geometry><box size="{words}"/></geometry></visual>'
+        f'<collision>{origin}<geometry><box size="{words}"/></geometry></collision>'
+    )
+
+
+def boxes(tmp_path):
+    a = box_link((0.2, 0.4, 0.6), 3.0, '<origin xyz="0.1 0 0" rpy="0.2 0 0"/>')
+    b = box_link((0.5, 0.1, 0.3), 2.0, '<origin xyz="0 0.05 0" rpy="0 0 0.4"/>')
+    return urdf(tmp_path, BOXES.replace("{box_a}", a).replace("{box_b}", b), "boxes")
+
+
+def test_a_merged_body_weighs_and_turns_as_its_shapes_together_and_keeps_every_frame(tmp_path):
+    path = boxes(tmp_path)
+    _stage, robot, _ = convert(path)
+    apart = {p.GetName(): UsdGeom.XformCache().GetLocalToWorldTransform(p) for p in Usd.PrimRange(robot)}
+    stage, robot, _ = convert(path, merge_fixed=True)
+    bodies = [p.GetName() for p in stage.Traverse() if p.HasAPI(UsdPhysics.RigidBodyAPI)]
+    assert bodies == ["base"]
+    assert not [p for p in stage.Traverse() if p.IsA(UsdPhysics.Joint)]
+    for name in ("lid", "eye"):
+        site = robot.GetPrimAtPath(f"base/{name}")
+        assert "IsaacSiteAPI" in site.GetPrimTypeInfo().GetAppliedAPISchemas()
+        placed = UsdGeom.XformCache().GetLocalToWorldTransform(site)
+        assert_allclose(np.array(placed), np.array(apart[name]), atol=1e-9)
+    body = robot.GetPrimAtPath("base")
+    colliders = list(robot.GetPrimAtPath("base/collisions").GetChildren())
+    assert [c.GetName() for c in colliders] == ["box", "lid"]
+    parts = [solids.read_solid([c], body) for c in colliders]
+    densities = [3.0 / 0.048, 2.0 / 0.015]  # mass over volume
+    whole = combined([part.mass_properties(d) for part, d in zip(parts, densities, strict=True)])
+    mass, centre, tensor = mass_of(body)
+    assert_allclose(mass, 5, rtol=1e-6)
+    assert_allclose(centre, whole.centre, atol=1e-6)
+    assert_allclose(tensor, whole.inertia, atol=1e-6)
+    assert_valid(path.with_suffix(".usda"), tmp_path)
+
+
+def test_merged_colliders_keep_their_own_links_friction(tmp_path):
+    path = boxes(tmp_path)
+    tag = '<gazebo reference="lid"><mu1>0.05</mu1></gazebo></robot>'
+    path.write_text(path.read_text().replace("</robot>", tag))
+    _stage, robot, _ = convert(path, merge_fixed=True)
+    grips = {}
+    for collider in robot.GetPrimAtPath("base/collisions").GetChildren():
+        grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0]
+        grips[collider.GetName()] = UsdPhysics.MaterialAPI(grip).GetDynamicFrictionAttr().Get()
+    assert_allclose([grips["box"], grips["lid"]], [0.5, 0.05], rtol=1e-6)
+
+
+def test_merging_the_real_robot_leaves_three_bodies_of_the_same_mass_and_balance(tmp_path, real_data):
+    path = real_data / "turtlebot4" / "turtlebot4.urdf"
+    total = {}
+    for merge in (False, True):
+        out = convert_urdf(
+            path, tmp_path / f"{merge}.usda", options=Options(single_file=True, merge_fixed=merge)
+        )
+        stage = Usd.Stage.Open(str(out))
+        parts, cache = [], UsdGeom.XformCache()
+        for p in stage.Traverse():
+            if p.HasAPI(UsdPhysics.MassAPI):
+                T = np.array(cache.GetLocalToWorldTransform(p)).T
+                parts.append(MassProperties(*mass_of(p)).moved(T))
+        total[merge] = len(parts), combined(parts)
+    (many, apart), (few, merged) = total[False], total[True]
+    assert (many, few) == (41, 3)
+    assert_allclose(merged.mass, apart.mass, rtol=1e-6)
+    assert_allclose(merged.centre, apart.centre, atol=1e-7)
+    assert_allclose(merged.inertia, apart.inertia, atol=1e-6)
+
+
+# --- bases and joints -----------------------------------------------------------------------------
+
+
+def test_a_fixed_base_is_bolted_to_the_robots_prim_where_it_stands(tmp_path):
+    body = """<link name="base_footprint"/><link name="base">{BODY}</link>
+    <joint name="up" type="fixed"><parent link="base_footprint"/><child link="base"/>
+      <origin xyz="0 0 0.1" rpy="0 0 1"/></joint>"""
+    path = urdf(tmp_path, body, "post")
+    stage, robot, _ = convert(path, fix_base=True)
+    joint = UsdPhysics.Joint(prim(robot, "root_joint"))
+    assert joint.GetBody0Rel().GetTargets() == [robot.GetPath()]
+    assert joint.GetBody1Rel().GetTargets() == [robot.GetPath().AppendChild("base")]
+    assert_allclose(joint.GetLocalPos0Attr().Get(), [0, 0, 0.1], atol=1e-7)
+    assert_valid(path.with_suffix(".usda"), tmp_path)
+    stage, robot, _ = convert(path)
+    assert not [p for p in stage.Traverse() if p.IsA(UsdPhysics.Joint)]
+
+
+def test_what_slides_on_a_root_without_mass_slides_on_the_world(tmp_path):
+    body = """<link name="rail"/><link name="cart">{BODY}</link>
+    <joint name="slide" type="prismatic"><parent link="rail"/><child link="cart"/><origin xyz="0 0 1"/>
+      <axis xyz="1 0 0"/><limit lower="-2" upper="2" effort="9" velocity="3"/></joint>"""
+    _stage, robot, _ = convert(urdf(tmp_path, body, "cartpole"))
+    joint = UsdPhysics.Joint(prim(robot, "slide"))
+    assert joint.GetBody0Rel().GetTargets() == [robot.GetPath()]
+    assert not robot.HasAPI(UsdPhysics.RigidBodyAPI)
+    assert "IsaacSiteAPI" in robot.GetPrimAtPath("rail").GetPrimTypeInfo().GetAppliedAPISchemas()
+
+
+def test_speed_damping_and_friction_reach_newton_and_physx_in_their_units(tmp_path):
+    path = arm(tmp_path, f'revolute|<axis xyz="0 0 1"/>{LIMIT}<dynamics damping="0.2" friction="0.1"/>')
+    _stage, robot, _ = convert(path)
+    joint = prim(robot, "j")
+    applied = joint.GetPrimTypeInfo().GetAppliedAPISchemas()
+    assert {"NewtonJointAPI", "PhysxJointAPI", "PhysxJointAxisAPI:angular"} <= set(applied)
+    figures = {
+        "newton:velocityLimit": np.degrees(2),
+        "newton:damping": np.radians(0.2),  # N m s per degree
+        "newton:friction": 0.1,
+        "physxJoint:maxJointVelocity": np.degrees(2),
+        "physxJointAxis:angular:maxJointVelocity": np.degrees(2),
+        "physxJointAxis:angular:viscousFrictionCoefficient": np.radians(0.2),
+        "physxJointAxis:angular:staticFrictionEffort": 0.1,
+        "physxJointAxis:angular:dynamicFrictionEffort": 0.1,
+    }
+    for name, value in figures.items():
+        assert_allclose(joint.GetAttribute(name).Get(), value, rtol=1e-6, err_msg=name)
+
+
+def test_limits_without_room_weld_a_joint_where_they_are(tmp_path):
+    limit = '<limit lower="0.3" upper="0.3" effort="1" velocity="1"/>'
+    _stage, robot, notes = convert(arm(tmp_path, f'prismatic|<axis xyz="0 1 0"/>{limit}'))
+    joint = prim(robot, "j")
+    assert joint.IsA(UsdPhysics.FixedJoint)
+    assert_allclose(UsdPhysics.Joint(joint).GetLocalPos0Attr().Get(), [0, 0.3, 0], atol=1e-7)
+    hand = UsdGeom.XformCache().GetLocalToWorldTransform(robot.GetPrimAtPath("hand"))
+    assert_allclose(hand.ExtractTranslation(), [0, 0.3, 0], atol=1e-9)
+    assert "joint 'j' (prismatic) cannot move by its own limits: welded" in notes
+
+
+def test_a_joint_that_may_not_stand_at_0_is_held_at_its_nearest_limit_and_noted(tmp_path):
+    limit = '<limit lower="0.2" upper="0.9" effort="1" velocity="1"/>'
+    _stage, robot, notes = convert(arm(tmp_path, f'revolute|<axis xyz="0 1 0"/>{limit}'))
+    drive, *_ = drive_of(robot, "j")
+    assert_allclose(drive.GetTargetPositionAttr().Get(), np.degrees(0.2), rtol=1e-6)
+    assert any("stands at 0, outside its limits 0.2 to 0.9" in note for note in notes)
+
+
+# --- mimics ---------------------------------------------------------------------------------------
+
+
+def follower(tmp_path, mimic, kind="revolute", lead=LIMIT):
+    body = f"""<link name="a">{{BODY}}</link><link name="b">{{BODY}}</link><link name="c">{{BODY}}</link>
+    <joint name="lead" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>{lead}</joint>
+    <joint name="f" type="{kind}"><parent link="a"/><child link="c"/><axis xyz="0 1 0"/>{LIMIT}
+      {mimic}</joint>"""
+    return urdf(tmp_path, body, "pair")
+
+
+def test_a_mimic_is_authored_for_newton_and_for_physx_and_has_no_drive_of_its_own(tmp_path):
+    path = follower(tmp_path, '<mimic joint="lead" multiplier="-2" offset="0.1"/>')
+    _stage, robot, _ = convert(path)
+    joint, lead = prim(robot, "f"), prim(robot, "lead").GetPath()
+    assert joint.GetRelationship("newton:mimicJoint").GetTargets() == [lead]
+    assert_allclose(joint.GetAttribute("newton:mimicCoef0").Get(), np.degrees(0.1), rtol=1e-6)
+    assert joint.GetAttribute("newton:mimicCoef1").Get() == -2
+    space = "physxMimicJoint:rotY"  # q + gearing q_leader + offset = 0
+    assert joint.GetRelationship(f"{space}:referenceJoint").GetTargets() == [lead]
+    assert joint.GetAttribute(f"{space}:referenceJointAxis").Get() == "rotZ"
+    assert joint.GetAttribute(f"{space}:gearing").Get() == 2
+    assert_allclose(joint.GetAttribute(f"{space}:offset").Get(), -np.degrees(0.1), rtol=1e-6)
+    applied = set(joint.GetPrimTypeInfo().GetAppliedAPISchemas())
+    assert {"NewtonMimicAPI", "PhysxMimicJointAPI:rotY"} <= applied
+    assert "PhysicsDriveAPI:angular" not in applied
+    hand = UsdGeom.XformCache().GetLocalToWorldTransform(robot.GetPrimAtPath("c"))
+    assert_allclose(hand.ExtractRotation().GetAngle(), np.degrees(0.1), atol=1e-6)  # where it rests
+
+
+def test_a_slide_that_follows_a_turn_gears_in_metres_per_degree(tmp_path):
+    path = follower(tmp_path, '<mimic joint="lead" multiplier="0.05"/>', kind="prismatic")
+    _stage, robot, _ = convert(path)
+    joint = prim(robot, "f")
+    assert_allclose(joint.GetAttribute("newton:mimicCoef1").Get(), 0.05, rtol=1e-6)
+    gearing = joint.GetAttribute("physxMimicJoint:rotY:gearing").Get()
+    assert_allclose(gearing, -0.05 * np.pi / 180, rtol=1e-6)
+
+
+def test_a_mimic_of_a_mimic_follows_the_first(tmp_path):
+    path = follower(tmp_path, '<mimic joint="lead" multiplier="2" offset="0.1"/>')
+    more = """<link name="d"><inertial><mass value="1"/></inertial></link>
+    <joint name="g" type="revolute"><parent link="a"/><child link="d"/><axis xyz="0 1 0"/>
+      <limit lower="-1" upper="1" effort="1" velocity="1"/>
+      <mimic joint="f" multiplier="3" offset="-0.2"/></joint></robot>"""
+    path.write_text(path.read_text().replace("</robot>", more))
+    _stage, robot, _ = convert(path)
+    joint = prim(robot, "g")
+    assert joint.GetRelationship("newton:mimicJoint").GetTargets() == [prim(robot, "lead").GetPath()]
+    assert joint.GetAttribute("newton:mimicCoef1").Get() == 6
+    assert_allclose(joint.GetAttribute("newton:mimicCoef0").Get(), np.degrees(3 * 0.1 - 0.2), rtol=1e-5)
+
+
+def test_what_follows_a_welded_joint_is_welded_too(tmp_path):
+    dead = '<limit lower="0" upper="1" effort="0" velocity="0"/>'
+    _stage, robot, notes = convert(follower(tmp_path, '<mimic joint="lead"/>', lead=dead))
+    assert prim(robot, "f").IsA(UsdPhysics.FixedJoint)
+    assert "joint 'f' follows 'lead', which cannot move: welded" in notes
+
+
+@pytest.mark.parametrize(
+    ("mimic", "kind", "message"),
+    [
+        ('<mimic joint="lead" multiplier="0"/>', "revolute", "mimics with multiplier 0; make it fixed"),
+        ('<mimic joint="lead"/>', "planar", "is planar and has no one value with which to mimic 'lead'"),
+    ],
+)
+def test_impossible_mimics_are_refused_with_their_line(tmp_path, mimic, kind, message):
+    with pytest.raises(InputError, match=rf"pair\.urdf:\d+: joint 'f' {message}"):
+        convert(follower(tmp_path, mimic, kind=kind))
+
+
+# --- drives ---------------------------------------------------------------------------------------
+
+
+def test_the_first_rule_that_fits_a_joint_drives_it(tmp_path):
+    path = follower(tmp_path, "")
+    rules = (
+        DriveRule(joints="le*", type="velocity", damping=0.7),
+        DriveRule(joints="*", type="position", stiffness=40.0, damping=3.0, max_force=9.0),
+    )
+    _stage, robot, _ = convert(path, drives=rules)
+    drive, stiffness, damping = drive_of(robot, "lead")
+    assert_allclose([stiffness, damping, drive.GetMaxForceAttr().Get()], [0, 0.7, 3], rtol=1e-6)
+    assert drive.GetTargetVelocityAttr().HasAuthoredValue()
+    drive, stiffness, damping = drive_of(robot, "f")
+    assert_allclose([stiffness, damping, drive.GetMaxForceAttr().Get()], [40, 3, 9], rtol=1e-6)
+    assert drive.GetTargetPositionAttr().HasAuthoredValue()
+    _stage, robot, _ = convert(path, drives=(DriveRule(joints="f", type="none"),))
+    assert drive_of(robot, "f")[1:] == (0, 0)
+
+
+def test_a_rule_drives_each_free_axis_of_a_planar_joint(tmp_path):
+    path = arm(tmp_path, 'planar|<axis xyz="0 0 1"/>')
+    _stage, robot, _ = convert(path)
+    joint = prim(robot, "j")
+    assert not [a for a in joint.GetPrimTypeInfo().GetAppliedAPISchemas() if "DriveAPI" in a]
+    _stage, robot, _ = convert(path, drives=(DriveRule(joints="j", damping=2.0, max_force=5.0),))
+    joint = prim(robot, "j")
+    applied = joint.GetPrimTypeInfo().GetAppliedAPISchemas()
+    driven = {a.split(":")[1] for a in applied if a.startswith("PhysicsDriveAPI")}
+    assert driven == {"transX", "transY", "rotZ"}
+    assert_allclose(UsdPhysics.DriveAPI(joint, "rotZ").GetDampingAttr().Get(), np.radians(2), rtol=1e-6)
+    assert_allclose(UsdPhysics.DriveAPI(joint, "transX").GetDampingAttr().Get(), 2, rtol=1e-6)
+
+
+def test_a_rule_that_fits_no_joint_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"drive rule 'laed' fits no joint .* did you mean 'lead'"):
+        convert(follower(tmp_path, ""), drives=(DriveRule(joints="laed", damping=1.0),))
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        ({"type": "velocity"}, "without damping it holds no velocity; give damping="),
+        ({"type": "position", "damping": 1.0}, "without stiffness it holds no position"),
+        ({"type": "velocity", "damping": 1.0, "stiffness": 2.0}, "type velocity has no stiffness, got 2"),
+        ({"type": "none", "damping": 1.0}, "type none has no damping, got 1"),
+        ({"damping": float("nan")}, "damping must be a number from 0 up, got nan"),
+        ({"damping": 1.0, "max_force": 0.0}, r"max_force must be above 0, got 0\.0"),
+    ],
+)
+def test_a_rule_that_would_do_nothing_or_other_than_it_says_is_refused(rule, message):
+    with pytest.raises(InputError, match=rf"drive 'x': {message}"):
+        DriveRule(joints="x", **rule)
+    with pytest.raises(InputError, match="drive 'x': without damping"):
+        DriveRule.parse("x:velocity")
+
+
+def test_a_root_called_world_does_not_hold_the_base_unasked(tmp_path):
+    body = """<link name="world"/><link name="base">{BODY}</link>
+    <joint name="j" type="fixed"><parent link="world"/><child link="base"/></joint>"""
+    path = urdf(tmp_path, body, "desk")
+    assert any("the base 'base' floats" in note for note in convert(path)[2])
+    stage, _, notes = convert(path, fix_base=True)
+    assert [p for p in stage.Traverse() if p.IsA(UsdPhysics.FixedJoint)]
+    assert not any("floats" in note for note in notes)
+
+
+# --- the profile of bases with two driven wheels --------------------------------------------------
+
+
+def rover(tmp_path, wheel="", swivel="continuous"):
+    """A base on two wheels, a ball and a swivel caster; one wheel hangs on a dead suspension."""
+    mass = INERTIAL
+    disc = '<collision><geometry><cylinder radius="0.1" length="0.03"/></geometry></collision>'
+    ball = '<collision><geometry><sphere radius="0.05"/></geometry></collision>'
+    chest = '<collision><geometry><box size="0.4 0.2 0.1"/></geometry></collision>'
+    turn = 'rpy="-1.57079632679 0 0"'
+    return urdf(
+        tmp_path,
+        f"""<link name="base_link">{mass}{chest}</link><link name="strut">{mass}</link>
+        <link name="left_wheel">{mass}{disc}</link><link name="right_wheel">{mass}{disc}</link>
+        <link name="skid">{mass}{ball}</link>
+        <link name="fork">{mass}</link><link name="roller">{mass}{disc}</link>
+        <joint name="spring" type="prismatic"><parent link="base_link"/><child link="strut"/>
+          <origin xyz="0 0.2 0"/><axis xyz="0 0 1"/>
+          <limit lower="0" upper="0.02" effort="0" velocity="1"/></joint>
+        <joint name="left" type="continuous"><parent link="strut"/><child link="left_wheel"/>
+          <origin xyz="0 0 0" {turn}/><axis xyz="0 0 1"/>{wheel}</joint>
+        <joint name="right" type="continuous"><parent link="base_link"/><child link="right_wheel"/>
+          <origin xyz="0 -0.2 0" {turn}/><axis xyz="0 0 1"/>{wheel}</joint>
+        <joint name="under" type="fixed"><parent link="base_link"/><child link="skid"/>
+          <origin xyz="0.3 0 -0.05"/></joint>
+        <joint name="swivel" type="{swivel}"><parent link="base_link"/><child link="fork"/>
+          <origin xyz="-0.3 0 0"/><axis xyz="0 0 1"/></joint>
+        <joint name="roll" type="continuous"><parent link="fork"/><child link="roller"/>
+          <origin xyz="-0.02 0 0" {turn}/><axis xyz="0 0 1"/></joint>""",
+        "rover",
+    )
+
+
+def friction(robot, link):
+    collider = robot.GetPrimAtPath(f"{link}/collisions").GetChildren()[0]
+    grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0]
+    return UsdPhysics.MaterialAPI(grip).GetDynamicFrictionAttr().Get()
+
+
+def test_diff_drive_drives_the_wheels_frees_the_casters_and_welds_the_dead_suspension(tmp_path):
+    _stage, robot, notes = convert(rover(tmp_path), profile="diff-drive")
+    kg, n, radius = 7.0, 2, 0.1
+    for name in ("left", "right"):
+        drive, stiffness, damping = drive_of(robot, name)
+        assert stiffness == 0
+        assert_allclose(damping, kg * radius**2 / n / 0.007, rtol=5e-3)  # three figures
+        assert_allclose(drive.GetMaxForceAttr().Get(), kg * 9.81 * radius / n, rtol=5e-3)
+        limit = prim(robot, name).GetAttribute("newton:velocityLimit").Get()
+        assert_allclose(limit, np.degrees(30), rtol=1e-6)
+    for name in ("swivel", "roll"):
+        drive, stiffness, damping = drive_of(robot, name)
+        assert (stiffness, damping) == (0, 0)
+        assert np.isfinite(drive.GetMaxForceAttr().Get())
+        assert f"joint {name!r} is no driven wheel: it turns freely" in notes
+    assert prim(robot, "spring").IsA(UsdPhysics.FixedJoint)
+    assert "joint 'spring' (prismatic) is a suspension without effort or speed: welded" in notes
+    found = [friction(robot, link) for link in ("left_wheel", "right_wheel", "skid", "base_link")]
+    assert_allclose(found, [1, 1, 0.05, 0.5], rtol=1e-6)
+    assert "link 'skid' is a caster and gives no friction: 0.05" in notes
+
+
+def test_all_wheels_that_a_plugin_names_are_driven_not_the_first_of_each_side(tmp_path):
+    wheel = INERTIAL + '<collision><geometry><cylinder radius="0.05" length="0.04"/></geometry></collision>'
+    parts, tags = ['<link name="base"><inertial><mass value="1"/></inertial></link>'], ""
+    for i, side in enumerate(("left", "right", "left", "right")):
+        place = f"{0.2 - i // 2 * 0.4} {0.15 - i % 2 * 0.3} 0"
+        parts.append(
+            f'<link name="w{i}">{wheel}</link><joint name="j{i}" type="continuous"><parent link="base"/>'
+            f'<child link="w{i}"/><origin xyz="{place}" rpy="-1.5708 0 0"/><axis xyz="0 0 1"/></joint>'
+        )
+        tags += f"<{side}_joint>j{i}</{side}_joint>"
+    plugin = f'<gazebo><plugin name="DiffDrive" filename="gz-sim-diff-drive-system">{tags}</plugin></gazebo>'
+    path = urdf(tmp_path, "".join(parts) + plugin)
+    stage, _, notes = convert(path, profile="diff-drive")
+    joints = [p for p in stage.Traverse() if p.IsA(UsdPhysics.RevoluteJoint)]
+    assert len(joints) == 4
+    assert all(UsdPhysics.DriveAPI(joint, "angular").GetDampingAttr().Get() > 0 for joint in joints)
+    assert not any("caster" in note or "freely" in note for note in notes)
+    assert "drive plugin: of 2 <left_joint> the first is the drive's" in notes
+
+
+def test_what_the_urdf_says_of_its_wheels_wins_over_the_profile(tmp_path):
+    path = rover(tmp_path, wheel='<limit effort="1.5" velocity="8"/>')
+    tag = '<gazebo reference="skid"><mu1>0.3</mu1></gazebo></robot>'
+    path.write_text(path.read_text().replace("</robot>", tag))
+    _stage, robot, _ = convert(path, profile="diff-drive")
+    assert drive_of(robot, "left")[0].GetMaxForceAttr().Get() == 1.5
+    assert_allclose(prim(robot, "left").GetAttribute("newton:velocityLimit").Get(), np.degrees(8), rtol=1e-6)
+    assert_allclose(friction(robot, "skid"), 0.3, rtol=1e-6)
+
+
+def test_the_general_profile_keeps_a_suspension_that_is_not_quite_dead(tmp_path):
+    _stage, robot, _ = convert(rover(tmp_path))
+    assert prim(robot, "spring").IsA(UsdPhysics.PrismaticJoint)
+    assert_allclose(drive_of(robot, "swivel")[2], 5, rtol=1e-6)  # as any joint that turns for ever
+
+
+def test_a_robot_without_two_wheels_is_no_diff_drive(tmp_path):
+    with pytest.raises(InputError, match=r"profile diff-drive wants two wheels, .* found none"):
+        convert(arm(tmp_path, f'revolute|<axis xyz="0 1 0"/>{LIMIT}'), profile="diff-drive")
+
+
+def test_a_converted_rover_passes_the_validators(tmp_path):
+    path = rover(tmp_path)
+    convert(path, profile="diff-drive", merge_fixed=True)
+    assert_valid(path.with_suffix(".usda"), tmp_path)

@@ -1,0 +1,263 @@
+"""URDF -> USD -> URDF: equal kinematics and inertia, shapes where they were; refusals."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from test_urdf import BODY, INERTIAL
+
+from magtwin.author.from_urdf import link_poses, write_urdf
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.files import shipped
+from magtwin.urdf import convert_urdf
+from magtwin.urdf.description.description import MOVING, origin_of, read_description
+from magtwin.urdf.options import Options
+from magtwin.usd.geometry import read_shapes
+
+EVERY = f"""<robot name="every"><link name="foot"/><link name="base_link">{BODY}</link>
+<link name="arm">{INERTIAL}<visual name="tube"><origin xyz="0.1 0 0.2" rpy="0.3 0.4 0.5"/>
+  <geometry><cylinder radius="0.03" length="0.4"/></geometry>
+  <material name="red"><color rgba="0.8 0.1 0.1 1"/></material></visual>
+  <collision><origin xyz="0 0 0.1"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision></link>
+<link name="hand"><inertial><origin xyz="0.01 0.02 0.03" rpy="0.1 0.2 0.3"/><mass value="0.7"/>
+  <inertia ixx="0.011" iyy="0.013" izz="0.017" ixy="0.001" ixz="-0.002" iyz="0.003"/></inertial></link>
+<link name="finger">{INERTIAL}</link><link name="slide">{INERTIAL}</link><link name="wheel">{INERTIAL}</link>
+<link name="puck">{INERTIAL}</link><link name="oblique">{INERTIAL}</link><link name="tip"/>
+<joint name="f" type="fixed"><parent link="foot"/><child link="base_link"/><origin xyz="0 0 0.04"/></joint>
+<joint name="j1" type="revolute"><parent link="base_link"/><child link="arm"/><axis xyz="0 0 1"/>
+  <origin xyz="0.1 0.2 0.3" rpy="0 1.5707963267948966 0.7"/>
+  <limit lower="-1.5708" upper="2.0944" effort="3.7" velocity="2.4"/>
+  <dynamics damping="0.05" friction="0.1"/></joint>
+<joint name="j2" type="revolute"><parent link="arm"/><child link="hand"/><axis xyz="0 0 -1"/>
+  <origin xyz="0.3 0 0" rpy="0.1 -0.2 0.3"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="j3" type="prismatic"><parent link="hand"/><child link="finger"/><axis xyz="0 1 0"/>
+  <origin xyz="0 0.01 0.1"/><limit lower="0" upper="0.05" effort="5" velocity="0.2"/></joint>
+<joint name="j4" type="prismatic"><parent link="hand"/><child link="slide"/><axis xyz="0 -1 0"/>
+  <limit lower="-0.1" upper="0.1" effort="5" velocity="0.2"/>
+  <mimic joint="j3" multiplier="-1.5" offset="0.02"/></joint>
+<joint name="j5" type="continuous"><parent link="base_link"/><child link="wheel"/><axis xyz="0 1 0"/>
+  <limit effort="2" velocity="12.87"/></joint>
+<joint name="j6" type="planar"><parent link="base_link"/><child link="puck"/><axis xyz="0 0 1"/>
+  <origin xyz="1 0 0" rpy="0.2 0 0"/></joint>
+<joint name="j7" type="revolute"><parent link="hand"/><child link="oblique"/><axis xyz="1 2 -3"/>
+  <origin xyz="0.1 0 0" rpy="0.3 0.2 0.1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+<joint name="t" type="fixed"><parent link="hand"/><child link="tip"/><origin xyz="0 0 0.2"/></joint>
+</robot>"""
+
+
+def there_and_back(urdf, folder, **choices):
+    """The descriptions of a URDF and of the URDF of its stage, and the latter's file."""
+    asset = convert_urdf(
+        urdf, folder / "usd" / "robot.usda", options=Options(missing_meshes="note", **choices)
+    )
+    write_urdf(asset, folder / "back" / "robot.urdf")
+    return (
+        read_description(urdf),
+        read_description(folder / "back" / "robot.urdf"),
+        folder / "back" / "robot.urdf",
+    )
+
+
+def every(tmp_path):
+    path = tmp_path / "every.urdf"
+    path.write_text(EVERY)
+    return path
+
+
+def assert_same_kinematics(urdf, before, after, back, atol):
+    rng = np.random.default_rng(0)
+    moving = [j for j in after.joints.values() if j.type in MOVING and j.mimic is None]
+    assert moving
+    for _ in range(2):
+        values = {joint.name: rng.uniform(-1, 1) for joint in moving}
+        one, two = link_poses(urdf, values), link_poses(back, values)
+        assert one.keys() == two.keys()
+        home = np.linalg.inv(one[after.root])
+        for link in one:
+            assert_allclose(two[link], home @ one[link], rtol=0, atol=atol, err_msg=link)
+
+
+def tensor(link):
+    """Mass, centre and inertia in the link's axes."""
+    T = origin_of(link.inertial)
+    return link.inertial.mass, T[:3, 3], T[:3, :3] @ link.inertial.inertia @ T[:3, :3].T
+
+
+def assert_same_inertia(before, after):
+    """To single precision, in which UsdPhysics has it; masses, and centres of few digits, to the bit."""
+    for name, link in before.links.items():
+        if link.inertial is None:
+            assert after.links[name].inertial is None
+            continue
+        (m1, c1, I1), (m2, c2, I2) = tensor(link), tensor(after.links[name])
+        assert m1 == m2
+        assert_allclose(c2, c1, rtol=0, atol=1e-12)
+        assert_allclose(I2, I1, rtol=0, atol=2e-7 * np.abs(I1).max(), err_msg=name)
+
+
+def test_our_robot_comes_back_with_equal_kinematics_and_inertia(tmp_path):
+    urdf = shipped("robots", "turtlebot4", "turtlebot4.urdf")
+    before, after, back = there_and_back(urdf, tmp_path, profile="diff-drive")
+    assert (after.name, after.root) == (before.name, before.root)
+    assert {j.name for j in after.joints.values() if j.type in MOVING} == {
+        "left_wheel_joint",
+        "right_wheel_joint",
+    }
+    assert_same_kinematics(urdf, before, after, back, 1e-12)
+    assert_same_inertia(before, after)
+
+
+def test_the_real_robot_comes_back_with_equal_kinematics_and_inertia(real_data, tmp_path):
+    urdf = real_data / "turtlebot4" / "turtlebot4.urdf"
+    before, after, back = there_and_back(urdf, tmp_path)
+    assert len(after.links) == 49
+    assert_same_kinematics(urdf, before, after, back, 1e-12)
+    assert_same_inertia(before, after)
+
+
+def test_every_kind_of_joint_comes_back_with_its_figures(tmp_path):
+    urdf = every(tmp_path)
+    before, after, back = there_and_back(urdf, tmp_path)
+    assert after.root == "foot"
+    joints = {j.name: j for j in before.joints.values()}, {j.name: j for j in after.joints.values()}
+    for name in ("j1", "j2", "j3", "j4", "j5", "j6", "j7"):
+        one, two = (j[name] for j in joints)
+        assert (one.type, one.parent, one.child) == (two.type, two.parent, two.child)
+        assert_allclose(two.axis, one.axis / np.linalg.norm(one.axis), rtol=0, atol=1e-12)
+        assert (one.limit is None) == (two.limit is None)
+        if one.limit is not None:
+            effort = None if one.mimic else one.limit.effort  # what follows has no drive of its own
+            assert vars(two.limit) == vars(one.limit) | {"effort": effort}
+    assert vars(joints[1]["j1"].dynamics) == {"damping": 0.05, "friction": 0.1}
+    assert vars(joints[1]["j4"].mimic) == {"joint": "j3", "multiplier": -1.5, "offset": 0.02}
+    assert_same_inertia(before, after)
+    assert_same_kinematics(urdf, before, after, back, 1e-12)
+
+
+def test_merged_links_come_back_as_frames_on_the_body_that_they_became(tmp_path):
+    urdf = shipped("robots", "turtlebot4", "turtlebot4.urdf")
+    before, after, back = there_and_back(urdf, tmp_path, merge_fixed=True)
+    assert_same_kinematics(urdf, before, after, back, 1e-12)
+    mass = sum(link.inertial.mass for link in before.links.values() if link.inertial)
+    assert sum(link.inertial.mass for link in after.links.values() if link.inertial) == pytest.approx(
+        mass, rel=1e-6
+    )
+    assert sum(link.inertial is not None for link in after.links.values()) == 3
+
+
+def test_shapes_come_back_where_they_were_in_their_colours(tmp_path):
+    _, after, _ = there_and_back(every(tmp_path), tmp_path)
+    (tube,), (box,) = after.links["arm"].visuals, after.links["arm"].collisions
+    assert (tube.name, tube.geometry.cylinder.radius, tube.geometry.cylinder.length) == ("tube", 0.03, 0.4)
+    assert_allclose(tube.material.color.rgba, (0.8, 0.1, 0.1, 1), atol=1e-3)
+    assert_allclose(origin_of(tube)[:3, 3], (0.1, 0, 0.2), rtol=0, atol=1e-12)
+    assert_allclose(box.geometry.box.size, (0.1, 0.2, 0.3), rtol=0, atol=1e-7)
+
+
+def test_triangles_come_back_where_they_were(tmp_path):
+    urdf = shipped("robots", "turtlebot4", "turtlebot4.urdf")
+    one = convert_urdf(urdf, tmp_path / "one.usda", options=Options(single_file=True))
+    write_urdf(one, tmp_path / "back.urdf")
+    two = convert_urdf(tmp_path / "back.urdf", tmp_path / "two.usda", options=Options(single_file=True))
+
+    def extents(asset):
+        found = {}
+        for shape in read_shapes(asset, purposes=("default", "render", "guide")):
+            found.setdefault(shape.link, []).append(shape.vertices)
+        return {link: (np.vstack(v).min(axis=0), np.vstack(v).max(axis=0)) for link, v in found.items()}
+
+    before, after = extents(one), extents(two)
+    assert before.keys() == after.keys()
+    for link in before:
+        assert_allclose(after[link], before[link], rtol=0, atol=1e-6, err_msg=link)
+
+
+def test_the_urdf_of_a_stage_is_the_same_bytes_every_time(tmp_path):
+    asset = convert_urdf(every(tmp_path), tmp_path / "usd" / "robot.usda")
+    for name in ("a", "b"):
+        write_urdf(asset, tmp_path / name / "robot.urdf")
+    assert (tmp_path / "a" / "robot.urdf").read_bytes() == (tmp_path / "b" / "robot.urdf").read_bytes()
+
+
+def test_the_robot_of_a_scene_is_written_as_it_stands_in_its_own_frame(tmp_path):
+    write_urdf(shipped("scenes", "lab", "lab.usda"), tmp_path / "robot.urdf")
+    urdf = shipped("robots", "turtlebot4", "turtlebot4.urdf")
+    after = read_description(tmp_path / "robot.urdf")
+    assert_same_kinematics(urdf, read_description(urdf), after, tmp_path / "robot.urdf", 1e-12)
+
+
+def edit(tmp_path, change):
+    """The stage of a two-link robot, changed."""
+    urdf = tmp_path / "two.urdf"
+    urdf.write_text(
+        f'<robot name="two"><link name="base_link">{BODY}</link><link name="arm">{INERTIAL}</link>'
+        '<joint name="j" type="continuous"><parent link="base_link"/><child link="arm"/>'
+        '<axis xyz="0 0 1"/></joint></robot>'
+    )
+    asset = convert_urdf(urdf, tmp_path / "two.usda", options=Options(single_file=True))
+    stage = Usd.Stage.Open(str(asset))
+    change(stage)
+    stage.Save()
+    return asset
+
+
+def _ball(stage):
+    UsdPhysics.SphericalJoint.Define(stage, "/two/joints/ball").CreateBody1Rel().SetTargets(
+        [Sdf.Path("/two/arm")]
+    )
+
+
+def _second(stage):
+    joint = UsdPhysics.FixedJoint.Define(stage, "/two/joints/again")
+    joint.CreateBody0Rel().SetTargets([Sdf.Path("/two/base_link")])
+    joint.CreateBody1Rel().SetTargets([Sdf.Path("/two/arm")])
+
+
+def _scaled(stage):
+    UsdGeom.Xformable(stage.GetPrimAtPath("/two/arm")).AddScaleOp().Set(Gf.Vec3f(2))
+
+
+def _off(stage):
+    UsdPhysics.Joint(stage.GetPrimAtPath("/two/joints/j")).GetLocalPos1Attr().Set(Gf.Vec3f(0.1, 0, 0))
+
+
+def _no_robot(stage):
+    stage.GetPrimAtPath("/two").RemoveAPI(UsdPhysics.ArticulationRootAPI)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (_ball, "URDF has no PhysicsSphericalJoint"),
+        (_second, "'arm' is held by two joints, in a circle"),
+        (_scaled, "is scaled, which no link of a URDF is"),
+        (_off, "turns about a point of 'arm' that is not its origin"),
+        (_no_robot, "a URDF is of one articulation, found none"),
+    ],
+)
+def test_what_no_urdf_holds_is_refused_with_nothing_written(tmp_path, change, said):
+    asset = edit(tmp_path, change)
+    with pytest.raises(InputError, match=said):
+        write_urdf(asset, tmp_path / "out" / "a.urdf")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_goes_both_ways_and_says_what_stays_behind(tmp_path, capfd):
+    out = tmp_path / "back.urdf"
+    main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), "--to-urdf", str(out), "--json"])
+    said = json.loads(capfd.readouterr().out)
+    assert said["figures"]["links"]["value"] == len(read_description(out).links)
+    assert "MagtwinMagnetometerAPI" in said["facts"]["notes"][0]
+    for words, message in (
+        ([], "give one of them"),
+        (["--out", "x", "--to-urdf", "y.urdf"], "give one of them"),
+        (["--to-urdf", str(out), "--mass", "3"], "leave the others out"),
+        (["--to-urdf", str(out)], "exists already"),
+        (["--to-urdf", "a.xml"], "a URDF ends in .urdf"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), *words])
+        assert message in capfd.readouterr().err

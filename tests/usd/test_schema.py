@@ -1,0 +1,263 @@
+"""The schema library: what is committed is what the source gives, and each schema holds its promises."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import MISSING, fields
+
+import pytest
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils, Vt
+
+from magtwin.errors import InputError
+from magtwin.field.sources.harmonic import HarmonicField
+from magtwin.files import shipped
+from magtwin.spec import scene as spec
+from magtwin.usd import schema, sensors
+from magtwin.usd.attributes import plain_value, write_pose
+from magtwin.usd.earth import DERIVED_FROM
+from magtwin.usd.schema import generate
+
+SPECS = {
+    "magnetometer": spec.MagnetometerSpec,
+    "imu": spec.ImuSpec,
+    "lidar": spec.LidarSpec,
+    "source": spec.SourceSpec,
+    "earth": spec.EarthFieldSpec,
+    "battery": spec.BatterySpec,
+    "mocap": spec.MocapSpec,
+    "drive": spec.DriveSpec,
+    "platform": spec.PlatformFieldSpec,
+    "lab": spec.LabSpec,
+    "harmonic": HarmonicField,
+}
+"""The spec whose figures each noun's attributes hold."""
+
+ELSEWHERE = {*sensors.POSE_FIELDS, "name", "p_world", "q_world_xyzw"}
+"""Fields that the prim's name, place or transform holds."""
+
+SHAPED = {"shape", "size_m", "vertices_m", "faces"}
+"""Fields of a source that its prim's type and geometry hold."""
+
+every_noun = pytest.mark.parametrize("noun", schema.NOUNS)
+
+READER = """
+import sys
+from pxr import Usd
+stage = Usd.Stage.Open(sys.argv[1])
+prim = stage.GetPrimAtPath("/thing")
+assert not Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(sys.argv[2]), "the plugin is here after all"
+assert sys.argv[2] in prim.GetMetadata("apiSchemas").GetAppliedItems()
+world = prim.GetAttribute("xformOp:translate").Get()
+print(repr(prim.GetAttribute(sys.argv[3]).Get()), tuple(world), bool(prim.IsA("Xformable")))
+"""
+
+
+def stage_with(noun: str) -> tuple[Usd.Stage, Usd.Prim]:
+    stage = Usd.Stage.CreateInMemory()
+    prim = UsdGeom.Xform.Define(stage, "/thing").GetPrim()
+    stage.SetDefaultPrim(prim)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    write_pose(prim, (1.0, 2.0, 3.0))
+    return stage, schema.apply_api(prim, noun)
+
+
+def attributes(noun: str) -> list[str]:
+    definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema.NOUNS[noun])
+    return [n for n in definition.GetPropertyNames() if definition.GetAttributeDefinition(n)]
+
+
+def other_value(attribute: Usd.Attribute):
+    """A value that is not the fallback."""
+    value = attribute.Get()
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, float):
+        return value + 1.0
+    if isinstance(value, str):
+        allowed = attribute.GetMetadata("allowedTokens")
+        return allowed[0] if allowed else "some text"
+    if isinstance(value, Gf.Matrix3d):
+        return Gf.Matrix3d(*range(9))
+    if isinstance(value, Gf.Vec3d | Gf.Vec2d):
+        return value + type(value)(1.0)
+    if isinstance(value, Sdf.AssetPath):
+        return Sdf.AssetPath("./somewhere.bin")
+    return {
+        "string[]": Vt.StringArray(["a", "b"]),
+        "int[]": Vt.IntArray([1, 2]),
+        "bool[]": Vt.BoolArray([True, False]),
+        "float[]": Vt.FloatArray([1.5]),
+        "double[]": Vt.DoubleArray([1.5]),
+        "double3[]": Vt.Vec3dArray([Gf.Vec3d(1, 2, 3)]),
+        "int": 7,
+        "double": 1.5,  # one without a fallback: unknown unless authored
+    }[str(attribute.GetTypeName())]
+
+
+def test_a_fresh_generation_equals_what_is_committed(tmp_path):
+    generate.generate(tmp_path)
+    for name in generate.GENERATED:
+        assert (tmp_path / name).read_text() == (schema.FOLDER / name).read_text(), (
+            f"run `make schema`: {name}"
+        )
+
+
+def test_the_reference_for_people_says_what_the_source_says():
+    assert generate.REFERENCE.read_text() == generate.reference(), "run `make schema`"
+
+
+def test_the_library_holds_the_schemas_that_the_table_names_and_no_other():
+    plugin = json.loads((schema.FOLDER / "plugInfo.json").read_text())["Plugins"][0]
+    assert set(plugin["Info"]["Types"]) == set(schema.NOUNS.values())
+
+
+def test_registering_again_does_nothing():
+    schema.register()
+
+
+def test_registering_too_late_is_refused():
+    late = "from pxr import Usd; Usd.Stage.CreateInMemory().DefinePrim('/a', 'Xform'); import magtwin.usd"
+    done = subprocess.run([sys.executable, "-c", late], capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "InputError: the USD schemas MagtwinAnomalyMapAPI" in done.stderr
+    assert "came too late" in done.stderr
+    assert "import magtwin.usd before" in done.stderr
+
+
+@every_noun
+def test_a_schema_is_registered_as_single_apply(noun):
+    registry = Usd.SchemaRegistry()
+    assert registry.IsAppliedAPISchema(schema.NOUNS[noun])
+    assert not registry.IsMultipleApplyAPISchema(schema.NOUNS[noun])
+
+
+@every_noun
+def test_a_schema_applies_to_an_xform(noun):
+    _, prim = stage_with(noun)
+    assert prim.GetAppliedSchemas() == [schema.NOUNS[noun]]
+    assert schema.require_api(prim, noun) == prim
+
+
+@pytest.mark.parametrize("kind", ["Cube", "Scope", ""])
+@pytest.mark.parametrize("noun", sorted(schema.NOUNS.keys() - {"source"}))
+def test_a_schema_refuses_what_is_no_xform(noun, kind):
+    stage = Usd.Stage.CreateInMemory()
+    prim = stage.DefinePrim("/thing", kind)
+    with pytest.raises(InputError, match=rf"</thing>: {schema.NOUNS[noun]} goes on an Xform only"):
+        schema.apply_api(prim, noun)
+    assert prim.GetAppliedSchemas() == []
+
+
+def test_a_source_is_an_xform_or_a_shape_with_a_volume_and_nothing_else():
+    stage = Usd.Stage.CreateInMemory()
+    for kind in ("Xform", "Cube", "Cylinder", "Sphere", "Mesh"):
+        assert schema.apply_api(stage.DefinePrim(f"/{kind}", kind), "source").HasAPI(schema.NOUNS["source"])
+    with pytest.raises(
+        InputError, match="goes on an Xform, Cube, Cylinder, Sphere or Mesh only, not on a Cone"
+    ):
+        schema.apply_api(stage.DefinePrim("/Cone", "Cone"), "source")
+
+
+@every_noun
+def test_every_attribute_is_named_by_its_noun_and_told_in_words(noun):
+    definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema.NOUNS[noun])
+    assert definition.GetPropertyNames()
+    for name in definition.GetPropertyNames():
+        assert re.fullmatch(rf"magtwin:{noun}:[a-z][A-Za-z0-9]*", name)
+        assert definition.GetPropertyDocumentation(name)
+
+
+@pytest.mark.parametrize("noun", sorted({*SPECS, "robot"}))
+def test_every_number_has_its_unit_in_words(noun):
+    definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema.NOUNS[noun])
+    for name in attributes(noun):
+        if str(definition.GetAttributeDefinition(name).GetTypeName()).startswith(("double", "matrix")):
+            assert re.search(r"\[[^\]]+\]", definition.GetPropertyDocumentation(name)), name
+
+
+@pytest.mark.parametrize("noun", SPECS)
+def test_one_attribute_stands_for_each_field_of_the_spec(noun):
+    definition = Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(schema.NOUNS[noun])
+    wanted = {schema.attribute_name(noun, f.name) for f in fields(SPECS[noun]) if f.name not in ELSEWHERE}
+    if noun == "source":
+        wanted -= {schema.attribute_name(noun, field) for field in SHAPED}
+        wanted = {name.replace("mWorld", "moment") for name in wanted}  # which turns with the prim
+    beside_the_spec = {sensors.MAP_RELATIONSHIP, sensors.MAP_CHECKSUM, DERIVED_FROM}
+    assert set(definition.GetPropertyNames()) - beside_the_spec == wanted
+
+
+@pytest.mark.parametrize("noun", SPECS)
+def test_fallbacks_are_the_defaults_of_the_spec(noun):
+    _, prim = stage_with(noun)
+    defaults = {f.name: f.default for f in fields(SPECS[noun]) if f.default is not MISSING}
+    for field in defaults.keys() - ELSEWHERE - SHAPED - {"m_world"} - set(sensors.JOINT_FIELDS):
+        assert plain_value(prim.GetAttribute(schema.attribute_name(noun, field))) == defaults[field]
+
+
+def test_the_footprints_fallback_is_the_default_of_the_robot():
+    _, prim = stage_with("robot")
+    default = next(f.default for f in fields(spec.RobotSpec) if f.name == "footprint_radius_m")
+    assert sensors.read_footprint(prim) == default
+
+
+@every_noun
+def test_values_survive_flattening_and_usdz(noun, tmp_path):
+    stage, prim = stage_with(noun)
+    wanted = {}
+    for name in attributes(noun):
+        attribute = prim.GetAttribute(name)
+        wanted[name] = other_value(attribute)
+        if isinstance(wanted[name], Sdf.AssetPath):  # a package holds the file itself
+            (tmp_path / "somewhere.bin").write_bytes(b"weights")
+        attribute.Set(wanted[name])
+    stage.Export(str(tmp_path / "s.usdc"))
+    flat = Usd.Stage.Open(str(tmp_path / "s.usdc")).Flatten()
+    assert UsdUtils.CreateNewUsdzPackage(str(tmp_path / "s.usdc"), str(tmp_path / "s.usdz"))
+    for again in (Usd.Stage.Open(flat), Usd.Stage.Open(str(tmp_path / "s.usdz"))):
+        read = again.GetPrimAtPath("/thing")
+        assert read.HasAPI(schema.NOUNS[noun])
+        for name, value in wanted.items():
+            got = read.GetAttribute(name).Get()
+            if isinstance(value, Sdf.AssetPath):
+                assert got.path.endswith("somewhere.bin")
+            else:
+                assert got == value
+
+
+def test_values_and_places_survive_a_reader_without_the_plugin(tmp_path):
+    for noun, api in schema.NOUNS.items():
+        stage, prim = stage_with(noun)
+        name = attributes(noun)[0]
+        prim.GetAttribute(name).Set(other_value(prim.GetAttribute(name)))
+        file = str(tmp_path / f"{noun}.usda")
+        stage.Export(file)
+        done = subprocess.run(
+            [sys.executable, "-c", READER, file, api, name], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.strip() == f"{prim.GetAttribute(name).Get()!r} (1.0, 2.0, 3.0) True"
+
+
+def test_a_reader_without_the_plugin_sees_every_figure_of_the_shipped_robot():
+    asset = str(shipped("robots", "turtlebot4", "turtlebot4.usda"))
+    reader = """
+import sys
+from pxr import Usd
+stage = Usd.Stage.Open(sys.argv[1])  # held in a name: a prim does not keep its stage alive
+prim = stage.GetPrimAtPath("/turtlebot4")
+names = ("drive:vMax", "drive:wheelSeparationM", "drive:wheelRadiusM", "robot:footprintRadiusM")
+print([prim.GetAttribute(f"magtwin:{name}").Get() for name in names])
+"""
+    done = subprocess.run([sys.executable, "-c", reader, asset], capture_output=True, text=True, check=True)
+    drive = spec.DriveSpec()
+    wanted = [drive.v_max, drive.wheel_separation_m, drive.wheel_radius_m, 0.171]
+    assert json.loads(done.stdout) == wanted
+
+
+def test_a_prim_without_the_schema_is_refused():
+    stage, _ = stage_with("lab")
+    with pytest.raises(InputError, match=r"</thing>: has no MagtwinImuAPI"):
+        schema.require_api(stage.GetPrimAtPath("/thing"), "imu")
+    with pytest.raises(InputError, match=r"</thing>: needs one prim with MagtwinImuAPI below it, found none"):
+        schema.only_prim_with(stage.GetPrimAtPath("/thing"), "imu")

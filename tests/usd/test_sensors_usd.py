@@ -1,0 +1,380 @@
+"""What is authored is what is read: each spec through its prim and back, to the bit."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+
+from magtwin.errors import InputError
+from magtwin.spec.scene import (
+    MAGNETOMETER_KINDS,
+    BatterySpec,
+    DriveSpec,
+    ImuSpec,
+    LidarSpec,
+    MagnetometerSpec,
+    MocapSpec,
+    PlatformFieldSpec,
+)
+from magtwin.usd import sensors
+from magtwin.usd.attributes import read_pose
+
+LINK = "/robot/some_link"
+
+unhurried = settings(deadline=None)  # USD loads plugins at the first example
+
+number = st.floats(allow_nan=False, allow_infinity=False)
+not_negative = st.floats(0, 1e300)
+above_zero = st.floats(1e-300, 1e300)
+vec3 = st.tuples(number, number, number)
+turns = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
+unit = turns.map(lambda q: tuple((np.array(q) / np.linalg.norm(q)).tolist()))
+mount = {"link": st.just("some_link"), "p_link_sensor": vec3, "q_link_sensor_xyzw": unit}
+text = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=12)
+name = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,12}", fullmatch=True)
+
+
+def ordered(values):
+    """Two of the values, the lesser first."""
+    return st.tuples(values, values).map(lambda pair: tuple(sorted(pair)))
+
+
+def stage_with_link() -> Usd.Stage:
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.Xform.Define(stage, "/robot")
+    UsdGeom.Xform.Define(stage, LINK)
+    return stage
+
+
+def stage_with_wheels(spec: DriveSpec) -> Usd.Stage:
+    stage = stage_with_link()
+    for joint in (spec.left_wheel_joint, spec.right_wheel_joint):
+        UsdPhysics.RevoluteJoint.Define(stage, f"/robot/joints/{joint}")
+    return stage
+
+
+@unhurried
+@given(
+    st.builds(
+        MagnetometerSpec,
+        **mount,
+        rate_hz=above_zero,
+        noise_density_nt=not_negative,
+        resolution_nt=not_negative,
+        kind=st.sampled_from(MAGNETOMETER_KINDS),
+        vector_bias_nt=vec3,
+        vector_misalignment=st.tuples(*[number] * 9),
+        network=st.sampled_from([None, Path(__file__)]),
+        network_sha256=text,
+        inputs=st.lists(text, max_size=4).map(tuple),
+    )
+)
+def test_a_magnetometer_survives_the_stage(spec):
+    stage = stage_with_link()
+    assert sensors.read_magnetometer(sensors.define_magnetometer(stage, f"{LINK}/mag", spec)) == spec
+
+
+@unhurried
+@given(
+    st.builds(
+        ImuSpec,
+        **mount,
+        rate_hz=above_zero,
+        orientation_noise_std=not_negative,
+        gyro_noise_std=not_negative,
+        accel_noise_std=not_negative,
+        latency_s=not_negative,
+        yaw_zero=not_negative,
+        tilt=st.tuples(not_negative, not_negative),
+        gyro_bias=st.tuples(not_negative, not_negative, not_negative),
+        accel_vibration=st.tuples(not_negative, not_negative, not_negative),
+    )
+)
+def test_an_imu_survives_the_stage(spec):
+    stage = stage_with_link()
+    assert sensors.read_imu(sensors.define_imu(stage, f"{LINK}/imu", spec)) == spec
+
+
+@unhurried
+@given(
+    st.fixed_dictionaries(
+        {
+            **mount,
+            "scan_rate_hz": above_zero,
+            "on_s": not_negative,
+            "off_s": not_negative,
+            "phase_s": not_negative,
+            "rays": st.integers(1, 100_000),
+        }
+    ),
+    ordered(not_negative).filter(lambda ranges: ranges[0] < ranges[1]),
+)
+def test_a_lidar_survives_the_stage(figures, ranges):
+    spec = LidarSpec(**figures, range_min_m=ranges[0], range_max_m=ranges[1])
+    stage = stage_with_link()
+    assert sensors.read_lidar(sensors.define_lidar(stage, f"{LINK}/lidar", spec)) == spec
+
+
+@unhurried
+@given(
+    st.builds(
+        BatterySpec,
+        model=st.sampled_from(["power", "linear"]),
+        discharge=st.lists(st.floats(0, 1), max_size=5).map(lambda between: (0.0, *sorted(between), 1.0)),
+        capacity_wh=above_zero,
+        load_w=not_negative,
+        initial_fraction=st.floats(0, 1),
+        voltage_full_v=st.just(1e300),
+        voltage_noise_std_v=not_negative,
+        rate_hz=above_zero,
+    ),
+    ordered(above_zero),
+)
+def test_a_battery_survives_the_stage(spec, voltages):
+    spec = replace(spec, voltage_empty_v=voltages[0], voltage_full_v=voltages[1])
+    stage = stage_with_link()
+    assert sensors.read_battery(sensors.define_battery(stage, "/robot/battery", spec)) == spec
+
+
+@unhurried
+@given(st.data())
+def test_motion_capture_survives_the_stage(data):
+    places = {"offset_m": st.tuples(number, number), "offset_drift_m": st.tuples(number, number)}
+    spec = MocapSpec(**{f.name: data.draw(places.get(f.name, above_zero)) for f in fields(MocapSpec)})
+    stage = stage_with_link()
+    prim = stage.GetPrimAtPath("/robot")
+    assert sensors.read_mocap(prim) == MocapSpec()
+    assert sensors.read_mocap(sensors.define_mocap(prim, spec)) == spec
+
+
+@unhurried
+@given(st.data())
+def test_a_drive_survives_the_stage(data):
+    names = data.draw(st.lists(name, min_size=2, max_size=2, unique=True))
+    joints = dict(zip(sensors.JOINT_FIELDS, names, strict=True))
+    figures = {
+        f.name: tuple(data.draw(above_zero) for _ in f.default) if isinstance(f.default, tuple)
+        else data.draw(above_zero)
+        for f in fields(DriveSpec) if f.name not in joints
+    } | {"yaw_slip": 0.25, "slip_s2_m": 0.0}  # fmt: skip
+    spec = DriveSpec(**joints, **figures)
+    stage = stage_with_wheels(spec)
+    assert sensors.read_drive(sensors.define_drive(stage.GetPrimAtPath("/robot"), spec)) == spec
+
+
+@unhurried
+@given(st.data())
+def test_a_platform_field_survives_the_stage(data):
+    figures = {
+        f.name: tuple(data.draw(number) for _ in f.default)
+        if isinstance(f.default, tuple)
+        else data.draw(above_zero)
+        for f in fields(PlatformFieldSpec)
+    }
+    spec = PlatformFieldSpec(**figures)
+    stage = stage_with_link()
+    assert sensors.read_platform(sensors.define_platform(stage.GetPrimAtPath("/robot"), spec)) == spec
+
+
+@unhurried
+@given(above_zero)
+def test_a_footprint_survives_the_stage(radius):
+    stage = stage_with_link()
+    assert sensors.read_footprint(sensors.define_footprint(stage.GetPrimAtPath("/robot"), radius)) == radius
+
+
+def test_a_sensor_is_placed_where_the_spec_says():
+    stage = stage_with_link()
+    UsdGeom.XformCommonAPI(stage.GetPrimAtPath(LINK)).SetTranslate((0, 0, 1))
+    quarter = (0.0, 0.0, 0.5**0.5, 0.5**0.5)  # a quarter turn about z
+    spec = ImuSpec(link="some_link", p_link_sensor=(1.0, 2.0, 3.0), q_link_sensor_xyzw=quarter)
+    prim = sensors.define_imu(stage, f"{LINK}/imu", spec)
+    world = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())
+    assert Gf.IsClose(world.Transform(Gf.Vec3d(1, 0, 0)), Gf.Vec3d(1, 3, 4), 1e-12)
+
+
+def test_a_pose_that_others_wrote_as_a_matrix_is_read():
+    stage = stage_with_link()
+    matrix = Gf.Matrix4d(Gf.Rotation(Gf.Vec3d(0, 0, 1), 90), Gf.Vec3d(1, 2, 3))
+    UsdGeom.Xformable(stage.GetPrimAtPath(LINK)).MakeMatrixXform().Set(matrix)
+    p, q = read_pose(stage.GetPrimAtPath(LINK))
+    assert p == (1, 2, 3)
+    assert q == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
+
+
+def test_a_turn_that_others_wrote_in_single_or_half_precision_is_read_at_unit_length():
+    stage = stage_with_link()
+    for kind, quaternion in (("half", Gf.Quath), ("single", Gf.Quatf)):
+        prim = sensors.define_imu(stage, f"{LINK}/{kind}", ImuSpec(link="some_link"))
+        prim.RemoveProperty("xformOp:orient")
+        names = {"half": Sdf.ValueTypeNames.Quath, "single": Sdf.ValueTypeNames.Quatf}
+        prim.CreateAttribute("xformOp:orient", names[kind], custom=False).Set(quaternion(0.6, 0.8, 0, 0))
+        q = sensors.read_imu(prim).q_link_sensor_xyzw
+        assert np.linalg.norm(q) == pytest.approx(1, abs=1e-15)
+        assert q == pytest.approx((0.8, 0, 0, 0.6), abs=5e-4)
+
+
+def test_every_figure_is_authored_also_one_that_equals_the_schemas_fallback():
+    stage = stage_with_link()
+    battery = sensors.define_battery(stage, "/robot/battery", BatterySpec())
+    magnetometer = sensors.define_magnetometer(stage, f"{LINK}/mag", MagnetometerSpec(link="some_link"))
+    platform = sensors.define_platform(stage.GetPrimAtPath("/robot"), PlatformFieldSpec())
+    footprint = sensors.define_footprint(stage.GetPrimAtPath("/robot"), 0.171)
+    for prim, noun in ((battery, "battery"), (platform, "platform"), (footprint, "robot:footprint")):
+        figures = [a for a in prim.GetAttributes() if a.GetName().startswith(f"magtwin:{noun}")]
+        assert figures
+        assert all(a.HasAuthoredValue() for a in figures)
+    figures = [a for a in magnetometer.GetAttributes() if a.GetName().startswith("magtwin")]
+    unsaid = {a.GetName().split(":")[-1] for a in figures if not a.HasAuthoredValue()}
+    assert unsaid == {"network", "networkSha256", "inputs", "mapSha256"}, "what is empty says nothing"
+
+
+def test_a_layer_over_a_sensor_holds_only_what_it_changes():
+    stage = stage_with_link()
+    spec = MagnetometerSpec(
+        link="some_link", rate_hz=100.0, noise_density_nt=1.0, p_link_sensor=(0.1, 0.0, 0.0)
+    )
+    sensors.define_magnetometer(stage, f"{LINK}/mag", spec)
+    imu, lidar = ImuSpec(link="some_link", rate_hz=61.0), LidarSpec(link="some_link", range_min_m=0.2)
+    sensors.define_imu(stage, f"{LINK}/imu", imu)
+    sensors.define_lidar(stage, f"{LINK}/lidar", lidar)
+    session = Sdf.Layer.CreateAnonymous(".usda")
+    stage.GetSessionLayer().subLayerPaths.append(session.identifier)
+    stage.SetEditTarget(session)
+    sensors.define_imu(stage, f"{LINK}/imu", imu)
+    sensors.define_lidar(stage, f"{LINK}/lidar", lidar)
+    assert session.empty
+    sensors.define_magnetometer(stage, f"{LINK}/mag", replace(spec, noise_density_nt=2.0))
+    attributes = session.GetPrimAtPath(f"{LINK}/mag").attributes
+    assert [a.name for a in attributes] == ["magtwin:magnetometer:noiseDensityNt"]
+
+
+def test_a_network_is_named_relative_to_the_edited_layer_and_moves_with_it(tmp_path):
+    (tmp_path / "a" / "weights").mkdir(parents=True)
+    (tmp_path / "a" / "weights" / "net.safetensors").write_bytes(b"net")
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a" / "s.usda"))
+    UsdGeom.Xform.Define(stage, LINK)
+    spec = MagnetometerSpec(link="some_link", network=tmp_path / "a" / "weights" / "net.safetensors")
+    prim = sensors.define_magnetometer(stage, f"{LINK}/mag", spec)
+    assert prim.GetAttribute("magtwin:magnetometer:network").Get().path == "./weights/net.safetensors"
+    stage.Save()
+    (tmp_path / "a").rename(tmp_path / "b")
+    moved = Usd.Stage.Open(str(tmp_path / "b" / "s.usda"))
+    read = sensors.read_magnetometer(moved.GetPrimAtPath(f"{LINK}/mag"))
+    assert read.network == tmp_path / "b" / "weights" / "net.safetensors"
+
+
+def test_nvidias_imu_and_lidar_carry_what_they_can():
+    stage = stage_with_link()
+    imu = sensors.define_imu(stage, f"{LINK}/imu", ImuSpec(link="some_link", rate_hz=50.0))
+    lidar = sensors.define_lidar(stage, f"{LINK}/lidar", LidarSpec(link="some_link", range_max_m=8.0))
+    imu_sensor, omni = imu.GetChild("imu_sensor"), lidar.GetChild("omni_lidar")
+    assert imu_sensor.GetTypeName() == "IsaacImuSensor"
+    assert imu_sensor.GetAttribute("sensorPeriod").Get() == pytest.approx(0.02)
+    assert omni.GetTypeName() == "OmniLidar"
+    assert omni.GetMetadata("apiSchemas").GetAppliedItems() == [sensors.LIDAR_API, sensors.EMITTER_API]
+    assert omni.GetAttribute("omni:sensor:Core:numberOfEmitters").Get() == 1
+    assert omni.GetAttribute("omni:sensor:Core:patternFiringRateHz").Get() == 720 * 8
+    assert omni.GetAttribute("omni:sensor:Core:scanRateBaseHz").Get() == 8
+    assert omni.GetAttribute("omni:sensor:Core:farRangeM").Get() == 8.0
+
+
+def test_a_missing_network_is_read_as_where_it_should_be(tmp_path):
+    (tmp_path / "a").mkdir()
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a" / "s.usda"))
+    UsdGeom.Xform.Define(stage, LINK)
+    spec = MagnetometerSpec(link="some_link", network=tmp_path / "gone.safetensors")
+    prim = sensors.define_magnetometer(stage, f"{LINK}/mag", spec)
+    assert sensors.read_magnetometer(prim) == spec
+    over = Usd.Stage.CreateNew(str(tmp_path / "over.usda"))
+    over.GetRootLayer().subLayerPaths.append("./a/s.usda")
+    assert sensors.read_magnetometer(over.GetPrimAtPath(f"{LINK}/mag")) == spec
+
+
+def test_a_figure_out_of_range_is_refused_by_prim():
+    stage = stage_with_link()
+    prim = sensors.define_battery(stage, "/robot/battery", BatterySpec())
+    prim.GetAttribute("magtwin:battery:capacityWh").Set(-1.0)
+    with pytest.raises(InputError, match=r"</robot/battery>: capacity_wh of BatterySpec must be above 0"):
+        sensors.read_battery(prim)
+
+
+@pytest.mark.parametrize(
+    ("noun", "attribute", "value", "said"),
+    [
+        ("battery", "loadW", float("nan"), "</robot/battery>: load_w of BatterySpec must be finite, got nan"),
+        ("battery", "voltageFullV", 5.0, "voltage_full_v of BatterySpec must not be below voltage_empty_v"),
+        ("imu", "gyroNoiseStd", float("inf"), "some_link/imu>: gyro_noise_std of ImuSpec must be finite"),
+        ("lidar", "rangeMinM", 12.0, r"some_link/lidar>: range_min_m of LidarSpec must be below range_max_m"),
+    ],
+)
+def test_a_figure_that_makes_no_sense_is_refused_by_prim(noun, attribute, value, said):
+    stage = stage_with_link()
+    prim = {
+        "battery": lambda: sensors.define_battery(stage, "/robot/battery", BatterySpec()),
+        "imu": lambda: sensors.define_imu(stage, f"{LINK}/imu", ImuSpec(link="some_link")),
+        "lidar": lambda: sensors.define_lidar(stage, f"{LINK}/lidar", LidarSpec(link="some_link")),
+    }[noun]()
+    prim.GetAttribute(f"magtwin:{noun}:{attribute}").Set(value)
+    with pytest.raises(InputError, match=said):
+        getattr(sensors, f"read_{noun}")(prim)
+
+
+def test_a_turn_that_is_none_is_refused_by_prim():
+    stage = stage_with_link()
+    prim = sensors.define_imu(stage, f"{LINK}/imu", ImuSpec(link="some_link"))
+    prim.GetAttribute("xformOp:orient").Set(Gf.Quatd(1, 1, 0, 0))
+    with pytest.raises(
+        InputError, match="some_link/imu>: q_link_sensor_xyzw of ImuSpec must be a unit quaternion"
+    ):
+        sensors.read_imu(prim)
+
+
+def test_a_drive_with_one_joint_for_both_wheels_is_refused_by_prim():
+    stage = stage_with_wheels(DriveSpec())
+    prim = sensors.define_drive(stage.GetPrimAtPath("/robot"), DriveSpec())
+    left = prim.GetRelationship("magtwin:drive:leftWheelJoint").GetTargets()
+    prim.GetRelationship("magtwin:drive:rightWheelJoint").SetTargets(left)
+    with pytest.raises(InputError, match="</robot>: right_wheel_joint of DriveSpec must be another joint"):
+        sensors.read_drive(prim)
+
+
+def test_a_figure_of_another_type_is_refused_by_prim():
+    stage = stage_with_link()
+    sensors.define_battery(stage, "/robot/battery", BatterySpec())
+    battery = stage.GetRootLayer().GetPrimAtPath("/robot/battery")
+    battery.RemoveProperty(battery.attributes["magtwin:battery:loadW"])
+    spec = Sdf.AttributeSpec(battery, "magtwin:battery:loadW", Sdf.ValueTypeNames.String)
+    spec.default = "much"
+    with pytest.raises(InputError, match=r"</robot/battery>: magtwin:battery:loadW must be a double, got"):
+        sensors.read_battery(stage.GetPrimAtPath("/robot/battery"))
+
+
+def test_a_prim_that_is_no_sensor_is_refused():
+    stage = stage_with_link()
+    with pytest.raises(InputError, match=r"</robot>: has no MagtwinBatteryAPI"):
+        sensors.read_battery(stage.GetPrimAtPath("/robot"))
+
+
+def test_a_sensor_away_from_its_link_is_refused():
+    with pytest.raises(InputError, match=r"</robot/mag>: this sensor sits on 'some_link'"):
+        sensors.define_magnetometer(stage_with_link(), "/robot/mag", MagnetometerSpec(link="some_link"))
+
+
+def test_a_drive_without_its_joint_is_refused_with_the_near_name():
+    spec = DriveSpec()
+    stage = stage_with_wheels(spec)
+    with pytest.raises(InputError, match=r"no joint 'left_whel_joint'.*did you mean 'left_wheel_joint'"):
+        sensors.define_drive(stage.GetPrimAtPath("/robot"), replace(spec, left_wheel_joint="left_whel_joint"))
+
+
+def test_a_drive_whose_joint_was_removed_is_refused():
+    stage = stage_with_wheels(DriveSpec())
+    prim = sensors.define_drive(stage.GetPrimAtPath("/robot"), DriveSpec())
+    stage.RemovePrim("/robot/joints/left_wheel_joint")
+    with pytest.raises(InputError, match="magtwin:drive:leftWheelJoint must point to one prim of the stage"):
+        sensors.read_drive(prim)
