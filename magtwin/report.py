@@ -22,11 +22,11 @@ class Figure:
 
 @dataclass(frozen=True, repr=False)
 class Report(Summarized):
-    """A titled list of figures, with the facts that they rest on."""
+    """A titled list of figures, with the metadata that they rest on."""
 
     title: str
     figures: tuple[Figure, ...] = ()
-    facts: dict[str, Any] = field(default_factory=dict)
+    metadata: dict[str, Any] = field(default_factory=dict)
     verdict: str = ""
     """Whether what it is of is any good, in one line; see `magtwin.verdict`."""
 
@@ -36,18 +36,18 @@ class Report(Summarized):
             f.name: {k: v for k, v in vars(f).items() if k != "name" and v not in ("", None)}
             for f in self.figures
         }
-        told = {"title": self.title, "figures": figures, "facts": self.facts}
+        told = {"title": self.title, "figures": figures, "metadata": self.metadata}
         return json.dumps(told | ({"verdict": self.verdict} if self.verdict else {}), indent=2)
 
     def _summary(self) -> Summary:
-        """The figures, of which a prompt shows the first four; a notebook shows the facts as well."""
-        facts = [(str(name), str(value)) for name, value in self.facts.items()]
+        """The figures, of which a prompt shows the first four; a notebook shows the metadata as well."""
+        metadata = [(str(name), str(value)) for name, value in self.metadata.items()]
         count = f" ({len(self.figures)} figures)" if len(self.figures) >= LINES else ""
         return Summary(
             f"{self.title}{count}",
             (("verdict", self.verdict), *((one.name, _told(one)) for one in self.figures)),
             ("fact", "value"),
-            facts,
+            metadata,
         )
 
 

@@ -28,7 +28,7 @@ from magtwin.version import __version__
 
 Kind = Literal["physical", "neural", "map-only"]
 Session = int | Literal["survey"]
-Facts = dict[str, str | int | float | bool]
+Metadata = dict[str, str | int | float | bool]
 
 if TYPE_CHECKING:
     from tempfile import TemporaryDirectory
@@ -61,7 +61,7 @@ class Twin(Summarized):
     obstacles: Obstacles = dataclasses.field(default_factory=Obstacles)
     """What stands in the scene."""
 
-    facts: Mapping[str, str | int | float | bool] = dataclasses.field(default_factory=dict)
+    metadata: Mapping[str, str | int | float | bool] = dataclasses.field(default_factory=dict)
     """What a run is to say of the files that were opened: their names as they were given, and checksums."""
 
     platforms: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -74,7 +74,8 @@ class Twin(Summarized):
     """Statistics of that error; None draws none."""
 
     session: Mapping[str, str | int] = dataclasses.field(default_factory=dict)
-    """Facts of the session that the robots are in (`session`, `session_seed`); empty before one is chosen."""
+    """Metadata of the session that the robots are in (`session`, `session_seed`); empty before one is
+    chosen."""
 
     stage: object = dataclasses.field(default=None, repr=False, compare=False)
     """Keeps the temporary stage of a `Scene` that no file holds; None where `scene_file` is a user's own."""
@@ -121,8 +122,8 @@ def _twin_of_scene(
         magnetometer=magnetometer,
         model_error=model_error,
     )
-    facts = {name: fact for name, fact in twin.facts.items() if name != "scene_file"}
-    return dataclasses.replace(twin, facts=facts, stage=stage)
+    metadata = {name: fact for name, fact in twin.metadata.items() if name != "scene_file"}
+    return dataclasses.replace(twin, metadata=metadata, stage=stage)
 
 
 def open_twin(
@@ -168,15 +169,15 @@ def open_twin(
         ),
     )
     obstacles, field, network = read_obstacles(scene_file), load_map(scene.map_layer), _magnetometer(scene)
-    facts: Facts = {"scene_file": scene_file.as_posix(), "scene_sha256": stage_sha256(scene_file)}
+    metadata: Metadata = {"scene_file": scene_file.as_posix(), "scene_sha256": stage_sha256(scene_file)}
     if revision := git_revision(scene_file.parent):
-        facts["git_revision"] = revision
-    facts |= {"map": field.name, "map_sha256": sha256(scene.map_layer)}
+        metadata["git_revision"] = revision
+    metadata |= {"map": field.name, "map_sha256": sha256(scene.map_layer)}
     platforms = {one.robot.name: _platform_sha256(one.robot) for one in scene.robots}
-    facts["platform_sha256"] = platforms[scene.robot.name]
-    twin = _with_network(Twin(scene, scene_file, field, network, obstacles, facts, platforms, model_error))
+    metadata["platform_sha256"] = platforms[scene.robot.name]
+    twin = _with_network(Twin(scene, scene_file, field, network, obstacles, metadata, platforms, model_error))
     if network and net is not None:
-        return dataclasses.replace(twin, facts={**twin.facts, "network_file": FilePath(net).as_posix()})
+        return dataclasses.replace(twin, metadata={**twin.metadata, "network_file": FilePath(net).as_posix()})
     return twin
 
 
@@ -196,22 +197,22 @@ def _platform_of(twin: Twin, robot: RobotSpec) -> str:
 
 
 def _with_network(twin: Twin) -> Twin:
-    """The twin with what its network tells: facts of runs, warnings, and the statistics of its error."""
+    """The twin with what its network tells: metadata of runs, warnings, and the statistics of its error."""
     network, robot = twin.magnetometer, twin.scene.robot
     if network is None:
         return twin
     from magtwin.learn.data.origin import mismatches
 
     found = mismatches(
-        network.net.facts,
+        network.net.metadata,
         network.name,
         residual_sd_nt=network.residual_sd_nt,
         field=twin.field,
-        map_sha256=str(twin.facts["map_sha256"]),
+        map_sha256=str(twin.metadata["map_sha256"]),
         robot=robot,
         platform_sha256=_platform_of(twin, robot),
     )
-    facts = {**twin.facts, **network.facts}
+    metadata = {**twin.metadata, **network.metadata}
     texts = [one.text for one in found]
     statistics = network.model_error() if twin.errors else None
     if twin.errors and statistics is None:
@@ -222,9 +223,9 @@ def _with_network(twin: Twin) -> Twin:
     for text in texts:
         warnings.warn(text, MismatchWarning, stacklevel=3)
     if found:
-        facts["network_mismatch"] = "; ".join(one.text for one in found)
-    facts["model_error"] = statistics is not None
-    return dataclasses.replace(twin, facts=facts, model_error=statistics)
+        metadata["network_mismatch"] = "; ".join(one.text for one in found)
+    metadata["model_error"] = statistics is not None
+    return dataclasses.replace(twin, metadata=metadata, model_error=statistics)
 
 
 def _with_magnetometer(robot: RobotSpec, net: str | FilePath | None, kind: Kind | None) -> RobotSpec:
@@ -245,31 +246,31 @@ def _with_magnetometer(robot: RobotSpec, net: str | FilePath | None, kind: Kind 
 def twin_of(
     run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None, check: bool = True
 ) -> Twin:
-    """The twin that a run came from: the scene that its facts name, with their network and magnetometer.
+    """The twin that a run came from: the scene that its metadata name, with their network and magnetometer.
 
     Args:
-        run: A run that `simulate` made, from any file that keeps its facts.
-        scene: Where the scene lies now; None looks for it where the facts say.
+        run: A run that `simulate` made, from any file that keeps its metadata.
+        scene: Where the scene lies now; None looks for it where the metadata say.
         near: The run's own file: names are taken from its folder too, where they lead nowhere from here.
-        check: Whether what is found must be what the run came from, by the checksums of its facts.
+        check: Whether what is found must be what the run came from, by the checksums of its metadata.
 
     Raises:
-        InputError: The facts name no scene, or it or its network is not there, or is not what it was.
+        InputError: The metadata name no scene, or it or its network is not there, or is not what it was.
     """
-    facts, scene = run.facts, scene_of(run, scene, near=near)
-    kind: Any = facts.get("magnetometer")
-    network = str(facts["network_file"]) if "network_file" in facts else None
+    metadata, scene = run.metadata, scene_of(run, scene, near=near)
+    kind: Any = metadata.get("magnetometer")
+    network = str(metadata["network_file"]) if "network_file" in metadata else None
     twin = open_twin(
         scene,
         net=network if network is None else locate(network, near) or network,
         magnetometer=kind if network is None else None,
-        model_error=bool(facts.get("model_error", False)),
+        model_error=bool(metadata.get("model_error", False)),
     )
     for name, what in _CHECKSUMS.items() if check else ():
-        if facts.get(name, "") != twin.facts.get(name, ""):
+        if metadata.get(name, "") != twin.metadata.get(name, ""):
             raise InputError(
                 f"{scene}: {what} is not what the run came from: {name} is "
-                f"{twin.facts.get(name, 'none')}, the run says {facts.get(name, 'none')}"
+                f"{twin.metadata.get(name, 'none')}, the run says {metadata.get(name, 'none')}"
             )
     return twin
 
@@ -317,37 +318,37 @@ def in_session(twin: Twin, session: Session | None = None, *, seed: int = 0) -> 
     return dataclasses.replace(twin, scene=scene, session={"session": number, "session_seed": seed})
 
 
-def in_session_of(twin: Twin, facts: Mapping[str, str | int | float | bool]) -> Twin:
+def in_session_of(twin: Twin, metadata: Mapping[str, str | int | float | bool]) -> Twin:
     """The twin in the session of a run.
 
     Args:
         twin: The twin of the run.
-        facts: Those of the run. Without `session_seed`, the run is of the robot as it was surveyed.
+        metadata: Those of the run. Without `session_seed`, the run is of the robot as it was surveyed.
 
     Raises:
-        InputError: The facts do not say which session it was.
+        InputError: The metadata do not say which session it was.
     """
-    if "session_seed" not in facts:
+    if "session_seed" not in metadata:
         return in_session(twin, "survey")
     try:
-        seed, session = int(facts["session_seed"]), int(facts["session"])
+        seed, session = int(metadata["session_seed"]), int(metadata["session"])
     except (KeyError, ValueError) as error:
-        raise InputError(f"the facts of the run do not say which session it was of: {error}") from error
+        raise InputError(f"the metadata of the run do not say which session it was of: {error}") from error
     return in_session(twin, session, seed=seed)
 
 
-def check_figures(scene: Scene, facts: Mapping[str, str | int | float | bool], name: str) -> None:
+def check_figures(scene: Scene, metadata: Mapping[str, str | int | float | bool], name: str) -> None:
     """Refuse a scene that is not, figure by figure, the one that a run came from.
 
     Args:
         scene: The scene, its robot as it was in the run's session.
-        facts: Those of the run.
+        metadata: Those of the run.
         name: What to call the run.
 
     Raises:
         InputError: Its figures have another checksum, or the run tells none.
     """
-    found, said = _config_sha256(scene), facts.get("config_sha256", "none")
+    found, said = _config_sha256(scene), metadata.get("config_sha256", "none")
     if found != said:
         raise InputError(
             f"{name}: came from a scene whose figures have the sha256 {said}, those of {scene.name!r} in its "
@@ -361,22 +362,24 @@ def scene_of(
     """The file of the scene that a run came from; arguments as for `twin_of`.
 
     Raises:
-        InputError: The facts name none, or it is not there.
+        InputError: The metadata name none, or it is not there.
     """
     if scene is not None:
         return existing(scene, "scene")
-    if "scene_file" not in run.facts:
+    if "scene_file" not in run.metadata:
         raise InputError("the run does not say which scene it came from; name it (--scene)")
-    found = locate(str(run.facts["scene_file"]), near)
+    found = locate(str(run.metadata["scene_file"]), near)
     if found is None:
-        raise InputError(f"{run.facts['scene_file']}: the scene of the run is not there; name it (--scene)")
+        raise InputError(
+            f"{run.metadata['scene_file']}: the scene of the run is not there; name it (--scene)"
+        )
     return found
 
 
 def locate(file: str, near: str | FilePath | None = None) -> FilePath | None:
-    """A file or folder that facts name, seen from here or from the folder of `near`, or none.
+    """A file or folder that metadata name, seen from here or from the folder of `near`, or none.
 
-    A device or pipe is none: facts come with files of anyone's, and reading it might never end.
+    A device or pipe is none: metadata come with files of anyone's, and reading it might never end.
     """
     places = [FilePath(file)]
     if near is not None:  # a run may be a folder of its own
@@ -621,7 +624,7 @@ def simulate(
         progress: As for `engine_named`.
 
     Returns:
-        A Run with every column of `magtwin.COLUMNS`; its facts tell how it came about.
+        A Run with every column of `magtwin.COLUMNS`; its metadata tell how it came about.
 
     Raises:
         InputError: The path leaves the floor or touches an obstacle, an option is out of range, the scene's
@@ -661,8 +664,8 @@ def simulate(
         engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
     )
     check_read(run, twin.field)
-    return run.with_columns(**_known(twin.scene, run, read)).with_facts(
-        **_facts(twin, seed, path, duration_s, _config_sha256(twin.scene))
+    return run.with_columns(**_known(twin.scene, run, read)).with_metadata(
+        **_metadata(twin, seed, path, duration_s, _config_sha256(twin.scene))
     )
 
 
@@ -725,7 +728,7 @@ def simulate_robots(
         controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`.
 
     Returns:
-        Runs by the robots' names, in the scene's order. Beside what `simulate` says, facts name the robot,
+        Runs by the robots' names, in the scene's order. Beside what `simulate` says, metadata name the robot,
         and the one that came nearest with time and clearance.
 
     Raises:
@@ -780,8 +783,8 @@ def simulate_robots(
     for name, run in runs.items():
         check_read(run, twin.field)
         own = led[name]
-        runs[name] = run.with_columns(**_known(own.scene, run, reads.get(name))).with_facts(
-            **_facts(own, seed, ways[name], duration_s, _config_sha256(own.scene))
+        runs[name] = run.with_columns(**_known(own.scene, run, reads.get(name))).with_metadata(
+            **_metadata(own, seed, ways[name], duration_s, _config_sha256(own.scene))
         )
     return runs
 
@@ -800,10 +803,10 @@ def led_by(twin: Twin, name: str) -> Twin:
         network = _magnetometer(scene)
     if name == twin.scene.robot.name:
         return twin
-    own = {"model_error", "network_mismatch", *(twin.magnetometer.facts if twin.magnetometer else ())}
-    facts: Facts = {key: fact for key, fact in twin.facts.items() if key not in own}
-    facts["platform_sha256"] = _platform_of(twin, scene.robot)
-    led = dataclasses.replace(twin, scene=scene, magnetometer=network, facts=facts, model_error=None)
+    own = {"model_error", "network_mismatch", *(twin.magnetometer.metadata if twin.magnetometer else ())}
+    metadata: Metadata = {key: fact for key, fact in twin.metadata.items() if key not in own}
+    metadata["platform_sha256"] = _platform_of(twin, scene.robot)
+    led = dataclasses.replace(twin, scene=scene, magnetometer=network, metadata=metadata, model_error=None)
     return _with_network(led)
 
 
@@ -912,7 +915,7 @@ def simulate_many(
             check_read(run, twin.field)
             known = _known(job.scene, run, read)
             run = run.with_columns(**{name: known[name] for name in known.keys() & run.keys()})
-            runs.append(run.with_facts(**_facts(own, job.seed, job.path, duration_s, config)))
+            runs.append(run.with_metadata(**_metadata(own, job.seed, job.path, duration_s, config)))
         return runs
 
     conditions = Conditions(
@@ -946,8 +949,8 @@ def _opened(
 
 def without_model_error(twin: Twin) -> Twin:
     """The twin, with readings of a neural magnetometer that are what its network predicts."""
-    facts = twin.facts if twin.magnetometer is None else {**twin.facts, "model_error": False}
-    return dataclasses.replace(twin, errors=False, model_error=None, facts=facts)
+    metadata = twin.metadata if twin.magnetometer is None else {**twin.metadata, "model_error": False}
+    return dataclasses.replace(twin, errors=False, model_error=None, metadata=metadata)
 
 
 def _seed(seed: object) -> int:
@@ -994,22 +997,28 @@ def _known(scene: Scene, run: Run, read: "Read | None") -> dict[str, NDArray[Any
     if read is None:
         return {}
     spec = scene.robot.magnetometer
-    noise = spec.noise_density_nt * np.sqrt(float(run.facts["rate_hz"]) / 2)
+    noise = spec.noise_density_nt * np.sqrt(float(run.metadata["rate_hz"]) / 2)
     known: dict[str, NDArray[Any]] = {"b_sd_nt": np.hypot(read.sd_nt, noise)}
     return known if read.outside is None else known | {"flag_out_of_distribution": read.outside}
 
 
-def _facts(
+def _metadata(
     twin: Twin, seed: int, path: "Path | Commands | Run | str", duration_s: float | None, config_sha256: str
-) -> Facts:
-    """What a twin adds to the facts of a run, beside what its motion and sensors say of themselves."""
-    facts: Facts = {"magtwin": __version__, "numpy": np.__version__, "seed": seed}
+) -> Metadata:
+    """What a twin adds to the metadata of a run, beside what its motion and sensors say of themselves."""
+    metadata: Metadata = {"magtwin": __version__, "numpy": np.__version__, "seed": seed}
     if duration_s is not None:
-        facts["asked_duration_s"] = float(duration_s)
-    return facts | dict(twin.session) | path_facts(path) | dict(twin.facts) | {"config_sha256": config_sha256}
+        metadata["asked_duration_s"] = float(duration_s)
+    return (
+        metadata
+        | dict(twin.session)
+        | path_metadata(path)
+        | dict(twin.metadata)
+        | {"config_sha256": config_sha256}
+    )
 
 
-def path_facts(path: "Path | Commands | Run | str") -> Facts:
+def path_metadata(path: "Path | Commands | Run | str") -> Metadata:
     """Where what was driven came from, and its checksum."""
     if isinstance(path, str):
         return {}
@@ -1020,13 +1029,13 @@ def path_facts(path: "Path | Commands | Run | str") -> Facts:
         arrays, what, file = (path.p_xy, np.array([path.closed])), "path", path.file
     else:
         arrays, what, file = (path.rows,), "commands", path.file
-    facts: Facts = {f"{what}_file": file} if file else {}
+    metadata: Metadata = {f"{what}_file": file} if file else {}
     if isinstance(path, Path) and path.placing:
-        facts["path_placing"] = " ".join(map(repr, path.placing))
+        metadata["path_placing"] = " ".join(map(repr, path.placing))
     checksum = hashlib.sha256()
     for array in arrays:
         checksum.update(np.ascontiguousarray(array).tobytes())
-    return {**facts, f"{what}_sha256": checksum.hexdigest()}
+    return {**metadata, f"{what}_sha256": checksum.hexdigest()}
 
 
 def _config_sha256(scene: Scene) -> str:
@@ -1060,6 +1069,6 @@ def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Sc
     from magtwin.sim.sensors.lidar import scans_of
 
     if not isinstance(twin, Twin):
-        twin = in_session_of(open_twin(twin, magnetometer="map-only"), run.facts)
+        twin = in_session_of(open_twin(twin, magnetometer="map-only"), run.metadata)
     rng = streams(np.random.default_rng(seed))["lidar"]
     return scans_of(run, twin.scene.robot, twin.obstacles, rng)

@@ -22,7 +22,7 @@ HOLDS_ONE = (0.5, 1.0)
 deviations off its mean holds 70 %."""
 
 SEPARATOR = ", "
-"""Between the names of sessions and paths in the facts of weights."""
+"""Between the names of sessions and paths in the metadata of weights."""
 
 
 def coverage(error_nt: NDArray[Any], sd_nt: NDArray[Any]) -> float:

@@ -167,7 +167,7 @@ def test_a_map_tells_extent_spacing_headings_method_height_day_and_range(twin):
 def test_hostile_names_stay_in_their_line_and_are_escaped_in_html(twin, run):
     field = dataclasses.replace(twin.field, name=HOSTILE, method=HOSTILE, source=HOSTILE)
     named = {
-        "run": run.with_facts(scene=HOSTILE, path=HOSTILE, network=HOSTILE).with_columns(
+        "run": run.with_metadata(scene=HOSTILE, path=HOSTILE, network=HOSTILE).with_columns(
             **{HOSTILE: run["t"]}
         ),
         "spec": Run({"t": run["t"], "a": run["t"]}, {}, {"a": Column(HOSTILE, HOSTILE, HOSTILE)}),
@@ -209,7 +209,7 @@ def test_to_pandas_tells_units_and_frames(run):
     assert len(frame) == run.rows
     assert (frame.attrs["units"]["imu_w_x"], frame.attrs["frames"]["imu_w_x"]) == ("rad/s", "imu_link")
     assert frame.attrs["units"].keys() == frame.attrs["frames"].keys() == set(frame.columns)
-    assert frame.attrs["facts"]["scene"] == "lab"
+    assert frame.attrs["metadata"]["scene"] == "lab"
 
 
 def labels_of(figure):

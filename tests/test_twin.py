@@ -13,13 +13,13 @@ def test_a_run_is_in_a_session_of_its_seed_unless_another_is_chosen(lab_scene):
     twin = open_twin(lab_scene, magnetometer="physical")
     short = {"duration_s": 60.0, "rate_hz": 5.0, "lidar": "off"}
     first = simulate(twin, seed=3, **short)
-    assert (first.facts["session"], first.facts["session_seed"]) == (0, 3)
+    assert (first.metadata["session"], first.metadata["session_seed"]) == (0, 3)
     same = simulate(in_session(twin, 0, seed=3), seed=3, **short)
     assert all(first[name].tobytes() == same[name].tobytes() for name in first)
     other = simulate(twin, seed=3, session=1, **short)
     surveyed = simulate(twin, seed=3, session="survey", **short)
-    assert surveyed.facts["session"] == "survey"
-    assert "session_seed" not in surveyed.facts
+    assert surveyed.metadata["session"] == "survey"
+    assert "session_seed" not in surveyed.metadata
     offsets = [float(np.mean(run["b_total_nt"] - run["b_map_nt"])) for run in (first, other, surveyed)]
     assert min(offsets[0], offsets[1]) - offsets[2] > 200  # hard_iron_drift_nt since the survey
     assert offsets[0] != offsets[1]

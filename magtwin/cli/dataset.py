@@ -133,7 +133,7 @@ def info(dataset: Path, *, json: Json = False) -> None:
         f"{one.label_mean_nt:.0f} ± {one.label_sd_nt:.0f} nT"
         for one in found.recordings
     }
-    print_report(replace(report, facts={**report.facts, "recordings": each}), json)
+    print_report(replace(report, metadata={**report.metadata, "recordings": each}), json)
 
 
 @dataset_app.command

@@ -107,7 +107,7 @@ def drive(
             "commands.csv",
             folder,
             commands=folder / "commands.csv",
-            facts={"commands_file": "commands.csv"},
+            metadata={"commands_file": "commands.csv"},
             steps=announcer(quiet=json),
             net=net,
             model_error=model_error,

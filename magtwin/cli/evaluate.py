@@ -235,8 +235,8 @@ def _budget(
         return twins[kind]
 
     def day_of(name: str, run: "Run") -> "Scene":
-        day = in_session_of(opened(run.facts.get("magnetometer")), run.facts).scene
-        check_figures(day, run.facts, name)
+        day = in_session_of(opened(run.metadata.get("magnetometer")), run.metadata).scene
+        check_figures(day, run.metadata, name)
         return day
 
     truth = Truth(opened("physical").scene, day_of)
@@ -265,11 +265,11 @@ def _traversals(
     first = found.judged[0]
     if against is not None:
         other, name = read_run(against), against.stem
-        path = str(other.facts.get("path", ""))
+        path = str(other.metadata.get("path", ""))
         able = [one for one in found.judged if one.path == path and one.name != name]
         first = able[0] if able else first
     else:
-        seed = first.run.facts.get("seed")
+        seed = first.run.metadata.get("seed")
         seed = seed + 1 if isinstance(seed, int) and seed >= 0 else 1
         with progress(f"Driving {first.path}", "steps") as advance:
             other = made_again(first.run, scene, engine=engine, seed=seed, progress=advance)

@@ -196,7 +196,7 @@ def _info_of_usd(file: Path) -> Any:
     try:
         return replace(run, figures=(*run.figures, *info_of_stage(file).figures))
     except InputError as error:  # the run is whole without its scene
-        return replace(run, facts={**run.facts, "stage": str(error)})
+        return replace(run, metadata={**run.metadata, "stage": str(error)})
 
 
 def _info_of_map(file: Path) -> Any:
@@ -230,7 +230,7 @@ def _info_of_run(file: Path) -> Any:
             filter(None, (spec.unit or "-", spec.frame and f"in {spec.frame}", spec.doc))
         )
     figures = [*report.figures[:2], Figure("columns", len(run)), *report.figures[2:]]
-    return replace(report, figures=tuple(figures), facts={**report.facts, "columns": columns})
+    return replace(report, figures=tuple(figures), metadata={**report.metadata, "columns": columns})
 
 
 def _info_of_net(file: Path) -> Any:
@@ -249,15 +249,15 @@ def _twin(run: "Run", file: Path, scene: Path | None) -> "Twin | None":
 
     try:
         twin = open_twin(scene_of(run, scene, near=file), magnetometer="map-only")  # needs no network
-        if "robot" in run.facts:
-            twin = led_by(twin, str(run.facts["robot"]))
+        if "robot" in run.metadata:
+            twin = led_by(twin, str(run.metadata["robot"]))
     except InputError as error:
         if scene is not None:
             raise
         _note(f"without a scene: {error}")
         return None
-    then = run.facts.get("scene_sha256")
-    if then is not None and then != twin.facts.get("scene_sha256") and scene != file:
+    then = run.metadata.get("scene_sha256")
+    if then is not None and then != twin.metadata.get("scene_sha256") and scene != file:
         _note(f"{twin.scene_file}: has changed since the run; it is shown as it is now")
     return twin
 

@@ -477,7 +477,7 @@ def map_diff(
         plot_difference(found, out, force=force)
     report = found.report()
     if json:  # every region, in numbers
-        report = replace(report, facts={**report.facts, "regions": [asdict(r) for r in found.regions]})
+        report = replace(report, metadata={**report.metadata, "regions": [asdict(r) for r in found.regions]})
     print_report(report, json)
     if out is not None and not json:
         say(f"Wrote {out}")
@@ -571,8 +571,10 @@ def map_epochs(*files: Path, out: Path, force: Force = False, json: Json = False
 
 
 def _joined(report: Any, found: Any) -> Any:
-    """A report with the figures and facts of another below its own."""
-    return replace(report, figures=report.figures + found.figures, facts={**report.facts, **found.facts})
+    """A report with the figures and metadata of another below its own."""
+    return replace(
+        report, figures=report.figures + found.figures, metadata={**report.metadata, **found.metadata}
+    )
 
 
 def _open_map(file: Path, date: str | None = None) -> Any:

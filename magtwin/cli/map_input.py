@@ -39,7 +39,9 @@ def read_sources(
     masked, found = mask_latched(readings)
     taken = [part for part in readings.source.split("; ") if part.startswith(TAKEN)]
     if taken:
-        found = replace(found, facts={**found.facts, "taken": [part.removeprefix(TAKEN) for part in taken]})
+        found = replace(
+            found, metadata={**found.metadata, "taken": [part.removeprefix(TAKEN) for part in taken]}
+        )
     if not (keep_latched or masked.good.any()):
         raise InputError(
             f"{sources[0]}: all {len(readings)} readings are those of a sensor that was stuck; "
@@ -80,7 +82,7 @@ def worth_a_map(readings: Any, found: Any, source: Path) -> Any:
             f"one heading only, {np.degrees(np.angle(way)):.0f} deg: nothing tells the robot's own field "
             "from the room's, and a simulated robot adds its whole platform field; survey in all headings"
         )
-    return replace(found, facts={**found.facts, "doubts": notes}) if notes else found
+    return replace(found, metadata={**found.metadata, "doubts": notes}) if notes else found
 
 
 def method_options(methods: list[str], kernel: str | None, earth: str | None) -> dict[str, dict[str, Any]]:

@@ -158,7 +158,7 @@ def _run_and_scene(file: Path, scene: Path | None) -> "tuple[Run, Path]":
     step("Reading the run")
     run = read_run(file)
     stage = scene_of(run, scene, near=file)
-    if "scene_sha256" in run.facts and run.facts["scene_sha256"] != stage_sha256(stage):
+    if "scene_sha256" in run.metadata and run.metadata["scene_sha256"] != stage_sha256(stage):
         print(f"  {stage} has changed since the run; it is drawn as it is now", file=sys.stderr)  # noqa: T201
     return run, stage
 

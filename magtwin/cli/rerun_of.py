@@ -51,7 +51,7 @@ def rerun_of(
     if not json:
         for cause in found.causes:
             say(cause)
-        report = replace(report, facts={})
+        report = replace(report, metadata={})
     print_report(report, json)
     if out is not None and not json:
         say(f"Wrote {out}")

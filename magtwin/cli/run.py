@@ -81,7 +81,7 @@ def demo(
             scene_file,
             "figure8",
             folder,
-            facts={"scene_file": scene_file.relative_to(folder).as_posix()},
+            metadata={"scene_file": scene_file.relative_to(folder).as_posix()},
             steps=steps,
             seed=seed,
             model_error=model_error,
@@ -335,7 +335,8 @@ def write_run(
         steps: Told what is being done.
         title: Title of the report.
         scans: Whether the LiDAR's rays are cast.
-        options: `commands`, `replay`, `facts` that say where files will lie as seen from the run's own, and
+        options: `commands`, `replay`, `metadata` that say where files will lie as seen from the run's own,
+        and
             those of `open_twin` and `simulate`.
     """
     driven = _drive(scene_file, path, steps=steps, scans=scans, **options)
@@ -367,12 +368,12 @@ def _drive(
     seed: int = 0,
     session: int | Literal["survey"] | None = None,
     fit: bool = False,
-    facts: Mapping[str, str | int] = MappingProxyType({}),
+    metadata: Mapping[str, str | int] = MappingProxyType({}),
     **options: Any,
 ) -> _Driven:
     """Run a scene: along `path`, unless commands or a run say otherwise.
 
-    `facts` say where files will lie as seen from the run's own, for those that move with it.
+    `metadata` say where files will lie as seen from the run's own, for those that move with it.
     """
     from magtwin.io.formats import read_run
     from magtwin.sim.motion.commands import read_commands
@@ -396,10 +397,10 @@ def _drive(
         print(f"  {what.beyond(twin.scene.robot.drive)}", file=sys.stderr)  # noqa: T201
     steps(f"Driving {planned.name if planned else path}")
     if replay is not None:
-        facts = {"replay_file": replay.as_posix(), **facts}
+        metadata = {"replay_file": replay.as_posix(), **metadata}
     slow = options.get("engine") == "newton"
     with progress("Driving in Newton", "steps") if slow else nullcontext() as advance:
-        result = simulate(twin, what, seed=seed, progress=advance, **options).with_facts(**facts)
+        result = simulate(twin, what, seed=seed, progress=advance, **options).with_metadata(**metadata)
     seen = None
     if scans:
         steps("Casting the LiDAR's rays")
@@ -468,7 +469,7 @@ def _run_together(
     reports = {name: run.report(name) for name, run in runs.items()}
     figures = tuple(replace(f, name=f"{n}: {f.name}") for n, r in reports.items() for f in r.figures)
     print_report(
-        Report(f"{', '.join(names)} in {scene_file}", figures, {n: r.facts for n, r in reports.items()}),
+        Report(f"{', '.join(names)} in {scene_file}", figures, {n: r.metadata for n, r in reports.items()}),
         quiet,
     )
     if not quiet:

@@ -154,9 +154,9 @@ def runs(
                 file = f"run_{k:05d}.parquet"
                 write_parquet(run, folder / file)
                 run.add_to(tally)
-                listed = (run.facts[name] for name in ("path", "seed", "session", "speed_m_s"))
+                listed = (run.metadata[name] for name in ("path", "seed", "session", "speed_m_s"))
                 table.writerow((file, *listed, run.rows))
-                readings, seconds = readings + run.rows, seconds + float(run.facts["duration_s"])
+                readings, seconds = readings + run.rows, seconds + float(run.metadata["duration_s"])
                 advance(k + 1, count)
     took = time.monotonic() - start
     report = Report(

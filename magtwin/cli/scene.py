@@ -66,6 +66,6 @@ def scene(
         ]
         notes = {f"notes on {robot.name}": notes_of(robot.asset) for robot in built}
     report = info_of_stage(root)
-    print_report(replace(report, facts={**report.facts, **notes}), json)
+    print_report(replace(report, metadata={**report.metadata, **notes}), json)
     if not json:
         say("\n".join([*told, f"Wrote {root}"]))

@@ -111,7 +111,7 @@ def print_report(report: Any, as_json: bool) -> None:
             spread = f"± {_rounded(figure.spread)}" if figure.spread is not None else ""
             cells = (figure.name, value, f"{spread} {figure.unit}".strip())
             numbers.add_row(*map(Text, cells), Text(figure.note, style="dim"))
-    for name, fact in report.facts.items():
+    for name, fact in report.metadata.items():
         if isinstance(fact, (dict, list)):
             lists.append((name, fact))
         elif fact != "":

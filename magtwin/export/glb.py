@@ -248,8 +248,8 @@ class _Scene:
 
     def glb(self) -> bytes:
         """The file: a header, JSON, and the buffer."""
-        facts = self.stage.GetRootLayer().customLayerData.get("magtwin", {}).get("export", {})
-        asset = {"version": "2.0", "generator": f"magtwin {__version__}", "extras": dict(facts)}
+        metadata = self.stage.GetRootLayer().customLayerData.get("magtwin", {}).get("export", {})
+        asset = {"version": "2.0", "generator": f"magtwin {__version__}", "extras": dict(metadata)}
         self.data += bytes(-len(self.data) % 4)
         nodes = [{k: v for k, v in node.items() if v != []} for node in self.nodes]
         said = {
@@ -313,8 +313,8 @@ def _roughness(prim: Usd.Prim) -> float:
 
 
 def _said_of_colours(prim: Usd.Prim) -> dict[str, Any]:
-    facts: Mapping[str, Any] = prim.GetCustomDataByKey("magtwin") or {}
-    return {key: _said(value) for key, value in facts.items()} if "colourMap" in facts else {}
+    metadata: Mapping[str, Any] = prim.GetCustomDataByKey("magtwin") or {}
+    return {key: _said(value) for key, value in metadata.items()} if "colourMap" in metadata else {}
 
 
 def _said(value: Any) -> Any:

@@ -89,8 +89,8 @@ class Exported:
             figures.append(
                 Figure(str(file), size, "MB", note=f"{len(inside)} files" if file.is_dir() else "")
             )
-        facts = {"licences": self.licences, "notes": list(self.notes)}
-        return Report(str(self.files[0]), tuple(figures), {k: v for k, v in facts.items() if v})
+        metadata = {"licences": self.licences, "notes": list(self.notes)}
+        return Report(str(self.files[0]), tuple(figures), {k: v for k, v in metadata.items() if v})
 
 
 def export_scene(
@@ -293,9 +293,9 @@ class _Work:
                 self.networks.append(file)
                 self.licences[self._said(file)] = licence_of(file) or UNKNOWN
         for layer in stage.GetUsedLayers():
-            facts = layer.customLayerData.get("SimReady_Metadata", {})
-            if layer.realPath and facts.get("asset_license"):
-                self.licences[self._said(Path(layer.realPath))] = facts["asset_license"]
+            metadata = layer.customLayerData.get("SimReady_Metadata", {})
+            if layer.realPath and metadata.get("asset_license"):
+                self.licences[self._said(Path(layer.realPath))] = metadata["asset_license"]
         self.licences = dict(sorted(self.licences.items()))
         is_scene = all(prims_with(world, noun) for noun in ("lab", "robot", "magnetometer"))
         self.scene = read_scene(self.root) if is_scene else None
@@ -339,10 +339,10 @@ class _Work:
             "sourceSha256": self.checksum,
             "licences": self.licences,
         }
-        facts = dict(layer.customLayerData)
-        facts["creator"] = facts.get("creator", "magtwin")
-        facts["magtwin"] = {**dict(facts.get("magtwin", {})), "export": said}
-        layer.customLayerData = facts
+        metadata = dict(layer.customLayerData)
+        metadata["creator"] = metadata.get("creator", "magtwin")
+        metadata["magtwin"] = {**dict(metadata.get("magtwin", {})), "export": said}
+        layer.customLayerData = metadata
         layer.Save()
 
     def animate(self, run: Run) -> None:
@@ -444,7 +444,7 @@ def _values_layer(prim: Usd.Prim) -> Path:
 
 
 def licence_of(network: Path) -> str:
-    """The licence that the facts of a network's weights say, "" where they say none."""
+    """The licence that the metadata of a network's weights say, "" where they say none."""
     if network.suffix != ".safetensors":
         return ""
     with open(network, "rb") as file:
@@ -454,8 +454,8 @@ def licence_of(network: Path) -> str:
             return ""
         text = file.read(size)
     try:
-        facts = json.loads(json.loads(text)["__metadata__"]["magtwin"])["facts"]
-        return str(facts.get("licence", ""))
+        metadata = json.loads(json.loads(text)["__metadata__"]["magtwin"])["facts"]
+        return str(metadata.get("licence", ""))
     except (ValueError, KeyError, TypeError, AttributeError):
         return ""
 

@@ -234,7 +234,7 @@ def _models(found: Evaluation) -> Table:
     for one in found.contenders:
         arm = ", ".join(f"{1000 * part:.1f}" for part in one.alignment.lever_arm_m)
         inputs = len(one.model.features)
-        checksum = str(one.facts.get("sha256", ""))[:12]
+        checksum = str(one.metadata.get("sha256", ""))[:12]
         rows.append((one.name, one.chart.name, inputs, arm, 1000 * one.alignment.latency_s, checksum))
     head = ("model", "map", "inputs", "lever arm [mm]", "latency [ms]", "SHA-256")
     return Table("Models", head, tuple(rows))
@@ -309,7 +309,7 @@ def _every(one: Judged, rate_hz: float) -> int:
 
 def of_weights(found: Evaluation) -> list[int]:
     """Models that came from weights files, or all but the naive one; `MOST_PANELS` of them at most."""
-    own = [i for i, one in enumerate(found.contenders) if "sha256" in one.facts]
+    own = [i for i, one in enumerate(found.contenders) if "sha256" in one.metadata]
     own = own or list(range(1, len(found.contenders))) or [0]
     return own if len(own) <= MOST_PANELS else [own[0], *own[1 - MOST_PANELS :]]
 

@@ -1,7 +1,7 @@
 """Pages: a run, a set of runs, or two laid over each other, told in HTML, Markdown or JSON.
 
 An HTML page is one file: its pictures lie inside, it asks nothing of any other place and runs no script. What
-comes from a run's file, its facts and its name above all, is text in it and nothing else.
+comes from a run's file, its metadata and its name above all, is text in it and nothing else.
 """
 
 import base64
@@ -150,11 +150,11 @@ def page_of_comparison(a: Told, b: Told, found: Comparison) -> Page:
         "Along-track: ahead of the first run; cross-track: to its left.",
     )
     pictures = tuple(pictures_of_comparison(a.run, b.run, found, (a.name, b.name)))
-    facts = sorted({*a.run.facts, *b.run.facts}, key=lambda name: (name not in a.run.facts, name))
+    metadata = sorted({*a.run.metadata, *b.run.metadata}, key=lambda name: (name not in a.run.metadata, name))
     differ = tuple(
-        (name, a.run.facts.get(name, ""), b.run.facts.get(name, ""))
-        for name in facts
-        if a.run.facts.get(name) != b.run.facts.get(name)
+        (name, a.run.metadata.get(name, ""), b.run.metadata.get(name, ""))
+        for name in metadata
+        if a.run.metadata.get(name) != b.run.metadata.get(name)
     )
     tables = [table]
     if differ:
@@ -163,7 +163,7 @@ def page_of_comparison(a: Told, b: Told, found: Comparison) -> Page:
         " and ".join(short_names((a.name, b.name))),
         f"{a.name} and {b.name}: {len(found.at):,} readings compared. {how}",
         (Section("Comparison", "", pictures, tuple(tables)),),
-        data={"a": a.name, "b": b.name, **found.summary(), "facts": [_facts(a.run), _facts(b.run)]},
+        data={"a": a.name, "b": b.name, **found.summary(), "metadata": [_metadata(a.run), _metadata(b.run)]},
     )
 
 
@@ -187,14 +187,14 @@ def write_page(page: Page, path: str | os.PathLike[str], *, force: bool = False)
 
 
 def _title(one: Told) -> str:
-    facts = one.run.facts
-    path, scene = facts.get("path"), facts.get("scene")
+    metadata = one.run.metadata
+    path, scene = metadata.get("path"), metadata.get("scene")
     return " ".join([f"Run: {path}" if path else f"Run {one.name}", *([f"in {scene}"] if scene else [])])
 
 
 def _sentence(run: Run) -> str:
     """What was run, in a line."""
-    facts, words = run.facts, [f"{run.rows:,} readings in {run.duration_s:,.1f} s"]
+    metadata, words = run.metadata, [f"{run.rows:,} readings in {run.duration_s:,.1f} s"]
     distance = _distance_m(run)
     if distance is not None:
         words.append(f"{distance:,.1f} m driven")
@@ -206,8 +206,8 @@ def _sentence(run: Run) -> str:
         ("map", "map {}"),
         ("seed", "seed {}"),
     ):
-        if fact in facts:
-            words.append(text.format(facts[fact]))
+        if fact in metadata:
+            words.append(text.format(metadata[fact]))
     return ", ".join(words) + "."
 
 
@@ -234,7 +234,12 @@ def _section(one: Told, pictures: bool) -> Section:
         Table("Events", ("flag", "meaning", "readings", "times [s]"), events, "" if events else "None.")
     )
     tables.append(
-        Table("Provenance", ("metadata", ""), tuple(run.facts.items()), "" if run.facts else "No metadata.")
+        Table(
+            "Provenance",
+            ("metadata", ""),
+            tuple(run.metadata.items()),
+            "" if run.metadata else "No metadata.",
+        )
     )
     drawn = pictures_of_run(run, one.field, one.planned) if pictures else []
     lead = f"{one.name}. {one.note}".strip()
@@ -242,13 +247,13 @@ def _section(one: Told, pictures: bool) -> Section:
 
 
 def _overview(one: Told) -> tuple[Any, ...]:
-    run, facts = one.run, one.run.facts
+    run, metadata = one.run, one.run.metadata
     distance, total = _distance_m(run), errors_of(run).get("total")
     events = sum(int(run[name].any()) for name in run if name.startswith("flag_"))
     return (
         one.name,
-        facts.get("path", ""),
-        facts.get("seed", ""),
+        metadata.get("path", ""),
+        metadata.get("seed", ""),
         run.rows,
         round(run.duration_s, 1),
         "" if distance is None else round(distance, 1),
@@ -272,12 +277,12 @@ def _data(one: Told) -> dict[str, Any]:
             {"flag": name, "readings": count, "spans_s": [list(span) for span in _spans(run, name)]}
             for name, _, count, _ in _events(run)
         ],
-        "facts": _facts(run),
+        "metadata": _metadata(run),
     }
 
 
-def _facts(run: Run) -> dict[str, Any]:
-    return dict(run.facts)
+def _metadata(run: Run) -> dict[str, Any]:
+    return dict(run.metadata)
 
 
 def _agreement(one: Agreement) -> tuple[float, float, float, float, int]:

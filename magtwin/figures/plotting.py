@@ -199,8 +199,8 @@ def _draw_panels(side: Any, run: Run, panels: Sequence[_Panel]) -> None:
 
 def _title(run: Run, p_xy: Array | None = None) -> str:
     """Scene, path and network of a run, and its size."""
-    facts = [str(run.facts[key]) for key in ("scene", "path", "network") if run.facts.get(key)]
+    metadata = [str(run.metadata[key]) for key in ("scene", "path", "network") if run.metadata.get(key)]
     size = [f"{run.rows:,} readings", f"{run.duration_s:.1f} s"]
     if p_xy is not None:
         size.append(f"{np.linalg.norm(np.diff(p_xy, axis=0), axis=1).sum():.1f} m")
-    return f"{', '.join(facts) or 'run'}\n{', '.join(size)}"
+    return f"{', '.join(metadata) or 'run'}\n{', '.join(size)}"

@@ -177,7 +177,7 @@ class Scenery:
         stage, scene = open_stage(scene_file), read_scene(scene_file, check_network=False)
         shapes, links = read_shapes(stage), read_links(stage)
         moving = _links_of(links, [placed.robot.name for placed in scene.robots], run)
-        drive = scene.led_by(str(run.facts["robot"])).robot.drive if scene.others else scene.robot.drive
+        drive = scene.led_by(str(run.metadata["robot"])).robot.drive if scene.others else scene.robot.drive
         self._sides = {drive.left_wheel_joint: 0, drive.right_wheel_joint: 1}
         still = [shape for shape in shapes if shape.link not in moving]
         if not shapes:
@@ -431,7 +431,7 @@ def _links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dic
     bases = list(dict.fromkeys(link.base for link in links.values() if link.joint))
     if not bases:
         raise InputError("the scene has no robot that could move")
-    name = str(run.facts.get("robot", robots[0] if len(robots) == 1 else ""))
+    name = str(run.metadata.get("robot", robots[0] if len(robots) == 1 else ""))
     if len(robots) > 1 and name not in robots:
         raise InputError(f"the run does not say of which robot it is; the scene has {', '.join(robots)}")
     base = bases[robots.index(name)] if len(robots) == len(bases) and name in robots else bases[0]

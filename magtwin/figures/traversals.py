@@ -5,7 +5,7 @@ from magtwin.figures.evaluations import Drawing, pictured
 from magtwin.figures.pages import Section, Table
 from magtwin.figures.plots import INK, new_figure
 from magtwin.run.compare import Comparison, Traversals
-from magtwin.run.run import Facts
+from magtwin.run.run import Metadata
 
 ALIGNED = {
     "recorded": "by time from each start",
@@ -22,7 +22,7 @@ def section_of_traversals(found: Traversals, names: tuple[str, str]) -> Section:
         found: What `magtwin.run.compare.traversals` gave.
         names: What to call the two runs.
     """
-    told = [f"{name}: {_told(run.facts)}" for name, run in zip(names, (found.a, found.b), strict=True)]
+    told = [f"{name}: {_told(run.metadata)}" for name, run in zip(names, (found.a, found.b), strict=True)]
     rows = []
     for how, words in ALIGNED.items():
         comparison: Comparison = getattr(found, how)
@@ -37,10 +37,10 @@ def section_of_traversals(found: Traversals, names: tuple[str, str]) -> Section:
     )
 
 
-def _told(facts: Facts) -> str:
-    """What a run's facts say of how it was driven."""
-    words = [str(facts.get("path", "a path of its own")), f"engine {facts.get('engine', 'kinematic')}"]
-    words += [f"seed {facts['seed']}"] if "seed" in facts else ["recorded"]
+def _told(metadata: Metadata) -> str:
+    """What a run's metadata say of how it was driven."""
+    words = [str(metadata.get("path", "a path of its own")), f"engine {metadata.get('engine', 'kinematic')}"]
+    words += [f"seed {metadata['seed']}"] if "seed" in metadata else ["recorded"]
     return ", ".join(words)
 
 

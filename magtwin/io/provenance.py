@@ -1,4 +1,4 @@
-"""Provenance: a run made once more from what its facts say, and whether it is the same."""
+"""Provenance: a run made once more from what its metadata say, and whether it is the same."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
 from magtwin.report import Figure, Report
 from magtwin.run.run import COLUMNS, Run
-from magtwin.twin import in_session_of, locate, path_facts, scene_of, simulate, simulate_robots, twin_of
+from magtwin.twin import in_session_of, locate, path_metadata, scene_of, simulate, simulate_robots, twin_of
 
 CAUSES: Mapping[str, str] = {
     "magtwin": "another version of magtwin",
@@ -26,7 +26,7 @@ CAUSES: Mapping[str, str] = {
     "commands_sha256": "the commands changed",
     "replay_sha256": "the run that was driven once more changed",
 }
-"""Facts that decide a run's columns, and what it means where they differ, likeliest cause first."""
+"""Metadata that decide a run's columns, and what it means where they differ, likeliest cause first."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Repeat:
     original: Run
     again: Run
     causes: tuple[str, ...]
-    """Facts that differ and decide the columns, each with what was and what is."""
+    """Metadata that differ and decide the columns, each with what was and what is."""
     differences: tuple[Difference, ...]
     """Columns of the original that are not the same to the bit."""
 
@@ -59,7 +59,7 @@ class Repeat:
         return not self.differences
 
     def report(self, title: str) -> Report:
-        """Columns that differ, and the verdict; the facts say what changed since."""
+        """Columns that differ, and the verdict; the metadata say what changed since."""
         figures = []
         for d in self.differences:
             note = f"{d.rows} of {self.original.rows} rows, from row {d.first + 1} on"
@@ -88,15 +88,15 @@ def repeat_of(file: str | FilePath, scene: str | FilePath | None = None) -> Repe
 
 
 def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None) -> Repeat:
-    """Make a run once more, from what its facts say, and compare.
+    """Make a run once more, from what its metadata say, and compare.
 
     Args:
         run: A run that `simulate`, `simulate_many` or a command made.
-        scene: Where its scene lies now; None looks where the facts say.
-        near: The run's own file: files that its facts name are looked for in its folder too.
+        scene: Where its scene lies now; None looks where the metadata say.
+        near: The run's own file: files that its metadata name are looked for in its folder too.
 
     Raises:
-        InputError: The facts do not say enough, a file is not there, or the run is of something that was
+        InputError: The metadata do not say enough, a file is not there, or the run is of something that was
             made in Python and is no longer at hand.
     """
     return _compared(run, made_again(run, scene, near=near))
@@ -111,7 +111,7 @@ def made_again(
     seed: int | None = None,
     progress: Callable[[int, int, str], Any] | None = None,
 ) -> Run:
-    """A run made once more, from what its facts say; or what it drove, driven by another engine.
+    """A run made once more, from what its metadata say; or what it drove, driven by another engine.
 
     Args:
         run: As for `repeat`.
@@ -124,32 +124,32 @@ def made_again(
     Raises:
         InputError: As for `repeat`; or the engine is not known or not installed.
     """
-    facts = run.facts
-    if "seed" not in facts and seed is None:
+    metadata = run.metadata
+    if "seed" not in metadata and seed is None:
         raise InputError(
             "the run does not say its seed, so it cannot be repeated; was it recorded elsewhere?"
         )
     twin = twin_of(run, scene, near=near, check=False)
-    twin = in_session_of(twin, facts)
+    twin = in_session_of(twin, metadata)
     what = _driven(run, near)
     try:
-        seed, rate = int(facts["seed"]) if seed is None else seed, float(facts["rate_hz"])
-        asked = float(facts["asked_duration_s"]) if "asked_duration_s" in facts else None
-        speed = float(facts.get("speed_m_s", 0.2))
+        seed, rate = int(metadata["seed"]) if seed is None else seed, float(metadata["rate_hz"])
+        asked = float(metadata["asked_duration_s"]) if "asked_duration_s" in metadata else None
+        speed = float(metadata.get("speed_m_s", 0.2))
     except (KeyError, ValueError) as error:
-        raise InputError(f"the facts of the run do not say how it was made: {error}") from error
-    moved_by: Any = engine or facts.get("engine", "kinematic")
+        raise InputError(f"the metadata of the run do not say how it was made: {error}") from error
+    moved_by: Any = engine or metadata.get("engine", "kinematic")
     options: dict[str, Any] = {
-        "lidar": facts.get("lidar", "schedule"),
-        "outside": facts.get("outside", "nan"),
+        "lidar": metadata.get("lidar", "schedule"),
+        "outside": metadata.get("outside", "nan"),
     }
     if isinstance(what, Path):
-        options["controller"] = facts.get("controller", "follower")
+        options["controller"] = metadata.get("controller", "follower")
     if engine is None and moved_by not in ("kinematic", "newton", "replay"):
         raise InputError(
             f"the run was moved by an engine of its maker's own, {moved_by!r}, which is not here"
         )
-    name = str(facts.get("robot", ""))
+    name = str(metadata.get("robot", ""))
     if engine is None and name and twin.scene.others:  # beside others, which drive what the scene says
         return simulate_robots(
             twin,
@@ -177,11 +177,13 @@ def made_again(
 
 def _compared(run: Run, again: Run) -> Repeat:
     """A run, and what came out when it was made once more."""
-    causes = [f"the run was made from another: {run.facts['derived']}"] if "derived" in run.facts else []
+    causes = (
+        [f"the run was made from another: {run.metadata['derived']}"] if "derived" in run.metadata else []
+    )
     causes += [
-        f"{why}: {fact} was {run.facts.get(fact, 'none')}, is {again.facts.get(fact, 'none')}"
+        f"{why}: {fact} was {run.metadata.get(fact, 'none')}, is {again.metadata.get(fact, 'none')}"
         for fact, why in CAUSES.items()
-        if run.facts.get(fact) != again.facts.get(fact)
+        if run.metadata.get(fact) != again.metadata.get(fact)
     ]
     return Repeat(run, again, tuple(causes), differences(run, again))
 
@@ -205,8 +207,8 @@ def map_of(
 
     Args:
         run: The run.
-        scene: Where its scene lies now; None looks where the facts say.
-        near: The run's own file: files that its facts name are looked for in its folder too.
+        scene: Where its scene lies now; None looks where the metadata say.
+        near: The run's own file: files that its metadata name are looked for in its folder too.
 
     Raises:
         InputError: The scene is not there, or its map is another.
@@ -216,7 +218,7 @@ def map_of(
     from magtwin.usd.maps import load_map
 
     layer = read_scene(scene_of(run, scene, near=near), check_network=False).map_layer
-    if "map_sha256" in run.facts and run.facts["map_sha256"] != sha256(layer):
+    if "map_sha256" in run.metadata and run.metadata["map_sha256"] != sha256(layer):
         raise InputError(f"{layer}: is not the map that the run read")
     return load_map(layer)
 
@@ -227,7 +229,7 @@ def planned_of(run: Run, *, near: str | FilePath | None = None) -> NDArray[np.fl
         path = _driven(run, near)
     except InputError:
         return None
-    if not isinstance(path, Path) or run.facts.get("path_sha256") != path_facts(path)["path_sha256"]:
+    if not isinstance(path, Path) or run.metadata.get("path_sha256") != path_metadata(path)["path_sha256"]:
         return None
     return path.p_xy
 
@@ -264,18 +266,18 @@ def _driven(run: Run, near: str | FilePath | None) -> Any:
     """What was driven: a path, commands, a run, or "random" where a driver went where they liked."""
     from magtwin.sim.motion.commands import read_commands
 
-    facts = run.facts
+    metadata = run.metadata
     for kind, read in (("path", read_path_csv), ("commands", read_commands), ("replay", _read_run)):
-        if f"{kind}_file" in facts:
-            file = str(facts[f"{kind}_file"])
+        if f"{kind}_file" in metadata:
+            file = str(metadata[f"{kind}_file"])
             place = locate(file, near)
             if place is None:
                 raise InputError(f"{file}: the file that the run drove is not there; put it back")
             return _placed(read(place), run)
-    name = str(facts.get("path", ""))
-    if "replay_sha256" in facts or "commands_sha256" in facts:
+    name = str(metadata.get("path", ""))
+    if "replay_sha256" in metadata or "commands_sha256" in metadata:
         raise InputError(
-            f"the run drove {name!r}, which came from no file; it cannot be repeated from its facts"
+            f"the run drove {name!r}, which came from no file; it cannot be repeated from its metadata"
         )
     if name == "random":
         return name
@@ -285,8 +287,8 @@ def _driven(run: Run, near: str | FilePath | None) -> Any:
 
 
 def _placed(driven: Any, run: Run) -> Any:
-    """A path as the run drove it: scaled and moved as its facts tell."""
-    placing = str(run.facts.get("path_placing", ""))
+    """A path as the run drove it: scaled and moved as its metadata tell."""
+    placing = str(run.metadata.get("path_placing", ""))
     if not placing or not isinstance(driven, Path):
         return driven
     try:

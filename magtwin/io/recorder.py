@@ -32,7 +32,7 @@ class Sink(Protocol):
     """What takes a run as it comes, such as RrdWriter, ParquetParts, BagWriter."""
 
     def append(self, run: Run) -> None:
-        """Take the next rows, with the facts; whatever happens, they can be read from then on."""
+        """Take the next rows, with the metadata; whatever happens, they can be read from then on."""
 
     def close(self) -> None:
         """Complete what was written, and give it its name: no rows come any more."""
@@ -62,7 +62,7 @@ class Recorder:
         """Rows appended so far."""
 
     def append(self, run: Run) -> None:
-        """The next rows, a slice of the run: its columns and facts.
+        """The next rows, a slice of the run: its columns and metadata.
 
         Raises:
             InputError: A sink cannot take them; the text says which and why.
@@ -88,7 +88,7 @@ class Recorder:
             return
         first = waiting[0]
         columns = {name: np.concatenate([run[name] for run in waiting]) for name in first}
-        block = Run(columns, first.facts, first.specs)
+        block = Run(columns, first.metadata, first.specs)
         for file in self._files:
             file.append(block)
 

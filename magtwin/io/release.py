@@ -74,7 +74,7 @@ def read_release(path: str | os.PathLike[str]) -> Run:
     Returns:
         A Run with b_measured_nt, b_map_nt, mocap_p, mocap_q_xyzw (z is 0: it is not recorded), p_world_base,
         q_world_base_xyzw, yaw, odom_v, odom_w, imu_q_xyzw, imu_w, imu_a, battery_v, battery_fraction,
-        lidar_on. Its facts say how many frames there were, and whether the end was missing.
+        lidar_on. Its metadata say how many frames there were, and whether the end was missing.
 
     Raises:
         InputError: The file is missing or no such list, a frame is not as above (the text names it and
@@ -106,9 +106,9 @@ def read_release(path: str | os.PathLike[str]) -> Run:
             "the magnetometer's node running?"
         )
     rows = np.frombuffer(table, float).reshape(-1, _WIDTH)
-    facts: dict[str, Any] = {"recording": path.name, "recording_sha256": sha256(path), "frames": frames}
-    facts |= {"start_s": float(rows[0, 0]), "recording_end": reader.end, "truth": "motion capture"}
-    return Run(_columns(rows), facts)
+    metadata: dict[str, Any] = {"recording": path.name, "recording_sha256": sha256(path), "frames": frames}
+    metadata |= {"start_s": float(rows[0, 0]), "recording_end": reader.end, "truth": "motion capture"}
+    return Run(_columns(rows), metadata)
 
 
 def _columns(rows: NDArray[np.float64]) -> dict[str, NDArray[Any]]:

@@ -25,8 +25,8 @@ from magtwin.errors import InputError, find
 from magtwin.files import check_free, existing, output
 from magtwin.run.arrow import (
     FACTS,
-    facts_from_json,
-    facts_to_json,
+    metadata_from_json,
+    metadata_to_json,
     run_of,
     said_of,
     spec_said,
@@ -64,7 +64,7 @@ def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | N
     """The run that `write_parquet` wrote, to the last bit; or that a folder of parts holds.
 
     A file that another program wrote is read too where it has the column names: without the metadata
-    it just brings no facts.
+    it just brings no metadata.
 
     Args:
         path: The file; or the folder that a `ParquetParts` left when its program ended before its time.
@@ -208,9 +208,9 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
         InputError: As for `write_parquet`.
     """
     table = table_of(run)
-    lines = [f"# {_ABOUT} run: facts, then columns by name with unit, frame and meaning, in JSON"]
+    lines = [f"# {_ABOUT} run: metadata, then columns by name with unit, frame and meaning, in JSON"]
     lines.append(f"# rows {table.num_rows}")
-    lines.append(f"# facts {_line_safe(facts_to_json(run))}")
+    lines.append(f"# facts {_line_safe(metadata_to_json(run))}")
     for field in table.schema:
         said = {key.decode(): text.decode() for key, text in field.metadata.items()}
         lines.append(f"# column {field.name} {_line_safe(_json({'type': str(field.type), **said}))}")
@@ -245,7 +245,7 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
         about, names, skipped = _csv_head(file, path)
         file.seek(-1, os.SEEK_END)
         cut = file.read(1) != b"\n"
-    rows, facts, said = _csv_about(about, path)
+    rows, metadata, said = _csv_about(about, path)
     if columns:
         names = _renamed(names, columns, path)
     types = {name: pa.bool_() if _is_flag(name) else pa.float64() for name in names}
@@ -277,7 +277,7 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
             "edited; copy it again, or take that line out"
         )
     fields = [f.with_metadata(said.get(f.name) or None) for f in table.schema]
-    table = table.cast(pa.schema(fields, metadata={FACTS: facts}))
+    table = table.cast(pa.schema(fields, metadata={FACTS: metadata}))
     return run_of(_on_the_floor(table) if columns else table, path)
 
 
@@ -321,18 +321,18 @@ def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str]
 
 
 def _csv_about(lines: list[str], path: Path) -> tuple[str, str, dict[str, dict[str, str]]]:
-    """What a CSV says of the number of its rows, "" if nothing, its facts in JSON, and of its columns."""
-    rows, facts, said = "", "{}", {}
+    """What a CSV says of the number of its rows, "" if nothing, its metadata in JSON, and of its columns."""
+    rows, metadata, said = "", "{}", {}
     for number, line in enumerate(lines, 1):
         kind, _, rest = line[1:].strip().partition(" ")
         if kind == "rows":
             rows = rest
         elif kind == "facts":
-            facts = rest
+            metadata = rest
         elif kind == "column":
             name, _, text = rest.partition(" ")
             said[name] = _texts(text, f"{path}:{number}")
-    return rows, facts, said
+    return rows, metadata, said
 
 
 def _texts(text: str, where: str) -> dict[str, str]:
@@ -364,7 +364,7 @@ def _is_flag(name: str) -> bool:
 
 
 def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write a run as npz: an array a column, and `magtwin`, a text in JSON with facts, units and frames.
+    """Write a run as npz: an array a column, and `magtwin`, a text in JSON with metadata, units and frames.
 
     The arrays are not compressed, so that they are read as fast as the disk is; nothing is pickled. The
     same run gives the same bytes.
@@ -384,7 +384,7 @@ def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
     columns = {
         name: {**said_of(run.spec(name), name), "parts": ",".join(run.spec(name).parts)} for name in run
     }
-    about = _json({"facts": json.loads(facts_to_json(run)), "columns": columns})
+    about = _json({"facts": json.loads(metadata_to_json(run)), "columns": columns})
     with output(path, force=force) as aside, open(aside, "wb") as file:
         np.savez(file, allow_pickle=False, **{_ABOUT: np.array(about)}, **run.columns)
 
@@ -410,7 +410,7 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
             arrays = {name.removesuffix(".npy"): _array(archive, name, path) for name in names}
     except (zipfile.BadZipFile, EOFError, OSError, NotImplementedError, RuntimeError) as error:
         raise InputError(f"{path}: not an npz file, damaged, or cut short ({error})") from error
-    facts, said = _npz_about(arrays.pop(_ABOUT, np.array("{}")), path)
+    metadata, said = _npz_about(arrays.pop(_ABOUT, np.array("{}")), path)
     specs = {
         name: spec_said(told, tuple(filter(None, told.get("parts", "").split(","))))
         for name, told in said.items()
@@ -423,7 +423,7 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
                 f"of shape {values.shape}"
             )
     try:
-        run = Run(arrays, facts, specs)
+        run = Run(arrays, metadata, specs)
     except (InputError, TypeError) as error:
         raise InputError(f"{path}: {error}") from error
     check_clock(run, str(path))
@@ -452,11 +452,11 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path) -> NDArray[Any]:
 
 
 def _npz_about(about: NDArray[Any], path: Path) -> tuple[Any, dict[str, dict[str, str]]]:
-    """Facts, and what is said of columns."""
+    """Metadata, and what is said of columns."""
     try:
         told = json.loads(str(about))
-        facts, columns = told.get("facts", {}), told.get("columns", {})
+        metadata, columns = told.get("facts", {}), told.get("columns", {})
         said = {str(name): _texts(json.dumps(text), str(path)) for name, text in columns.items()}
     except (ValueError, AttributeError, RecursionError) as error:
         raise InputError(f"{path}: array {_ABOUT!r} tells nothing of a run ({error})") from error
-    return facts_from_json(json.dumps(facts), path), said
+    return metadata_from_json(json.dumps(metadata), path), said

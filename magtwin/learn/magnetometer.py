@@ -46,8 +46,8 @@ class NeuralMagnetometer(Summarized):
 
         Args:
             net: The predictor.
-            name: Where it comes from, for the facts of a run.
-            sha256: Checksum of its file, for the facts of a run.
+            name: Where it comes from, for the metadata of a run.
+            sha256: Checksum of its file, for the metadata of a run.
         """
         self.net, self.name, self.sha256 = net, name, sha256
 
@@ -91,32 +91,33 @@ class NeuralMagnetometer(Summarized):
         Raises:
             InputError: Its file tells figures that cannot be.
         """
-        told = [self.net.facts.get(name) for name in ("residual_offset_sd_nt", "residual_time_s")]
+        told = [self.net.metadata.get(name) for name in ("residual_offset_sd_nt", "residual_time_s")]
         if None in told or (self.net.kind == "mlp" and math.isnan(self.residual_sd_nt)):
             return None
         figures = [float(one) if isinstance(one, int | float) else math.nan for one in told]
         if not all(0 <= one < math.inf for one in figures):
             raise InputError(
-                f"{self.name}: residual_offset_sd_nt and residual_time_s of its facts must be finite and not "
+                f"{self.name}: residual_offset_sd_nt and residual_time_s of its metadata must be finite and "
+                f"not "
                 f"below 0, got {told[0]!r} and {told[1]!r}"
             )
         return ModelError(*figures)
 
     @property
-    def facts(self) -> Mapping[str, Fact]:
-        """Facts of a run about its network: file, checksum, layers, parameters; its kind if no perceptron.
+    def metadata(self) -> Mapping[str, Fact]:
+        """Metadata of a run about its network: file, checksum, layers, parameters; its kind if no perceptron.
 
         The mean training label too, where the weights have it.
         """
-        facts: dict[str, Fact] = {
+        metadata: dict[str, Fact] = {
             "network": self.name,
             "network_sha256": self.sha256,
             "network_layers": self.net.layers_text,
             "network_parameters": self.net.parameters_count,
         }
-        if "label_mean_nt" in self.net.facts:
-            facts["network_label_mean_nt"] = float(self.net.facts["label_mean_nt"])
-        return facts if self.net.kind == "mlp" else facts | {"network_kind": self.net.kind}
+        if "label_mean_nt" in self.net.metadata:
+            metadata["network_label_mean_nt"] = float(self.net.metadata["label_mean_nt"])
+        return metadata if self.net.kind == "mlp" else metadata | {"network_kind": self.net.kind}
 
     def disturbance_nt(self, run: Run) -> Array:
         """Disturbance at each reading of a run [nT], shape (N,).

@@ -325,8 +325,8 @@ def compensate_run(run: Run, model: TollesLawson) -> tuple[Run, Report]:
         than="no compensation",
         judged_on="the spread of measured less map in this run",
     )
-    facts = {"tolles_lawson": " ".join(model.terms)}
-    return compensated.with_facts(**facts), Report("Compensation", figures, told, line)
+    metadata = {"tolles_lawson": " ".join(model.terms)}
+    return compensated.with_metadata(**metadata), Report("Compensation", figures, told, line)
 
 
 def fit_platform(

@@ -131,7 +131,7 @@ class Player:
             InputError: The run has none of them.
         """
         self._run = run
-        who = sender_for(twin, units, run.facts.get("rate_hz"))
+        who = sender_for(twin, units, run.metadata.get("rate_hz"))
         self._stream = Stream(run, who, None, topics=(*READ, *SAMPLED.values()), whole=True)
         said = [t for t in self._stream.topics if bus.knows(t.kind) and (not topics or t.name in topics)]
         if not said:

@@ -4,7 +4,7 @@ A vector column of a Run becomes one table column a part (`p_world_base_x`, `p_w
 a column of lists: pandas then holds plain float64 (lists would be Python objects), SQL in DuckDB and
 expressions in polars need no indexing, one part can be read alone, and byte-stream-split coding works.
 What a flat table cannot say stands in the metadata: on every Arrow field `column`, `part`, `unit`,
-`frame`, `doc` and `interpolation`; on the table `magtwin_facts`, the Run's facts in JSON.
+`frame`, `doc` and `interpolation`; on the table `magtwin_facts`, the Run's metadata in JSON.
 """
 
 import json
@@ -39,7 +39,7 @@ def table_of(run: Run) -> pa.Table:
         )
         for name, (column, part, values) in flat.items()
     ]
-    schema = pa.schema(fields, metadata={FACTS: facts_to_json(run)})
+    schema = pa.schema(fields, metadata={FACTS: metadata_to_json(run)})
     return pa.Table.from_arrays([pa.array(values) for _, _, values in flat.values()], schema=schema)
 
 
@@ -47,7 +47,7 @@ def run_of(table: pa.Table, path: Path) -> Run:
     """The run that a table holds; what another program wrote too, where it has the column names.
 
     Args:
-        table: With the metadata of `table_of`, or without, and then without facts.
+        table: With the metadata of `table_of`, or without, and then without metadata.
         path: Where it was read, for refusals.
 
     Raises:
@@ -66,7 +66,7 @@ def run_of(table: pa.Table, path: Path) -> Run:
         elif "column" in said:
             named = tuple(_metadata(table, member)[b"part"].decode() for member in members) if vector else ()
             specs[name] = spec_said(said, named)
-    run = Run(columns, facts_from_json((table.schema.metadata or {}).get(FACTS, b"{}"), path), specs)
+    run = Run(columns, metadata_from_json((table.schema.metadata or {}).get(FACTS, b"{}"), path), specs)
     check_clock(run, str(path))
     return run
 
@@ -85,36 +85,36 @@ def spec_said(said: dict[str, str], parts: tuple[str, ...]) -> Column:
     return Column(unit, frame, doc, len(parts) or 1, parts, rule if rule in RULES else "linear")
 
 
-def facts_to_json(run: Run) -> str:
-    """The facts of a run as a JSON object.
+def metadata_to_json(run: Run) -> str:
+    """The metadata of a run as a JSON object.
 
     Raises:
         InputError: One is no text, number or truth value.
     """
-    for key, value in run.facts.items():
+    for key, value in run.metadata.items():
         if not isinstance(value, str | int | float | bool):
             raise InputError(f"fact {key!r} must be a text, a number, or true or false, got {value!r}")
-    return json.dumps(dict(run.facts), ensure_ascii=False)
+    return json.dumps(dict(run.metadata), ensure_ascii=False)
 
 
-def facts_from_json(text: str | bytes, path: Path) -> dict[str, str | int | float | bool]:
-    """The facts that `facts_to_json` wrote.
+def metadata_from_json(text: str | bytes, path: Path) -> dict[str, str | int | float | bool]:
+    """The metadata that `metadata_to_json` wrote.
 
     Raises:
         InputError: They are not JSON, or no object of texts, numbers and truth values.
     """
     try:
-        facts = json.loads(text)
+        metadata = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: metadata {FACTS.decode()!r} is not JSON: {error}") from error
-    if not isinstance(facts, dict):
+    if not isinstance(metadata, dict):
         raise InputError(f"{path}: metadata {FACTS.decode()!r} must be an object, got {text[:40]!r}")
-    for key, value in facts.items():
+    for key, value in metadata.items():
         if not isinstance(value, str | int | float | bool):
             raise InputError(
                 f"{path}: fact {key!r} must be a text, a number, or true or false, got {value!r}"
             )
-    return facts
+    return metadata
 
 
 def _metadata(table: pa.Table, name: str) -> dict[bytes, bytes]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure as Picture
 
-Facts = Mapping[str, str | int | float | bool]
+Metadata = Mapping[str, str | int | float | bool]
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ as far from the mean as the network was from recordings that it never saw.
 
 @dataclass(frozen=True, repr=False)
 class Run(Summarized, Mapping[str, NDArray[Any]]):
-    """A table of equally long columns, and the facts under which it came about.
+    """A table of equally long columns, and the metadata under which it came about.
 
     A mapping from column name to array: `run["b_total_nt"]` has shape (N,), `run["p_world_base"]`
     has shape (N, 3). `bool` columns have dtype bool, all others float64. Runs are not changed in
@@ -147,7 +147,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
     columns: Mapping[str, NDArray[Any]]
     """Arrays by column name, in the order of the table; all (N,) or (N, width)."""
 
-    facts: Facts = field(default_factory=dict)
+    metadata: Metadata = field(default_factory=dict)
     """What produced the run: scene, path, seed, network, map, versions."""
 
     specs: Mapping[str, Column] = field(default_factory=dict)
@@ -159,7 +159,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         if len(set(rows.values())) > 1:
             raise InputError(f"columns of a Run must be equally long, got {rows}")
         object.__setattr__(self, "columns", MappingProxyType(arrays))
-        object.__setattr__(self, "facts", MappingProxyType(dict(self.facts)))
+        object.__setattr__(self, "metadata", MappingProxyType(dict(self.metadata)))
         own = {name: spec for name, spec in self.specs.items() if name in arrays and name not in COLUMNS}
         for name, spec in own.items():
             parts = arrays[name].shape[1] if arrays[name].ndim == 2 else 0
@@ -209,19 +209,19 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
 
     def with_columns(self, **columns: NDArray[Any]) -> "Run":
         """This run with columns added, or replaced in their place."""
-        return Run({**self.columns, **columns}, self.facts, self.specs)
+        return Run({**self.columns, **columns}, self.metadata, self.specs)
 
-    def with_facts(self, **facts: str | int | float | bool) -> "Run":
-        """This run with facts added or replaced."""
-        return Run(self.columns, {**self.facts, **facts}, self.specs)
+    def with_metadata(self, **metadata: str | int | float | bool) -> "Run":
+        """This run with metadata added or replaced."""
+        return Run(self.columns, {**self.metadata, **metadata}, self.specs)
 
     def with_specs(self, **specs: Column) -> "Run":
         """This run with columns of the user's own described."""
-        return Run(self.columns, self.facts, {**self.specs, **specs})
+        return Run(self.columns, self.metadata, {**self.specs, **specs})
 
     def take(self, rows: "slice | NDArray[Any]") -> "Run":
         """Some of the rows: a slice, indices, or a mask of shape (N,)."""
-        return Run({name: values[rows] for name, values in self.items()}, self.facts, self.specs)
+        return Run({name: values[rows] for name, values in self.items()}, self.metadata, self.specs)
 
     def select(self, *names: str) -> "Run":
         """The columns of these names, in this order, behind the clock `t`, which always stays.
@@ -301,7 +301,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
     def join(self, other: "Run", suffix: str = "_2") -> "Run":
         """The columns of another run beside this one's, causally on this one's clock.
 
-        Each row gets the latest that the other knew by then. Facts of the other get the suffix too.
+        Each row gets the latest that the other knew by then. Metadata of the other get the suffix too.
 
         Args:
             other: A run that begins no later, and ends no more than one of its own steps earlier; see
@@ -326,12 +326,12 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         if twice := sorted(named.keys() & self.columns.keys()):
             raise InputError(f"column {twice[0]!r} is in both runs; give another suffix")
         specs = {**self.specs, **{f"{name}{suffix}": other.spec(name) for name in held}}
-        facts = {**{f"{key}{suffix}": value for key, value in other.facts.items()}, **self.facts}
-        return Run({**self.columns, **named}, facts, specs)._derived(f"join({suffix})")
+        metadata = {**{f"{key}{suffix}": value for key, value in other.metadata.items()}, **self.metadata}
+        return Run({**self.columns, **named}, metadata, specs)._derived(f"join({suffix})")
 
     @staticmethod
     def concat(runs: "Sequence[Run]", *, offset: bool = False) -> "Run":
-        """Runs one after the other, as one; facts in which they differ are left out.
+        """Runs one after the other, as one; metadata in which they differ are left out.
 
         Args:
             runs: At least one, all of the same columns.
@@ -367,7 +367,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
             clocks.append(t)
         columns = {name: np.concatenate([run[name] for run in runs]) for name in first}
         columns["t"] = np.concatenate(clocks)
-        shared = {k: v for k, v in first.facts.items() if all(r.facts.get(k) == v for r in runs)}
+        shared = {k: v for k, v in first.metadata.items() if all(r.metadata.get(k) == v for r in runs)}
         return Run(columns, shared, first.specs)._derived(f"concat({len(runs)} runs)")
 
     def flat(self) -> dict[str, NDArray[Any]]:
@@ -398,8 +398,8 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
     def to_pandas(self) -> "pd.DataFrame":
         """A DataFrame with the columns of `flat`, one row a reading.
 
-        `attrs["units"]` and `attrs["frames"]` give the unit and the frame of every column, `attrs["facts"]`
-        the run's facts.
+        `attrs["units"]` and `attrs["frames"]` give the unit and the frame of every column,
+        `attrs["metadata"]` the run's metadata.
 
         Raises:
             InputError: pandas is not installed, or a column cannot stand in a table.
@@ -409,7 +409,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         frame.attrs = {
             "units": {name: spec.unit for name, spec in specs.items()},
             "frames": {name: spec.frame for name, spec in specs.items()},
-            "facts": dict(self.facts),
+            "metadata": dict(self.metadata),
         }
         return frame
 
@@ -425,7 +425,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         """A Dataset along the coordinate `t` [s]; vectors keep a second dimension of named parts.
 
         The dimensions of parts are called after them (`x_y_z`, `left_right`); `units`, `frame` and
-        `long_name` are attributes of each variable, the run's facts those of the dataset.
+        `long_name` are attributes of each variable, the run's metadata those of the dataset.
 
         Raises:
             InputError: xarray is not installed, or the run has no column `t`.
@@ -443,7 +443,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
             variables[name] = (dims, values, {key: text for key, text in attrs.items() if text})
         self["t"]  # refuses
         coords["t"] = variables.pop("t")
-        return xarray.Dataset(variables, coords, dict(self.facts))
+        return xarray.Dataset(variables, coords, dict(self.metadata))
 
     def plot(self, anomaly_map: Any = None) -> "Picture":
         """Draw the path over the floor and the readings against time; see `magtwin.plot`.
@@ -484,7 +484,7 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
             Figure(n, int(self[n].sum()), "readings", None, COLUMNS[n].doc if n in COLUMNS else "")
             for n in raised
         ]
-        return Report(title, tuple(figures), dict(self.facts), self._verdict())
+        return Report(title, tuple(figures), dict(self.metadata), self._verdict())
 
     def _verdict(self) -> str:
         """How well a network predicted the exact field of a simulated run; "" where none did."""
@@ -495,21 +495,23 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
     def add_to(self, tally: Tally) -> None:
         """Add the errors of a simulated run's network against the exact field, where it has both."""
         wanted = {"b_sd_nt", "b_total_nt", "b_map_nt", "b_truth_nt"}
-        if self.facts.get("magnetometer") != "neural" or not wanted <= set(self):
+        if self.metadata.get("magnetometer") != "neural" or not wanted <= set(self):
             return
-        truth, mean = self["b_truth_nt"], float(self.facts.get("network_label_mean_nt", 0.0))
+        truth, mean = self["b_truth_nt"], float(self.metadata.get("network_label_mean_nt", 0.0))
         tally.than = "the map plus the mean training label" if mean else "the map alone"
         tally.add(self["b_total_nt"] - truth, self["b_map_nt"] + mean - truth, self["b_sd_nt"])
 
     def _derived(self, step: str, columns: Mapping[str, NDArray[Any]] | None = None) -> "Run":
         """What a step made of this run, and the fact that it did."""
-        told = "; ".join(text for text in (str(self.facts.get("derived", "")), step) if text)
-        return Run(self.columns if columns is None else columns, {**self.facts, "derived": told}, self.specs)
+        told = "; ".join(text for text in (str(self.metadata.get("derived", "")), step) if text)
+        return Run(
+            self.columns if columns is None else columns, {**self.metadata, "derived": told}, self.specs
+        )
 
     def _summary(self) -> Summary:
         return run_summary(
             self.columns,
-            self.facts,
+            self.metadata,
             [(name, *(getattr(self.spec(name), part) for part in ("unit", "frame", "doc"))) for name in self],
         )
 

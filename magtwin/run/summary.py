@@ -11,19 +11,21 @@ from magtwin.summary import Summary, listed, rectangle, span
 Columns = Mapping[str, NDArray[Any]]
 
 
-def run_summary(columns: Columns, facts: Mapping[str, Any], described: Sequence[tuple[str, ...]]) -> Summary:
+def run_summary(
+    columns: Columns, metadata: Mapping[str, Any], described: Sequence[tuple[str, ...]]
+) -> Summary:
     """The summary of a run.
 
     Args:
         columns: Arrays by column name, shape (N,) or (N, width).
-        facts: What produced the run.
+        metadata: What produced the run.
         described: Name, unit, frame and meaning of each column.
     """
     flags = _flags(columns)
     return Summary(
         _title(columns),
         (
-            ("from", _origin(facts)),
+            ("from", _origin(metadata)),
             ("path", _driven(columns)),
             ("field", _field_range(columns)),
             ("flags" if flags else "columns", flags or listed(columns)),
@@ -45,15 +47,17 @@ def _title(columns: Columns) -> str:
     return f"{size}, {float(t[-1] - t[0]):.4g} s{rate}"
 
 
-def _origin(facts: Mapping[str, Any]) -> str:
-    """Scene, path, robot and seed of a run, as far as its facts name them."""
+def _origin(metadata: Mapping[str, Any]) -> str:
+    """Scene, path, robot and seed of a run, as far as its metadata name them."""
     parts = [
-        f"{name} {facts[name]}" for name in ("scene", "path", "robot", "seed", "session") if name in facts
+        f"{name} {metadata[name]}"
+        for name in ("scene", "path", "robot", "seed", "session")
+        if name in metadata
     ]
-    if "magnetometer" in facts:
-        parts.append(f"{facts['magnetometer']} magnetometer")
-        if "network" in facts:
-            parts[-1] += f" ({facts['network']})"
+    if "magnetometer" in metadata:
+        parts.append(f"{metadata['magnetometer']} magnetometer")
+        if "network" in metadata:
+            parts[-1] += f" ({metadata['network']})"
     return ", ".join(parts)
 
 

@@ -77,7 +77,7 @@ class ExactField:
         return bool(np.any(np.abs(values - values[:1]) > CONSTANT_NT))
 
     @property
-    def facts(self) -> Mapping[str, str]:
+    def metadata(self) -> Mapping[str, str]:
         """What a run is to say of its truth; empty where Earth and sources make it."""
         if self.of != "map":
             return {}

@@ -108,7 +108,7 @@ def offset_generator(
     """Source of a session's part of the model error: the same session, the same part.
 
     Args:
-        session: Facts of the session, `session_seed` and `session`; without them each seed is a session of
+        session: Metadata of the session, `session_seed` and `session`; without them each seed is a session of
             its own.
         seed: Seed of the run.
         which: Place of the robot in a scene of several, from 0.

@@ -163,8 +163,8 @@ def read_notes(asset: str | os.PathLike[str]) -> tuple[str, ...]:
         InputError: The file is missing or is not USD.
     """
     stage = open_stage(asset)  # held in a name: a layer does not outlive its stage
-    facts = stage.GetRootLayer().customLayerData.get("magtwin", {})
-    return tuple(facts.get("notes", ()))
+    metadata = stage.GetRootLayer().customLayerData.get("magtwin", {})
+    return tuple(metadata.get("notes", ()))
 
 
 def _write(

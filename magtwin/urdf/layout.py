@@ -263,8 +263,8 @@ def _describe(layer: Sdf.Layer, flat: Sdf.Layer, name: str, robot: str) -> None:
         if name in ("instances", "materials"):
             root.specifier, root.typeName = Sdf.SpecifierDef, "Scope"
     layer.documentation = f"{robot}: {ROLES[name]}."
-    facts = {"interface": Path(flat.realPath).name} if name == "base" else {}
-    layer.customLayerData = {"creator": "magtwin", **({"magtwin": facts} if facts else {})}
+    metadata = {"interface": Path(flat.realPath).name} if name == "base" else {}
+    layer.customLayerData = {"creator": "magtwin", **({"magtwin": metadata} if metadata else {})}
 
 
 def _compose(parts: dict[str, Sdf.Layer], robot: Sdf.PrimSpec) -> None:

@@ -138,14 +138,14 @@ class ConversionReport:
             Figure("losses", len(self.losses)),
             Figure("doubts about the description", len(self.lint)),
         ]
-        facts = {
+        metadata = {
             "source": self.source,
             "sha256": self.source_sha256,
             "losses": list(self.losses),
             "notes": list(self.notes),
             "lint": list(self.lint),
         }
-        return Report(f"{self.robot}: {self.source} -> {self.stage}", tuple(figures), facts)
+        return Report(f"{self.robot}: {self.source} -> {self.stage}", tuple(figures), metadata)
 
     def refuse_losses(self) -> None:
         """Go on only if nothing was lost.

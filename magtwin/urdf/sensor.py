@@ -151,7 +151,7 @@ def _define_imu(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd
     )
     if not prims_with(robot, "imu"):
         return define_imu(site.stage, site.path, spec)
-    prim = _facts(
+    prim = _metadata(
         site.define(), rateHz=rate, gyroNoiseStd=spec.gyro_noise_std, accelNoiseStd=spec.accel_noise_std
     )
     define_isaac_imu(prim, rate)
@@ -166,7 +166,7 @@ def _define_magnetometer(tags: Tags, sensor: Element, site: Site, robot: Usd.Pri
         tags.description.note(f"{_say(sensor)}: its noise is taken as tesla, {noise:.6g} nT")
     if prims_with(robot, "magnetometer"):
         tags.description.note(f"{_say(sensor)} is a magnetometer more than magtwin simulates")
-        return _facts(site.define(), rateHz=rate, noiseStdNt=noise)
+        return _metadata(site.define(), rateHz=rate, noiseStdNt=noise)
     density = noise / math.sqrt(rate / 2)
     spec = MagnetometerSpec(**site.mount, rate_hz=rate, noise_density_nt=density, resolution_nt=0.0)
     return define_magnetometer(site.stage, site.path, spec)
@@ -208,7 +208,7 @@ def _define_lidar(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> U
         _define_fixed(lidar, across, up)
     _write(lidar, "rangeResolutionM", Sdf.ValueTypeNames.Float, step)
     _write(lidar, "rangeAccuracyM", Sdf.ValueTypeNames.Float, noise)
-    _facts(
+    _metadata(
         prim,
         rateHz=rate,
         noiseStdM=noise,
@@ -288,7 +288,7 @@ def _define_camera(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> 
     camera.CreateClippingRangeAttr(Gf.Vec2f(near, far))
     kind = (sensor.get("type") or "").lower()
     _define_image(prim, camera, (width, height), depth=kind != "camera", colour=not kind.startswith("depth"))
-    return _facts(
+    return _metadata(
         prim,
         type=kind,
         rateHz=_rate(tags, sensor, 30.0),
@@ -417,9 +417,9 @@ def _pose(tags: Tags, element: Element) -> NDArray[np.float64]:
     return T
 
 
-def _facts(prim: Usd.Prim, **facts: object) -> Usd.Prim:
+def _metadata(prim: Usd.Prim, **metadata: object) -> Usd.Prim:
     """Keep figures that no schema has on a sensor's prim."""
-    for name, value in facts.items():
+    for name, value in metadata.items():
         prim.SetCustomDataByKey(f"{FACTS}:{name}", value)
     return prim
 

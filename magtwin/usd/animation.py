@@ -163,7 +163,7 @@ def write_animation(
     if scene_file is not None:
         stage = open_stage(scene_file)
         _check_apart(path, stage)
-        stand = _stand(stage, str(run.facts.get("robot", "")))
+        stand = _stand(stage, str(run.metadata.get("robot", "")))
     with output(path, force=force) as aside:
         layer = Sdf.Layer.CreateNew(str(aside))
         if layer is None:
@@ -255,9 +255,9 @@ def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
         columns[name] = _array(attribute, path)
         if name not in COLUMNS:
             specs[name] = _spec_said(attribute)
-    facts = json.loads(layer.customLayerData.get(_FACTS, "{}"))
+    metadata = json.loads(layer.customLayerData.get(_FACTS, "{}"))
     try:
-        return Run(columns, {key: value for key, value in facts.items() if _is_fact(value)}, specs)
+        return Run(columns, {key: value for key, value in metadata.items() if _is_fact(value)}, specs)
     except InputError as error:
         raise InputError(f"{path}: holds a damaged run: {error}") from error
 
@@ -351,7 +351,7 @@ def _relative(scene_file: Path, path: Path) -> str:
 def _describe(layer: Sdf.Layer, run: Run, stand: _Stand, rate: float, end: float) -> None:
     stage = Usd.Stage.Open(layer)
     describe_stage(stage, "A run of magtwin's: its robot moved, its sensors read; play it over time")
-    layer.customLayerData = {"creator": "magtwin", _FACTS: json.dumps(dict(run.facts), ensure_ascii=False)}
+    layer.customLayerData = {"creator": "magtwin", _FACTS: json.dumps(dict(run.metadata), ensure_ascii=False)}
     layer.defaultPrim = stand.world.name
     layer.startTimeCode, layer.endTimeCode = 0.0, float(end)
     layer.timeCodesPerSecond = layer.framesPerSecond = float(rate)

@@ -198,9 +198,11 @@ def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
 def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
     """The scale of the first visible heat-map of a stage; none where there is none."""
     for prim in _prims(stage):
-        facts = prim.GetCustomDataByKey("magtwin") or {}
-        if "colourMap" in facts and UsdGeom.Imageable(prim).ComputeVisibility() != "invisible":
-            name, least, greatest, unit = (facts[key] for key in ("colourMap", "least", "greatest", "unit"))
+        metadata = prim.GetCustomDataByKey("magtwin") or {}
+        if "colourMap" in metadata and UsdGeom.Imageable(prim).ComputeVisibility() != "invisible":
+            name, least, greatest, unit = (
+                metadata[key] for key in ("colourMap", "least", "greatest", "unit")
+            )
             return ColourScale(name, least, greatest, unit, str(prim.GetPath()))
     return None
 

@@ -50,8 +50,8 @@ def test_a_scene_that_names_a_urdf_is_driven_in_two_commands(tmp_path, capsys):
         ]
     )
     out = capsys.readouterr().out
-    facts = json.loads(out[out.rindex('{\n  "title"') :])["facts"]
-    assert facts["scene"] == "mine"
+    metadata = json.loads(out[out.rindex('{\n  "title"') :])["metadata"]
+    assert metadata["scene"] == "mine"
     from magtwin.author.scene import read_scene
 
     robot = read_scene(tmp_path / "mine" / "mine.usda").robot

@@ -87,8 +87,8 @@ def test_the_page_ends_in_readings_of_the_field_that_was_surveyed(followed):
     off = run["b_measured_nt"][met] - want
     assert np.ptp(want) > 1_000, "the way is worth a map"
     assert np.sqrt(np.mean(off**2)) < 80, "nT"
-    assert str(run.facts["truth"]).startswith("the fitted map; platform field from the robot's spec")
-    assert run.facts["magnetometer"] == "physical"
+    assert str(run.metadata["truth"]).startswith("the fitted map; platform field from the robot's spec")
+    assert run.metadata["magnetometer"] == "physical"
 
 
 def test_the_page_ends_in_the_robot_that_the_urdf_describes(followed):

@@ -118,8 +118,8 @@ def test_the_command_line_gives_the_same_bytes_for_one_seed_and_others_for_anoth
                 "--json",
             ]
         )
-        facts = json.loads(capsys.readouterr().out)["facts"]
-        assert facts["seed"] == seed
+        metadata = json.loads(capsys.readouterr().out)["metadata"]
+        assert metadata["seed"] == seed
     a, b, c = ((tmp_path / f"{name}.parquet").read_bytes() for name in "abc")
     assert a == b
     assert a != c

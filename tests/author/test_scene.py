@@ -844,8 +844,8 @@ def test_a_twin_loads_a_network_only_for_a_neural_magnetometer(lab_scene, tmp_pa
         open_twin(lab_scene, magnetometer="physicall")  # type: ignore[arg-type]
     run = simulate(open_twin(lab_scene, magnetometer="map-only"), duration_s=1.0)
     np.testing.assert_array_equal(run["b_total_nt"], run["b_map_nt"])
-    assert run.facts["magnetometer"] == "map-only"
-    assert "network" not in run.facts
+    assert run.metadata["magnetometer"] == "map-only"
+    assert "network" not in run.metadata
 
 
 def test_a_robot_that_stands_nowhere_is_refused_by_prim(parts, tmp_path):

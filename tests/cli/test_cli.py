@@ -221,7 +221,7 @@ def test_run_takes_the_kind_of_magnetometer(lab_scene, tmp_path, capsys):
         out = tmp_path / f"{kind}.parquet"
         main(["run", str(lab_scene), "--duration", "1", "--parquet", str(out), "--json", *options])
         run = read_parquet(out)
-        assert run.facts["magnetometer"] == kind
+        assert run.metadata["magnetometer"] == kind
         assert (run["b_disturbance_nt"] == 0).all() == (kind == "map-only")
     capsys.readouterr()
     line = refused(capsys, "run", lab_scene, "--net", "none", "--magnetometer", "neural", "--duration", "1")
@@ -233,9 +233,9 @@ def test_options_come_from_the_environment_and_from_magtwin_toml(tmp_path, monke
     (tmp_path / "magtwin.toml").write_text("[run]\nspeed = 0.15\nseed = 5\n")
     monkeypatch.setenv("MAGTWIN_RUN_SEED", "9")
     main(["run", str(lab_scene), "--duration", "2", "--parquet", "a.parquet", "--json"])
-    facts = json.loads(capsys.readouterr().out)["facts"]
-    assert facts["seed"] == 9
-    assert facts["speed_m_s"] == 0.15
+    metadata = json.loads(capsys.readouterr().out)["metadata"]
+    assert metadata["seed"] == 9
+    assert metadata["speed_m_s"] == 0.15
     (tmp_path / "magtwin.toml").write_text("[run]\nspeeed = 0.15\n")
     with pytest.raises(SystemExit) as stop:
         main(["run", str(lab_scene), "--duration", "2", "--parquet", "b.parquet"])

@@ -46,7 +46,7 @@ def recorded(tmp_path_factory):
     for i, (day, name) in enumerate((("monday", "a"), ("monday", "b"), ("tuesday", "a"))):
         (folder / day).mkdir(exist_ok=True)
         node(folder / day / f"{name}.json", 1.7e9 + 1000 * i, i)
-    write_run(read_run(folder / "tuesday" / "a.json").with_facts(path="circle"), folder / "c.parquet")
+    write_run(read_run(folder / "tuesday" / "a.json").with_metadata(path="circle"), folder / "c.parquet")
     return folder
 
 
@@ -118,7 +118,7 @@ def test_a_folder_of_runs_stands_for_its_runs_and_their_sessions(recorded, tmp_p
     (tmp_path / "runs").mkdir()
     run = read_run(recorded / "c.parquet")
     for k in range(3):
-        dealt = run.with_facts(session=k % 2, session_seed=5)
+        dealt = run.with_metadata(session=k % 2, session_seed=5)
         write_run(dealt, tmp_path / "runs" / f"run_0000{k}.parquet")
     (tmp_path / "runs" / "runs.csv").write_text("file\n")
     main(["dataset", "build", str(tmp_path / "runs"), "--map", str(MAP), "--out", str(tmp_path / "set")])
@@ -129,8 +129,8 @@ def test_a_folder_of_runs_stands_for_its_runs_and_their_sessions(recorded, tmp_p
 def test_info_tells_of_every_recording_and_reads_every_shard(made, capsys):
     main(["dataset", "info", str(made), "--json"])
     told = json.loads(capsys.readouterr().out)
-    assert list(told["facts"]["recordings"]) == ["c", "monday_a", "b", "tuesday_a"]
-    assert told["facts"]["feature sets"] == "full, correlated"
+    assert list(told["metadata"]["recordings"]) == ["c", "monday_a", "b", "tuesday_a"]
+    assert told["metadata"]["feature sets"] == "full, correlated"
     assert told["figures"]["labels"]["value"] == 320
 
 
@@ -139,7 +139,7 @@ def test_correlate_tells_and_draws(made, tmp_path, capsys):
     told = json.loads(capsys.readouterr().out)
     assert len(told["figures"]) == 20
     assert told["figures"]["odom_v_x"]["value"] == "never varies"
-    assert told["facts"]["groups"] == 4
+    assert told["metadata"]["groups"] == 4
     assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
     main(["dataset", "correlate", str(made), "--features", "lidar_on, imu_w_x", "--json"])
     assert list(json.loads(capsys.readouterr().out)["figures"]) == ["lidar_on", "imu_w_x"]

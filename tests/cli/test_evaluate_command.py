@@ -128,10 +128,10 @@ def test_of_its_own_data_set_weights_are_judged_by_their_test_recordings(room, c
     own = ["--dataset", str(room / "set"), "--train", str(room / "set"), "--map", str(room / "hills.usdc")]
     main(["evaluate", str(room / "net.safetensors"), *own, "--out", str(room / "own"), "--json"])
     told = json.loads(capsys.readouterr().out)
-    facts = told["models"][1]["facts"]
-    assert told["cases"][-2]["models"]["net"]["mae_nt"] == pytest.approx(facts["test_mae_nt"], rel=1e-4)
+    metadata = told["models"][1]["metadata"]
+    assert told["cases"][-2]["models"]["net"]["mae_nt"] == pytest.approx(metadata["test_mae_nt"], rel=1e-4)
     assert told["cases"][-2]["models"]["naive"]["mae_nt"] == pytest.approx(
-        facts["test_naive_mae_nt"], rel=1e-3
+        metadata["test_naive_mae_nt"], rel=1e-3
     )
 
 
@@ -180,9 +180,9 @@ def test_a_table_that_is_no_learning_curve_is_refused(tmp_path):
 def test_a_budget_is_made_where_the_scene_is_at_hand(room, lab_scene, tmp_path, capsys):
     twin = open_twin(lab_scene, magnetometer="physical")
     for day in range(3):
-        facts = {"session_seed": 1, "session": day}
-        run = simulate(in_session_of(twin, facts), "figure8", seed=day, duration_s=20.0, rate_hz=10.0)
-        write_run(run.with_facts(**facts), tmp_path / f"d{day}.parquet")
+        metadata = {"session_seed": 1, "session": day}
+        run = simulate(in_session_of(twin, metadata), "figure8", seed=day, duration_s=20.0, rate_hz=10.0)
+        write_run(run.with_metadata(**metadata), tmp_path / f"d{day}.parquet")
     layer = twin.scene.map_layer
     drives = [str(tmp_path / f"d{day}.parquet") for day in range(3)]
     main(["dataset", "build", *drives[:2], "--map", str(layer), "--out", str(tmp_path / "set"), "--json"])

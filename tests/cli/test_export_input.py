@@ -577,7 +577,7 @@ def test_a_stage_that_shows_nothing_is_exported_without_a_thumbnail_and_says_so(
         'def Xform "A"\n{\n}\n'
     )
     main(["export", str(stage), "--out", str(out), "--json"])
-    (note,) = json.loads(capsys.readouterr().out)["facts"]["notes"]
+    (note,) = json.loads(capsys.readouterr().out)["metadata"]["notes"]
     assert note.startswith("no thumbnail was drawn: bare.usda: shows nothing")
     assert (out / "bare.usda").is_file()
     assert not (out / ".thumbs").exists()

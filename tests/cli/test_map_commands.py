@@ -88,7 +88,7 @@ def refused(capsys, *arguments):
 
 def test_info_tells_everything_that_a_map_knows(layer, capsys):
     said = told(capsys, "map", "info", layer)
-    figures, facts = said["figures"], said["facts"]
+    figures, metadata = said["figures"], said["metadata"]
     assert figures["valid share"]["value"] == 100
     assert figures["standard deviation"]["value"] == 5
     assert figures["height"] == {"value": 0.35, "unit": "m", "note": "of the sensor above the floor"}
@@ -97,8 +97,8 @@ def test_info_tells_everything_that_a_map_knows(layer, capsys):
     assert figures["hard iron"]["note"] == "(300, 0, -400)"
     assert figures["soft iron"]["value"] == pytest.approx(0.02)
     assert figures["extent"]["value"] == "x -2..2, y -1.5..1.5"
-    assert facts["files"] == {"0_map.csv": SHA, "90_map.csv": SHA[::-1]}
-    assert facts["parameters"] == {"depth_m": 0.5, "notes": ["a", 1]}
+    assert metadata["files"] == {"0_map.csv": SHA, "90_map.csv": SHA[::-1]}
+    assert metadata["parameters"] == {"depth_m": 0.5, "notes": ["a", 1]}
     for name, value in (
         ("method", "harmonic"),
         ("frame", "world"),
@@ -107,7 +107,7 @@ def test_info_tells_everything_that_a_map_knows(layer, capsys):
         ("licence", "MIT"),
         ("headings deg", "0, 90, 180, 270"),
     ):
-        assert facts[name] == value
+        assert metadata[name] == value
     main(["map", "info", str(layer)])
     text = capsys.readouterr().out
     for part in ("the door", "0_map.csv", "dipoles", "(300, 0, -400)", "parameters", "depth_m  0.5"):
@@ -125,10 +125,10 @@ def test_info_says_what_is_unknown():
     card = map_card(bare)
     figures = {f.name: f.value for f in card.figures}
     assert figures["standard deviation"] == figures["height"] == "unknown"
-    assert [card.facts[n] for n in ("method", "frame", "datum", "created", "licence")] == ["unknown"] * 5
-    assert card.facts["source"] == "by hand"
+    assert [card.metadata[n] for n in ("method", "frame", "datum", "created", "licence")] == ["unknown"] * 5
+    assert card.metadata["source"] == "by hand"
     assert "dipoles" not in figures
-    assert map_card(replace(bare, source="")).facts["source"] == "unknown"
+    assert map_card(replace(bare, source="")).metadata["source"] == "unknown"
 
 
 def test_info_works_on_a_stage_that_holds_a_map(lab_scene, capsys):
@@ -142,7 +142,7 @@ def test_info_works_on_a_folder_of_csvs_and_tells_their_checksums(real_data, cap
 
     folder = real_data / "aprilab" / "maps"
     said = told(capsys, "map", "info", folder)
-    assert said["facts"]["files"] == {p.name: sha256(p) for p in folder.glob("*_map.csv")}
+    assert said["metadata"]["files"] == {p.name: sha256(p) for p in folder.glob("*_map.csv")}
     assert said["figures"]["valid share"]["value"] < 97
 
 
@@ -180,8 +180,8 @@ def test_info_of_a_map_of_several_days_tells_its_drift_and_every_day(series, cap
     said = told(capsys, "map", "info", series)
     assert said["figures"]["drift"]["value"] == pytest.approx(3.0, abs=1e-3)
     assert said["figures"]["epochs"]["note"] == "2026-01-01, 2026-01-11, 2026-01-21"
-    assert list(said["facts"]["epochs"]) == ["2026-01-01", "2026-01-11", "2026-01-21"]
-    assert said["facts"]["created"] == "2026-01-21"
+    assert list(said["metadata"]["epochs"]) == ["2026-01-01", "2026-01-11", "2026-01-21"]
+    assert said["metadata"]["created"] == "2026-01-21"
     between = told(capsys, "map", "info", series, "--date", "2026-01-06")
     mean = on("2026-01-06", 5).values_nt.mean()
     assert between["figures"]["mean"]["value"] == pytest.approx(mean, abs=0.06)
@@ -227,7 +227,7 @@ def test_diff_tells_and_draws_what_changed(tmp_path, layer, capsys):
     said = told(capsys, "map", "diff", layer, tmp_path / "b.usdc", "--out", tmp_path / "d.svg")
     assert said["figures"]["common bias"]["value"] == pytest.approx(30, abs=0.01)
     assert said["figures"]["changed nodes"]["value"] == 4
-    (region,) = said["facts"]["regions"]
+    (region,) = said["metadata"]["regions"]
     assert region["centre_m"] == [-0.5, -0.5]
     assert region["peak_nt"] == pytest.approx(400, abs=0.01)
     assert (

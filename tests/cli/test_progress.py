@@ -224,7 +224,7 @@ def piped(*arguments, cwd=None):
 
 @pytest.fixture(scope="module")
 def long_run(tmp_path_factory):
-    """A run whose name and facts are longer than a line of 80."""
+    """A run whose name and metadata are longer than a line of 80."""
     import numpy as np
 
     from magtwin.io.tables import write_parquet

@@ -28,10 +28,10 @@ def test_every_file_of_one_run_holds_that_run(written):
     folder, files = written
     run = read_run(folder / "out")
     assert run.rows == 405
-    assert run.facts["seed"] == 5
+    assert run.metadata["seed"] == 5
     for kind, file in files.items():
         back = read_run(file)
-        assert dict(back.facts) == dict(run.facts), kind
+        assert dict(back.metadata) == dict(run.metadata), kind
         for name in ("t", "p_world_base", "b_total_nt", "b_map_nt", "flag_bump"):
             assert np.array_equal(back[name], run[name]), (kind, name)
 

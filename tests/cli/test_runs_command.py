@@ -48,10 +48,10 @@ def test_each_file_is_the_run_of_its_seed_and_path_to_the_last_bit(lab_scene, tm
             twin, path_named(("figure8", "B")[k % 2]), seed=7 + k, session="survey", duration_s=1.0
         )
         run = read_parquet(out / row["file"])
-        assert dict(run.facts) == dict(own.facts)
+        assert dict(run.metadata) == dict(own.metadata)
         assert list(run) == list(own)
         assert all(run[name].tobytes() == own[name].tobytes() for name in own)
-        assert row["path"] == own.facts["path"]
+        assert row["path"] == own.metadata["path"]
         assert (int(row["seed"]), int(row["readings"]), row["session"]) == (7 + k, own.rows, "survey")
 
 
@@ -75,8 +75,8 @@ def test_sessions_differ_and_their_runs_share_what_a_session_has(lab_scene, tmp_
     runs = [read_parquet(tmp_path / "a" / row["file"]) for row in listed(tmp_path / "a")]
     charges = [run["battery_fraction"][0] for run in runs]
     assert charges[0] == charges[1] != charges[2] == charges[3]
-    assert [run.facts["session"] for run in runs] == [0, 0, 1, 1]
-    assert len({run.facts["speed_m_s"] for run in runs}) == 4
+    assert [run.metadata["session"] for run in runs] == [0, 0, 1, 1]
+    assert len({run.metadata["speed_m_s"] for run in runs}) == 4
     assert list(runs[0]) == ["t", "battery_fraction", "b_measured_nt"]
     assert not np.array_equal(runs[0]["b_measured_nt"], runs[1]["b_measured_nt"])
     for file in (tmp_path / "a").iterdir():
@@ -97,7 +97,7 @@ def test_the_default_is_a_mixture_of_paths_in_sessions_that_each_drive_all_of_th
         duration_s=1.0,
     )
     run = read_parquet(out / "run_00005.parquet")
-    assert dict(run.facts) == dict(own.facts)
+    assert dict(run.metadata) == dict(own.metadata)
     assert all(run[name].tobytes() == own[name].tobytes() for name in own)
 
 

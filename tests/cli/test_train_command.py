@@ -87,16 +87,16 @@ def test_the_error_told_is_that_of_the_weights_on_what_was_held_out(data, traine
     net = load_net(trained)
     rows = open_dataset(data).rows("full", ["f", "g"])
     error = NeuralMagnetometer(net).predict(rows.x) - rows.y
-    assert net.facts["test_mae_nt"] == pytest.approx(np.abs(error).mean())
+    assert net.metadata["test_mae_nt"] == pytest.approx(np.abs(error).mean())
     assert net.residual_sd_nt == pytest.approx(np.sqrt(np.mean(error**2)))
-    assert net.facts["test_mae_nt"] < 0.5 * net.facts["test_naive_mae_nt"]
-    assert net.facts["dataset_sha256"] == sha256(data / "dataset.json")
+    assert net.metadata["test_mae_nt"] < 0.5 * net.metadata["test_naive_mae_nt"]
+    assert net.metadata["dataset_sha256"] == sha256(data / "dataset.json")
 
 
 def test_the_card_tells_checksum_errors_by_path_and_how_to_repeat(trained):
     card = trained.with_suffix(".md").read_text()
     assert sha256(trained) in card
-    mae = load_net(trained).facts["test_mae_nt"]
+    mae = load_net(trained).metadata["test_mae_nt"]
     assert f"| test | 2 | 400 | {mae:.1f} |" in card
     assert "| test, path eight | 1 | 200 |" in card
     assert "Test: f, g." in card
@@ -104,7 +104,7 @@ def test_the_card_tells_checksum_errors_by_path_and_how_to_repeat(trained):
 
 
 def test_the_configuration_in_the_weights_repeats_them_to_the_byte(data, trained, tmp_path):
-    (tmp_path / "c.toml").write_text(load_net(trained).facts["config"])
+    (tmp_path / "c.toml").write_text(load_net(trained).metadata["config"])
     assert read_config(tmp_path / "c.toml").hold_out == ("f", "g")
     again = tmp_path / "g.safetensors"
     main(["train", str(data), "--out", str(again), "--config", str(tmp_path / "c.toml"), "--json"])
@@ -140,7 +140,7 @@ def test_a_simulation_runs_the_trained_network(trained, lab_scene, tmp_path, cap
     out = tmp_path / "a.parquet"
     main(["run", str(lab_scene), "--net", str(trained), "--duration", "1", "--parquet", str(out), "--json"])
     run = read_run(out)
-    assert run.facts["network_sha256"] == sha256(trained)
+    assert run.metadata["network_sha256"] == sha256(trained)
     assert run["b_sd_nt"][0] == pytest.approx(load_net(trained).residual_sd_nt)
     assert np.isfinite(run["b_disturbance_nt"]).all()
 
@@ -172,9 +172,9 @@ def test_fine_tuning_tells_the_error_before_and_after(data, trained, tmp_path, c
     words = ["--init", str(trained), "--freeze", "layers.0", "layers.1", "--layers", "12,12", "--epochs", "2"]
     main(["train", str(data), "--out", str(out), *words, "--hold-out", "f", "g", "--json"])
     figures = json.loads(capsys.readouterr().out)["figures"]
-    assert figures["test MAE before"]["value"] == pytest.approx(load_net(trained).facts["test_mae_nt"])
+    assert figures["test MAE before"]["value"] == pytest.approx(load_net(trained).metadata["test_mae_nt"])
     net = load_net(out)
-    assert net.facts["init_sha256"] == sha256(trained)
+    assert net.metadata["init_sha256"] == sha256(trained)
     assert net.layers[0].weight.equal(load_net(trained).layers[0].weight)
     card = card_of(out)
     assert (
@@ -190,14 +190,14 @@ def test_threads_are_those_asked_for_while_training_and_told(data, tmp_path, cap
     words = ["--layers", "4", "--epochs", "1", "--threads", "2", "--json"]
     main(["train", str(data), "--out", str(tmp_path / "f.safetensors"), *words])
     assert (seen, torch.get_num_threads()) == ([2], 1)
-    assert json.loads(capsys.readouterr().out)["facts"]["threads"] == 2
+    assert json.loads(capsys.readouterr().out)["metadata"]["threads"] == 2
 
 
 def test_a_split_by_row_carries_its_warning_everywhere(data, tmp_path, capsys):
     out = tmp_path / "f.safetensors"
     main(["train", str(data), "--out", str(out), *TINY[:2], "--epochs", "1", "--split", "row", "--json"])
-    assert json.loads(capsys.readouterr().out)["facts"]["warning"] == LEAK
-    assert load_net(out).facts["warning"] == LEAK
+    assert json.loads(capsys.readouterr().out)["metadata"]["warning"] == LEAK
+    assert load_net(out).metadata["warning"] == LEAK
     assert LEAK in card_of(out)
 
 
@@ -237,7 +237,7 @@ def test_what_is_told_of_a_kind_is_its_own_error_beside_the_naive_and_the_ridges
         mean, sd = predictor.predict(features(run, predictor.features))
         errors.append(np.abs(mean - run["label_nt"]))
         inside.append(errors[-1] <= 1.645 * sd)
-        naive.append(np.abs(predictor.facts["label_mean_nt"] - run["label_nt"]))
+        naive.append(np.abs(predictor.metadata["label_mean_nt"] - run["label_nt"]))
         ridge.append(np.abs(peer.predict(features(run, peer.features))[0] - run["label_nt"]))
     assert figures["test MAE"]["value"] == pytest.approx(np.mean(errors))
     assert figures["test naive MAE"]["value"] == pytest.approx(np.mean(naive))
@@ -250,7 +250,7 @@ def test_what_is_told_of_a_kind_is_its_own_error_beside_the_naive_and_the_ridges
 
 @pytest.mark.parametrize("kind", SMALL)
 def test_the_configuration_of_any_kind_repeats_its_weights_to_the_byte(data, kinds, kind, tmp_path):
-    (tmp_path / "c.toml").write_text(load_predictor(kinds[kind][0]).facts["config"])
+    (tmp_path / "c.toml").write_text(load_predictor(kinds[kind][0]).metadata["config"])
     again = tmp_path / f"{kind}.safetensors"
     main(["train", str(data), "--out", str(again), "--config", str(tmp_path / "c.toml"), "--json"])
     assert again.read_bytes() == kinds[kind][0].read_bytes()
@@ -301,10 +301,10 @@ def test_a_hybrid_keeps_its_network_only_where_the_base_leaves_something(tmp_pat
     words = ["--model", "hybrid", "--features", "odom_v_x,imu_w_z", "--layers", "16", "--epochs", "8"]
     words += ["--batch", "32", "--lr", "0.02", "--json"]
     main(["train", str(tmp_path / "set"), "--out", str(tmp_path / "h.safetensors"), *words])
-    facts = load_predictor(tmp_path / "h.safetensors").facts
-    assert facts["network"] == ("kept" if bent else "left out")
+    metadata = load_predictor(tmp_path / "h.safetensors").metadata
+    assert metadata["network"] == ("kept" if bent else "left out")
     if bent:
-        assert facts["test_mae_nt"] < 0.5 * facts["test_ridge_mae_nt"]
+        assert metadata["test_mae_nt"] < 0.5 * metadata["test_ridge_mae_nt"]
 
 
 def test_a_hybrid_is_fine_tuned_with_its_base_frozen(data, kinds, tmp_path):
@@ -340,7 +340,7 @@ def test_a_gpu_that_is_not_there_is_refused_and_auto_takes_the_cpu(data, kinds, 
     out = tmp_path / "f.safetensors"
     said = refused(capsys, "train", data, "--out", out, "--device", "cuda", *TINY)
     assert "device cuda: this torch sees no GPU" in said
-    assert load_predictor(kinds["tcn"][0]).facts["device"] == "cpu"
+    assert load_predictor(kinds["tcn"][0]).metadata["device"] == "cpu"
 
 
 @pytest.mark.parametrize(

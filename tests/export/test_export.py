@@ -363,9 +363,9 @@ def test_the_page_beside_an_export_says_what_plays_the_run(folder, package, isaa
     assert "plays a run" not in (isaac / HOWTO).read_text()
 
 
-@pytest.mark.parametrize(("facts", "said"), [({"licence": "MIT"}, "MIT"), ({}, ""), (None, "")])
-def test_the_licence_of_a_network_is_read_from_its_weights(facts, said, tmp_path):
-    header = {} if facts is None else {"__metadata__": {"magtwin": json.dumps({"facts": facts})}}
+@pytest.mark.parametrize(("metadata", "said"), [({"licence": "MIT"}, "MIT"), ({}, ""), (None, "")])
+def test_the_licence_of_a_network_is_read_from_its_weights(metadata, said, tmp_path):
+    header = {} if metadata is None else {"__metadata__": {"magtwin": json.dumps({"facts": metadata})}}
     text = json.dumps(header).encode()
     (tmp_path / "net.safetensors").write_bytes(struct.pack("<Q", len(text)) + text)
     assert licence_of(tmp_path / "net.safetensors") == said

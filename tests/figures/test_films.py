@@ -300,11 +300,11 @@ def test_of_two_robots_the_runs_own_moves(run, tmp_path):
     scene = author_scene(replace(lab, robot=ann, others=(placed,)), tmp_path / "scene")
     view, there = View.of("top"), {}
     for name in ("ann", "bob"):
-        with Scenery(run.with_facts(robot=name), scene, [0.0, 5.0], view=view, size=SIZE) as scenery:
+        with Scenery(run.with_metadata(robot=name), scene, [0.0, 5.0], view=view, size=SIZE) as scenery:
             there[name] = scenery.poses(1)
     assert there["ann"].keys().isdisjoint(there["bob"])
     for poses in there.values():
         places = np.array([T[:2, 3] for T in poses.values()])
         np.testing.assert_allclose(places, run["p_world_base"][[100] * len(places), :2], atol=0.3)
     with pytest.raises(InputError, match="does not say of which robot it is; the scene has ann, bob"):
-        Scenery(run.with_facts(robot="cleo"), scene, [0.0], view=view, size=SIZE)
+        Scenery(run.with_metadata(robot="cleo"), scene, [0.0], view=view, size=SIZE)

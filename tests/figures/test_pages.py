@@ -96,7 +96,7 @@ def test_pictures_inside_a_page_are_png_and_svg(page):
 
 
 def test_what_a_file_says_of_itself_is_text_and_nothing_else(runs):
-    run = runs[0].with_facts(path=EVIL, scene=EVIL, note=EVIL * 100, **{EVIL: EVIL})
+    run = runs[0].with_metadata(path=EVIL, scene=EVIL, note=EVIL * 100, **{EVIL: EVIL})
     told = Told(EVIL, run, note=EVIL)
     page = page_of_runs([told, told], pictures=False)
     read = Reader(to_html(page))
@@ -109,7 +109,7 @@ def test_what_a_file_says_of_itself_is_text_and_nothing_else(runs):
     assert "\x1b" not in markdown
     widths = [line.count("|") - line.count("\\|") for line in markdown.splitlines() if line.startswith("|")]
     assert set(widths) <= {3, 5, 6, 8, 10}
-    assert json.loads(to_json(page))["runs"][0]["facts"]["note"] == EVIL * 100
+    assert json.loads(to_json(page))["runs"][0]["metadata"]["note"] == EVIL * 100
 
 
 def test_the_three_forms_say_the_same_figures(page, runs):
@@ -121,7 +121,7 @@ def test_the_three_forms_say_the_same_figures(page, runs):
     shown = f"{error:.4g}"
     assert shown in to_markdown(page)
     assert shown in "".join(Reader(to_html(page)).text)
-    assert data["runs"][1]["facts"]["seed"] == 2
+    assert data["runs"][1]["metadata"]["seed"] == 2
 
 
 def test_events_are_told_with_their_times(page, runs):
@@ -145,7 +145,7 @@ def test_a_run_of_few_columns_is_told_by_what_it_has():
     page = page_of_runs([Told("bare", Run({"t": t, "b_measured_nt": field}, {"weight": float("nan")}))])
     titles = [picture.title for picture in page.sections[0].pictures]
     assert titles == ["Field"]
-    assert json.loads(to_json(page))["facts"]["weight"] is None
+    assert json.loads(to_json(page))["metadata"]["weight"] is None
     assert Reader(to_html(page)).open == []
 
 
@@ -200,7 +200,7 @@ def test_a_thinned_line_keeps_its_ends_and_its_extremes():
     assert (np.diff(x) > 0).all()
 
 
-def test_a_comparison_says_the_shift_and_what_facts_differ(runs):
+def test_a_comparison_says_the_shift_and_what_metadata_differ(runs):
     a, b = runs
     found = compare(a, b, align="path")
     page = page_of_comparison(Told("a", a), Told("b", b), found)
@@ -237,7 +237,7 @@ def test_a_data_sets_folder_is_reported_run_by_run(runs, tmp_path):
 
 def test_a_map_that_is_no_longer_what_the_run_read_is_not_shown(runs, tmp_path, capsys):
     file = tmp_path / "a.parquet"
-    write_parquet(runs[0].with_facts(map_sha256="0" * 64), file)
+    write_parquet(runs[0].with_metadata(map_sha256="0" * 64), file)
     main(["report", str(file), "--out", str(tmp_path / "a.md")])
     assert "is not the map that the run read" in (tmp_path / "a.md").read_text()
 

@@ -358,7 +358,7 @@ def test_a_picture_that_exists_is_kept_unless_force_is_given(tmp_path):
 
 def test_plotting_leaves_pyplot_alone(tmp_path):
     code = (
-        "import sys; from magtwin.io import plots; assert 'matplotlib' not in sys.modules;"
+        "import sys; from magtwin.figures import plots; assert 'matplotlib' not in sys.modules;"
         "from magtwin.field.maps.map import AnomalyMap; import numpy as np;"
         "m = AnomalyMap(values_nt=np.full((1, 2, 2), 4e4), origin_m=(0, 0), cell_m=(1, 1), headings_rad=[0]);"
         f"plots.plot_map(m, {str(tmp_path / 'a.png')!r}); sys.exit('matplotlib.pyplot' in sys.modules)"

@@ -378,7 +378,7 @@ def test_messages_that_an_index_lacks_are_read_and_counted(tmp_path, monkeypatch
     assert lacking == 2 * rows - indexed
     run = read_bag(tmp_path / "old.mcap")
     assert run.rows == rows
-    assert run.facts["messages_not_indexed"] == rows - indexed // 2
+    assert run.metadata["messages_not_indexed"] == rows - indexed // 2
 
 
 def test_a_chunk_of_blank_images_is_read(tmp_path):

@@ -57,7 +57,7 @@ def made(twin):
     from magtwin.twin import scan
 
     run = run.with_specs(est_p=Column("m", "world", "an estimate", 2, ("x", "y"), interpolation="hold"))
-    return run.with_facts(note='quoted "text", ä', share=0.1, yes=True), scan(twin, run)
+    return run.with_metadata(note='quoted "text", ä', share=0.1, yes=True), scan(twin, run)
 
 
 @pytest.fixture(scope="module")
@@ -72,9 +72,9 @@ def bags(made, twin, tmp_path_factory):
 
 
 def assert_same(back, run, *, unit="T"):
-    """Columns and facts are equal to the precision that bags promise."""
+    """Columns and metadata are equal to the precision that bags promise."""
     assert list(back) == list(run)
-    assert dict(back.facts) == dict(run.facts)
+    assert dict(back.metadata) == dict(run.metadata)
     assert dict(back.specs) == dict(run.specs)
     for name in run:
         assert back[name].dtype == run[name].dtype, name

@@ -35,11 +35,11 @@ def twin(lab_scene) -> Twin:
 
 @pytest.fixture(scope="module")
 def run(twin) -> Run:
-    """Four seconds along the figure of eight, with every column, true facts, and flags that change."""
+    """Four seconds along the figure of eight, with every column, true metadata, and flags that change."""
     run = simulate(twin, "figure8", seed=11, duration_s=4.0)
     flag = np.zeros(run.rows, bool)
     flag[200:203] = True
-    return run.with_columns(flag_bump=flag).with_facts(title="größe", big=2**60, quick=True)
+    return run.with_columns(flag_bump=flag).with_metadata(title="größe", big=2**60, quick=True)
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +55,14 @@ def written(run, twin, tmp_path_factory):
 
 def assert_carried(run, again):
     assert list(again) == list(run)
-    assert dict(again.facts) == dict(run.facts)
-    assert {key: type(value) for key, value in again.facts.items()} == {
-        key: type(value) for key, value in run.facts.items()
+    assert dict(again.metadata) == dict(run.metadata)
+    assert {key: type(value) for key, value in again.metadata.items()} == {
+        key: type(value) for key, value in run.metadata.items()
     }
 
 
 @pytest.mark.parametrize("name", EXACT)
-def test_a_run_comes_back_to_the_last_bit_with_its_facts(name, run, written):
+def test_a_run_comes_back_to_the_last_bit_with_its_metadata(name, run, written):
     again = read_run(written / name)
     assert_carried(run, again)
     assert_same(run, again)
@@ -207,7 +207,7 @@ def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_sce
     assert Usd.Stage.Open(str(tmp_path / "b.usdc")).GetTimeCodesPerSecond() == pytest.approx(135)
     main(["convert", str(written / "run.csv"), str(tmp_path / "c.mcap"), "--units", "nT"])
     assert np.array_equal(read_run(tmp_path / "c.mcap")["b_measured_nt"], run["b_measured_nt"])
-    stray = run.with_facts(scene_file="gone.usda")
+    stray = run.with_metadata(scene_file="gone.usda")
     write_run(stray, tmp_path / "stray.parquet")
     main(["convert", str(tmp_path / "stray.parquet"), str(tmp_path / "d.usdc")])
     assert "without a scene: gone.usda: the scene of the run is not there" in capsys.readouterr().err
@@ -241,9 +241,9 @@ def test_info_of_every_format_tells_rows_columns_units_and_what_the_run_came_fro
     told = json.loads(capsys.readouterr().out)
     assert told["figures"]["readings"]["value"] == run.rows
     assert told["figures"]["columns"]["value"] == len(run)
-    assert told["facts"]["columns"]["b_total_nt"].startswith("nT  b_map_nt + b_disturbance_nt")
+    assert told["metadata"]["columns"]["b_total_nt"].startswith("nT  b_map_nt + b_disturbance_nt")
     for fact in ("seed", "scene_sha256", "map_sha256", "magtwin", "path"):
-        assert told["facts"][fact] == run.facts[fact]
+        assert told["metadata"][fact] == run.metadata[fact]
 
 
 def test_info_of_a_playback_tells_of_the_run_where_its_scene_is_gone(run, tmp_path, capsys):
@@ -253,7 +253,7 @@ def test_info_of_a_playback_tells_of_the_run_where_its_scene_is_gone(run, tmp_pa
     main(["info", str(tmp_path / "run.usda"), "--json"])
     told = json.loads(capsys.readouterr().out)
     assert told["figures"]["readings"]["value"] == run.rows
-    assert "gone.usda" in told["facts"]["stage"]
+    assert "gone.usda" in told["metadata"]["stage"]
 
 
 @pytest.fixture

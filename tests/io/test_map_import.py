@@ -232,7 +232,7 @@ def test_a_check_takes_the_kernel_of_the_gaussian_process_and_leaves_headings_ou
     def told(*more):
         run("map", "check", tmp_path / "a.parquet", "--json", *more)
         report = json.loads(capsys.readouterr().out)
-        return report["facts"]["split"], report["figures"]
+        return report["metadata"]["split"], report["figures"]
 
     matern = told("--method", "gp", "--kernel", "matern")[1]["gp RMSE"]["value"]
     poisson = told("--method", "gp", "--kernel", "poisson")[1]["gp RMSE"]["value"]

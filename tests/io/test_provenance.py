@@ -34,18 +34,18 @@ def run(twin):
 
 
 def test_a_run_names_its_files_with_checksums(run, lab_scene, twin):
-    facts = run.facts
-    assert facts["scene_file"] == lab_scene.as_posix()
-    assert facts["scene_sha256"] == stage_sha256(lab_scene)
-    assert facts["map_sha256"] == sha256(twin.scene.map_layer)
-    assert facts["asked_duration_s"] == 2.0
-    assert "path_file" not in facts
+    metadata = run.metadata
+    assert metadata["scene_file"] == lab_scene.as_posix()
+    assert metadata["scene_sha256"] == stage_sha256(lab_scene)
+    assert metadata["map_sha256"] == sha256(twin.scene.map_layer)
+    assert metadata["asked_duration_s"] == 2.0
+    assert "path_file" not in metadata
 
 
 def test_a_run_of_a_network_named_by_hand_says_its_file(lab_scene):
     twin = open_twin(lab_scene, net=open_twin(lab_scene).scene.robot.magnetometer.network)
-    network = simulate(twin, "figure8", **BRIEF).facts["network_file"]
-    assert sha256(network) == twin.facts["network_sha256"]
+    network = simulate(twin, "figure8", **BRIEF).metadata["network_file"]
+    assert sha256(network) == twin.metadata["network_sha256"]
 
 
 def test_the_stages_checksum_follows_content_in_any_layer_and_not_the_place(lab_scene, tmp_path):
@@ -129,13 +129,13 @@ def test_a_run_of_every_kind_comes_out_again_to_the_bit(twin, tmp_path):
         found = repeat(original)
         assert found.equal, found.report("differs")
         assert found.causes == ()
-        assert dict(found.again.facts) == dict(original.facts)
+        assert dict(found.again.metadata) == dict(original.metadata)
 
 
 def test_a_run_once_along_its_path_comes_out_again(twin, tmp_path):
     (tmp_path / "way.csv").write_text("-0.2,0\n0.2,0\n")
     run = simulate(twin, tmp_path / "way.csv", rate_hz=20.0)
-    assert "asked_duration_s" not in run.facts
+    assert "asked_duration_s" not in run.metadata
     assert repeat(run).equal
 
 
@@ -162,7 +162,7 @@ def test_a_run_of_a_data_set_comes_out_again_in_its_session(lab_scene, tmp_path,
     figures = json.loads(capsys.readouterr().out)["figures"]
     assert figures["equal"]["value"] == "yes, to the bit"
     assert figures["equal columns"]["value"] == 4
-    a, b = (read_parquet(out / f"run_0000{k}.parquet").facts["config_sha256"] for k in (0, 2))
+    a, b = (read_parquet(out / f"run_0000{k}.parquet").metadata["config_sha256"] for k in (0, 2))
     assert a != b
 
 
@@ -187,7 +187,7 @@ def test_what_changed_is_named_first_and_the_columns_that_differ(lab_scene, tmp_
     total = run["b_total_nt"].copy()
     total[7:] += 12.5
     claims = {"map_sha256": "0" * 64, "magtwin": "0.0.1"}
-    write_parquet(run.with_columns(b_total_nt=total).with_facts(**claims), file)
+    write_parquet(run.with_columns(b_total_nt=total).with_metadata(**claims), file)
     with pytest.raises(SystemExit) as stop:
         main(["rerun-of", str(file)])
     lines = capsys.readouterr().out.splitlines()
@@ -205,7 +205,7 @@ def test_a_run_is_found_beside_its_scene_when_both_have_moved(run, lab_scene, tm
     there.mkdir()
     moved.parent.symlink_to(lab_scene.parent)
     monkeypatch.chdir(tmp_path)
-    told = run.with_facts(scene_file=f"scene/{lab_scene.name}")
+    told = run.with_metadata(scene_file=f"scene/{lab_scene.name}")
     with pytest.raises(InputError, match="the scene of the run is not there; name it"):
         repeat(told)
     assert repeat(told, near=there / "run.parquet").equal
@@ -215,7 +215,7 @@ def test_a_run_is_found_beside_its_scene_when_both_have_moved(run, lab_scene, tm
 
 def test_a_twin_is_opened_as_the_run_had_it_or_refused(run, lab_scene):
     assert twin_of(run).scene.robot.magnetometer.kind == "map-only"
-    changed = run.with_facts(scene_sha256="0" * 64)
+    changed = run.with_metadata(scene_sha256="0" * 64)
     with pytest.raises(InputError, match="the scene is not what the run came from: scene_sha256 is "):
         twin_of(changed)
     assert twin_of(changed, check=False).scene_file == lab_scene
@@ -229,17 +229,17 @@ def test_what_is_no_longer_at_hand_is_refused(twin, run):
     ):
         with pytest.raises(InputError, match=f"the run drove .*{name}, which came from no file"):
             repeat(simulate(twin, what, duration_s=0.5, rate_hz=20.0))
-    lost = replace(run, facts={k: v for k, v in run.facts.items() if k != "seed"})
+    lost = replace(run, metadata={k: v for k, v in run.metadata.items() if k != "seed"})
     with pytest.raises(InputError, match="the run does not say its seed"):
         repeat(lost)
     with pytest.raises(InputError, match="does not say which scene it came from"):
         repeat(Run(run.columns, {"seed": 1}))
     with pytest.raises(InputError, match="do not say how it was made: could not convert"):
-        repeat(run.with_facts(rate_hz="often"))
+        repeat(run.with_metadata(rate_hz="often"))
     with pytest.raises(InputError, match="/dev/null: the file that the run drove is not there"):
-        repeat(run.with_facts(path_file="/dev/null"))  # a device, as a file of a stranger's may name one
+        repeat(run.with_metadata(path_file="/dev/null"))  # a device, as a file of a stranger's may name one
     with pytest.raises(InputError, match="an engine of its maker's own, 'wings'"):
-        repeat(run.with_facts(engine="wings"))
+        repeat(run.with_metadata(engine="wings"))
 
 
 def test_a_missing_column_and_missing_rows_count_as_differences():

@@ -51,7 +51,7 @@ def run(twin) -> Run:
 
 
 def equal(a: Run, b: Run) -> bool:
-    same = list(a) == list(b) and dict(a.facts) == dict(b.facts)
+    same = list(a) == list(b) and dict(a.metadata) == dict(b.metadata)
     return same and all(a[name].tobytes() == np.ascontiguousarray(b[name]).tobytes() for name in b)
 
 
@@ -77,7 +77,7 @@ def test_a_run_that_is_killed_leaves_files_that_lack_no_more_than_the_last_secon
         left = read_run(tmp_path / name)
         assert left["t"][-1] > driven - 1.0, name
         assert np.array_equal(left["b_total_nt"], run["b_total_nt"][: left.rows]), name
-        assert left.facts["seed"] == 1
+        assert left.metadata["seed"] == 1
     assert equal(
         read_run(tmp_path / "run.partial.rrd"), rows(run, slice(read_run(tmp_path / "run.partial.rrd").rows))
     )

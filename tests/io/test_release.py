@@ -47,9 +47,9 @@ def test_every_frame_with_a_reading_is_a_row_with_what_was_known_by_then(tmp_pat
     assert_allclose(run["imu_q_xyzw"], np.tile([0, 0, -0.6, 0.8], (5, 1)))
     assert_allclose(run["odom_w"][:, 2], 0.1 * i)
     assert_array_equal(run["lidar_on"], i % 4 // 2 == 1)
-    assert run.facts["frames"] == 9
-    assert run.facts["recording_end"] == "whole"
-    assert run.facts["start_s"] == 1.7e9
+    assert run.metadata["frames"] == 9
+    assert run.metadata["recording_end"] == "whole"
+    assert run.metadata["start_s"] == 1.7e9
     assert features(run, "full").shape == (5, 20)
     assert np.isfinite(features(run, "full")).all()
 
@@ -72,7 +72,7 @@ def test_every_frame_with_a_reading_is_a_row_with_what_was_known_by_then(tmp_pat
 def test_a_node_that_was_killed_leaves_all_whole_frames(tmp_path, end, told, rows):
     run = read_release(recorded(tmp_path, text([frame(i) for i in range(5)], end)))
     assert run.rows == rows
-    assert run.facts["recording_end"] == told
+    assert run.metadata["recording_end"] == told
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 100, 613])
@@ -83,7 +83,7 @@ def test_pieces_of_any_size_give_the_same_run(tmp_path, monkeypatch, chunk):
     again = read_release(path)
     for name in whole:
         assert_array_equal(whole[name], again[name])
-    assert whole.facts == again.facts
+    assert whole.metadata == again.metadata
 
 
 def test_what_was_not_heard_of_yet_is_nan(tmp_path):

@@ -211,11 +211,11 @@ def test_every_column_is_a_component_under_its_own_name_at_full_rate(parts, writ
         assert np.array_equal(np.array(rows), run[name], equal_nan=column.unit != "bool"), name
 
 
-def test_a_run_comes_back_to_the_bit_with_its_facts_and_the_order_of_its_columns(parts, written):
+def test_a_run_comes_back_to_the_bit_with_its_metadata_and_the_order_of_its_columns(parts, written):
     run, _ = parts
     back = read_run(written)
     assert list(back) == list(run)
-    assert dict(back.facts) == dict(run.facts)
+    assert dict(back.metadata) == dict(run.metadata)
     for name in run:
         assert back[name].dtype == run[name].dtype
         assert back[name].tobytes() == np.ascontiguousarray(run[name]).tobytes(), name
@@ -325,7 +325,7 @@ def test_a_run_of_a_few_rows_is_recorded_too(parts, rows, tmp_path):
     write_rrd(few, tmp_path / "run.rrd", **rest)
     times, _ = columns_of(tmp_path / "run.rrd", "run")
     assert len(times) == rows
-    assert r"| note | a \| b |" in columns_of(tmp_path / "run.rrd", "facts")[1]["TextDocument:text"][0][0]
+    assert r"| note | a \| b |" in columns_of(tmp_path / "run.rrd", "metadata")[1]["TextDocument:text"][0][0]
 
 
 def test_a_map_and_a_run_that_know_no_field_are_recorded_too(parts, tmp_path):
@@ -338,13 +338,13 @@ def test_a_map_and_a_run_that_know_no_field_are_recorded_too(parts, tmp_path):
     assert np.isnan(read_run(tmp_path / "run.rrd")["b_total_nt"]).all()
 
 
-def test_the_facts_are_properties_of_the_recording_and_a_page_in_it(parts, written):
+def test_the_metadata_are_properties_of_the_recording_and_a_page_in_it(parts, written):
     run, _ = parts
     batch = next(c for c in RrdReader(written).stream().to_chunks() if c.entity_path == "/__properties/run")
     told = {k: v[0][0] for k, v in batch.to_record_batch().to_pydict().items() if not k.startswith("rerun.")}
-    assert told == dict(run.facts)
-    page = columns_of(written, "facts")[1]["TextDocument:text"][0][0]
-    assert all(f"| {key} | {value} |" in page for key, value in run.facts.items())
+    assert told == dict(run.metadata)
+    page = columns_of(written, "metadata")[1]["TextDocument:text"][0][0]
+    assert all(f"| {key} | {value} |" in page for key, value in run.metadata.items())
 
 
 def rerun(*arguments):
@@ -362,7 +362,7 @@ def test_reruns_own_tool_verifies_the_file(written):
 
 def test_two_recordings_of_one_run_are_the_same_recording(parts, tmp_path):
     run, rest = parts
-    run = Run({name: np.nan_to_num(values) for name, values in run.items()}, run.facts)  # nan != nan
+    run = Run({name: np.nan_to_num(values) for name, values in run.items()}, run.metadata)  # nan != nan
     for name in ("a.rrd", "b.rrd"):
         write_rrd(run, tmp_path / name, **rest)
     a, b = (RrdReader(tmp_path / name).recordings()[0].recording_id for name in ("a.rrd", "b.rrd"))
@@ -373,7 +373,7 @@ def test_two_recordings_of_one_run_are_the_same_recording(parts, tmp_path):
 
 def test_another_run_is_another_recording(parts, written, tmp_path):
     run, rest = parts
-    write_rrd(run.with_facts(seed=2), tmp_path / "seed.rrd", **rest)
+    write_rrd(run.with_metadata(seed=2), tmp_path / "seed.rrd", **rest)
     write_rrd(run.with_columns(yaw=run["yaw"] + 1e-9), tmp_path / "yaw.rrd", **rest)
     ids = [
         RrdReader(p).recordings()[0].recording_id
@@ -420,8 +420,8 @@ def test_columns_of_other_kinds_come_back_too(tmp_path):
     write_rrd(run, tmp_path / "run.rrd")
     back = read_run(tmp_path / "run.rrd")
     assert list(back) == list(run)
-    assert dict(back.facts) == dict(run.facts)
-    assert {type(fact) for fact in back.facts.values()} == {int, str, float, bool}
+    assert dict(back.metadata) == dict(run.metadata)
+    assert {type(fact) for fact in back.metadata.values()} == {int, str, float, bool}
     for name in run:
         assert back[name].dtype == run[name].dtype
         assert np.array_equal(back[name], run[name])
@@ -430,13 +430,13 @@ def test_columns_of_other_kinds_come_back_too(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["run.rrd"]
 
 
-def test_reruns_schema_lists_every_column_of_the_run_and_its_facts(parts, written):
+def test_reruns_schema_lists_every_column_of_the_run_and_its_metadata(parts, written):
     run, _ = parts
     schema = RrdReader(written).store().schema()
     columns = {one.component for one in schema.component_columns() if one.entity_path == "/run"}
     assert columns >= set(COLUMNS)
-    facts = {one.component for one in schema.component_columns() if one.entity_path == "/__properties/run"}
-    assert facts == set(run.facts)
+    metadata = {one.component for one in schema.component_columns() if one.entity_path == "/__properties/run"}
+    assert metadata == set(run.metadata)
 
 
 def test_plots_of_error_and_interval_follow_from_the_columns(parts, tmp_path):
@@ -514,7 +514,7 @@ def test_runs_that_are_compared_stand_on_one_timeline_with_their_offsets_and_com
     back = read_runs(tmp_path / "two.rrd")
     assert list(back) == list(runs)
     for name, one in runs.items():
-        assert dict(back[name].facts) == dict(one.facts)
+        assert dict(back[name].metadata) == dict(one.metadata)
         assert all(back[name][key].tobytes() == np.ascontiguousarray(one[key]).tobytes() for key in one)
     for entity in ("run/b_2", "world/robot/b_2"):
         times, _ = columns_of(tmp_path / "two.rrd", entity)

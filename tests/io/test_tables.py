@@ -53,7 +53,7 @@ def some_run(rows=50, seed=0):
 
 def assert_same(a, b):
     assert list(a) == list(b)
-    assert dict(a.facts) == dict(b.facts)
+    assert dict(a.metadata) == dict(b.metadata)
     for name in a:
         assert a[name].dtype == b[name].dtype, name
         assert a[name].shape == b[name].shape, name
@@ -77,7 +77,7 @@ def test_the_same_run_gives_the_same_bytes(written, tmp_path):
 
 
 def test_another_run_gives_other_bytes(written, tmp_path):
-    write_parquet(some_run().with_facts(seed=8), tmp_path / "other.parquet")
+    write_parquet(some_run().with_metadata(seed=8), tmp_path / "other.parquet")
     assert (tmp_path / "other.parquet").read_bytes() != written.read_bytes()
 
 
@@ -136,7 +136,7 @@ def test_a_file_rewritten_without_metadata_is_still_a_run(written, tmp_path):
     bare = pa.table({name: bare.column(name) for name in reversed(bare.column_names)})
     pq.write_table(bare, tmp_path / "bare.parquet")
     run = read_parquet(tmp_path / "bare.parquet")
-    assert not run.facts
+    assert not run.metadata
     for name, values in some_run().items():
         assert np.array_equal(run[name], values, equal_nan=True), name
 
@@ -234,12 +234,12 @@ def test_every_table_of_the_same_run_has_the_same_bytes(write, read, name, tmp_p
     write(some_run(), tmp_path / name)
     write(some_run(), tmp_path / f"again-{name}")
     assert (tmp_path / name).read_bytes() == (tmp_path / f"again-{name}").read_bytes()
-    write(some_run().with_facts(seed=8), tmp_path / f"other-{name}")
+    write(some_run().with_metadata(seed=8), tmp_path / f"other-{name}")
     assert (tmp_path / name).read_bytes() != (tmp_path / f"other-{name}").read_bytes()
 
 
 @pytest.mark.parametrize(("write", "read", "name"), TABLES, ids=NAMES)
-def test_a_users_own_columns_keep_dtype_width_unit_and_facts_of_any_text(write, read, name, tmp_path):
+def test_a_users_own_columns_keep_dtype_width_unit_and_metadata_of_any_text(write, read, name, tmp_path):
     spec = Column("K", "head", "temperature", 2, ("in", "out"), "hold")
     run = Run(
         {
@@ -256,7 +256,7 @@ def test_a_users_own_columns_keep_dtype_width_unit_and_facts_of_any_text(write, 
     again = read(tmp_path / name)
     assert_same(run, again)
     assert again.spec("head_k") == spec
-    assert {key: type(value) for key, value in again.facts.items()} == {
+    assert {key: type(value) for key, value in again.metadata.items()} == {
         "note": str,
         "big": int,
         "tiny": float,
@@ -329,11 +329,11 @@ def test_numpy_reads_the_npz_without_pickle(tables):
     with np.load(tables / "run.npz", allow_pickle=False) as arrays:
         assert np.array_equal(arrays["p_world_base"], some_run()["p_world_base"])
         told = json.loads(str(arrays["magtwin"]))
-    assert told["facts"] == FACTS
+    assert told["metadata"] == FACTS
     assert told["columns"]["b_total_nt"]["unit"] == "nT"
 
 
-def test_a_csv_tells_people_facts_units_and_frames_before_its_rows(tables):
+def test_a_csv_tells_people_metadata_units_and_frames_before_its_rows(tables):
     lines = (tables / "run.csv").read_text().splitlines()
     assert lines[1] == f"# rows {some_run().rows}"
     assert lines[2].startswith('# facts {"path": "figure8", "seed": 7')

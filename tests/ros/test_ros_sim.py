@@ -302,8 +302,8 @@ def test_a_run_is_said_again_as_its_robot_said_it(
     assert again.rows == part.rows
     for name in ("t", "b_measured_nt", "odom_p", "imu_w", "p_world_base"):
         np.testing.assert_allclose(again[name], part[name], rtol=1e-12, err_msg=name)
-    assert again.facts == part.facts
-    assert again.facts["magnetometer"] == "neural"
+    assert again.metadata == part.metadata
+    assert again.metadata["magnetometer"] == "neural"
     with pytest.raises(InputError, match="those of a neural magnetometer"):  # so no network learns from one
         read_source(Source("again", lambda: again))
 

@@ -59,10 +59,10 @@ def test_unequal_columns_and_wrong_shapes_are_refused():
 
 def test_a_run_is_not_changed_in_place():
     run = Run({"t": [0.0]}, {"seed": 1})
-    other = run.with_columns(yaw=np.array([1.0])).with_facts(path="sine")
+    other = run.with_columns(yaw=np.array([1.0])).with_metadata(path="sine")
     assert "yaw" not in run
     assert list(other) == ["t", "yaw"]
-    assert dict(other.facts) == {"seed": 1, "path": "sine"}
+    assert dict(other.metadata) == {"seed": 1, "path": "sine"}
     with pytest.raises(TypeError):
         run.columns["t"] = np.zeros(1)
 
@@ -107,7 +107,7 @@ def test_to_pandas_has_a_column_a_part_with_units():
     assert len(frame) == run.rows
     assert np.array_equal(frame["imu_q_xyzw_w"], run["imu_q_xyzw"][:, 3])
     assert frame.attrs["units"]["b_total_nt"] == "nT"
-    assert frame.attrs["facts"] == dict(run.facts)
+    assert frame.attrs["metadata"] == dict(run.metadata)
 
 
 def test_to_xarray_keeps_vectors_whole_with_named_parts_on_the_clock():
@@ -117,7 +117,7 @@ def test_to_xarray_keeps_vectors_whole_with_named_parts_on_the_clock():
     assert np.array_equal(data["t"], run["t"])
     assert np.array_equal(data["p_world_base"].sel(x_y_z="y"), run["p_world_base"][:, 1])
     assert data["imu_w"].attrs == {"units": "rad/s", "frame": "imu_link", "long_name": "gyroscope"}
-    assert data.attrs == dict(run.facts)
+    assert data.attrs == dict(run.metadata)
 
 
 @pytest.mark.parametrize("module", ["pandas", "polars", "xarray"])
@@ -138,7 +138,7 @@ def test_to_polars_has_a_column_a_part():
 def test_select_keeps_the_clock_and_takes_patterns_in_the_order_asked():
     run = every_column()
     assert list(run.select("yaw", "b_t*")) == ["t", "yaw", "b_total_nt", "b_truth_nt"]
-    assert run.select("yaw").facts["derived"] == "select(yaw)"
+    assert run.select("yaw").metadata["derived"] == "select(yaw)"
     with pytest.raises(UnknownNameError, match="no column 'b_totl_nt'; did you mean 'b_total_nt'"):
         run.select("b_totl_nt")
     with pytest.raises(UnknownNameError, match=r"no column 'est_\*'"):
@@ -218,7 +218,7 @@ def test_a_rate_gives_instants_from_the_start_none_after_the_end():
     run = Run({"t": np.arange(28) / 135, "yaw": np.zeros(28)})
     assert np.array_equal(run.resample(rate_hz=135)["t"], run["t"])
     assert_allclose(run.resample(rate_hz=10)["t"], [0, 0.1, 0.2])
-    assert run.resample(rate_hz=10).facts["derived"] == "resample(rate_hz=10)"
+    assert run.resample(rate_hz=10).metadata["derived"] == "resample(rate_hz=10)"
 
 
 def test_another_rule_can_be_asked_for_a_column():
@@ -259,7 +259,7 @@ def test_a_joined_run_is_held_causally_on_the_clock_of_the_first():
     assert np.array_equal(both["yaw_b"], [5, 6, 6, 7])
     assert np.array_equal(both["flag_bump_b"], [True, False, False, True])
     assert both.spec("yaw_b") == COLUMNS["yaw"]
-    assert both.facts == {"seed": 1, "seed_b": 2, "derived": "join(_b)"}
+    assert both.metadata == {"seed": 1, "seed_b": 2, "derived": "join(_b)"}
 
 
 def test_a_run_that_does_not_cover_the_first_or_shares_names_is_refused():
@@ -280,7 +280,7 @@ def test_runs_that_do_not_run_on_are_refused_or_shifted():
     both = Run.concat([a, b], offset=True)
     assert_allclose(both["t"], [0, 0.5, 1.0, 1.5])
     assert np.array_equal(both["yaw"], [1, 2, 3, 4])
-    assert both.facts == {"scene": "lab", "derived": "concat(2 runs)"}
+    assert both.metadata == {"scene": "lab", "derived": "concat(2 runs)"}
     with pytest.raises(InputError, match="runs 0 and 1: column 'yaw' is in one alone"):
         Run.concat([a, b.select()])
     with pytest.raises(InputError, match="at least one run"):
@@ -291,7 +291,7 @@ def test_a_users_own_column_keeps_what_it_was_said_to_hold():
     spec = Column("K", "", "temperature of the head")
     run = Run({"t": [0.0, 1.0], "head_k": [290.0, 291.0]}).with_specs(head_k=spec)
     assert run.spec("head_k") == spec
-    for other in (run.with_facts(a=1), run.select("head_k"), run.resample([0.5]), Run.concat([run])):
+    for other in (run.with_metadata(a=1), run.select("head_k"), run.resample([0.5]), Run.concat([run])):
         assert other.spec("head_k") == spec
     assert run.with_columns(est_q_xyzw=np.zeros((2, 4))).spec("est_q_xyzw").interpolation == "quaternion"
     assert run.with_columns(flag_x=np.zeros(2, bool)).spec("flag_x").interpolation == "hold"

@@ -139,7 +139,7 @@ def test_without_earth_and_fit_the_field_dips_by_60_deg_towards_y():
     scene = replace(SURVEYED, robot=replace(ROBOT, platform=PlatformFieldSpec(hard_iron_change_nt=change)))
     run = drive(scene)
     assert_allclose(run["b_disturbance_nt"], -500 * np.sin(DIP), atol=2)
-    assert "assumed 60 deg down towards +y" in str(run.facts["truth"])
+    assert "assumed 60 deg down towards +y" in str(run.metadata["truth"])
 
 
 @pytest.mark.parametrize("layers", [1, 6])
@@ -157,7 +157,7 @@ def test_a_map_without_headings_is_the_lab_at_the_sensor_and_the_whole_platform_
     b = ONE.lookup(at[:, :2], 0.0)[:, None] * unit
     want = np.linalg.norm(b + b @ np.reshape(iron.soft_iron, (3, 3)).T + iron.hard_iron_nt, axis=1)
     assert_allclose(run["b_truth_nt"], want, rtol=1e-12)
-    assert "the whole platform field" in str(run.facts["truth"])
+    assert "the whole platform field" in str(run.metadata["truth"])
 
 
 @pytest.mark.parametrize("session", ["survey", "later"])
@@ -193,14 +193,16 @@ def test_earth_without_sources_leaves_a_map_that_varies_the_truth():
 
 
 def test_a_run_says_that_the_map_is_its_truth_and_where_sources_are_it_does_not():
-    assert str(drive().facts["truth"]).startswith("the fitted map; platform field from the robot's spec")
-    assert "truth" not in drive(KNOWN).facts
+    assert str(drive().metadata["truth"]).startswith("the fitted map; platform field from the robot's spec")
+    assert "truth" not in drive(KNOWN).metadata
 
 
 @pytest.mark.parametrize(("height", "says"), [(None, False), (0.34, False), (0.2, True)])
 def test_a_run_says_that_its_sensor_is_not_at_the_height_of_the_map(height, says):
     run = drive(field=replace(MAP, height_m=height))
-    assert ("it holds 0.2 m above the floor, and the sensor is at 0.36 m" in str(run.facts["truth"])) == says
+    assert (
+        "it holds 0.2 m above the floor, and the sensor is at 0.36 m" in str(run.metadata["truth"])
+    ) == says
 
 
 def test_a_reading_off_the_map_is_nan():

@@ -215,8 +215,8 @@ def test_a_camera_keeps_its_view_resolution_range_and_direction(tmp_path, kind, 
     assert tuple(product.GetResolutionAttr().Get()) == (640, 480)
     assert product.GetCameraRel().GetTargets() == [camera.GetPath()]
     assert [path.name for path in product.GetOrderedVarsRel().GetTargets()] == channels
-    facts = camera.GetPrim().GetParent().GetCustomDataByKey("magtwin:sensor")
-    assert (facts["rateHz"], facts["noiseStd"]) == (30, 0.007)
+    metadata = camera.GetPrim().GetParent().GetCustomDataByKey("magtwin:sensor")
+    assert (metadata["rateHz"], metadata["noiseStd"]) == (30, 0.007)
     assert_valid(tmp_path / "cart.usda", tmp_path)
 
 

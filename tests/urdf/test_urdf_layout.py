@@ -55,7 +55,7 @@ def composed(path):
     assert not stage.GetCompositionErrors()
     cache, prims = UsdGeom.XformCache(), {}
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
-        facts = {
+        metadata = {
             "type": prim.GetTypeName(),
             "schemas": sorted(prim.GetPrimTypeInfo().GetAppliedAPISchemas()),
             "kind": Usd.ModelAPI(prim).GetKind(),
@@ -65,14 +65,18 @@ def composed(path):
         }
         for prop in prim.GetAuthoredProperties():
             if isinstance(prop, Usd.Relationship):
-                facts[prop.GetName()] = tuple(map(str, prop.GetTargets()))
+                metadata[prop.GetName()] = tuple(map(str, prop.GetTargets()))
                 continue
             value = prop.Get()
             if isinstance(value, Sdf.AssetPath):
                 assert value.resolvedPath
                 value = Path(value.resolvedPath).read_bytes()
-            facts[prop.GetName()] = (str(prop.GetTypeName()), value, tuple(map(str, prop.GetConnections())))
-        prims[str(prim.GetPath())] = facts
+            metadata[prop.GetName()] = (
+                str(prop.GetTypeName()),
+                value,
+                tuple(map(str, prop.GetConnections())),
+            )
+        prims[str(prim.GetPath())] = metadata
     return prims
 
 
@@ -85,8 +89,8 @@ def both(urdf, folder, **choices):
 
 def assert_equal(one, two):
     assert one.keys() == two.keys()
-    for path, facts in one.items():
-        assert facts == two[path], path
+    for path, metadata in one.items():
+        assert metadata == two[path], path
 
 
 def test_the_layers_compose_to_the_single_file_prim_by_prim(tmp_path):
@@ -110,7 +114,7 @@ def test_textures_come_along(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(f'<robot name="arm"><link name="base_link">{INERTIAL}{shape}</link></robot>')
     one, two = both(path, tmp_path)
-    assert any("inputs:file" in facts for facts in one.values())
+    assert any("inputs:file" in metadata for metadata in one.values())
     assert_equal(one, two)
 
 
@@ -278,9 +282,9 @@ def failures(simready, asset, profile, version, scratch):
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     ran = subprocess.run(command, capture_output=True, check=False, text=True, env=clean)
     assert report.exists(), ran.stdout + ran.stderr
-    (facts,) = json.loads(report.read_text()).values()
-    assert facts["features_summary"], "no feature was looked at"
-    return {name for name, feature in facts["features_summary"].items() if feature["blocking_failure"]}
+    (metadata,) = json.loads(report.read_text()).values()
+    assert metadata["features_summary"], "no feature was looked at"
+    return {name for name, feature in metadata["features_summary"].items() if feature["blocking_failure"]}
 
 
 def thumbnail(asset, png):

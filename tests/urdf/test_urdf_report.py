@@ -200,17 +200,17 @@ def test_a_follower_that_rests_beside_0_is_where_it_belongs(tmp_path):
 
 def test_the_json_of_a_report_holds_all_of_it(tmp_path):
     report = convert(urdf(tmp_path, f'{ARM}<gazebo reference="hand"><maxVel>1</maxVel></gazebo>'))
-    facts = json.loads(report.to_json())
-    assert facts["unknown_tags"] == {"gazebo/maxVel": 1}
-    assert facts["links"][1] == {
+    metadata = json.loads(report.to_json())
+    assert metadata["unknown_tags"] == {"gazebo/maxVel": 1}
+    assert metadata["links"][1] == {
         "name": "hand",
         "became": "body",
         "prim": "/arm/hand",
         "mass_in_kg": 1.0,
         "mass_out_kg": 1.0,
     }
-    assert facts["geometries"][0]["box_out"] == [list(corner) for corner in report.geometries[0].box_out]
-    assert set(facts) == set(vars(report))
+    assert metadata["geometries"][0]["box_out"] == [list(corner) for corner in report.geometries[0].box_out]
+    assert set(metadata) == set(vars(report))
 
 
 def test_the_summary_says_the_figures_that_matter(tmp_path):

@@ -250,7 +250,7 @@ def test_the_command_goes_both_ways_and_says_what_stays_behind(tmp_path, capfd):
     main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), "--to-urdf", str(out), "--json"])
     said = json.loads(capfd.readouterr().out)
     assert said["figures"]["links"]["value"] == len(read_description(out).links)
-    assert "MagtwinMagnetometerAPI" in said["facts"]["notes"][0]
+    assert "MagtwinMagnetometerAPI" in said["metadata"]["notes"][0]
     for words, message in (
         ([], "give one of them"),
         (["--out", "x", "--to-urdf", "y.urdf"], "give one of them"),

@@ -112,12 +112,12 @@ def test_no_flag_is_lost_between_frames(run, played):
 def test_a_run_comes_back_to_the_last_bit_at_whatever_frame_rate(name, fps, lab_scene, tmp_path):
     spec = Column("K", "", "temperature of the head")
     run = every_column(start_s=1.7e9).with_columns(est_n=np.arange(40), head_k=np.arange(40.0))
-    run = run.with_specs(head_k=spec).with_facts(network="größe", seed=2**70, quick=True, speed=0.1)
+    run = run.with_specs(head_k=spec).with_metadata(network="größe", seed=2**70, quick=True, speed=0.1)
     run["v_cmd"][:4] = [np.inf, -np.inf, -0.0, 5e-324]
     write_animation(run, tmp_path / name, lab_scene, fps=fps)
     again = read_animation(tmp_path / name)
     assert_same(run, again)
-    assert dict(again.facts) == dict(run.facts)
+    assert dict(again.metadata) == dict(run.metadata)
     assert again.spec("head_k") == spec
     stage = Usd.Stage.Open(str(tmp_path / name))
     assert 0 < stage.GetEndTimeCode() < 100  # counted from the run's own start, not from 1970
@@ -301,7 +301,7 @@ def test_two_robots_play_in_one_stage_a_layer_each(lab_scene, run, tmp_path):
     scene = open_twin(lab_scene, magnetometer="physical").scene
     second = PlacedRobot(robot=replace(scene.robot, name="second"), start=(1.0, -0.5, 0.0))
     both = author_scene(replace(scene, others=(second,)), tmp_path / "two")
-    shifted = run.with_columns(p_world_base=run["p_world_base"] + (0.3, 0.2, 0)).with_facts(robot="second")
+    shifted = run.with_columns(p_world_base=run["p_world_base"] + (0.3, 0.2, 0)).with_metadata(robot="second")
     write_animation(run, tmp_path / "one.usdc", both)
     write_animation(shifted, tmp_path / "two.usdc", tmp_path / "one.usdc")
     stage = Usd.Stage.Open(str(tmp_path / "two.usdc"))
@@ -310,4 +310,4 @@ def test_two_robots_play_in_one_stage_a_layer_each(lab_scene, run, tmp_path):
         assert_allclose(p, ran.resample([3.0])["p_world_base"][0], atol=1e-12)
     assert_same(read_animation(tmp_path / "two.usdc"), shifted)
     with pytest.raises(InputError, match="no robot 'secnd'; did you mean 'second'"):
-        write_animation(run.with_facts(robot="secnd"), tmp_path / "no.usdc", both)
+        write_animation(run.with_metadata(robot="secnd"), tmp_path / "no.usdc", both)

@@ -225,7 +225,7 @@ def test_info_of_a_map_and_of_its_csvs_tells_all_that_it_knows(tmp_path, capsys)
     for file in ("a.usdc", "csv"):
         main(["info", str(tmp_path / file), "--json"])
         told = json.loads(capsys.readouterr().out)
-        figures, facts = told["figures"], told["facts"]
+        figures, metadata = told["figures"], told["metadata"]
         for h, heading in enumerate(("0", "90", "180", "270")):
             values, of = made.values_nt[h][made.valid[h]], figures[f"heading {heading}"]
             assert of["value"] == pytest.approx(values.mean(), abs=0.06)
@@ -235,9 +235,13 @@ def test_info_of_a_map_and_of_its_csvs_tells_all_that_it_knows(tmp_path, capsys)
         assert figures["standard deviation"]["value"] == 9.0
         assert figures["height"]["value"] == 0.3
         assert {"median gradient", "greatest gradient", "extent"} <= figures.keys()
-        assert (facts["method"], facts["parameters"]) == ("gp", made.parameters)
-        assert (facts["frame"], facts["created"], facts["licence"]) == (made.frame, "2024-05-01", "MIT")
-        assert facts["headings deg"] == "0, 90, 180, 270"
+        assert (metadata["method"], metadata["parameters"]) == ("gp", made.parameters)
+        assert (metadata["frame"], metadata["created"], metadata["licence"]) == (
+            made.frame,
+            "2024-05-01",
+            "MIT",
+        )
+        assert metadata["headings deg"] == "0, 90, 180, 270"
 
 
 def test_info_of_a_heading_without_a_valid_node_says_so(tmp_path, capsys):

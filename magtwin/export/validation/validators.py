@@ -104,17 +104,17 @@ def _profile(command: str, profile: str, version: str, robots: Mapping[str, Path
             said = _run(
                 [command, "--profile", profile, "--version", version, "--output", str(report), str(asset)]
             )
-            facts = _facts(report)
+            metadata = _metadata(report)
         if (
-            facts is None and "is not registered" in said.stdout + said.stderr
+            metadata is None and "is not registered" in said.stdout + said.stderr
         ):  # of a tier that is not installed
             get = f"{command} has not the profile; `make simready` makes an environment that has"
             return Check(f"simready {profile} {version}", not_run=get)
-        if facts is None:
+        if metadata is None:
             findings.append(_unfinished("simready-validate", said))
             continue
-        scope = f"simready-validate {facts.get('simready_validate_version', '')}".strip()
-        features = facts["features_summary"]
+        scope = f"simready-validate {metadata.get('simready_validate_version', '')}".strip()
+        features = metadata["features_summary"]
         if not features:
             findings.append(Finding(profile, "no feature was looked at", prim, "install the profile's tier"))
         for name, feature in features.items():
@@ -128,13 +128,13 @@ def _profile(command: str, profile: str, version: str, robots: Mapping[str, Path
     return Check(f"simready {profile} {version}", tuple(findings), scope=scope)
 
 
-def _facts(report: Path) -> dict[str, Any] | None:
+def _metadata(report: Path) -> dict[str, Any] | None:
     """What a report says of its one asset, None where it says nothing."""
     try:
-        (facts,) = json.loads(report.read_text(encoding="utf-8")).values()
+        (metadata,) = json.loads(report.read_text(encoding="utf-8")).values()
     except (OSError, ValueError, AttributeError):
         return None
-    return facts if isinstance(facts, dict) and "features_summary" in facts else None
+    return metadata if isinstance(metadata, dict) and "features_summary" in metadata else None
 
 
 def _unmet(name: str, feature: Mapping[str, Any], prim: str) -> list[Finding]:

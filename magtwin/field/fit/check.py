@@ -98,10 +98,10 @@ def check(
         figures += _figures(method, readings, tested, np.concatenate(mean), np.concatenate(variance), heading)
     if progress is not None:
         progress(steps, steps, "done")
-    facts: dict[str, Any] = {"split": named}
+    metadata: dict[str, Any] = {"split": named}
     if within_m is not None:
-        facts["within"] = f"{within_m:g} m of a reading that was fitted"
-    return Report(f"check of {readings.name or 'survey'}", tuple(figures), facts)
+        metadata["within"] = f"{within_m:g} m of a reading that was fitted"
+    return Report(f"check of {readings.name or 'survey'}", tuple(figures), metadata)
 
 
 def _shown(readings: Readings, rows: Rows) -> Readings:

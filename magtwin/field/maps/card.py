@@ -29,8 +29,8 @@ def map_card(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report:
     Returns:
         The figures of `AnomalyMap.report`, the share of valid nodes, the spread of their standard
         deviations, the height, mean and range of each heading, those of the harmonic field and of the robot
-        it was surveyed with, and the drift. As facts its method with its figures, frame, datum, day, licence,
-        and the files that it was made from with their checksums. What is unknown is said to be.
+        it was surveyed with, and the drift. As metadata its method with its figures, frame, datum, day,
+        licence, and the files that it was made from with their checksums. What is unknown is said to be.
     """
     figures = [*field.report().figures]
     share = 100 * float(field.valid.mean())
@@ -45,15 +45,15 @@ def map_card(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report:
         figures += _harmonic(field.harmonic, "sensor" if field.height_m is None else "floor")
     if len(epochs) > 1:
         figures += drift(epochs).figures
-    facts: dict[str, Any] = {"headings deg": ", ".join(f"{h:.6g}" for h in np.degrees(field.headings_rad))}
-    facts |= {name: getattr(field, name) or "unknown" for name in _TEXTS}
+    metadata: dict[str, Any] = {"headings deg": ", ".join(f"{h:.6g}" for h in np.degrees(field.headings_rad))}
+    metadata |= {name: getattr(field, name) or "unknown" for name in _TEXTS}
     if field.parameters:
-        facts["parameters"] = dict(field.parameters)
+        metadata["parameters"] = dict(field.parameters)
     files = source_files(field.source)
-    facts |= {"files": files} if files else {"source": field.source or "unknown"}
+    metadata |= {"files": files} if files else {"source": field.source or "unknown"}
     if len(epochs) > 1:
-        facts["epochs"] = {m.created: m.source or "source unknown" for m in epochs}
-    return Report(f"map {field.name}", tuple(figures), facts)
+        metadata["epochs"] = {m.created: m.source or "source unknown" for m in epochs}
+    return Report(f"map {field.name}", tuple(figures), metadata)
 
 
 def source_files(source: str) -> dict[str, str]:

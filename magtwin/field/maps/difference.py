@@ -155,12 +155,12 @@ class MapDifference(Summarized):
         ]
         for number, region in enumerate(self.regions[:TOLD], 1):
             figures.append(Figure(f"region {number}", region.peak_nt, "nT", region.peak_sd_nt, region.said()))
-        facts: dict[str, Any] = {}
+        metadata: dict[str, Any] = {}
         for label, name, day in zip(("from", "to"), self.names, self.days, strict=True):
-            facts[label] = " ".join(text for text in (name, day) if text)
+            metadata[label] = " ".join(text for text in (name, day) if text)
         if self.cautions:
-            facts["caution"] = list(self.cautions)
-        return Report(f"difference {self.names[0]} to {self.names[1]}", tuple(figures), facts)
+            metadata["caution"] = list(self.cautions)
+        return Report(f"difference {self.names[0]} to {self.names[1]}", tuple(figures), metadata)
 
     def _where(self, h: Any, j: Any, i: Any) -> str:
         x, y = self.grid.x_m[i], self.grid.y_m[j]

@@ -470,7 +470,7 @@ def _report(layers: list[_Layer], field: AnomalyMap, folder: str | os.PathLike[s
             ),
             *found.figures,
         ),
-        {"files": {s.path.name: s.sha256 for s in layers}, **found.facts},
+        {"files": {s.path.name: s.sha256 for s in layers}, **found.metadata},
     )
 
 

@@ -168,8 +168,8 @@ class Readings(Summarized):
             Figure("greatest", round(float(good.b_nt.max()), 1), "nT"),
         ]
         files = [part for part in self.source.split("; ") if not part.startswith(TAKEN)]
-        facts = {"source": files, "licence": self.licence, "created": self.created}
-        return Report(f"readings {self.name}", tuple(figures), {k: v for k, v in facts.items() if v})
+        metadata = {"source": files, "licence": self.licence, "created": self.created}
+        return Report(f"readings {self.name}", tuple(figures), {k: v for k, v in metadata.items() if v})
 
     def with_(self, **changes: Any) -> "Readings":
         """The same readings with other values of some fields, such as `good`."""

@@ -129,7 +129,7 @@ class Findings:
             Figure("stuck readings", int(self.stuck.sum()), note="repeat to the last digit, robot moving"),
             Figure("latched readings", int(masked.sum()), note="stuck ones included"),
         ]
-        facts: dict[str, object] = {}
+        metadata: dict[str, object] = {}
         if self.level_nt is not None:
             figures.append(
                 Figure("latch level", round(self.level_nt, 1), "nT", spread=round(self.spread_nt, 1))
@@ -145,23 +145,23 @@ class Findings:
                 every = int(at.all(axis=0).sum())
                 figures.append(Figure("latched nodes", int(at.any(axis=0).sum()), note="at any heading"))
                 figures.append(Figure("latched at every heading", every, "nodes"))
-                facts["latched"] = {
+                metadata["latched"] = {
                     f"{np.degrees(h):g} deg": f"{int(layer.sum())} nodes"
                     for h, layer in zip(readings.grid.headings_rad, at, strict=True)
                 }
             else:
-                facts["latched"] = {
+                metadata["latched"] = {
                     readings.runs[r] or f"run {r}": f"{int(masked[readings.run == r].sum())} readings"
                     for r in np.unique(readings.run[masked])
                 }
         outliers = np.flatnonzero(self.outlier)
         figures.append(Figure("outliers", len(outliers), note="left in"))
         if not self.judged:
-            facts["note"] = f"fewer than {LEAST} good readings: only repeats were looked for"
+            metadata["note"] = f"fewer than {LEAST} good readings: only repeats were looked for"
         if len(outliers):
             first = outliers[np.argsort(-np.abs(self.outlier[outliers]), kind="stable")][:NAMED]
-            facts["outliers"] = [_say(readings, int(row), float(self.outlier[row])) for row in first]
-        return Report(f"latched and outlying readings of {readings.name}", tuple(figures), facts)
+            metadata["outliers"] = [_say(readings, int(row), float(self.outlier[row])) for row in first]
+        return Report(f"latched and outlying readings of {readings.name}", tuple(figures), metadata)
 
 
 def find_latched(readings: Readings) -> Findings:

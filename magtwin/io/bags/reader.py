@@ -46,7 +46,7 @@ from magtwin.run.arrow import spec_said
 from magtwin.run.run import COLUMNS, Column, Run
 
 Array = NDArray[np.float64]
-Facts = dict[str, str | int | float | bool]
+Metadata = dict[str, str | int | float | bool]
 FieldUnit = Literal["nT", "uT", "T", "mG", "G"]
 
 LARGEST_METADATA = 1 << 24
@@ -78,8 +78,8 @@ def read_bag(
 ) -> Run:
     """The run that a bag holds: one that magtwin wrote, or what a robot recorded.
 
-    A bag of `write_bag` gives back the columns and facts of its run: fields to a part in 10^15, the battery's
-    columns in single precision, all others to the last bit.
+    A bag of `write_bag` gives back the columns and metadata of its run: fields to a part in 10^15, the
+    battery's columns in single precision, all others to the last bit.
 
     Of a robot's recording the magnetometer's topic is the clock, a row a message; t begins at 0. The topics
     are those of `magtwin.io.bags.messages.TOPICS`, and all but the magnetometer's may be missing. Slower
@@ -87,7 +87,7 @@ def read_bag(
     are held causally by the stamps of their headers, and are nan before their first; a topic whose messages
     have none is taken as received, less what the magnetometer's messages took. p_world_base,
     q_world_base_xyzw and yaw are motion capture's too, between two poses interpolated. Gravity is taken off
-    accelerations that hold it. The facts say which topics were read, the unit and how it was told.
+    accelerations that hold it. The metadata say which topics were read, the unit and how it was told.
 
     Messages that the index of an MCAP file lacks are read too; the fact `messages_not_indexed` counts them.
 
@@ -119,7 +119,7 @@ def read_bag(
             run = _own(bag)
         else:
             run = _recorded(bag, topics or {}, unit)
-        return run.with_facts(messages_not_indexed=bag.unindexed) if bag.unindexed else run
+        return run.with_metadata(messages_not_indexed=bag.unindexed) if bag.unindexed else run
 
 
 @contextlib.contextmanager
@@ -196,7 +196,7 @@ class _Bag:
         elif reader.note:
             self.notes |= _custom(yaml.safe_load(reader.note))
 
-    def facts(self) -> Facts:
+    def metadata(self) -> Metadata:
         """What magtwin noted of the run."""
         notes = self.notes.items()
         return _plain({k.removeprefix(FACTS): json.loads(v) for k, v in notes if k.startswith(FACTS)})
@@ -243,10 +243,10 @@ def _files(path: Path) -> tuple[list[Path], dict[str, str]]:
     return [path / name for name in names], _custom(about)
 
 
-def _plain(said: Any) -> Facts:
-    """Facts, which are texts and numbers by name."""
+def _plain(said: Any) -> Metadata:
+    """Metadata, which are texts and numbers by name."""
     if not isinstance(said, dict):
-        raise InputError("its facts are no table")
+        raise InputError("its metadata are no table")
     for key, value in said.items():
         if not isinstance(value, str | int | float | bool):
             raise InputError(f"fact {key!r} is neither a text nor a number")
@@ -316,7 +316,7 @@ def _own(bag: _Bag) -> Run:
             specs[name] = spec_said(said, tuple(map(str, column["parts"])))
     if "t" in columns:
         _check_order(bag.path, READING.name, columns["t"])
-    return Run(columns, {**_plain(table.get("facts", {})), **bag.facts()}, specs)
+    return Run(columns, {**_plain(table.get("facts", {})), **bag.metadata()}, specs)
 
 
 def _held(topic: Topic, messages: Messages, rows: Index, unit: str) -> dict[str, NDArray[Any]]:
@@ -407,9 +407,9 @@ def _recorded(bag: _Bag, names: Mapping[str, str], unit: FieldUnit | None) -> Ru
     columns["b_measured_nt"] = told[first]
     if vector is not None:
         columns["b_vector_measured_nt"] = vector[first]
-    facts: Facts = {"bag": path.name, "bag_sha256": " ".join(sha256(file) for file in bag.files)}
-    facts |= {"clock": clock.name, "stamps": "header" if by_header else "receipt", "start_ns": str(start)}
-    facts |= {"field_unit": clock.fields["unit"], "field_unit_told": clock.fields["told"]}
+    metadata: Metadata = {"bag": path.name, "bag_sha256": " ".join(sha256(file) for file in bag.files)}
+    metadata |= {"clock": clock.name, "stamps": "header" if by_header else "receipt", "start_ns": str(start)}
+    metadata |= {"field_unit": clock.fields["unit"], "field_unit_told": clock.fields["told"]}
     for topic, signal in signals.items():
         if topic is MAGNITUDE:
             continue
@@ -421,9 +421,9 @@ def _recorded(bag: _Bag, names: Mapping[str, str], unit: FieldUnit | None) -> Ru
                 f"{path}: {signal.name} spans {when[0]:.3f}..{when[-1]:.3f} s since the first reading of "
                 f"{clock.name}, which ends at {t[-1]:.3f} s; are they of one clock?"
             )
-        columns |= _columns(signal, when, t, facts, path)
-    facts["topics"] = " ".join(sorted(signal.name for signal in signals.values()))
-    return Run({name: columns[name] for name in COLUMNS if name in columns}, facts)
+        columns |= _columns(signal, when, t, metadata, path)
+    metadata["topics"] = " ".join(sorted(signal.name for signal in signals.values()))
+    return Run({name: columns[name] for name in COLUMNS if name in columns}, metadata)
 
 
 _RECORDED = (MAGNITUDE, POSE, ODOMETRY, IMU, BATTERY, COMMAND, JOINTS, SCAN, VECTOR)
@@ -471,7 +471,9 @@ def _field(signal: _Signal, path: Path, unit: FieldUnit | None) -> tuple[Array, 
     return NT_PER[unit] * size, None if vector is None else NT_PER[unit] * vector
 
 
-def _columns(signal: _Signal, when: Array, t: Array, facts: Facts, path: Path) -> dict[str, NDArray[Any]]:
+def _columns(
+    signal: _Signal, when: Array, t: Array, metadata: Metadata, path: Path
+) -> dict[str, NDArray[Any]]:
     """The columns that a slower signal gives, held causally at the times of readings [s]."""
     at = np.searchsorted(when, t, side="right") - 1
     known = at >= 0
@@ -486,7 +488,7 @@ def _columns(signal: _Signal, when: Array, t: Array, facts: Facts, path: Path) -
         if not np.isfinite(size).any():
             return {}
         unit = unit_of(float(size[np.isfinite(size)].mean()), path, signal.name)  # perhaps not the clock's
-        facts["vector_unit"] = unit
+        metadata["vector_unit"] = unit
         values = {"b_vector_measured_nt": values["magnetic_field"] * NT_PER[unit]}
     for name in values.keys() & {"mocap_q_xyzw", "imu_q_xyzw"}:
         values[name] = canonical(values[name])
@@ -496,7 +498,7 @@ def _columns(signal: _Signal, when: Array, t: Array, facts: Facts, path: Path) -
         mean = float(np.linalg.norm(known_a.mean(axis=0))) if len(known_a) else 0.0
         if abs(mean - GRAVITY) < GRAVITY / 10:
             values["imu_a"] = a - rotate(quat_conjugate(values["imu_q_xyzw"]), (0.0, 0.0, GRAVITY))
-            facts["imu_gravity"] = "removed"
+            metadata["imu_gravity"] = "removed"
     found = {name: _taken(array, at, known) for name, array in values.items()}
     if signal.topic is POSE:
         once = np.flatnonzero(np.diff(when, prepend=-np.inf) > 0)
@@ -505,7 +507,7 @@ def _columns(signal: _Signal, when: Array, t: Array, facts: Facts, path: Path) -
         found["q_world_base_xyzw"] = np.where(inside[:, None], q, found["mocap_q_xyzw"])
         found["yaw"] = yaw_from_quat(found["q_world_base_xyzw"])
         found["flag_pose_lost"] = ~inside
-        facts["truth"] = f"motion capture, {signal.name}"
+        metadata["truth"] = f"motion capture, {signal.name}"
     return found
 
 

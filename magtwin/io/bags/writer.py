@@ -37,7 +37,7 @@ from magtwin.io.bags.messages import (
     transforms,
 )
 from magtwin.io.recorder import PARTIAL, partial_of
-from magtwin.run.arrow import check_clock, facts_to_json
+from magtwin.run.arrow import check_clock, metadata_to_json
 from magtwin.run.run import Run
 from magtwin.version import __version__
 
@@ -55,7 +55,7 @@ FACTS = "magtwin."
 """Before the name of a fact in a bag's custom data; what it says is JSON."""
 
 NOTE = "magtwin"
-"""Record of metadata in an MCAP file that holds the facts."""
+"""Record of metadata in an MCAP file that holds the metadata."""
 
 BLOCK = 16_384
 """Rows that are written at a time."""
@@ -96,7 +96,7 @@ def write_bag(
     path = Path(path)
     storage = storage_of(path, storage)
     check_free(path, force=force)
-    who = sender_for(twin, units, run.facts.get("rate_hz"))
+    who = sender_for(twin, units, run.metadata.get("rate_hz"))
     with output(path, force=force) as aside, refused(path):
         sink = _Sink(aside, storage, who, scans, live=False)
         try:
@@ -163,7 +163,7 @@ class BagWriter:
         """Add rows of a run, later than those before and of the same columns; they outlive this process.
 
         Args:
-            run: The rows; facts that are new or other than before replace them.
+            run: The rows; metadata that are new or other than before replace them.
 
         Raises:
             InputError: As `write_bag`.
@@ -199,7 +199,7 @@ class BagWriter:
             self.abort()
 
     def _open(self, run: Run) -> "_Sink":
-        who = sender_for(self._twin, self._units, run.facts.get("rate_hz"))
+        who = sender_for(self._twin, self._units, run.metadata.get("rate_hz"))
         if self.partial.is_dir():
             for file in self.partial.iterdir():
                 file.unlink()
@@ -296,7 +296,7 @@ class _Sink:
             self._store: _Store = McapWriter(path, f"magtwin {__version__}")
         else:
             self._store = Db3Writer(path, live=live)
-        self._facts: dict[str, str] | None = None
+        self._noted: dict[str, str] | None = None
         self._connections: dict[str, Connection] = {}
         self._tally = Tally({})
         self._stream: Stream | None = None
@@ -306,11 +306,11 @@ class _Sink:
         if self._stream is None:
             self._stream = Stream(run, self._who, self._scans)
             self._connect(self._stream.topics)
-        facts = {name: json.dumps(value) for name, value in json.loads(facts_to_json(run)).items()}
-        if facts != self._facts:
-            self._facts = facts
+        metadata = {name: json.dumps(value) for name, value in json.loads(metadata_to_json(run)).items()}
+        if metadata != self._noted:
+            self._noted = metadata
             if isinstance(self._store, McapWriter):
-                self._store.note(NOTE, facts)
+                self._store.note(NOTE, metadata)
         self._write(self._stream.messages(run))
 
     def flush(self) -> None:
@@ -358,7 +358,7 @@ class _Sink:
             self._store.note(VERSION, yaml_of(self._metadata()))
 
     def _metadata(self) -> dict[str, Any]:
-        custom = {FACTS + name: value for name, value in (self._facts or {}).items()}
+        custom = {FACTS + name: value for name, value in (self._noted or {}).items()}
         connections = list(self._connections.values())
         return metadata(self._storage, [self._file.name], connections, self._tally, custom)
 
@@ -416,7 +416,8 @@ class Stream:
             scans: What its LiDAR will have seen; none says nothing of it.
             topics: Those that are said, as far as the run has their columns.
             whole: Whether /magtwin/reading tells every column, and not only those that no other topic does,
-                and /magtwin/columns the run's facts, which who records live topics knows from nowhere else.
+                and /magtwin/columns the run's metadata, which who records live topics knows from nowhere
+                else.
         """
         self._who, self._scans = who, scans
         self._t = -np.inf
@@ -427,7 +428,7 @@ class Stream:
         self._carried: dict[str, Topic] = carried
         self._rest = [name for name in run if name not in self._carried]
         self._columns = {name: (values.dtype, values.shape[1:]) for name, values in run.items()}
-        self._table = self._told(run, run.facts if whole else {})
+        self._table = self._told(run, run.metadata if whole else {})
         for name, values in run.items():
             if values.ndim > 2 or values.dtype.kind not in "bfiu":
                 raise InputError(
@@ -534,7 +535,7 @@ class Stream:
             sent &= _finite(run, topic.needs)
         return np.flatnonzero(sent)
 
-    def _told(self, run: Run, facts: Mapping[str, Any]) -> str:
+    def _told(self, run: Run, metadata: Mapping[str, Any]) -> str:
         """What columns there are, and where each is: the content of /magtwin/columns."""
         columns, first = [], 0
         for name, (dtype, shape) in self._columns.items():
@@ -548,7 +549,11 @@ class Stream:
                 told["first"] = first
                 first += shape[0] if shape else 1
             columns.append(told)
-        table = {"unit": self._who.unit, "columns": columns, **({"facts": dict(facts)} if facts else {})}
+        table = {
+            "unit": self._who.unit,
+            "columns": columns,
+            **({"facts": dict(metadata)} if metadata else {}),
+        }
         return json.dumps(table, ensure_ascii=False, indent=1)
 
 

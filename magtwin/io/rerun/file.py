@@ -19,7 +19,7 @@ from magtwin.io.rerun.recording import (
     ROOM,
     Recording,
     content_id,
-    facts_page,
+    metadata_page,
     send_properties,
     size_of,
     stream,
@@ -72,8 +72,8 @@ def write_rrd(
         output(path, force=force) as aside,
         stream(content_id(run), name, views, file=aside, said=FilePath(path), room=room) as rec,
     ):
-        send_properties(rec, run.facts)
-        rec.log("facts", facts_page(run.facts, run.rows), static=True)
+        send_properties(rec, run.metadata)
+        rec.log("metadata", metadata_page(run.metadata, run.rows), static=True)
         robot = None
         if interior is not None:
             robot = Room.enter(rec, interior, run, planned=planned).robot()

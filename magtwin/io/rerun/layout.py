@@ -236,7 +236,7 @@ def layout(
     states = rrb.StateTimelineView(
         origin="states", contents=[f"$origin/{name}" for name in lanes], name="States", time_view=axis
     )
-    pages = rrb.Tabs(_event_view(), rrb.TextDocumentView(origin="facts", name="Run"))
+    pages = rrb.Tabs(_event_view(), rrb.TextDocumentView(origin="metadata", name="Run"))
     about = rrb.Vertical(states, pages, row_shares=[1.2, 1.4])
     if lab is None:
         root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
@@ -263,8 +263,8 @@ def comparison_layout(
         for title, column, part in _COMPARED
     ]
     side = rrb.Vertical(*_stacked(*rows, whole=whole, tall=0))
-    facts = [rrb.TextDocumentView(origin=entity_of("facts", one.name), name=one.name) for one in runs]
-    about = rrb.Tabs(_event_view(), *facts)
+    metadata = [rrb.TextDocumentView(origin=entity_of("metadata", one.name), name=one.name) for one in runs]
+    about = rrb.Tabs(_event_view(), *metadata)
     if lab is None:
         root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
     else:

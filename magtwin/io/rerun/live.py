@@ -21,7 +21,7 @@ from magtwin.io.rerun.recording import (
     ROOM,
     Recording,
     check_room,
-    facts_page,
+    metadata_page,
     send_properties,
     size_of,
     stream,
@@ -225,11 +225,11 @@ class _Growing:
                 room=ROOM + (interior.size if interior else 0),
             )
         )
-        send_properties(rec, run.facts)
-        rec.log("facts", facts_page(run.facts), static=True)
+        send_properties(rec, run.metadata)
+        rec.log("metadata", metadata_page(run.metadata), static=True)
         robot = None
         if interior is not None:
-            rate = run.facts.get("rate_hz", 0.0)
+            rate = run.metadata.get("rate_hz", 0.0)
             room = Room.enter(rec, interior, known, planned=self._planned)
             robot = room.robot(rate if isinstance(rate, float) else 0.0)
         return Recording(rec, robot=robot, scans=self._scans)

@@ -18,7 +18,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from magtwin.errors import InputError
-from magtwin.io.rerun.series import Flags, entity_of, send_columns, send_facts, send_rows
+from magtwin.io.rerun.series import Flags, entity_of, send_columns, send_metadata, send_rows
 from magtwin.io.rerun.world import Feed, Robot
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
@@ -32,7 +32,7 @@ END = b"RRF2FOOT"
 """What stands at the end of a file that Rerun finished."""
 
 ROOM = 1 << 20
-"""Bytes that a layout, the facts and what names all columns take, or more."""
+"""Bytes that a layout, the metadata and what names all columns take, or more."""
 
 POSED = frozenset(("p_world_base", "q_world_base_xyzw"))
 """Columns that place a robot."""
@@ -161,7 +161,7 @@ class Recording:
         if not run.rows:
             return
         if not self._rows:
-            send_facts(self.rec, run, self.name)
+            send_metadata(self.rec, run, self.name)
         send_columns(self.rec, run, run["t"] + self.offset_s, self.name)
         self._flags.append(run)
         if self.robot is not None and run.keys() >= POSED:
@@ -181,12 +181,14 @@ class Recording:
         if self._feed is not None:
             self._feed.clear(float(self._last["t"][-1]))
         send_rows(self.rec, self._rows, self.name)
-        self.rec.log(entity_of("facts", self.name), facts_page(self._last.facts, self._rows), static=True)
+        self.rec.log(
+            entity_of("metadata", self.name), metadata_page(self._last.metadata, self._rows), static=True
+        )
 
 
-def send_properties(rec: rr.RecordingStream, facts: Mapping[str, Any]) -> None:
-    """The facts of a run as properties of the recording, for the viewer and for catalogs."""
-    known: dict[str, Any] = {key: [value] for key, value in facts.items() if not _too_large(value)}
+def send_properties(rec: rr.RecordingStream, metadata: Mapping[str, Any]) -> None:
+    """The metadata of a run as properties of the recording, for the viewer and for catalogs."""
+    known: dict[str, Any] = {key: [value] for key, value in metadata.items() if not _too_large(value)}
     if known:
         rec.send_property("run", rr.AnyValues(**known))
 
@@ -197,7 +199,7 @@ def _too_large(value: object) -> bool:
 
 def title_of(run: Run) -> str:
     """What the viewer calls a run: path and seed."""
-    return ", ".join(f"{key} {run.facts[key]}" for key in ("path", "seed") if key in run.facts)
+    return ", ".join(f"{key} {run.metadata[key]}" for key in ("path", "seed") if key in run.metadata)
 
 
 def content_id(*runs: Run) -> str:
@@ -208,13 +210,13 @@ def content_id(*runs: Run) -> str:
             name: (str(values.dtype), values.shape, zlib.crc32(np.ascontiguousarray(values).data))
             for name, values in run.items()
         }
-        digest.update(json.dumps([sums, dict(run.facts)], sort_keys=True).encode())
+        digest.update(json.dumps([sums, dict(run.metadata)], sort_keys=True).encode())
     return digest.hexdigest()[:32]
 
 
-def facts_page(facts: Mapping[str, Any], rows: int | None = None) -> rr.TextDocument:
-    """The facts of a run as a page with a table."""
-    said = {**({} if rows is None else {"readings": f"{rows:,}"}), **facts}
+def metadata_page(metadata: Mapping[str, Any], rows: int | None = None) -> rr.TextDocument:
+    """The metadata of a run as a page with a table."""
+    said = {**({} if rows is None else {"readings": f"{rows:,}"}), **metadata}
     cells = [(_cell(key), _cell(value)) for key, value in said.items()]
     lines = ["| fact | value |", "|---|---|", *(f"| {key} | {value} |" for key, value in cells)]
     return rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)

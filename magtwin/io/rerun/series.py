@@ -35,7 +35,8 @@ COLUMNS_ENTITY, DERIVED_ENTITY = "run", "derived"
 """Entities of a run's columns, and of what plots show beside them."""
 
 FACTS, NAMES, NAME, ROWS = "magtwin_facts", "magtwin_columns", "magtwin_name", "magtwin_rows"
-"""Components beside the columns, without time: facts and columns in JSON; the name of the run among others;
+"""Components beside the columns, without time: metadata and columns in JSON; the name of the run among
+others;
 the rows of a run that ended."""
 
 INTERVAL = 1.645
@@ -141,10 +142,10 @@ def send(rec: rr.RecordingStream, entity: str, t: Array, archetype: Any, **value
         rec.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=times[part])], columns)
 
 
-def send_facts(rec: rr.RecordingStream, run: Run, name: str) -> None:
-    """What is known of a run before its first row: facts, and the columns in their order."""
+def send_metadata(rec: rr.RecordingStream, run: Run, name: str) -> None:
+    """What is known of a run before its first row: metadata, and the columns in their order."""
     told = {key: said_of(run.spec(key), key) for key in run}
-    texts = {FACTS: dict(run.facts), NAMES: told}
+    texts = {FACTS: dict(run.metadata), NAMES: told}
     as_json: dict[str, Any] = {key: [json.dumps(value, ensure_ascii=False)] for key, value in texts.items()}
     rec.log(entity_of(COLUMNS_ENTITY, name), rr.AnyValues(**as_json | {NAME: [name]}), static=True)
 
@@ -216,18 +217,18 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
             known = [key for key in (FACTS, NAMES, NAME, ROWS) if key in batch.schema.names]
             told |= {key: batch.column(key)[0][0].as_py() for key in known}
     try:
-        facts, names = (json.loads(told[key]) for key in (FACTS, NAMES))
+        metadata, names = (json.loads(told[key]) for key in (FACTS, NAMES))
         rows = int(told[ROWS]) if ROWS in told else None
-        whole = all(isinstance(one, dict) for one in (facts, names))
-        if not whole or not all(isinstance(fact, str | int | float | bool) for fact in facts.values()):
-            raise ValueError("facts and columns must be tables of plain values")
+        whole = all(isinstance(one, dict) for one in (metadata, names))
+        if not whole or not all(isinstance(fact, str | int | float | bool) for fact in metadata.values()):
+            raise ValueError("metadata and columns must be tables of plain values")
         order = np.argsort([table.column(TIMELINE)[0].value for table in tables], kind="stable")
         columns = {
             name: np.concatenate([_values(tables[k].column(name)) for k in order])
             for name in (names if tables else ())
         }
         own = {name: _spec(tables[0].column(name), names[name]) for name in columns if name not in COLUMNS}
-        run = Run(columns, facts, own)
+        run = Run(columns, metadata, own)
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, pa.ArrowException) as error:
         raise InputError(
             f"{what}: a Rerun recording, but not one of a run that magtwin can read "

@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -153,15 +154,8 @@ def headless_viewer(size: tuple[int, int] = (1600, 1000)) -> Iterator[ViewerClie
     Raises:
         InputError: It cannot run here; the text says what it said.
     """
-    port = _free_port()
-    command = [_binary(), "--headless", "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen"]
-    command += ["--window-size", f"{size[0]}x{size[1]}"]
-    with tempfile.TemporaryFile("w+") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-        try:
-            yield _connected(process, port, log)
-        finally:
-            _end(process)
+    with _started("--headless", "--window-size", f"{size[0]}x{size[1]}") as (_, client):
+        yield client
 
 
 @contextmanager
@@ -177,16 +171,40 @@ def live_viewer(*, headless: bool = False) -> Iterator[tuple[str, ViewerClient]]
     Raises:
         InputError: It cannot run here; the text says what it said.
     """
+    with _started(*["--headless"] * headless) as viewer:
+        yield viewer
+
+
+@contextmanager
+def _started(*options: str) -> Iterator[tuple[str, ViewerClient]]:
+    """A viewer process that listens on this machine only, its address and a client; ended with the block."""
     port = _free_port()
-    command = [_binary(), "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen"]
+    command = [_binary(), "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen", *options]
+    process = None
     with tempfile.TemporaryFile("w+") as log:
-        process = subprocess.Popen(
-            command + ["--headless"] * headless, stdout=log, stderr=log, start_new_session=True
-        )
         try:
+            with _interrupt_later():
+                process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
             yield f"rerun+http://{LOCALHOST}:{port}/proxy", _connected(process, port, log)
         finally:
-            _end(process)
+            if process is not None:
+                _end(process)
+
+
+@contextmanager
+def _interrupt_later() -> Iterator[None]:
+    """Delay Ctrl-C to the end of the block, so that no process is started whose handle is lost."""
+    if threading.current_thread() is not threading.main_thread():  # Python interrupts the main thread only
+        yield
+        return
+    interrupts: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: interrupts.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if interrupts:
+        signal.raise_signal(signal.SIGINT)
 
 
 def _connected(process: "subprocess.Popen[bytes]", port: int, log: IO[str]) -> ViewerClient:

@@ -27,12 +27,12 @@ from magtwin.files import existing, output, sha256
 from magtwin.learn.data.features import FEATURES, SETS, columns_of, feature_names
 from magtwin.learn.data.features import features as features_of
 from magtwin.learn.data.labels import Alignment, fit_alignment, labelled
-from magtwin.learn.data.origin import map_facts, shared_facts
+from magtwin.learn.data.origin import map_metadata, shared_metadata
 from magtwin.learn.data.recording import Recording, Rows, Source, read, sources_of, thinned
 from magtwin.learn.data.split import Part, Split
 from magtwin.report import Figure, Report
 from magtwin.run.arrow import run_of, table_of
-from magtwin.run.run import Facts, Run
+from magtwin.run.run import Metadata, Run
 from magtwin.summary import Summarized, Summary, listed, span
 from magtwin.version import __version__
 
@@ -83,7 +83,7 @@ class Dataset(Summarized):
     alignment: Alignment
     """Lever arm and latency that they were made with."""
 
-    facts: Facts
+    metadata: Metadata
     """Version of magtwin, the map's method and values, how the alignment came about, and the robot that
     drove, where the recordings tell; see `magtwin.learn.data.origin`."""
 
@@ -241,13 +241,13 @@ class Dataset(Summarized):
             *self.alignment.report().figures,
         ]
         sets = [name for name in SETS if set(columns_of(name)) <= set(self.columns)]
-        facts = {
+        metadata = {
             "map": self.map_name,
             "map_sha256": self.map_sha256,
-            **{name: fact for name, fact in self.facts.items() if name != "map_samples_nt"},
+            **{name: fact for name, fact in self.metadata.items() if name != "map_samples_nt"},
             "feature sets": ", ".join(sets),
         }
-        return Report(f"Data set {self.folder}", tuple(figures), facts)
+        return Report(f"Data set {self.folder}", tuple(figures), metadata)
 
     def _check_features(self, names: Sequence[str]) -> None:
         for name in names:
@@ -368,7 +368,7 @@ def build_dataset(
         raise InputError(f'alignment must be "fit", an Alignment or None, got {alignment!r}')
     done: list[Recording] = []
     columns: list[set[str]] = []
-    told: list[Facts] = []
+    told: list[Metadata] = []
     with output(folder, force=force) as aside:
         (aside / RUNS).mkdir(parents=True)
         for i, source in enumerate(sources):
@@ -381,16 +381,16 @@ def build_dataset(
             run = run.select(*(column for column in KEPT if column in run))
             done.append(_write(run, source, aside / RUNS / f"{source.name}.parquet"))
             columns.append(set(run))
-            told.append(run.facts)
+            told.append(run.metadata)
         _check_labels(done, field)
         shared = [c for c in KEPT if all(c in one for one in columns)]
-        facts: dict[str, Any] = {"alignment": how, "magtwin": __version__}
-        facts |= {"map_source": field.source, "map_licence": field.licence, **map_facts(field)}
-        facts |= {"poses": "mocap" if "mocap_p" in shared else "true", **shared_facts(told)}
+        metadata: dict[str, Any] = {"alignment": how, "magtwin": __version__}
+        metadata |= {"map_source": field.source, "map_licence": field.licence, **map_metadata(field)}
+        metadata |= {"poses": "mocap" if "mocap_p" in shared else "true", **shared_metadata(told)}
         manifest = {
             "kind": KIND,
             "version": VERSION,
-            "facts": {key: text for key, text in facts.items() if text},
+            "facts": {key: text for key, text in metadata.items() if text},
             "map": {"name": field.name, "sha256": map_sha256 or values_sha256(field)},
             "alignment": asdict(alignment or Alignment()),
             "columns": shared,
@@ -470,7 +470,7 @@ def _write(run: Run, source: Source, path: Path) -> Recording:
         column_encoding=floats,
     )
     label = run["label_nt"][np.isfinite(run["label_nt"])]
-    told = run.facts
+    told = run.metadata
     session = source.session
     if not session and "session" in told:
         seed = f"{told['session_seed']}-" if "session_seed" in told else ""

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import into_base
-from magtwin.run.run import Facts
+from magtwin.run.run import Metadata
 from magtwin.spec.scene import RobotSpec
 
 Array = NDArray[np.float64]
 
 ROBOT_FACTS = ("robot_name", "sensor_m", "platform_sha256", "mocap_offset_m", "mocap_latency_s")
-"""Facts of a run that tell which robot drove, and how motion capture saw it."""
+"""Metadata of a run that tell which robot drove, and how motion capture saw it."""
 
 UNKNOWN, SEVERAL = "unknown", "several"
 """What a data set says of its robot where no recording tells, or where they differ."""
@@ -54,32 +54,32 @@ class Mismatch:
     """Whether predictions are meaningless: another robot."""
 
 
-def shared_facts(runs: Iterable[Mapping[str, Any]]) -> dict[str, str]:
-    """What the facts of recordings tell of their robot: one value, `UNKNOWN` or `SEVERAL` for each."""
+def shared_metadata(runs: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """What the metadata of recordings tell of their robot: one value, `UNKNOWN` or `SEVERAL` for each."""
     told: dict[str, set[str]] = {name: set() for name in ROBOT_FACTS}
-    for facts in runs:
+    for metadata in runs:
         for name in ROBOT_FACTS:
-            told[name].add(str(facts.get(name, UNKNOWN)))
+            told[name].add(str(metadata.get(name, UNKNOWN)))
     return {
         name: next(iter(values)) if len(values) == 1 else SEVERAL for name, values in told.items() if values
     }
 
 
-def map_facts(field: AnomalyMap) -> dict[str, str]:
+def map_metadata(field: AnomalyMap) -> dict[str, str]:
     """What is kept of a map to compare others with it: its method, and its values at `SAMPLES` poses."""
     p, yaw = _poses(field.extent)
     values = field.lookup(p, yaw)
-    facts = {
+    metadata = {
         "map_method": field.method,
         "map_height_m": "" if field.height_m is None else f"{field.height_m:g}",
         "map_extent_m": _text(field.extent),
         "map_samples_nt": " ".join(f"{value:.0f}" for value in values),
     }
-    return {name: text for name, text in facts.items() if text}
+    return {name: text for name, text in metadata.items() if text}
 
 
 def mismatches(
-    facts: Facts,
+    metadata: Metadata,
     name: str,
     *,
     residual_sd_nt: float,
@@ -94,7 +94,7 @@ def mismatches(
     there too, to some mm; labels without took it where motion capture saw the robot.
 
     Args:
-        facts: Those of the network.
+        metadata: Those of the network.
         name: What to call the network.
         residual_sd_nt: Its own error [nT]; nan where unknown.
         field: The map that its predictions are added to.
@@ -106,35 +106,38 @@ def mismatches(
         One for each thing that differs; none where everything is as it learned it.
 
     Raises:
-        InputError: Facts of the network are not what they should be.
+        InputError: Metadata of the network are not what they should be.
     """
     found = [
-        _robot_mismatch(facts, name, field, robot, platform_sha256),
-        _map_mismatch(facts, name, field, map_sha256),
-        _frame_mismatch(facts, name, field, residual_sd_nt),
+        _robot_mismatch(metadata, name, field, robot, platform_sha256),
+        _map_mismatch(metadata, name, field, map_sha256),
+        _frame_mismatch(metadata, name, field, residual_sd_nt),
     ]
     return tuple(one for one in found if one is not None)
 
 
-def label_frame(facts: Facts, name: str = "") -> tuple[float, float, float] | None:
+def label_frame(metadata: Metadata, name: str = "") -> tuple[float, float, float] | None:
     """Where a network's labels took the map, seen from the robot's true pose.
 
     Labels took it at p(t - latency) + R l of what motion capture saw, which is the true pose of `a` seconds
     ago less R o. So the map was read l - o forward and left of the true place, and latency + a late.
 
     Args:
-        facts: Those of the network.
+        metadata: Those of the network.
         name: What to call the network, in a refusal.
 
     Returns:
         Forward [m], left [m] and lateness [s]; all 0 where labels took the true pose. None where the robot
         does not tell how motion capture saw it, as a real one.
     """
-    lever, late = _numbers(facts, name, "lever_arm_m", 2), _numbers(facts, name, "latency_s", 1)
-    offset, age = _numbers(facts, name, "mocap_offset_m", 2), _numbers(facts, name, "mocap_latency_s", 1)
+    lever, late = _numbers(metadata, name, "lever_arm_m", 2), _numbers(metadata, name, "latency_s", 1)
+    offset, age = (
+        _numbers(metadata, name, "mocap_offset_m", 2),
+        _numbers(metadata, name, "mocap_latency_s", 1),
+    )
     if lever is None or late is None:
         return None
-    if facts.get("poses") == "true":
+    if metadata.get("poses") == "true":
         offset, age = [0.0, 0.0], [0.0]
     if offset is None or age is None:
         return None
@@ -155,20 +158,20 @@ def displacement_nt(field: AnomalyMap, forward_m: float, left_m: float, late_s: 
     return float(np.sqrt(np.mean(change[known] ** 2))) if known.any() else math.nan
 
 
-def _map_mismatch(facts: Facts, name: str, field: AnomalyMap, map_sha256: str) -> Mismatch | None:
-    if "map_sha256" not in facts:
+def _map_mismatch(metadata: Metadata, name: str, field: AnomalyMap, map_sha256: str) -> Mismatch | None:
+    if "map_sha256" not in metadata:
         return Mismatch(
             f"{name} does not say which map it was trained on; if that was not {field.name!r}, its field "
             "errs by the difference of the two"
         )
-    if facts["map_sha256"] == map_sha256:
+    if metadata["map_sha256"] == map_sha256:
         return None
-    learned = f"{facts.get('map', '')!r}"
-    if "map_method" in facts:
-        learned += f" ({facts['map_method']})"
+    learned = f"{metadata.get('map', '')!r}"
+    if "map_method" in metadata:
+        learned += f" ({metadata['map_method']})"
     here = f"{field.name!r}" + (f" ({field.method})" if field.method else "")
-    effect, known = "the expected effect is unknown", _numbers(facts, name, "map_samples_nt", SAMPLES)
-    extent = _numbers(facts, name, "map_extent_m", 4)
+    effect, known = "the expected effect is unknown", _numbers(metadata, name, "map_samples_nt", SAMPLES)
+    extent = _numbers(metadata, name, "map_extent_m", 4)
     if known is not None and extent is not None:
         low_x, high_x, low_y, high_y = extent
         difference = field.lookup(*_poses((low_x, high_x, low_y, high_y))) - np.array(known)
@@ -188,8 +191,10 @@ def _map_mismatch(facts: Facts, name: str, field: AnomalyMap, map_sha256: str) -
     )
 
 
-def _frame_mismatch(facts: Facts, name: str, field: AnomalyMap, residual_sd_nt: float) -> Mismatch | None:
-    frame = label_frame(facts, name)
+def _frame_mismatch(
+    metadata: Metadata, name: str, field: AnomalyMap, residual_sd_nt: float
+) -> Mismatch | None:
+    frame = label_frame(metadata, name)
     if frame is None:
         return None
     effect = displacement_nt(field, *frame)
@@ -201,16 +206,16 @@ def _frame_mismatch(facts: Facts, name: str, field: AnomalyMap, residual_sd_nt: 
         f"pose, an error of about {effect:.0f} nT RMS at {TYPICAL_M_S:g} m/s; its stated error includes it. "
         + (
             "Their fit of lever arm and latency is that far off: record more turns at several speeds"
-            if facts.get("alignment") == "fitted"
+            if metadata.get("alignment") == "fitted"
             else "To avoid it, train on labels with fitted lever arm and latency (dataset build --align fit)"
         )
     )
 
 
 def _robot_mismatch(
-    facts: Facts, name: str, field: AnomalyMap, robot: RobotSpec, platform_sha256: str
+    metadata: Metadata, name: str, field: AnomalyMap, robot: RobotSpec, platform_sha256: str
 ) -> Mismatch | None:
-    learned, sensor = facts.get("robot_name", UNKNOWN), _numbers(facts, name, "sensor_m", 3)
+    learned, sensor = metadata.get("robot_name", UNKNOWN), _numbers(metadata, name, "sensor_m", 3)
     if learned == UNKNOWN:
         return None
     if learned == SEVERAL:
@@ -220,10 +225,11 @@ def _robot_mismatch(
     here = _text(robot.p_base_magnetometer)
     if learned != robot.name and away > 1e-3:
         size = ""
-        if {"label_mean_nt", "label_sd_nt"} <= set(facts):
-            size = f" ({float(facts['label_mean_nt']):.0f} ± {float(facts['label_sd_nt']):.0f} nT)"
+        if {"label_mean_nt", "label_sd_nt"} <= set(metadata):
+            size = f" ({float(metadata['label_mean_nt']):.0f} ± {float(metadata['label_sd_nt']):.0f} nT)"
         return Mismatch(
-            f"WRONG ROBOT: {name} learned the robot {learned!r} with its sensor at ({facts['sensor_m']}) m, "
+            f"WRONG ROBOT: {name} learned the robot {learned!r} with its sensor at ({metadata['sensor_m']}) "
+            f"m, "
             f"and this is {robot.name!r} with its sensor at ({here}) m. The disturbance it predicts{size} is "
             "not this robot's, and readings are meaningless; train a network on this robot, or use a "
             "physical magnetometer",
@@ -232,11 +238,11 @@ def _robot_mismatch(
     if away > 1e-3 and moved is not None:
         effect = displacement_nt(field, float(moved[0]), float(moved[1]), 0.0)
         return Mismatch(
-            f"{name} learned {learned!r} with its sensor at ({facts['sensor_m']}) m, and now it is at "
+            f"{name} learned {learned!r} with its sensor at ({metadata['sensor_m']}) m, and now it is at "
             f"({here}) m: at least {effect:.0f} nT RMS, by the map's gradient alone; train a network on this "
             "robot"
         )
-    told = facts.get("platform_sha256", UNKNOWN)
+    told = metadata.get("platform_sha256", UNKNOWN)
     if told not in (UNKNOWN, SEVERAL, platform_sha256):
         return Mismatch(
             f"{name} learned {learned!r} with another [platform] than {robot.name!r} has here: what it "
@@ -267,13 +273,13 @@ def _poses(extent: tuple[float, float, float, float]) -> tuple[Array, Array]:
     return p, 2 * np.pi * at[:, 2]
 
 
-def _numbers(facts: Facts, name: str, key: str, count: int) -> list[float] | None:
+def _numbers(metadata: Metadata, name: str, key: str, count: int) -> list[float] | None:
     """Numbers that a fact lists; None where it is not there, or says that they are not known.
 
     Raises:
         InputError: It is there and lists something else.
     """
-    text = str(facts.get(key, UNKNOWN))
+    text = str(metadata.get(key, UNKNOWN))
     if text in (UNKNOWN, SEVERAL):
         return None
     try:

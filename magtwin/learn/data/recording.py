@@ -152,7 +152,7 @@ def read(source: Source) -> Run:
     if not posed or "b_measured_nt" not in run:
         wanted = "b_measured_nt" if posed else "mocap_p with mocap_q_xyzw, or p_world_base with yaw"
         raise InputError(f"{source.name}: nothing to label: it has no column {wanted}")
-    if (kind := run.facts.get("magnetometer")) in ("neural", "map-only"):
+    if (kind := run.metadata.get("magnetometer")) in ("neural", "map-only"):
         raise InputError(
             f"{source.name}: its readings are those of a {kind} magnetometer, and what learns from them "
             "learns that model; record a robot, or drive the twin with --magnetometer physical"
@@ -169,4 +169,4 @@ def thinned(run: Run, rate_hz: float | None) -> Run:
     if every == 1:
         return run
     columns = {name: values[::every] for name, values in run.items()}
-    return Run(columns, {**run.facts, "every": every}, run.specs)
+    return Run(columns, {**run.metadata, "every": every}, run.specs)

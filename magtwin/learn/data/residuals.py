@@ -56,7 +56,7 @@ class Residuals:
     sessions: int
     """Sessions that this was estimated from."""
 
-    def facts(self) -> dict[str, float | int]:
+    def metadata(self) -> dict[str, float | int]:
         """The figures, by the names that a weights file has."""
         return {
             "residual_offset_sd_nt": self.offset_sd_nt,

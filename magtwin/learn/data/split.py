@@ -121,10 +121,10 @@ class Split(Summarized):
     def report(self, title: str = "Split") -> Report:
         """How many recordings are in each part, and what is wrong with it."""
         figures = [Figure(part, len(self.names(part)), "recordings") for part in PARTS]
-        facts: dict[str, object] = {"by": self.by}
+        metadata: dict[str, object] = {"by": self.by}
         if self.leak:
-            facts["warning"] = self.leak
-        return Report(title, tuple(figures), facts)
+            metadata["warning"] = self.leak
+        return Report(title, tuple(figures), metadata)
 
     def _summary(self) -> Summary:
         return Summary(

@@ -364,7 +364,7 @@ def steps(found: Evaluation) -> list[int]:
     def rank(m: int) -> tuple[int, ...]:
         one = found.contenders[m]
         chart = found.charts.index(one.chart)
-        own = "sha256" in one.facts
+        own = "sha256" in one.metadata
         gradient = bool(set(one.model.features) & set(GRADIENT))
         aligned = one.alignment != Alignment()
         return (chart, int(own) if chart else int(not own), int(gradient), int(aligned), m)

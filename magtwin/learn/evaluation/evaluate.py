@@ -114,7 +114,7 @@ class Contender(Summarized):
     model: Model
     chart: Chart
     alignment: Alignment = field(default_factory=Alignment)
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    metadata: Mapping[str, Any] = field(default_factory=dict)
     """What its file tells, or how it was made."""
 
     def _summary(self) -> Summary:
@@ -268,10 +268,10 @@ class Evaluation(Summarized):
         naive, paths = every.scores[0].mae_nt, {one.path for one in self.judged}
         found = {}
         for one, score in zip(self.contenders[1:], every.scores[1:], strict=True):
-            if "sha256" not in one.facts:
+            if "sha256" not in one.metadata:
                 continue
             learned = [
-                None if fact not in one.facts else str(one.facts[fact]).split(SEPARATOR)
+                None if fact not in one.metadata else str(one.metadata[fact]).split(SEPARATOR)
                 for fact in ("training_sessions", "training_paths")
             ]
             found[one.name] = verdict(
@@ -308,7 +308,7 @@ class Evaluation(Summarized):
                     "features": list(one.model.features),
                     "lever_arm_m": list(one.alignment.lever_arm_m),
                     "latency_s": one.alignment.latency_s,
-                    "facts": dict(one.facts),
+                    "metadata": dict(one.metadata),
                 }
                 for one in self.contenders
             ],
@@ -438,7 +438,7 @@ def _judge(
 ) -> tuple[Judged, dict[str, int]]:
     """What every model makes of a recording, and why readings are left out."""
     run = trial.read()
-    run = Run({name: run[name] for name in KEPT if name in run}, run.facts)
+    run = Run({name: run[name] for name in KEPT if name in run}, run.metadata)
     _check_readings(trial.name, run, truth)
     session, path = told_by(run, trial)
     measured = run["b_truth_nt" if truth else "b_measured_nt"]
@@ -480,11 +480,11 @@ def _judge(
 
 def told_by(run: Run, trial: Trial) -> tuple[str, str]:
     """Session and path of a recording: as given, as its run says, else its name."""
-    session, facts = trial.session, run.facts
-    if not session and "session" in facts:
-        session = f"{facts['session_seed']}-" if "session_seed" in facts else ""
-        session += str(facts["session"])
-    return session or trial.name, trial.path or str(facts.get("path", "")) or trial.name
+    session, metadata = trial.session, run.metadata
+    if not session and "session" in metadata:
+        session = f"{metadata['session_seed']}-" if "session_seed" in metadata else ""
+        session += str(metadata["session"])
+    return session or trial.name, trial.path or str(metadata.get("path", "")) or trial.name
 
 
 def _check_readings(name: str, run: Run, truth: bool) -> None:
@@ -493,7 +493,7 @@ def _check_readings(name: str, run: Run, truth: bool) -> None:
     if wanted not in run or not np.isfinite(run[wanted]).any():
         advice = "; leave --truth out" if truth else ""
         raise InputError(f"{name}: tells no {wanted}, so there is nothing to judge by{advice}")
-    kind = run.facts.get("magnetometer")
+    kind = run.metadata.get("magnetometer")
     if kind in ("neural", "map-only") and not truth:
         raise InputError(
             f"{name}: its readings are those of a {kind} magnetometer, a model's own; judge by a robot's "
@@ -539,34 +539,36 @@ def contender(
         InputError: Not a weights file, or it was trained on a map that is not at hand.
     """
     magnetometer = NeuralMagnetometer.load(path)
-    facts = dict(magnetometer.net.facts)
-    wanted = str(facts.get("map_sha256", ""))
+    metadata = dict(magnetometer.net.metadata)
+    wanted = str(metadata.get("map_sha256", ""))
     fits = [chart for chart in charts if wanted in chart.checksums]
     if wanted and not fits and not any_map:
         held = "; ".join(f"{chart.name} has {', '.join(sorted(chart.checksums))}" for chart in charts)
         raise InputError(
-            f"{path}: was trained on the map {facts.get('map', '')!r} of sha256 {wanted}, and {held}; name "
+            f"{path}: was trained on the map {metadata.get('map', '')!r} of sha256 {wanted}, and {held}; "
+            f"name "
             "its own map with --map, or take the first one all the same with --any-map"
         )
     chart = fits[0] if fits else charts[0]
-    told = {"sha256": magnetometer.sha256, **facts}
-    return Contender(name or magnetometer.name, magnetometer, chart, alignment_of(facts, path), told)
+    told = {"sha256": magnetometer.sha256, **metadata}
+    return Contender(name or magnetometer.name, magnetometer, chart, alignment_of(metadata, path), told)
 
 
-def alignment_of(facts: Mapping[str, Any], where: object = "") -> Alignment:
+def alignment_of(metadata: Mapping[str, Any], where: object = "") -> Alignment:
     """Lever arm and latency as weights tell them; none where they do not.
 
     Raises:
         InputError: They are no numbers.
     """
     try:
-        arm = [float(part) for part in str(facts.get("lever_arm_m", "0, 0")).split(",")]
+        arm = [float(part) for part in str(metadata.get("lever_arm_m", "0, 0")).split(",")]
         forward, left = arm
-        return Alignment((forward, left), float(facts.get("latency_s", 0.0)))
+        return Alignment((forward, left), float(metadata.get("latency_s", 0.0)))
     except ValueError as error:
         raise InputError(
-            f"{where}: lever_arm_m {facts.get('lever_arm_m')!r} and latency_s {facts.get('latency_s')!r} of "
-            f"its facts are no lengths and time ({error}); train it again"
+            f"{where}: lever_arm_m {metadata.get('lever_arm_m')!r} and latency_s "
+            f"{metadata.get('latency_s')!r} of "
+            f"its metadata are no lengths and time ({error}); train it again"
         ) from error
 
 
@@ -594,9 +596,9 @@ def naive(
         alignment = _alignment(dataset, chart)
         return Contender(NAIVE, model, chart, alignment, {"fitted to": dataset.folder.name})
     for one in weights:
-        mean = one.facts.get("label_mean_nt")
-        if one.facts.get("map_sha256") in chart.checksums and isinstance(mean, int | float):
-            sd = one.facts.get("label_sd_nt", math.nan)
+        mean = one.metadata.get("label_mean_nt")
+        if one.metadata.get("map_sha256") in chart.checksums and isinstance(mean, int | float):
+            sd = one.metadata.get("label_sd_nt", math.nan)
             told = {"mean label of": one.name}
             return Contender(NAIVE, Mean(float(mean), float(sd)), chart, one.alignment, told)
     raise InputError(
@@ -706,7 +708,7 @@ def unseen(dataset: Dataset, contenders: Sequence[Contender]) -> tuple[tuple[str
     """Recordings of a data set that no model learned from, and those that each of them may have.
 
     Of a set that weights were trained on, what is left is their test recordings, by the split that their
-    facts repeat; of any other set, all of it.
+    metadata repeat; of any other set, all of it.
 
     Raises:
         InputError: Nothing is left, or weights were trained on rows of every recording.
@@ -714,14 +716,15 @@ def unseen(dataset: Dataset, contenders: Sequence[Contender]) -> tuple[tuple[str
     checksum = sha256(dataset.folder / MANIFEST)
     names, learned = list(dataset.names), list(dataset.names)
     for one in contenders:
-        if one.facts.get("dataset_sha256") != checksum:
+        if one.metadata.get("dataset_sha256") != checksum:
             continue
         try:
-            config = tomllib.loads(str(one.facts.get("config", "")))
+            config = tomllib.loads(str(one.metadata.get("config", "")))
             by, seed, hold_out = config["split"], int(config["seed"]), tuple(config.get("hold_out", ()))
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(
-                f"{one.name}: was trained on {dataset.folder}, and its facts do not say how that was split "
+                f"{one.name}: was trained on {dataset.folder}, and its metadata do not say how that was "
+                f"split "
                 f"({error}); judge it by recordings of another set"
             ) from error
         if by == "row":

@@ -220,7 +220,7 @@ def ensemble_of(weights: Weights) -> Ensemble:
         y_scale_nt=weights.number("y_scale_nt", above=0.0),
         sd_factor=weights.number("sd_factor", above=0.0),
         residual_sd_nt=weights.residual_sd_nt,
-        facts=dict(weights.about["facts"]),
+        metadata=dict(weights.about["facts"]),
     )
 
 

@@ -32,7 +32,7 @@ def train(
     batch: int = 1024,
     lr: float = 1e-3,
     patience: int | None = None,
-    facts: Mapping[str, Fact] | None = None,
+    metadata: Mapping[str, Fact] | None = None,
     init: FieldNet | None = None,
     freeze: Sequence[str] = (),
     checkpoint: str | os.PathLike[str] | None = None,
@@ -62,7 +62,7 @@ def train(
         batch: Rows a step.
         lr: Largest step size of Adam.
         patience: Stop after so many epochs without a better one; None runs them all.
-        facts: Provenance to keep in the weights file.
+        metadata: Provenance to keep in the weights file.
         init: Network of the same inputs and layers whose weights and scalers are gone on from. It is an
             epoch 0 of its own, so that what is kept is never worse on the validation rows than it was.
         freeze: Names of layers that stay as `init` has them: "layers.0" is the first.
@@ -100,7 +100,7 @@ def train(
     seed = int(rng.integers(2**62))
     with torch.random.fork_rng(devices=[]):  # first weights are drawn from torch's own generator
         torch.manual_seed(seed)
-        net = FieldNet(names, layers, dropout=dropout, facts=facts)
+        net = FieldNet(names, layers, dropout=dropout, metadata=metadata)
     if init is None:
         net.set_scalers(x, y)
     else:

@@ -101,7 +101,7 @@ def hybrid_of(weights: Weights) -> Hybrid:
         net=net,
         sd_factor=weights.number("sd_factor", above=0.0),
         residual_sd_nt=weights.residual_sd_nt,
-        facts=dict(weights.about["facts"]),
+        metadata=dict(weights.about["facts"]),
     )
 
 

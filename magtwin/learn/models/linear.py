@@ -202,7 +202,7 @@ def linear_of(weights: Weights) -> Linear:
     """
     model = linear_from(weights, weights.fit(like(len(weights.features))))
     model.residual_sd_nt = weights.residual_sd_nt
-    model.facts = dict(weights.about["facts"])
+    model.metadata = dict(weights.about["facts"])
     return model
 
 

@@ -65,7 +65,7 @@ class FieldNet(Summarized, torch.nn.Module):
         *,
         dropout: float = 0.3,
         residual_sd_nt: float = math.nan,
-        facts: Mapping[str, Fact] | None = None,
+        metadata: Mapping[str, Fact] | None = None,
     ) -> None:
         """A network with random weights and scalers that change nothing.
 
@@ -75,13 +75,13 @@ class FieldNet(Summarized, torch.nn.Module):
             dropout: Share of units dropped in training.
             residual_sd_nt: Standard deviation of label minus prediction on held-out runs [nT]; nan
                 where unknown.
-            facts: Provenance: on what it was trained, source, licence.
+            metadata: Provenance: on what it was trained, source, licence.
         """
         super().__init__()
         self.features = feature_names(features)
         self.dropout = dropout
         self.residual_sd_nt = residual_sd_nt
-        self.facts: dict[str, Fact] = dict(facts or {})
+        self.metadata: dict[str, Fact] = dict(metadata or {})
         if not hidden or not all(width > 0 for width in hidden) or not 0 <= dropout < 1:
             raise InputError(
                 f"a network needs hidden layers above 0 wide and dropout in 0..1, "
@@ -186,7 +186,7 @@ class FieldNet(Summarized, torch.nn.Module):
             self.state_dict(),
             features=self.features,
             residual_sd_nt=self.residual_sd_nt,
-            facts=self.facts,
+            metadata=self.metadata,
             hidden=self.hidden,
             dropout=self.dropout,
             force=force,
@@ -203,7 +203,7 @@ class FieldNet(Summarized, torch.nn.Module):
         ]
         if not math.isnan(self.residual_sd_nt):
             figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out runs"))
-        return Report(title, tuple(figures), shown(self.facts))
+        return Report(title, tuple(figures), shown(self.metadata))
 
     def _summary(self) -> Summary:
         return summary_of(self, "FieldNet")
@@ -235,7 +235,7 @@ def convert(
     Args:
         checkpoint: The `.pth`, read as data (see `magtwin.learn.models.checkpoint`).
         out: The safetensors file to write.
-        licence: Licence of the weights, which no checkpoint says; kept in their facts.
+        licence: Licence of the weights, which no checkpoint says; kept in their metadata.
         force: Whether one that exists is replaced.
 
     Raises:
@@ -243,7 +243,7 @@ def convert(
     """
     net = net_of_checkpoint(existing(checkpoint, "checkpoint"))
     if licence:
-        net.facts["licence"] = licence
+        net.metadata["licence"] = licence
     net.save(out, force=force)
     return net
 
@@ -259,7 +259,7 @@ def net_of_checkpoint(path: str | os.PathLike[str]) -> FieldNet:
     net = FieldNet(
         FULL,
         [len(bias) for _, bias in saved.layers[:-1]],
-        facts={
+        metadata={
             "source": path.name,
             "source_sha256": sha256(path),
             "scalers_by": saved.written_by,
@@ -302,7 +302,7 @@ def net_of(weights: Weights) -> FieldNet:
             [len(weight) for weight in held[:-1]],
             dropout=dropout,
             residual_sd_nt=weights.residual_sd_nt,
-            facts=weights.about["facts"],
+            metadata=weights.about["facts"],
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error

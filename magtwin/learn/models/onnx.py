@@ -87,7 +87,7 @@ def export_onnx(
         aside.write_bytes(data)
     found = _report(model, str(out))
     difference = Figure("largest difference", worst, "nT", note=f"from torch, of {PROBE} rows")
-    return Report(found.title, (*found.figures, difference), found.facts)
+    return Report(found.title, (*found.figures, difference), found.metadata)
 
 
 def report_onnx(path: str | os.PathLike[str]) -> Report:
@@ -157,7 +157,7 @@ def model_of(predictor: Predictor, *, weights_sha256: str = "") -> "onnx.ModelPr
         "context": predictor.context,
         "step_s": predictor.step_s,
         "weights_sha256": weights_sha256,
-        "facts": predictor.facts,
+        "facts": predictor.metadata,
     }
     for key, value in told.items():
         text = value if isinstance(value, str) else json.dumps(value, sort_keys=True, allow_nan=False)
@@ -325,7 +325,7 @@ class _Graph:
 
 def _report(model: Any, title: str) -> Report:
     told = {one.key: one.value for one in model.metadata_props}
-    names, units, facts, low, high, context, step_s = (
+    names, units, metadata, low, high, context, step_s = (
         json.loads(told[key])
         for key in ("features", "units", "facts", "training_min", "training_max", "context", "step_s")
     )
@@ -346,7 +346,7 @@ def _report(model: Any, title: str) -> Report:
     if (sd := json.loads(told["residual_sd_nt"])) is not None:
         figures.append(Figure("residual sd", float(sd), "nT", note="on held-out runs"))
     return Report(
-        title, tuple(figures), {"weights_sha256": told["weights_sha256"], **facts, "features": ranges}
+        title, tuple(figures), {"weights_sha256": told["weights_sha256"], **metadata, "features": ranges}
     )
 
 

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 class Predictor(Protocol):
     """A disturbance with its standard deviation, row by row; of which kind is its own business."""
 
-    facts: dict[str, Fact]
+    metadata: dict[str, Fact]
     """Provenance: on what it was trained."""
 
     residual_sd_nt: float

@@ -22,7 +22,7 @@ class Regressor(Summarized, ABC):
 
     inputs: Inputs
     residual_sd_nt: float = math.nan
-    facts: dict[str, Fact] = field(default_factory=dict)
+    metadata: dict[str, Fact] = field(default_factory=dict)
 
     kind: ClassVar[str]
 
@@ -59,7 +59,7 @@ class Regressor(Summarized, ABC):
             self.tensors(),
             features=self.features,
             residual_sd_nt=self.residual_sd_nt,
-            facts=self.facts,
+            metadata=self.metadata,
             force=force,
             **self.settings(),
         )
@@ -69,13 +69,13 @@ class Regressor(Summarized, ABC):
         figures = [Figure("kind", self.kind), *self.figures()]
         if not math.isnan(self.residual_sd_nt):
             figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note="on held-out recordings"))
-        return Report(title, tuple(figures), shown(self.facts))
+        return Report(title, tuple(figures), shown(self.metadata))
 
     def _summary(self) -> Summary:
         return summary_of(self, type(self).__name__)
 
 
-def summary_of(net: Any, title: str, *facts: tuple[str, str]) -> Summary:
+def summary_of(net: Any, title: str, *metadata: tuple[str, str]) -> Summary:
     """Kind, layers, inputs, error and provenance of a predictor."""
     error = (
         "unknown"
@@ -83,9 +83,9 @@ def summary_of(net: Any, title: str, *facts: tuple[str, str]) -> Summary:
         else f"{net.residual_sd_nt:.4g} nT rms on held-out recordings"
     )
     trained = [
-        f"{name} {net.facts[name]}"
+        f"{name} {net.metadata[name]}"
         for name in ("dataset", "map", "created", "licence", "source")
-        if name in net.facts
+        if name in net.metadata
     ]
     return Summary(
         f"{title}: {net.kind}, {net.parameters_count:,} parameters",
@@ -93,9 +93,9 @@ def summary_of(net: Any, title: str, *facts: tuple[str, str]) -> Summary:
             ("layers", net.layers_text),
             ("inputs", f"{len(net.features)}: {listed(net.features)}"),
             ("error", error),
-            *facts,
-            ("facts", ", ".join(trained) or listed(tuple(net.facts))),
+            *metadata,
+            ("metadata", ", ".join(trained) or listed(tuple(net.metadata))),
         ),
         ("fact", "value"),
-        [(name, str(value)) for name, value in net.facts.items()],
+        [(name, str(value)) for name, value in net.metadata.items()],
     )

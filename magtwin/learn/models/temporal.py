@@ -269,7 +269,7 @@ def temporal_of(weights: Weights) -> Temporal:
         step_s=weights.number("step_s", above=0.0),
         sd_factor=weights.number("sd_factor", above=0.0),
         residual_sd_nt=weights.residual_sd_nt,
-        facts=dict(weights.about["facts"]),
+        metadata=dict(weights.about["facts"]),
     )
 
 

@@ -34,7 +34,7 @@ class Weights:
     """"mlp", "linear", "hybrid", "ensemble" or "tcn"."""
 
     about: Mapping[str, Any]
-    """Features, units, facts, `residual_sd_nt`, and what the kind keeps beside them."""
+    """Features, units, metadata, `residual_sd_nt`, and what the kind keeps beside them."""
 
     tensors: Mapping[str, torch.Tensor]
 
@@ -149,7 +149,7 @@ def write_weights(
     *,
     features: Sequence[str],
     residual_sd_nt: float,
-    facts: Mapping[str, Fact],
+    metadata: Mapping[str, Fact],
     force: bool = False,
     **about: Any,
 ) -> None:
@@ -161,7 +161,7 @@ def write_weights(
         tensors: By name.
         features: Names of the inputs, in order.
         residual_sd_nt: Root mean square error on held-out recordings [nT]; nan where unknown.
-        facts: Provenance.
+        metadata: Provenance.
         force: Whether a file that exists is replaced.
         about: What else the file says of itself, as JSON has it.
 
@@ -175,16 +175,16 @@ def write_weights(
         "output": "disturbance of the field's magnitude",
         "output_unit": "nT",
         "residual_sd_nt": None if math.isnan(residual_sd_nt) else residual_sd_nt,
-        "facts": facts,
+        "facts": metadata,
         **about,
     }
     if kind != "mlp":
         told["kind"] = kind
     whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     # One key, because safetensors orders several at random.
-    metadata = {"magtwin": json.dumps(told, sort_keys=True, allow_nan=False)}
+    header = {"magtwin": json.dumps(told, sort_keys=True, allow_nan=False)}
     with output(path, force=force) as aside:
-        aside.write_bytes(save(whole, metadata))  # save_file would leave it readable by its owner alone
+        aside.write_bytes(save(whole, header))  # save_file would leave it readable by its owner alone
 
 
 def read_weights(path: str | os.PathLike[str]) -> Weights:
@@ -248,9 +248,9 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     return about
 
 
-def shown(facts: Mapping[str, Fact]) -> dict[str, Fact]:
-    """Facts for people: without the map's samples, which are for comparing maps."""
-    return {name: fact for name, fact in facts.items() if name != "map_samples_nt"}
+def shown(metadata: Mapping[str, Fact]) -> dict[str, Fact]:
+    """Metadata for people: without the map's samples, which are for comparing maps."""
+    return {name: fact for name, fact in metadata.items() if name != "map_samples_nt"}
 
 
 def say(tensor: torch.Tensor) -> str:

@@ -34,7 +34,7 @@ def card_of(trained: "Trained", name: str, checksum: str) -> str:
         name: Of the weights file.
         checksum: Its SHA-256.
     """
-    net, facts = trained.net, trained.net.facts
+    net, metadata = trained.net, trained.net.metadata
     what = (
         "Predicts what a robot adds to a map of the magnetic field at its magnetometer [nT]. "
         f"{NOUNS[net.kind]}: {net.layers_text}, {net.parameters_count:,} parameters. SHA-256 `{checksum}`."
@@ -43,7 +43,7 @@ def card_of(trained: "Trained", name: str, checksum: str) -> str:
         what += f" Licence: {trained.config.licence}."
     if trained.config.init is not None:
         kept = ", ".join(trained.config.freeze) or "no layer"
-        what += f" It goes on from `{facts['init']}` (SHA-256 `{facts['init_sha256']}`), {kept} frozen."
+        what += f" It goes on from `{metadata['init']}` (SHA-256 `{metadata['init_sha256']}`), {kept} frozen."
     parts = [
         f"# {name}",
         _wrapped(what),
@@ -63,16 +63,17 @@ def card_of(trained: "Trained", name: str, checksum: str) -> str:
 
 
 def _data(trained: "Trained") -> str:
-    facts, split = trained.net.facts, trained.split
+    metadata, split = trained.net.metadata, trained.split
     counts = ", ".join(f"{len(split.names(part))} in {part}" for part in PARTS)
     names = ", ".join(split.test[:MOST_NAMES])
     names += f" and {len(split.test) - MOST_NAMES} more" if len(split.test) > MOST_NAMES else ""
-    dataset, field = (_plain(str(facts[key])) for key in ("dataset", "map"))
+    dataset, field = (_plain(str(metadata[key])) for key in ("dataset", "map"))
     label = f"{trained.label_mean_nt:.1f} +- {trained.label_sd_nt:.1f} nT"
     points = (
-        f"Data set `{dataset}`, SHA-256 of its manifest `{facts['dataset_sha256']}`.",
-        f"Labelled on the map `{field}`, SHA-256 `{facts['map_sha256']}`: what was measured less the map, at "
-        f"a lever arm of {facts['lever_arm_m']} m and a latency of {facts['latency_s']:g} s.",
+        f"Data set `{dataset}`, SHA-256 of its manifest `{metadata['dataset_sha256']}`.",
+        f"Labelled on the map `{field}`, SHA-256 `{metadata['map_sha256']}`: what was measured less the map, "
+        f"at "
+        f"a lever arm of {metadata['lever_arm_m']} m and a latency of {metadata['latency_s']:g} s.",
         f"{trained.rows:,} training rows, labels {label}.",
         f"Recordings split by {split.by}: {counts}.",
         f"Test: {names}.",
@@ -130,13 +131,13 @@ def _spread(kind: str) -> str:
 
 
 def _repeat(trained: "Trained", name: str) -> str:
-    facts = trained.net.facts
-    by = f"magtwin {facts['magtwin']}"
-    if "torch" in facts:
-        by += f", torch {facts['torch']}, with --threads {facts['threads']} on {facts['device']}"
-    command = f"magtwin train {_plain(str(facts['dataset']))} --config F.toml --out {name}"
+    metadata = trained.net.metadata
+    by = f"magtwin {metadata['magtwin']}"
+    if "torch" in metadata:
+        by += f", torch {metadata['torch']}, with --threads {metadata['threads']} on {metadata['device']}"
+    command = f"magtwin train {_plain(str(metadata['dataset']))} --config F.toml --out {name}"
     said = _wrapped(f"{by}, and as `F.toml` in `{command}`:")
-    return f"{said}\n\n```toml\n{str(facts['config']).rstrip()}\n```"
+    return f"{said}\n\n```toml\n{str(metadata['config']).rstrip()}\n```"
 
 
 def _wrapped(text: str, *, bullet: bool = False) -> str:

@@ -32,7 +32,7 @@ ORIGIN = (
     *("map_method", "map_height_m", "map_extent_m", "map_samples_nt", "alignment", "poses"),
     *ROBOT_FACTS,
 )
-"""Facts of a data set that weights keep."""
+"""Metadata of a data set that weights keep."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Trained(Summarized):
     """A network with all that its card tells."""
 
     net: Predictor
-    """`residual_sd_nt` is its error on the test, `facts` repeat it."""
+    """`residual_sd_nt` is its error on the test, `metadata` repeat it."""
 
     config: TrainConfig
     history: tuple[Epoch, ...]
@@ -136,8 +136,8 @@ class Trained(Summarized):
             ]
             if not math.isnan(one.before_mae_nt):
                 figures.append(Figure(f"{one.name} MAE before", one.before_mae_nt, "nT"))
-        facts = {name: fact for name, fact in shown(self.net.facts).items() if name != "config"}
-        return Report(title, tuple(figures), facts, self.verdict())
+        metadata = {name: fact for name, fact in shown(self.net.metadata).items() if name != "config"}
+        return Report(title, tuple(figures), metadata, self.verdict())
 
     def verdict(self) -> str:
         """Whether it is better than the naive mean on the test, in one line."""
@@ -214,28 +214,28 @@ def fit(
     path_of = {one.name: one.path for one in dataset.recordings}
     _, *paths = _judged(of, "test", models, mean, [path_of[name] for name in of.rows["test"].names])
     net.residual_sd_nt = parts[-1].rmse_nt
-    net.facts.update(_facts(config, dataset, split, len(learned.y), device))
-    net.facts.update(label_mean_nt=mean, label_sd_nt=sd)
+    net.metadata.update(_metadata(config, dataset, split, len(learned.y), device))
+    net.metadata.update(label_mean_nt=mean, label_sd_nt=sd)
     if made.history:
         kept = next(epoch for epoch in reversed(made.history) if epoch.best)
-        net.facts.update(epochs_run=made.history[-1].number, epoch_kept=kept.number)
+        net.metadata.update(epochs_run=made.history[-1].number, epoch_kept=kept.number)
     if made.choice:
-        net.facts.update(
+        net.metadata.update(
             network="kept" if made.choice.kept else "left out",
             base_validation_mae_nt=made.choice.base_mae_nt,
             whole_validation_mae_nt=made.choice.whole_mae_nt,
         )
     for one in parts:
         told = {"mae_nt": one.mae_nt, "naive_mae_nt": one.naive_mae_nt, "ridge_mae_nt": one.ridge_mae_nt}
-        net.facts.update({f"{one.name}_{key}": value for key, value in told.items()})
+        net.metadata.update({f"{one.name}_{key}": value for key, value in told.items()})
         if math.isfinite(one.coverage):
-            net.facts[f"{one.name}_coverage_90"] = one.coverage
+            net.metadata[f"{one.name}_coverage_90"] = one.coverage
     if (found := residuals(_held_out(of, made))) is not None:
-        net.facts.update(found.facts())
+        net.metadata.update(found.metadata())
     known = {one.name: one for one in dataset.recordings}
     mine, tested = ([known[name] for name in split.names(part)] for part in ("train", "test"))
     sessions, driven = ({one.session: None for one in mine}, {one.path: None for one in mine})
-    net.facts.update(training_sessions=SEPARATOR.join(sessions), training_paths=SEPARATOR.join(driven))
+    net.metadata.update(training_sessions=SEPARATOR.join(sessions), training_paths=SEPARATOR.join(driven))
     judged_on = recordings_text(
         len(tested), [one.session for one in tested], [one.path for one in tested], sessions, driven
     )
@@ -303,19 +303,19 @@ def _judged(
     ]
 
 
-def _facts(config: TrainConfig, dataset: Dataset, split: Split, rows: int, device: str) -> dict[str, Fact]:
+def _metadata(config: TrainConfig, dataset: Dataset, split: Split, rows: int, device: str) -> dict[str, Fact]:
     """What repeats a training, for the weights file."""
     lever = dataset.alignment
     told = config if config.init is None else replace(config, init=Path(config.init.name))
-    facts: dict[str, Fact] = {"warning": split.leak} if split.leak else {}
-    facts |= {
+    metadata: dict[str, Fact] = {"warning": split.leak} if split.leak else {}
+    metadata |= {
         "dataset": dataset.folder.resolve().name,
         "dataset_sha256": sha256(dataset.folder / MANIFEST),
         "map": dataset.map_name,
         "map_sha256": dataset.map_sha256,
         "lever_arm_m": ", ".join(f"{c:g}" for c in lever.lever_arm_m),
         "latency_s": lever.latency_s,
-        **{name: dataset.facts[name] for name in ORIGIN if name in dataset.facts},
+        **{name: dataset.metadata[name] for name in ORIGIN if name in dataset.metadata},
         "config": told.to_toml(),
         "seed": config.seed,
         "split": split.by,
@@ -324,12 +324,12 @@ def _facts(config: TrainConfig, dataset: Dataset, split: Split, rows: int, devic
     }
     if config.kind != "linear":
         threads = config.threads or torch.get_num_threads()
-        facts |= {"threads": threads, "torch": str(torch.__version__), "device": device}
+        metadata |= {"threads": threads, "torch": str(torch.__version__), "device": device}
     if config.licence:
-        facts["licence"] = config.licence
+        metadata["licence"] = config.licence
     if config.init is not None:
-        facts |= {"init": config.init.name, "init_sha256": sha256(config.init)}
-    return facts
+        metadata |= {"init": config.init.name, "init_sha256": sha256(config.init)}
+    return metadata
 
 
 def _mae(error: Array) -> float:

@@ -22,7 +22,7 @@ class Engine(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is called in the facts of a run."""
+        """What it is called in the metadata of a run."""
 
     def drive(self, course: Course, controller: Controller | None, obstacles: Obstacles | None) -> Travel:
         """Drive until the controller is done and the robot stands, or the course's steps are over.

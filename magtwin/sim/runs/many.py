@@ -16,7 +16,7 @@ import numpy as np
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.path import Path
-from magtwin.run.run import COLUMNS, Facts, Run
+from magtwin.run.run import COLUMNS, Metadata, Run
 from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.course import PAYS, Course, run_courses, warm_up
 from magtwin.sim.motion.drive import Motion, Pose, draw_wheel_errors
@@ -174,13 +174,13 @@ class Runs(Summarized, Sequence[Run]):
         for i in numbers:
             with self._numbered(i):
                 if i in together:
-                    motion, facts = self._travelled(self._jobs[i], courses[i], together.pop(i))
+                    motion, metadata = self._travelled(self._jobs[i], courses[i], together.pop(i))
                 else:
-                    motion, facts = self._travel(self._jobs[i], draws[i])
-                done.append(self._sense(self._jobs[i], draws[i], motion, facts))
+                    motion, metadata = self._travel(self._jobs[i], draws[i])
+                done.append(self._sense(self._jobs[i], draws[i], motion, metadata))
         return done
 
-    def _travelled(self, job: Job, course: Course, motion: Motion) -> tuple[Travel, Facts]:
+    def _travelled(self, job: Job, course: Course, motion: Motion) -> tuple[Travel, Metadata]:
         """What a robot did that was driven among others."""
         common = self._conditions
         if isinstance(job.path, Commands):
@@ -191,7 +191,7 @@ class Runs(Summarized, Sequence[Run]):
         name, speed = job.path.name, float(job.speed)
         return motion, {"path": name, "controller": common.controller, "speed_m_s": speed}
 
-    def _travel(self, job: Job, draws: dict[str, np.random.Generator]) -> tuple[Travel, Facts]:
+    def _travel(self, job: Job, draws: dict[str, np.random.Generator]) -> tuple[Travel, Metadata]:
         """What a robot does that somebody drives, or did when it was recorded."""
         common = self._conditions
         return travel(
@@ -205,7 +205,9 @@ class Runs(Summarized, Sequence[Run]):
             Kinematic(),
         )
 
-    def _sense(self, job: Job, draws: dict[str, np.random.Generator], motion: Travel, facts: Facts) -> Sensed:
+    def _sense(
+        self, job: Job, draws: dict[str, np.random.Generator], motion: Travel, metadata: Metadata
+    ) -> Sensed:
         common = self._conditions
         rate = job.scene.robot.magnetometer.rate_hz if common.rate_hz is None else common.rate_hz
         return sense(
@@ -217,7 +219,7 @@ class Runs(Summarized, Sequence[Run]):
             duration_s=common.duration_s,
             outside=common.outside,
             lidar=common.lidar,
-            facts=facts,
+            metadata=metadata,
             network=common.network,
             wanted=self._columns,
             inputs=common.inputs,

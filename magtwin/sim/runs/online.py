@@ -155,10 +155,10 @@ class Online:
         self._exact = ExactField(scene=scene, anomaly_map=anomaly_map, outside=outside)
         physical = network is None and robot.magnetometer.kind == "physical"
         self._known = self._exact.of == "sources" or (self._exact.of == "map" and physical)
-        self._facts: dict[str, str | int | float | bool]
-        self._facts = {"scene": scene.name, "controller": "commands", "rate_hz": float(self.rate_hz)}
-        self._facts |= {"lidar": lidar, "magnetometer": "neural" if network else robot.magnetometer.kind}
-        self._facts |= self._exact.facts if physical else {}
+        self._metadata: dict[str, str | int | float | bool]
+        self._metadata = {"scene": scene.name, "controller": "commands", "rate_hz": float(self.rate_hz)}
+        self._metadata |= {"lidar": lidar, "magnetometer": "neural" if network else robot.magnetometer.kind}
+        self._metadata |= self._exact.metadata if physical else {}
 
     @property
     def t(self) -> float:
@@ -238,7 +238,7 @@ class Online:
         columns |= flags(scene, true)
         columns["b_sd_nt"], error = np.full(count, np.nan), np.zeros(count)
         if self._network is not None:
-            disturbance, sd, beyond = self._network(Run(columns, self._facts))
+            disturbance, sd, beyond = self._network(Run(columns, self._metadata))
             if self._model_error is not None:
                 process = self._wandering.next(self._error_rng.standard_normal(count))
                 error = rounded(self._model_error.error_nt(sd, process), robot.magnetometer.resolution_nt)
@@ -257,7 +257,7 @@ class Online:
         columns["b_measured_nt"][dropped] = np.nan
         columns["b_noise_nt"] = columns["b_measured_nt"] - columns["b_total_nt"]
         add_error(columns)
-        return Run({name: columns[name] for name in COLUMNS if name in columns}, self._facts)
+        return Run({name: columns[name] for name in COLUMNS if name in columns}, self._metadata)
 
     def _steepness(self, t: Array) -> NDArray[np.bool_]:
         """Whether lock is lost to the gradient at each reading, as it is looked at `LOCK_RATE_HZ`."""

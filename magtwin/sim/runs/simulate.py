@@ -145,7 +145,7 @@ def simulate(
         network=disturbance_nt is not None,
     )
     draws = streams(rng)
-    motion, facts = travel(
+    motion, metadata = travel(
         scene, path, draws, speed, duration_s, obstacles or Obstacles(), controller, engine or Kinematic()
     )
     sensed = sense(
@@ -157,7 +157,7 @@ def simulate(
         duration_s=duration_s,
         outside=outside,
         lidar=lidar,
-        facts=facts,
+        metadata=metadata,
         network=disturbance_nt is not None,
     )
     return sensed.read(None if disturbance_nt is None else disturbance_nt(sensed.run), model_error)
@@ -176,7 +176,9 @@ def travel(
     """What the robot did, and how that came about."""
     robot = scene.robot
     if isinstance(path, Run):
-        told = {name: path.facts[name] for name in ("path", "controller", "speed_m_s") if name in path.facts}
+        told = {
+            name: path.metadata[name] for name in ("path", "controller", "speed_m_s") if name in path.metadata
+        }
         return replayed(path, robot.drive), {**told, "engine": "replay"}
     room: dict[str, Any] = {
         "duration_s": duration_s,
@@ -185,16 +187,16 @@ def travel(
         "wheel_errors": draw_wheel_errors(robot.drive, draws["drive"]),
         "engine": engine,
     }
-    facts: dict[str, str | int | float | bool] = {}
+    metadata: dict[str, str | int | float | bool] = {}
     if engine.name != "kinematic":
-        facts["engine"] = engine.name
+        metadata["engine"] = engine.name
     if isinstance(path, Path):
         name = controller if isinstance(controller, str) else type(controller).__name__
         motion = follow(path, robot.drive, speed=speed, controller=controller, **room)
-        return motion, {"path": path.name, "controller": name, "speed_m_s": float(speed), **facts}
+        return motion, {"path": path.name, "controller": name, "speed_m_s": float(speed), **metadata}
     if isinstance(path, Commands):
         motion = play(path.rows, robot.drive, start=scene.start, **room)
-        return motion, {"path": path.name, "controller": "commands", **facts}
+        return motion, {"path": path.name, "controller": "commands", **metadata}
     if not isinstance(path, str) or path != "random":
         raise InputError(f'what to drive must be a Path, Commands, a Run or "random", got {path!r}')
     room["duration_s"] = RANDOM_S if duration_s is None else duration_s
@@ -209,7 +211,7 @@ def travel(
         duration_s=room["duration_s"],
     )
     motion = play([[0.0, 0.0, 0.0]], robot.drive, start=scene.start, controller=driver, **room)
-    return motion, {"path": "random", "controller": "driver", "speed_m_s": float(speed), **facts}
+    return motion, {"path": "random", "controller": "driver", "speed_m_s": float(speed), **metadata}
 
 
 def check_run(
@@ -321,7 +323,7 @@ class Sensed:
                 axes="b_vector_measured_nt" in self.wanted,
             )
             add_error(columns)
-        return Run({name: columns[name] for name in COLUMNS if name in self.wanted}, self.run.facts)
+        return Run({name: columns[name] for name in COLUMNS if name in self.wanted}, self.run.metadata)
 
 
 def sense(
@@ -334,7 +336,7 @@ def sense(
     duration_s: float | None,
     outside: Literal["nan", "clamp", "raise"],
     lidar: Literal["schedule", "on", "off"],
-    facts: Mapping[str, str | int | float | bool],
+    metadata: Mapping[str, str | int | float | bool],
     network: bool,
     wanted: Iterable[str] = COLUMNS,
     inputs: Iterable[str] = COLUMNS,
@@ -354,7 +356,7 @@ def sense(
         duration_s: How long [s]; None is as long as the motion.
         outside: As for `simulate`.
         lidar: As for `simulate`.
-        facts: How the motion came about.
+        metadata: How the motion came about.
         network: Whether a network will predict the disturbance.
         wanted: Columns of `COLUMNS` that the whole run is to have.
         inputs: Columns that the network reads.
@@ -414,14 +416,14 @@ def sense(
     columns["b_sd_nt"] = np.full(len(t), np.nan)
     told: dict[str, str | int | float | bool] = {
         "scene": scene.name,
-        **facts,
-        **robot_facts(robot),
+        **metadata,
+        **robot_metadata(robot),
         "rate_hz": float(rate_hz),
         "duration_s": round(float(end), 9),
         "outside": outside,
         "lidar": lidar,
         "magnetometer": "neural" if network else robot.magnetometer.kind,
-        **(field.facts if physical else {}),
+        **(field.metadata if physical else {}),
     }
     return Sensed(
         run=Run(columns, told),
@@ -435,7 +437,7 @@ def sense(
     )
 
 
-def robot_facts(robot: RobotSpec) -> dict[str, str | int | float | bool]:
+def robot_metadata(robot: RobotSpec) -> dict[str, str | int | float | bool]:
     """What a run tells of its robot, for a network that learns from it: name, sensor, motion capture.
 
     `mocap_latency_s` is the mean age of motion capture's pose: latency, mean jitter and half a period.

@@ -66,8 +66,8 @@ def simulate_together(
         lidar: As for `simulate`.
 
     Returns:
-        A Run for each that is wanted, by name. Its facts name the robot, and of the others the one that came
-        nearest, how near [m] and when [s].
+        A Run for each that is wanted, by name. Its metadata name the robot, and of the others the one that
+        came nearest, how near [m] and when [s].
 
     Raises:
         InputError: Robots would meet, or `simulate` would refuse one; the text names it.
@@ -78,7 +78,7 @@ def simulate_together(
     predicts = {name: (disturbances_nt or {}).get(name) for name in ways}
     led = {name: scene.led_by(name) for name in ways}
     names = tuple(ways) if wanted is None else tuple(wanted)
-    rates, draws, robots, facts = {}, {}, {}, {}
+    rates, draws, robots, metadata = {}, {}, {}, {}
     for name, way in ways.items():
         try:
             rates[name] = check_run(
@@ -91,7 +91,7 @@ def simulate_together(
                 network=predicts[name] is not None,
             )
             draws[name] = streams(rngs[name])
-            motion, facts[name] = travel(
+            motion, metadata[name] = travel(
                 led[name],
                 way,
                 draws[name],
@@ -119,13 +119,13 @@ def simulate_together(
             duration_s=duration_s,
             outside=outside,
             lidar=lidar,
-            facts=facts[name],
+            metadata=metadata[name],
             network=predicts[name] is not None,
             companions=[other for key, other in robots.items() if key != name],
         )
         predict = predicts[name]
         run = sensed.read(None if predict is None else predict(sensed.run), (model_errors or {}).get(name))
-        runs[name] = run.with_facts(robot=name, **_nearest(name, near))
+        runs[name] = run.with_metadata(robot=name, **_nearest(name, near))
     return runs
 
 
@@ -144,7 +144,7 @@ def _check_apart(near: Iterable[Approach]) -> None:
 
 
 def _nearest(name: str, near: Iterable[Approach]) -> dict[str, str | float]:
-    """Facts of the approach that was the nearest of a robot's; none of one that drove alone."""
+    """Metadata of the approach that was the nearest of a robot's; none of one that drove alone."""
     own = [one for one in near if name in one.names]
     if not own:
         return {}

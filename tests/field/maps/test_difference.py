@@ -188,14 +188,14 @@ def test_the_report_tells_where_when_and_what_is_doubtful_and_is_json():
     after = replace(with_a_magnet(after), created="2026-02-01", height_m=None)
     report = difference(before, after).report()
     assert report.title == "difference a to b"
-    assert report.facts["from"] == "a 2026-01-01"
-    assert report.facts["to"] == "b 2026-02-01"
+    assert report.metadata["from"] == "a 2026-01-01"
+    assert report.metadata["to"] == "b 2026-02-01"
     told = {f.name: f for f in report.figures}["region 1"]
     assert told.value == pytest.approx(933, abs=100)
     assert told.spread == pytest.approx(NOISE_NT * np.sqrt(2))
     assert "about (1.0" in told.note
     assert told.note.endswith(" nodes")
-    assert report.facts["caution"] == [
+    assert report.metadata["caution"] == [
         "height unknown in one map, taken for one",
         "datum unknown in both maps, taken for one",
     ]

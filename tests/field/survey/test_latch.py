@@ -84,9 +84,9 @@ def test_a_reading_that_others_contradict_is_named_with_place_and_size_and_left_
     b[k] += 4_000
     masked, report = mask_latched(readings.with_(b_nt=b))
     assert masked.good[k]
-    assert "at (2, -1) m" in report.facts["outliers"][0]
-    assert "in 180_map.csv" in report.facts["outliers"][0]
-    assert float(report.facts["outliers"][0].split(" nT")[0].replace(",", "")) == pytest.approx(
+    assert "at (2, -1) m" in report.metadata["outliers"][0]
+    assert "in 180_map.csv" in report.metadata["outliers"][0]
+    assert float(report.metadata["outliers"][0].split(" nT")[0].replace(",", "")) == pytest.approx(
         4_000, abs=400
     )
 
@@ -223,7 +223,7 @@ def test_rows_that_were_bad_before_stay_so_and_count_for_nothing():
 def test_few_readings_are_judged_by_repeats_alone_and_the_report_says_so():
     few = gridded(0, rows=2, columns=3)
     _, report = mask_latched(few)
-    assert "only repeats were looked for" in report.facts["note"]
+    assert "only repeats were looked for" in report.metadata["note"]
 
 
 def test_the_same_survey_gives_the_same_findings():

@@ -32,7 +32,7 @@ def a_map():
 FIELD = a_map()
 
 
-def a_run(seed=0, rows=240, **facts):
+def a_run(seed=0, rows=240, **metadata):
     """A drive with every column that features are made of, its labels 100 nT a m/s of speed, and noise."""
     rng = np.random.default_rng(seed)
     t = np.arange(rows) / 10
@@ -48,7 +48,7 @@ def a_run(seed=0, rows=240, **facts):
     columns["b_measured_nt"] = (
         FIELD.lookup(p[:, :2], yaw) + 100 * columns["odom_v"][:, 0] + rng.normal(0, 2, rows)
     )
-    return Run(columns, facts)
+    return Run(columns, metadata)
 
 
 RUNS = {
@@ -138,7 +138,7 @@ def test_the_same_runs_give_the_same_bytes_and_shards_are_runs_for_anyone(made, 
         assert (made.folder / name).read_bytes() == (again.folder / name).read_bytes()
     run = read_parquet(made.folder / "runs" / "a.parquet")
     assert run.spec("label_nt").unit == "nT"
-    assert run.facts["path"] == "sine"
+    assert run.metadata["path"] == "sine"
 
 
 def test_an_alignment_is_fitted_to_all_runs_together_and_kept(tmp_path):
@@ -147,7 +147,7 @@ def test_an_alignment_is_fitted_to_all_runs_together_and_kept(tmp_path):
     assert found.alignment.latency_s == pytest.approx(0.3, abs=0.05)
     assert open_dataset(found.folder).alignment == found.alignment
     given = build_dataset(late, FIELD, tmp_path / "e", alignment=Alignment(latency_s=0.3))
-    assert given.facts["alignment"] == "given"
+    assert given.metadata["alignment"] == "given"
     sds = [d.recordings[0].label_sd_nt for d in (given, build_dataset(late, FIELD, tmp_path / "f"))]
     assert sds[0] < sds[1]
 
@@ -175,7 +175,7 @@ def test_the_report_says_what_there_is_to_learn_from(made):
     assert figures["labels"].value == 720
     assert figures["sessions"].value == 3
     assert figures["label"].spread == pytest.approx(np.std(made.rows("full").y), rel=1e-6)
-    assert report.facts["feature sets"] == "full, correlated, circular, gradient, platform, vector"
+    assert report.metadata["feature sets"] == "full, correlated, circular, gradient, platform, vector"
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_the_report_says_what_there_is_to_learn_from(made):
             "a: none of 240 readings has a label on the map 'hills'",
         ),
         (
-            {"a": RUNS["a"].with_facts(magnetometer="neural")},
+            {"a": RUNS["a"].with_metadata(magnetometer="neural")},
             "a: its readings are those of a neural magnetometer, and what learns from them learns that model",
         ),
         (

@@ -214,11 +214,11 @@ def test_a_drive_becomes_a_run_on_the_magnetometers_clock(tmp_path, storage):
     assert_allclose(run["v_cmd"][1:], 0.1 * (came[1:] // 10))
     assert_array_equal(run["wheel_angle"], np.tile([1.0, 2.0], (200, 1)))
     assert_array_equal(run["lidar_on"], t < 1.9 + 0.5 - 1e-9)
-    assert run.facts["field_unit"] == "nT"
-    assert run.facts["stamps"] == "header"
-    assert run.facts["start_ns"] == str(START)
-    assert run.facts["imu_gravity"] == "removed"
-    assert POSE in run.facts["topics"]
+    assert run.metadata["field_unit"] == "nT"
+    assert run.metadata["stamps"] == "header"
+    assert run.metadata["start_ns"] == str(START)
+    assert run.metadata["imu_gravity"] == "removed"
+    assert POSE in run.metadata["topics"]
 
 
 @pytest.mark.parametrize("kind", ["PoseStamped", "PoseWithCovarianceStamped", "Odometry"])
@@ -235,8 +235,8 @@ def test_the_unit_is_told_by_size_and_said(tmp_path, scale, unit):
     bag = record(tmp_path / "bag", {MAG: readings(scale)})
     run = read_bag(bag)
     assert_allclose(run["b_measured_nt"], 41_000 + np.arange(200), rtol=1e-12)
-    assert (run.facts["field_unit"], run.facts["field_unit_told"]) == (unit, "by its size")
-    assert read_bag(bag, unit=unit).facts["field_unit_told"] == "given"
+    assert (run.metadata["field_unit"], run.metadata["field_unit_told"]) == (unit, "by its size")
+    assert read_bag(bag, unit=unit).metadata["field_unit_told"] == "given"
     with pytest.raises(InputError, match=f"were it {unit}"):
         read_bag(bag, unit="G")
 
@@ -254,13 +254,13 @@ def test_a_vector_beside_the_magnitude_has_a_unit_of_its_own(tmp_path):
     field = [(r, magnetic(s, *(b * 1e-9))) for s, r in at(50)]
     run = read_bag(record(tmp_path / "bag", {MAG: readings(), "/robot/qtfm/field": field}))
     assert_allclose(run["b_vector_measured_nt"], np.tile(b, (200, 1)))
-    assert (run.facts["field_unit"], run.facts["vector_unit"]) == ("nT", "T")
+    assert (run.metadata["field_unit"], run.metadata["vector_unit"]) == ("nT", "T")
 
 
 def test_plain_numbers_are_taken_as_received(tmp_path):
     said = [(r, make("std_msgs/msg/Float64", data=41_000.0)) for _, r in at(50)]
     run = read_bag(record(tmp_path / "bag", {"/mag": said, POSE: poses()}), topics={MAG: "/mag"})
-    assert run.facts["stamps"] == "receipt"
+    assert run.metadata["stamps"] == "receipt"
     assert_allclose(run["mocap_p"][:, 0], 0.2 * np.floor(run["t"] * 20 + 1e-6) / 20, atol=1e-9)
 
 
@@ -269,7 +269,7 @@ def test_a_simulation_that_begins_at_0_has_stamps(tmp_path):
     pose = [(START + k * 50 * MS, posed(k * 50 * MS, k, 0.0)) for k in range(40)]
     command = [(START + 70 * MS, twist(0.3, 0.0))]
     run = read_bag(record(tmp_path / "bag", {MAG: said, POSE: pose, CMD: command}))
-    assert run.facts["stamps"] == "header"
+    assert run.metadata["stamps"] == "header"
     assert_allclose(run["mocap_p"][:, 0], np.floor(run["t"] * 20 + 1e-6), atol=1e-9)
     assert_array_equal(np.isfinite(run["v_cmd"]), run["t"] >= 0.07)  # though it was received years later
 

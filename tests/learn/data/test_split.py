@@ -65,7 +65,7 @@ def test_what_is_held_out_is_the_whole_test():
 def test_a_split_by_row_deals_rows_of_every_run_once_and_says_that_it_leaks():
     found = deal(by="row", shares=(0.5, 0.3, 0.2))
     assert "both sides" in found.leak
-    assert "both sides" in str(found.report().facts["warning"])
+    assert "both sides" in str(found.report().metadata["warning"])
     masks = np.array([found.rows(part, "run_05", 20_000) for part in PARTS])
     assert (masks.sum(axis=0) == 1).all()
     np.testing.assert_allclose(masks.mean(axis=1), [0.5, 0.3, 0.2], atol=0.02)

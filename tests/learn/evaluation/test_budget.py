@@ -37,9 +37,9 @@ def drives(twin):
     """Short drives of two sessions, as `magtwin runs` deals them."""
 
     def drive(day, path):
-        facts = {"session_seed": SEED, "session": day}
-        run = simulate(in_session_of(twin, facts), path, seed=day, duration_s=25.0, rate_hz=10.0)
-        return run.with_facts(**facts)
+        metadata = {"session_seed": SEED, "session": day}
+        run = simulate(in_session_of(twin, metadata), path, seed=day, duration_s=25.0, rate_hz=10.0)
+        return run.with_metadata(**metadata)
 
     return {f"d{day}": drive(day, path) for day, path in enumerate(("figure8", "sine", "figure8"))}
 
@@ -47,8 +47,8 @@ def drives(twin):
 @pytest.fixture(scope="module")
 def truth(twin):
     def day_of(name, run):
-        scene = in_session_of(twin, run.facts).scene
-        check_figures(scene, run.facts, name)
+        scene = in_session_of(twin, run.metadata).scene
+        check_figures(scene, run.metadata, name)
         return scene
 
     return Truth(twin.scene, day_of)
@@ -156,7 +156,7 @@ def test_steps_go_from_naive_over_the_first_map_to_the_weights_on_the_last(chart
 
 
 def test_a_run_of_another_scene_is_refused(drives, truth, found, train):
-    changed = drives["d2"].with_facts(config_sha256="0" * 64)
+    changed = drives["d2"].with_metadata(config_sha256="0" * 64)
     other = replace(found, judged=(replace(found.judged[0], name="d9", run=changed),))
     with pytest.raises(InputError, match="d9: came from a scene whose figures have the sha256 0000"):
         budgets(other, [0], truth, train)
@@ -168,7 +168,7 @@ def test_a_run_of_no_known_session_is_refused(twin):
 
 
 def test_a_run_without_the_truth_is_refused(drives, truth, found, train):
-    bare = Run({k: v for k, v in drives["d2"].items() if k != "b_truth_nt"}, drives["d2"].facts)
+    bare = Run({k: v for k, v in drives["d2"].items() if k != "b_truth_nt"}, drives["d2"].metadata)
     other = replace(found, judged=(replace(found.judged[0], name="d8", run=bare),))
     with pytest.raises(InputError, match="d8: tells no b_truth_nt, and an error budget needs the truth"):
         budgets(other, [0], truth, train)

@@ -47,7 +47,7 @@ HILLS = chart_of("hills", a_map())
 HIGHER = chart_of("higher", a_map("higher", 41.5e3))
 
 
-def a_run(seed=0, rows=300, **facts):
+def a_run(seed=0, rows=300, **metadata):
     """A drive whose disturbance is 300 nT, 100 nT a m/s of speed, and noise."""
     rng = np.random.default_rng(seed)
     t = np.arange(rows) / 10
@@ -62,7 +62,7 @@ def a_run(seed=0, rows=300, **facts):
     columns |= {"t": t, "p_world_base": p, "yaw": yaw}
     field = HILLS.field.lookup(p[:, :2], yaw)
     columns["b_measured_nt"] = field + 300 + 100 * columns["odom_v"][:, 0] + rng.normal(0, 20, rows)
-    return Run(columns, {"session": seed % 4, "session_seed": 1, **facts})
+    return Run(columns, {"session": seed % 4, "session_seed": 1, **metadata})
 
 
 def trial(name="one", run=None, **told):
@@ -85,7 +85,7 @@ def data(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def weights(data, tmp_path_factory):
-    """A linear model of the data set, with the split that its facts repeat."""
+    """A linear model of the data set, with the split that its metadata repeat."""
     config = TrainConfig(model="linear", features="circular", seed=3)
     deals, draws = np.random.default_rng(config.seed).spawn(2)
     parts = split(data.recordings, config.split, rng=deals)
@@ -155,7 +155,7 @@ def test_naive_is_the_mean_training_label_on_the_map_at_hand(data):
 
 def test_weights_tell_their_mean_label_where_no_training_set_is_at_hand(weights):
     own = contender(weights[0], [HILLS])
-    assert naive(HILLS, weights=[own]).model.mean_nt == own.facts["label_mean_nt"]
+    assert naive(HILLS, weights=[own]).model.mean_nt == own.metadata["label_mean_nt"]
     with pytest.raises(InputError, match="nothing tells the mean training label on the map higher"):
         naive(HIGHER, weights=[own])
 
@@ -205,7 +205,7 @@ def test_baselines_are_not_judged_by_what_they_learn_from(data):
 
 def test_weights_trained_on_rows_of_every_recording_are_refused(data, weights):
     one = contender(weights[0], [HILLS])
-    leaky = replace(one, facts={**one.facts, "config": 'split = "row"\nseed = 3\n'})
+    leaky = replace(one, metadata={**one.metadata, "config": 'split = "row"\nseed = 3\n'})
     with pytest.raises(InputError, match="trained on rows of every recording"):
         unseen(data, [leaky])
 
@@ -236,7 +236,7 @@ def test_a_run_off_the_map_is_refused():
 
 def test_a_run_without_an_input_is_refused_with_the_near_name(weights):
     run = a_run(2, path="figure8")
-    bare = Run({name: v for name, v in run.items() if name != "odom_v"}, run.facts)
+    bare = Run({name: v for name, v in run.items() if name != "odom_v"}, run.metadata)
     with pytest.raises(InputError, match=r"one: line\.safetensors: no column 'odom_v'; did you mean 'odom_"):
         judged([FLAT, contender(weights[0], [HILLS])], trial(run=bare))
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from test_model import a_net
+from test_network import a_net
 
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.models.calibration import Spread

@@ -3,7 +3,7 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from test_features import a_run
-from test_model import RELEASED, a_net
+from test_network import RELEASED, a_net
 
 from magtwin.errors import InputError
 from magtwin.files import sha256, shipped
@@ -116,11 +116,11 @@ def test_outside_training_reads_the_run(paper):
     assert_array_equal(paper.outside_training(run), paper.outside(features(run)))
 
 
-def test_the_facts_name_the_file_its_checksum_and_its_shape(tmp_path):
+def test_the_metadata_name_the_file_its_checksum_and_its_shape(tmp_path):
     path = tmp_path / "small.safetensors"
     a_net(hidden=(8, 4), residual_sd_nt=55.0).save(path)
     magnetometer = NeuralMagnetometer.load(path, sha256=sha256(path).upper())
-    assert dict(magnetometer.facts) == {
+    assert dict(magnetometer.metadata) == {
         "network": "small.safetensors",
         "network_sha256": sha256(path),
         "network_layers": "20-8-4-1",
@@ -163,7 +163,7 @@ def new_days():
 
 def test_the_paper_s_network_has_its_shape_and_reads_its_inputs():
     paper = NeuralMagnetometer.load(shipped("weights", "turtlebot4_paper.safetensors"))
-    assert paper.facts["network_layers"] == "20-512-512-512-512-1"
+    assert paper.metadata["network_layers"] == "20-512-512-512-512-1"
     assert paper.features == FULL
 
 
@@ -177,7 +177,7 @@ def test_the_shipped_network_does_better_than_the_mean_label_on_days_and_paths_i
 ):
     label = np.concatenate([run["b_truth_nt"] - run["b_map_nt"] for run in new_days])
     found = np.concatenate([shipped_network.disturbance_nt(run) for run in new_days])
-    naive = np.abs(label - shipped_network.net.facts["label_mean_nt"]).mean()
+    naive = np.abs(label - shipped_network.net.metadata["label_mean_nt"]).mean()
     share = {"mlp": 0.85, "hybrid": 0.5}[shipped_network.net.kind]  # the cards: 0.66 and 0.27
     assert np.abs(found - label).mean() < share * naive
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from test_magnetometer import inputs
-from test_model import RELEASED, a_net
+from test_network import RELEASED, a_net
 from test_predictor import KINDS, a_predictor
 
 from magtwin.cli import main
@@ -29,7 +29,7 @@ def run(file, x):
 def weights(tmp_path_factory):
     """A small network with ranges and an error."""
     path = tmp_path_factory.mktemp("weights") / "n.safetensors"
-    a_net(["yaw_deg", "odom_w_z", "battery_v"], (16, 8), residual_sd_nt=42.0, facts={"seed": 3}).save(path)
+    a_net(["yaw_deg", "odom_w_z", "battery_v"], (16, 8), residual_sd_nt=42.0, metadata={"seed": 3}).save(path)
     return path
 
 
@@ -94,7 +94,7 @@ def test_info_tells_what_a_file_holds_and_runs_nothing_of_it(exported, capsys):
     assert told["figures"]["kind"]["value"] == "mlp"
     assert told["figures"]["layers"]["value"] == "3-16-8-1"
     assert told["figures"]["residual sd"]["value"] == 42.0
-    assert list(told["facts"]["features"]) == ["yaw_deg", "odom_w_z", "battery_v"]
+    assert list(told["metadata"]["features"]) == ["yaw_deg", "odom_w_z", "battery_v"]
 
 
 def test_the_command_says_what_it_wrote_and_replaces_nothing_unasked(weights, tmp_path, capsys):

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from test_features import a_run
-from test_model import RELEASED, a_net
+from test_network import RELEASED, a_net
 
 from magtwin.errors import InputError
 from magtwin.learn.data.features import SETS, features
@@ -51,7 +51,7 @@ def a_predictor(kind, names=NAMES, step_s=1 / 135):
         "tcn": lambda: Temporal(net=net.eval(), step_s=step_s, **heads),
     }[kind]()
     found.residual_sd_nt = 44.0
-    found.facts.update(source="here", rows=7)
+    found.metadata.update(source="here", rows=7)
     return found
 
 
@@ -70,7 +70,7 @@ def test_every_kind_comes_back_from_its_file_to_the_bit(predictor, tmp_path):
         assert_array_equal(ours, its)
     assert_array_equal(predictor.outside(x), again.outside(x))
     assert (again.kind, again.features, again.residual_sd_nt) == (predictor.kind, NAMES, 44.0)
-    assert again.facts == {"source": "here", "rows": 7}
+    assert again.metadata == {"source": "here", "rows": 7}
 
 
 def test_a_file_that_is_there_is_kept(predictor, tmp_path):
@@ -97,8 +97,8 @@ def test_a_magnetometer_tells_of_each_row_its_own_spread(predictor):
     assert (len(np.unique(sd)) == 1) == (predictor.kind == "mlp")
 
 
-def test_the_facts_of_a_run_tell_the_kind_where_it_is_no_perceptron(predictor):
-    assert NeuralMagnetometer(predictor).facts.get("network_kind", "mlp") == predictor.kind
+def test_the_metadata_of_a_run_tell_the_kind_where_it_is_no_perceptron(predictor):
+    assert NeuralMagnetometer(predictor).metadata.get("network_kind", "mlp") == predictor.kind
 
 
 def test_runs_in_one_stream_are_read_as_if_each_were_alone(predictor):
@@ -118,7 +118,7 @@ def test_one_look_back_lasts_as_long_at_twice_the_rate():
     magnetometer = NeuralMagnetometer(a_predictor("tcn", step_s=0.1))
     run = a_run(50)
     slow = run.with_columns(t=np.arange(50) / 10)
-    twice = type(run)({name: np.repeat(values, 2, axis=0) for name, values in run.items()}, run.facts)
+    twice = type(run)({name: np.repeat(values, 2, axis=0) for name, values in run.items()}, run.metadata)
     twice = twice.with_columns(t=np.arange(100) / 20)
     found, peer = magnetometer.disturbance_nt(twice), magnetometer.disturbance_nt(slow)
     assert_array_equal(found[::2], peer)
@@ -133,7 +133,7 @@ def test_a_simulation_is_read_by_any_kind_and_many_as_one(lab_scene, tmp_path, k
     a_predictor(kind).save(tmp_path / "n.safetensors")
     twin = open_twin(lab_scene, net=tmp_path / "n.safetensors")
     one = simulate(twin, seed=3, duration_s=1.0)
-    assert one.facts["network_kind"] == kind
+    assert one.metadata["network_kind"] == kind
     x = features(one, NAMES)
     noise = twin.scene.robot.magnetometer.noise_density_nt * math.sqrt(135 / 2)
     assert_allclose(one["b_sd_nt"], np.hypot(twin.magnetometer.net.predict(x)[1], noise))

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 from test_features import a_run
 from test_magnetometer import forward64, inputs
-from test_model import RELEASED, a_net
+from test_network import RELEASED, a_net
 from test_predictor import KINDS, a_predictor
 
 from magtwin.errors import InputError

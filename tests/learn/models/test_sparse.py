@@ -6,7 +6,7 @@ import pytest
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from test_magnetometer import inputs
-from test_model import a_net
+from test_network import a_net
 
 from magtwin.learn.data.features import FULL
 from magtwin.learn.models import compiled, sparse

@@ -265,7 +265,7 @@ def test_a_held_out_run_of_a_whole_robot_loses_over_95_percent_of_the_platforms_
     left = {}
     for vector, column in (("measured", "b_vector_measured_nt"), ("exact", "b_vector_nt")):
         model = fit_run(first, vector=vector, band_hz=None)
-        assert model.report("fit").facts["vector"] == column
+        assert model.report("fit").metadata["vector"] == column
         left[vector] = (platform - model.interference_nt(run[column], 60.0)).var()
     # the exact vector is as long as the reading itself, so it tells all; axes that are read in turn do not
     assert left["exact"] < 1e-6 * platform.var() < left["measured"] < 0.05 * platform.var()
@@ -283,7 +283,7 @@ def test_a_fit_takes_what_the_vector_axes_read_and_the_exact_field_only_when_ask
         fit_run(blind)
     exact.save(tmp_path / "model.json")
     compensated, report = compensate_run(blind, TollesLawson.load(tmp_path / "model.json"))
-    assert report.facts["vector"] == "b_vector_nt"
+    assert report.metadata["vector"] == "b_vector_nt"
     assert np.isfinite(compensated["b_measured_nt"]).all()
 
 
@@ -308,7 +308,7 @@ def test_a_run_compensated_by_another_s_fit_loses_over_95_percent_of_its_varianc
     assert removed > 0.95
     left = run["b_measured_nt"] - run["b_map_nt"]
     assert left.std() < 0.25 * calibration("curvilinear", 2)["b_disturbance_nt"].std()
-    assert run.facts["tolles_lawson"] == "permanent induced6 eddy9"
+    assert run.metadata["tolles_lawson"] == "permanent induced6 eddy9"
 
 
 def test_a_run_without_vectors_is_refused(calibration):
@@ -402,10 +402,10 @@ def test_compensate_says_which_vectors_it_took(calibration, tmp_path, capsys):
                 *options,
             ]
         )
-        fitted = json.loads(capsys.readouterr().out)["facts"]["vector"]
+        fitted = json.loads(capsys.readouterr().out)["metadata"]["vector"]
         out = ["--out", str(tmp_path / f"{name}.parquet"), "--json"]
         main(["compensate", "apply", str(tmp_path / "run.parquet"), model, *out])
-        told[name] = fitted, json.loads(capsys.readouterr().out)["facts"]["vector"]
+        told[name] = fitted, json.loads(capsys.readouterr().out)["metadata"]["vector"]
     assert told == {"measured": ("b_vector_measured_nt",) * 2, "exact": ("b_vector_nt",) * 2}
 
 

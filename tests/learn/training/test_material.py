@@ -46,7 +46,7 @@ def test_where_one_day_is_all_there_is_to_learn_from_its_recordings_are_left_out
 
 def test_the_ridge_takes_what_terms_the_recordings_have(tmp_path):
     kept = ("t", "p_world_base", "yaw", "odom_v", "b_measured_nt")
-    data = a_set(tmp_path, lambda run: Run({name: run[name] for name in kept}, run.facts))
+    data = a_set(tmp_path, lambda run: Run({name: run[name] for name in kept}, run.metadata))
     of = material(data, parts_of(data), INPUTS)
     terms = ("yaw_sin", "yaw_cos", "yaw_sin_2", "yaw_cos_2", "odom_v_x")
     assert of.ridge.model.features == terms

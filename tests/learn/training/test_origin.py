@@ -12,9 +12,9 @@ from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import sha256, shipped
-from magtwin.learn.data.origin import label_frame, map_facts, mismatches, shared_facts
+from magtwin.learn.data.origin import label_frame, map_metadata, mismatches, shared_metadata
 from magtwin.learn.models.network import FieldNet
-from magtwin.sim.runs.simulate import robot_facts
+from magtwin.sim.runs.simulate import robot_metadata
 from magtwin.sim.session import draw_session
 from magtwin.spec.scene import MocapSpec
 from magtwin.twin import _platform_sha256, in_session, open_twin, simulate_many
@@ -39,16 +39,16 @@ def a_map(shift_nt=0.0, slope_nt_m=SLOPE, name="hills"):
     )
 
 
-def learned(field=None, robot=ROBOT, **facts):
-    """Facts of a network that learned there, without an alignment from true poses."""
+def learned(field=None, robot=ROBOT, **metadata):
+    """Metadata of a network that learned there, without an alignment from true poses."""
     about = {"map": "hills", "map_sha256": "a" * 64, "lever_arm_m": "0, 0", "latency_s": 0.0, "poses": "true"}
     about |= {"label_mean_nt": 268.0, "label_sd_nt": 346.0, "platform_sha256": "p"}
-    return about | map_facts(field or a_map()) | robot_facts(robot) | facts
+    return about | map_metadata(field or a_map()) | robot_metadata(robot) | metadata
 
 
-def found(facts, *, field=None, map_sha256="a" * 64, robot=ROBOT, platform="p", residual_sd_nt=140.0):
+def found(metadata, *, field=None, map_sha256="a" * 64, robot=ROBOT, platform="p", residual_sd_nt=140.0):
     return mismatches(
-        facts,
+        metadata,
         "f.safetensors",
         residual_sd_nt=residual_sd_nt,
         field=field or a_map(),
@@ -136,16 +136,16 @@ def test_another_platform_and_another_name_alone_are_told():
 @pytest.mark.parametrize(
     "fact", [{"sensor_m": "here"}, {"lever_arm_m": "1"}, {"map_samples_nt": "1 2 3", "map_sha256": "b" * 64}]
 )
-def test_facts_that_are_no_numbers_are_refused_by_name(fact):
+def test_metadata_that_are_no_numbers_are_refused_by_name(fact):
     with pytest.raises(InputError, match=f"f.safetensors: its fact '{next(iter(fact))}' must list"):
         found(learned() | fact)
 
 
 def test_recordings_tell_one_robot_none_or_several():
-    own, other = robot_facts(ROBOT), {"robot_name": "husky"}
-    assert shared_facts([own, own])["robot_name"] == "turtlebot4"
-    assert shared_facts([own, other])["robot_name"] == "several"
-    assert shared_facts([{}, {}])["robot_name"] == "unknown"
+    own, other = robot_metadata(ROBOT), {"robot_name": "husky"}
+    assert shared_metadata([own, own])["robot_name"] == "turtlebot4"
+    assert shared_metadata([own, other])["robot_name"] == "several"
+    assert shared_metadata([{}, {}])["robot_name"] == "unknown"
 
 
 def test_a_run_tells_its_robot_and_motion_capture_as_it_was_in_the_session(lab_scene):
@@ -154,10 +154,10 @@ def test_a_run_tells_its_robot_and_motion_capture_as_it_was_in_the_session(lab_s
     drawn = simulate(twin, "sine", session=2, **short)
     surveyed = simulate(twin, "sine", session="survey", **short)
     (many,) = simulate_many(twin, "sine", [0], robots=in_session(twin, 2), **short)
-    assert drawn.facts["robot_name"] == "turtlebot4"
-    assert drawn.facts["mocap_offset_m"] == many.facts["mocap_offset_m"] == "0.055, -0.03"
-    assert surveyed.facts["mocap_offset_m"] == "0, 0"
-    assert drawn.facts["platform_sha256"] == surveyed.facts["platform_sha256"]
+    assert drawn.metadata["robot_name"] == "turtlebot4"
+    assert drawn.metadata["mocap_offset_m"] == many.metadata["mocap_offset_m"] == "0.055, -0.03"
+    assert surveyed.metadata["mocap_offset_m"] == "0, 0"
+    assert drawn.metadata["platform_sha256"] == surveyed.metadata["platform_sha256"]
 
 
 @pytest.fixture
@@ -170,10 +170,10 @@ def strange(tmp_path):
     off = dataclasses.replace(field, values_nt=field.values_nt + 300.0, harmonic=None, name="off")
     save_map(off, tmp_path / "off.usdc")
     other = dataclasses.replace(ROBOT, name="husky", p_base_magnetometer=(0.3, 0.0, 0.9))
-    facts = learned(off, other) | {"map": "off", "map_sha256": sha256(tmp_path / "off.usdc")}
-    facts |= {"residual_offset_sd_nt": 50.0, "residual_time_s": 1.0}
+    metadata = learned(off, other) | {"map": "off", "map_sha256": sha256(tmp_path / "off.usdc")}
+    metadata |= {"residual_offset_sd_nt": 50.0, "residual_time_s": 1.0}
     file = tmp_path / "strange.safetensors"
-    FieldNet("full", (4,), residual_sd_nt=100.0, facts=facts).save(file)
+    FieldNet("full", (4,), residual_sd_nt=100.0, metadata=metadata).save(file)
     return file
 
 
@@ -184,15 +184,15 @@ def test_open_twin_warns_and_runs_keep_what_it_said(lab_scene, strange):
     assert texts[0].startswith("WRONG ROBOT")
     assert "differ by 300 nT RMS" in texts[1]
     run = simulate(twin, "sine", duration_s=0.5, rate_hz=20.0)
-    assert run.facts["network_mismatch"] == "; ".join(texts)
+    assert run.metadata["network_mismatch"] == "; ".join(texts)
 
 
 def test_the_shipped_scene_s_network_belongs_to_its_map_and_robot(lab_scene):
     with warnings.catch_warnings():
         warnings.simplefilter("error", MismatchWarning)
         twin = open_twin(lab_scene)
-    assert "network_mismatch" not in twin.facts
-    assert twin.magnetometer.net.facts["map_sha256"] == sha256(shipped("maps", "lab", "lab.usdc"))
+    assert "network_mismatch" not in twin.metadata
+    assert twin.magnetometer.net.metadata["map_sha256"] == sha256(shipped("maps", "lab", "lab.usdc"))
 
 
 def test_a_command_says_each_mismatch_once_on_stderr_and_info_shows_it(lab_scene, strange, tmp_path, capsys):

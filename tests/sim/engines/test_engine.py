@@ -39,7 +39,7 @@ def test_a_run_that_is_replayed_has_the_poses_of_the_run_to_the_last_bit(twin):
     assert_allclose(again["yaw"], first["yaw"], atol=1e-15)  # unwrapped, and wrapped again
     for name in ("t", "p_world_base", "v_base", "w_base", "v_cmd", "w_cmd", "flag_bump"):
         assert_array_equal(again[name], first[name], err_msg=name)
-    assert again.facts["engine"] == "replay"
+    assert again.metadata["engine"] == "replay"
     # what is computed from between the rows is the same too, to rounding, though torques jump there
     assert np.ptp(first["b_truth_nt"]) > 1000
     assert_allclose(again["b_truth_nt"], first["b_truth_nt"], atol=1e-8)
@@ -65,7 +65,7 @@ def test_a_replay_of_rows_that_do_not_tell_the_steps_goes_evenly_from_row_to_row
     assert replayed(slow, DRIVE).step_s is None
     whole = simulate(twin, path, seed=3)
     assert replayed(whole, DRIVE).step_s == 0.02
-    cut = Run({name: values[100:] for name, values in whole.items()}, whole.facts)
+    cut = Run({name: values[100:] for name, values in whole.items()}, whole.metadata)
     assert replayed(cut, DRIVE).step_s is None
     again = simulate(twin, cut, seed=3)
     assert_allclose(again["p_world_base"], cut["p_world_base"], atol=1e-12)
@@ -314,7 +314,7 @@ def test_newton_follows_a_path_by_the_same_controller_and_gives_the_same_bits_ag
         assert_array_equal(runs[0][name], runs[1][name], err_msg=name)
     _, aside = path.nearest(runs[0]["p_world_base"][:, :2])
     assert np.abs(aside).max() < 0.02
-    assert runs[0].facts["engine"] == "newton"
+    assert runs[0].metadata["engine"] == "newton"
 
 
 @physics

@@ -499,5 +499,5 @@ def test_a_run_tells_which_controller_drove(name):
     run = simulate(
         open_twin(shipped("scenes", "lab", "lab.usda"), net="none"), duration_s=5.0, controller=name
     )
-    assert run.facts["controller"] == name
+    assert run.metadata["controller"] == name
     assert not run["flag_bump"].any()

@@ -39,10 +39,10 @@ def test_scene_twin_and_file_give_equal_bytes(lab_scene, twin):
     runs = [simulate(what, "sine", seed=4, **SHORT) for what in (lab_scene, twin, read_scene(lab_scene))]
     assert same(runs[0], runs[1])
     assert same(runs[0], runs[2])
-    facts = [dict(run.facts) for run in runs]
-    assert facts[0] == facts[1]
-    assert facts[0].keys() - facts[2].keys() <= {"scene_file", "git_revision"}
-    assert all(facts[0][name] == value for name, value in facts[2].items())
+    metadata = [dict(run.metadata) for run in runs]
+    assert metadata[0] == metadata[1]
+    assert metadata[0].keys() - metadata[2].keys() <= {"scene_file", "git_revision"}
+    assert all(metadata[0][name] == value for name, value in metadata[2].items())
 
 
 def test_a_scene_that_no_file_holds_runs_as_its_stage_does(tmp_path):
@@ -53,8 +53,8 @@ def test_a_scene_that_no_file_holds_runs_as_its_stage_does(tmp_path):
     physical = {"magnetometer": "physical", **SHORT}
     a, b = (simulate(what, commands, **physical) for what in (scene, file))
     assert same(a, b)
-    assert a.facts["scene_sha256"] == b.facts["scene_sha256"]
-    assert simulate(scene, commands, **physical).facts == a.facts
+    assert a.metadata["scene_sha256"] == b.metadata["scene_sha256"]
+    assert simulate(scene, commands, **physical).metadata == a.metadata
     many = list(simulate_many(scene, commands, [0], **physical))
     assert same(many[0], next(iter(simulate_many(file, commands, [0], **physical))))
 
@@ -73,7 +73,7 @@ def test_every_writer_and_the_lidar_take_the_twin_of_a_scene(lab_scene, tmp_path
 
 def test_the_stage_of_a_scene_lasts_as_long_as_its_twins(lab_scene):
     twin = open_twin(read_scene(lab_scene))
-    file, other = twin.scene_file, replace(twin, facts={})
+    file, other = twin.scene_file, replace(twin, metadata={})
     del twin
     gc.collect()
     assert file.is_file()
@@ -91,9 +91,9 @@ def test_points_give_the_run_of_their_csv(twin, tmp_path):
     for points in (POINTS, np.array(POINTS), tuple(map(tuple, POINTS)), np.array(POINTS, np.float32)):
         run = simulate(twin, points, **SHORT)
         assert same(run, read)
-        assert run.facts["path"] == "points"
-        assert run.facts["path_sha256"] == read.facts["path_sha256"]
-        assert "path_file" not in run.facts
+        assert run.metadata["path"] == "points"
+        assert run.metadata["path_sha256"] == read.metadata["path_sha256"]
+        assert "path_file" not in run.metadata
     many = simulate_many(twin, POINTS, [0, 1], **SHORT)
     assert same(many[0], read)
     mixed = simulate_many(twin, ["sine", np.array(POINTS)], [0, 0], **SHORT)

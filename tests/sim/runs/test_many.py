@@ -28,7 +28,7 @@ def neural(lab_scene, tmp_path_factory) -> Twin:
     torch.manual_seed(0)
     file = tmp_path_factory.mktemp("net") / "small.safetensors"
     error = {"residual_offset_sd_nt": 60.0, "residual_time_s": 2.0}
-    FieldNet("full", (48, 48), residual_sd_nt=100.0, facts=error).save(file)
+    FieldNet("full", (48, 48), residual_sd_nt=100.0, metadata=error).save(file)
     return open_twin(lab_scene, net=file)
 
 
@@ -47,7 +47,7 @@ def alone(neural) -> list[Run]:
 
 def assert_same(a: Run, b: Run) -> None:
     assert list(a) == list(b)
-    assert dict(a.facts) == dict(b.facts)
+    assert dict(a.metadata) == dict(b.metadata)
     for name in a:
         assert a[name].tobytes() == b[name].tobytes(), name
 
@@ -148,8 +148,8 @@ def test_each_robot_has_its_own_parameters(neural):
     for run, robot in zip(runs, robots, strict=True):
         own = dataclasses.replace(neural, scene=dataclasses.replace(neural.scene, robot=robot))
         direct = simulate(own, "figure8", seed=7, session="survey", **SHORT)
-        facts = {name: fact for name, fact in direct.facts.items() if name != "session"}
-        assert_same(run, Run(direct.columns, facts))
+        metadata = {name: fact for name, fact in direct.metadata.items() if name != "session"}
+        assert_same(run, Run(direct.columns, metadata))
     assert len({run["battery_fraction"][0] for run in runs}) == 3
 
 
@@ -192,13 +192,13 @@ def test_no_more_than_two_blocks_are_made_ahead(neural, monkeypatch):
 def test_what_differs_from_run_to_run_may_come_from_any_iterable(physical):
     options = {"speeds": np.array([0.1, 0.2], np.float32), **SHORT}
     runs = simulate_many(physical, (name for name in ("figure8", "sine")), iter((3, 4)), **options)
-    assert [(run.facts["path"], run.facts["seed"]) for run in runs] == [("figure8", 3), ("sine", 4)]
+    assert [(run.metadata["path"], run.metadata["seed"]) for run in runs] == [("figure8", 3), ("sine", 4)]
 
 
 def test_seeds_of_numpy_are_seeds(physical):
     run = simulate_many(physical, "figure8", np.arange(5), **SHORT)[4]
     assert_same(run, simulate(physical, "figure8", seed=4, **SHORT))
-    assert type(run.facts["seed"]) is int
+    assert type(run.metadata["seed"]) is int
 
 
 @pytest.mark.parametrize(

@@ -81,9 +81,9 @@ def test_a_run_has_every_column_in_order_and_no_other():
     assert np.isnan(run["b_sd_nt"]).all()
 
 
-def test_facts_tell_how_the_run_came_about():
+def test_metadata_tell_how_the_run_came_about():
     run = drive(speed=0.3, duration_s=2.0, lidar="on")
-    assert dict(run.facts) == {
+    assert dict(run.metadata) == {
         "scene": "known",
         "path": "line",
         "controller": "follower",
@@ -105,7 +105,7 @@ def test_readings_come_at_k_over_rate_for_the_whole_duration():
     assert_array_equal(run["t"], np.arange(1350) / 135.0)
     assert_array_equal(drive(duration_s=10.0, rate_hz=7.0)["t"], np.arange(70) / 7.0)
     whole = drive()
-    assert whole["t"][-1] == pytest.approx(whole.facts["duration_s"], abs=1 / 135)
+    assert whole["t"][-1] == pytest.approx(whole.metadata["duration_s"], abs=1 / 135)
     assert_allclose(whole["p_world_base"][-1], [0.5, 0.2, 0.0], atol=0.002)
 
 
@@ -365,10 +365,10 @@ def test_every_error_has_an_address():
 def test_a_physical_magnetometer_reads_the_exact_field_and_one_of_the_map_alone_the_map():
     exact, known = drive(), with_robot(KNOWN, magnetometer=MagnetometerSpec(kind="map-only"))
     alone, surveyed = drive(known), drive(with_robot(SURVEYED, magnetometer=known.robot.magnetometer))
-    assert exact.facts["magnetometer"] == "physical"
+    assert exact.metadata["magnetometer"] == "physical"
     assert_array_equal(exact["b_total_nt"], exact["b_map_nt"] + (exact["b_truth_nt"] - exact["b_map_nt"]))
     for run in (alone, surveyed):  # the map is there whether or not the exact field is known
-        assert run.facts["magnetometer"] == "map-only"
+        assert run.metadata["magnetometer"] == "map-only"
         assert_array_equal(run["b_total_nt"], run["b_map_nt"])
         assert_array_equal(run["b_disturbance_nt"], 0)
     assert_array_equal(alone["b_truth_nt"], exact["b_truth_nt"])

@@ -158,12 +158,12 @@ def test_robots_that_pass_feel_each_other_when_they_are_near_and_not_when_they_a
     assert not np.array_equal(passing["ann"]["odom_v"][:100], passing["bob"]["odom_v"][:100])
 
 
-def test_facts_name_the_nearest_robot_with_time_and_clearance(passing):
+def test_metadata_name_the_nearest_robot_with_time_and_clearance(passing):
     for name, other in (("ann", "bob"), ("bob", "ann")):
-        facts = passing[name].facts
-        assert (facts["robot"], facts["nearest_robot"]) == (name, other)
-        assert facts["nearest_clearance_m"] == pytest.approx(0.6 - 2 * 0.171, abs=1e-3)
-        assert facts["nearest_t_s"] == pytest.approx(passing[name]["t"][-1] / 2, abs=0.1)  # half way
+        metadata = passing[name].metadata
+        assert (metadata["robot"], metadata["nearest_robot"]) == (name, other)
+        assert metadata["nearest_clearance_m"] == pytest.approx(0.6 - 2 * 0.171, abs=1e-3)
+        assert metadata["nearest_t_s"] == pytest.approx(passing[name]["t"][-1] / 2, abs=0.1)  # half way
 
 
 def test_a_network_predicts_without_the_others_whose_iron_comes_to_it():
@@ -199,7 +199,7 @@ def test_bumps_are_flagged_in_both_while_they_overlap_where_that_is_asked_for():
     for name in ("ann", "bob"):
         assert_array_equal(runs[name]["flag_bump"], apart < 0.342)
     assert not runs["cleo"]["flag_bump"].any()
-    assert runs["cleo"].facts["nearest_clearance_m"] > 0.5
+    assert runs["cleo"].metadata["nearest_clearance_m"] > 0.5
 
 
 def test_who_arrives_stands_where_it_is_and_is_still_met():
@@ -240,7 +240,7 @@ def test_a_scene_drives_all_of_its_robots_the_first_as_by_itself(tmp_path):
     twin = Twin(scene, tmp_path / "two.usda", FLAT, None)
     runs = simulate_robots(twin, {"ann": line("short", (0, 1), (0.5, 1))}, seed=4, rate_hz=RATE_HZ)
     assert list(runs) == ["ann", "bob"]
-    assert [run.facts["path"] for run in runs.values()] == ["short", "far.csv"]
+    assert [run.metadata["path"] for run in runs.values()] == ["short", "far.csv"]
     alone = simulate_one(twin, line("short", (0, 1), (0.5, 1)), seed=4, rate_hz=RATE_HZ)
     for name in ("p_world_base", "odom_p", "imu_w", "battery_v", "b_map_nt", "mocap_p"):
         assert_array_equal(runs["ann"][name], alone[name], err_msg=name)
@@ -275,7 +275,7 @@ def test_run_writes_a_file_for_each_robot_and_robot_the_one_to_the_same_bits(two
     again = repeat(whole)
     assert again.equal
     assert not again.causes
-    assert whole.facts["nearest_robot"] == report["facts"]["bob"]["nearest_robot"] == "ann"
+    assert whole.metadata["nearest_robot"] == report["metadata"]["bob"]["nearest_robot"] == "ann"
 
 
 def test_meet_flag_lets_robots_drive_through_each_other(two, tmp_path, capsys):

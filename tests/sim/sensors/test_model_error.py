@@ -31,7 +31,7 @@ def weights(folder, **options):
 
 @pytest.fixture(scope="module")
 def net(tmp_path_factory):
-    return weights(tmp_path_factory.mktemp("net"), residual_sd_nt=SD, facts=FACTS)
+    return weights(tmp_path_factory.mktemp("net"), residual_sd_nt=SD, metadata=FACTS)
 
 
 @pytest.fixture(scope="module")
@@ -95,12 +95,12 @@ def test_readings_add_up_and_everything_else_is_as_without_the_error(twin):
     assert_array_equal(plain["b_model_error_nt"], 0)
     for name in COLUMNS.keys() - {"b_model_error_nt", "b_measured_nt"}:
         assert_array_equal(run[name], plain[name], err_msg=name)
-    assert (run.facts["model_error"], plain.facts["model_error"]) == (True, False)
+    assert (run.metadata["model_error"], plain.metadata["model_error"]) == (True, False)
 
 
 def offsets(lab_scene, tmp_path, of):
     """The constants of runs whose error is an offset alone."""
-    net = weights(tmp_path, residual_sd_nt=SD, facts=FACTS | {"residual_offset_sd_nt": SD})
+    net = weights(tmp_path, residual_sd_nt=SD, metadata=FACTS | {"residual_offset_sd_nt": SD})
     runs = of(open_twin(lab_scene, net=net))
     for run in runs:
         assert np.ptp(run["b_model_error_nt"]) < 1e-9
@@ -129,20 +129,20 @@ def test_sessions_that_are_drawn_from_the_seed_have_offsets_of_the_right_size(la
 def test_a_physical_magnetometer_has_no_model_error(lab_scene):
     run = simulate(lab_scene, "sine", magnetometer="physical", **SHORT)
     assert_array_equal(run["b_model_error_nt"], 0)
-    assert "model_error" not in run.facts
+    assert "model_error" not in run.metadata
 
 
-@pytest.mark.parametrize("options", [{"residual_sd_nt": SD}, {"facts": FACTS}])
+@pytest.mark.parametrize("options", [{"residual_sd_nt": SD}, {"metadata": FACTS}])
 def test_weights_that_do_not_say_how_their_error_varies_draw_none_and_warn(lab_scene, tmp_path, options):
     with pytest.warns(MismatchWarning, match="does not say how its error varies in time"):
         twin = open_twin(lab_scene, net=weights(tmp_path, **options))
     run = simulate(twin, "sine", **SHORT)
     assert_array_equal(run["b_model_error_nt"], 0)
-    assert run.facts["model_error"] is False
+    assert run.metadata["model_error"] is False
 
 
 def test_figures_that_cannot_be_are_refused(lab_scene, tmp_path):
-    net = weights(tmp_path, residual_sd_nt=SD, facts=FACTS | {"residual_time_s": -1.0})
+    net = weights(tmp_path, residual_sd_nt=SD, metadata=FACTS | {"residual_time_s": -1.0})
     with pytest.raises(magtwin.InputError, match="residual_time_s"):
         open_twin(lab_scene, net=net)
 

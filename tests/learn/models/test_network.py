@@ -42,18 +42,18 @@ def test_the_papers_network_has_799233_parameters():
 
 def test_what_is_known_of_a_network_survives_the_file(tmp_path):
     net = a_net(
-        ["yaw_deg", "odom_v_x"], dropout=0.1, residual_sd_nt=12.5, facts={"source": "here", "rows": 7}
+        ["yaw_deg", "odom_v_x"], dropout=0.1, residual_sd_nt=12.5, metadata={"source": "here", "rows": 7}
     )
     net.save(tmp_path / "n.safetensors")
     again = load_net(tmp_path / "n.safetensors")
     assert again.features == ("yaw_deg", "odom_v_x")
-    assert (again.dropout, again.residual_sd_nt, again.facts) == (0.1, 12.5, {"source": "here", "rows": 7})
+    assert (again.dropout, again.residual_sd_nt, again.metadata) == (0.1, 12.5, {"source": "here", "rows": 7})
     assert not again.training
 
 
 def test_one_network_gives_one_file_byte_for_byte(tmp_path):
     for name in ("a", "b"):
-        a_net(facts={"z": 1, "a": 2}).save(tmp_path / name)
+        a_net(metadata={"z": 1, "a": 2}).save(tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -107,8 +107,8 @@ def test_the_released_network_converts_once_and_stays_itself(real_data, tmp_path
     for layer, (weight, bias) in zip(net.linears, checkpoint.layers, strict=True):
         assert_array_equal(layer.weight.detach(), weight)
         assert_array_equal(layer.bias.detach(), bias)
-    assert net.facts == converted.facts
-    assert net.facts["source_sha256"] == "2418abc80cb0eab578e1e8af35f53566db2efa84b1cfa5257710d15273a07cf0"
+    assert net.metadata == converted.metadata
+    assert net.metadata["source_sha256"] == "2418abc80cb0eab578e1e8af35f53566db2efa84b1cfa5257710d15273a07cf0"
     assert math.isnan(net.residual_sd_nt)
     assert torch.isnan(net.x_min).all()
 
