@@ -388,7 +388,7 @@ def _drive(
         what = read_run(replay)
     else:
         way_of(path)  # refuses a name or file that is none before the scene is opened
-    twin = open_twin(scene_file, net=net, magnetometer=magnetometer, model_error=model_error)
+    twin = open_twin(scene_file, network=net, magnetometer=magnetometer, model_error=model_error)
     twin = in_session(twin, session, seed=seed)
     if commands is None and replay is None and path != "random":
         what = planned = way_of(path, room_of(twin), fit=fit)

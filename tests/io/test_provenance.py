@@ -43,7 +43,7 @@ def test_a_run_names_its_files_with_checksums(run, lab_scene, twin):
 
 
 def test_a_run_of_a_network_named_by_hand_says_its_file(lab_scene):
-    twin = open_twin(lab_scene, net=open_twin(lab_scene).scene.robot.magnetometer.network)
+    twin = open_twin(lab_scene, network=open_twin(lab_scene).scene.robot.magnetometer.network)
     network = simulate(twin, "figure8", **BRIEF).metadata["network_file"]
     assert sha256(network) == twin.metadata["network_sha256"]
 
