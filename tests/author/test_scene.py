@@ -838,7 +838,7 @@ def test_a_twin_loads_a_network_only_for_a_neural_magnetometer(lab_scene, tmp_pa
         assert twin.magnetometer is None
         assert twin.scene.robot.magnetometer.kind == kind
     assert open_twin(lab_scene, network="none").scene.robot.magnetometer.kind == "physical"
-    with pytest.raises(InputError, match="a neural magnetometer that names no network"):
+    with pytest.raises(InputError, match="a neural magnetometer without a network"):
         open_twin(lab_scene, network="none", magnetometer="neural")
     with pytest.raises(InputError, match=r"kind of MagnetometerSpec must be a known kind .*'physical'"):
         open_twin(lab_scene, magnetometer="physicall")  # type: ignore[arg-type]

@@ -132,7 +132,7 @@ def test_a_physical_magnetometer_has_no_model_error(lab_scene):
 
 @pytest.mark.parametrize("options", [{"residual_sd_nt": SD}, {"metadata": FACTS}])
 def test_weights_that_do_not_say_how_their_error_varies_draw_none_and_warn(lab_scene, tmp_path, options):
-    with pytest.warns(MismatchWarning, match="does not say how its error varies in time"):
+    with pytest.warns(MismatchWarning, match="has no statistics of its error"):
         twin = open_twin(lab_scene, network=weights(tmp_path, **options))
     run = simulate(twin, "sine", **SHORT)
     assert_array_equal(run["b_model_error_nt"], 0)
