@@ -21,8 +21,12 @@ from magtwin.path import Path
 from magtwin.placement import Room
 from magtwin.run.run import Run
 from magtwin.sim.motion.way import way_of, ways_of
+from magtwin.spec.base import spelled
+from magtwin.spec.lab import SurveySpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import MagnetometerSpec, RobotSpec, Scene, SurveySpec, spelled
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.summary import Summarized, Summary
 from magtwin.version import __version__
 

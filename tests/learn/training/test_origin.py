@@ -16,7 +16,7 @@ from magtwin.learn.data.origin import label_frame, map_metadata, mismatches, sha
 from magtwin.learn.models.network import FieldNet
 from magtwin.sim.runs.simulate import robot_metadata
 from magtwin.sim.session import draw_session
-from magtwin.spec.scene import MocapSpec
+from magtwin.spec.sensors import MocapSpec
 from magtwin.twin import _platform_sha256, in_session, open_twin, simulate_many
 from magtwin.usd.maps import save_map
 
