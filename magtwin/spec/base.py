@@ -74,19 +74,15 @@ def _least(value: float | tuple[float, ...]) -> float:
     return min(value) if isinstance(value, tuple) else value
 
 
-_OLD_NAMES = {"stuck_nt": "latched_nt", "stuck_std_nt": "latched_std_nt"}
-"""Names that fields had when the first checksums were taken."""
-
-
 def spelled(value: Any) -> str:
     """Every value of a spec as text, the input of its checksum.
 
     It is the `repr` of a plain dataclass, even if the class has its own `repr`. Runs keep the checksum, so
-    this text must not change.
+    the spelling must not change.
     """
     if is_dataclass(value) and not isinstance(value, type):
-        values = {_OLD_NAMES.get(f.name, f.name): getattr(value, f.name) for f in fields(value) if f.repr}
-        return f"{type(value).__qualname__}({', '.join(f'{k}={spelled(v)}' for k, v in values.items())})"
+        values = ", ".join(f"{f.name}={spelled(getattr(value, f.name))}" for f in fields(value) if f.repr)
+        return f"{type(value).__qualname__}({values})"
     if type(value) is tuple:
         return f"({', '.join(map(spelled, value))}{',' * (len(value) == 1)})"
     return repr(value)
