@@ -19,7 +19,6 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from magtwin.field.maps import lookup
 from magtwin.field.maps.lookup import LOOPS, warm_up
 from magtwin.field.maps.map import AnomalyMap
 

@@ -157,10 +157,10 @@ def open_twin(
     """
     if isinstance(scene_file, Scene):
         return _twin_of_scene(scene_file, net, magnetometer, model_error)
-    from magtwin.author.scene import read_scene
     from magtwin.usd.layers import stage_sha256
     from magtwin.usd.maps import load_map
     from magtwin.usd.obstacles import read_obstacles
+    from magtwin.usd.scene import read_scene
 
     scene_file = FilePath(scene_file)
     scene = read_scene(scene_file, check_network=net is None and magnetometer in (None, "neural"))
@@ -420,7 +420,7 @@ def scene_from_toml(
             neither a map nor a field to survey, or the map contradicts the Earth's field, sources and
             furniture; the text says by how much.
     """
-    from magtwin.author.scene import scene_from_toml as scene_of
+    from magtwin.author.scene_file import scene_from_toml as scene_of
     from magtwin.sim.contradiction import check_agrees
     from magtwin.usd.maps import load_map
 

@@ -13,7 +13,6 @@ from typing import Literal
 
 from pxr import Sdf, Usd, UsdGeom
 
-from magtwin.author.scene import read_scene
 from magtwin.errors import InputError, find
 from magtwin.export.attached import attach, detach
 from magtwin.export.contents import THUMBNAIL, bring_together
@@ -32,6 +31,7 @@ from magtwin.urdf.simready import UNKNOWN
 from magtwin.usd.animation import write_animation
 from magtwin.usd.layers import open_stage, stage_sha256
 from magtwin.usd.maps import read_map
+from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import FOLDER as SCHEMA
 from magtwin.usd.schema import attribute_name, place, prims_with
 from magtwin.usd.sensors import MAP_CHECKSUM

@@ -12,7 +12,6 @@ import pytest
 from numpy.testing import assert_allclose
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
-from magtwin.author.scene import read_scene
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.export.package import export_scene
@@ -22,6 +21,7 @@ from magtwin.export.usdz import pack, unpack
 from magtwin.files import sha256, shipped
 from magtwin.io.tables import write_parquet
 from magtwin.run.run import Run
+from magtwin.usd.scene import read_scene
 
 LAB = shipped("scenes", "lab", "lab.usda")
 HEAD = '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    upAxis = "Z"\n)\n'

@@ -18,7 +18,8 @@ from numpy.testing import assert_allclose
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, UsdValidation
 from validators import assert_valid
 
-from magtwin.author.scene import author_scene, read_scene, scene_from_toml
+from magtwin.author.scene import author_scene
+from magtwin.author.scene_file import scene_from_toml
 from magtwin.cli import main
 from magtwin.export.attached import BYTES, SCOPE
 from magtwin.export.glb import corner_normals
@@ -30,6 +31,7 @@ from magtwin.run.run import Run
 from magtwin.usd.animation import read_animation
 from magtwin.usd.geometry import read_shapes
 from magtwin.usd.maps import load_map, save_map
+from magtwin.usd.scene import read_scene
 
 LAB = shipped("scenes", "lab", "lab.usda")
 ROBOT, HEAT_MAP = "/World/turtlebot4", "/World/AnomalyMap/HeatMap"

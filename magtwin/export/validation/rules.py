@@ -14,9 +14,6 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
-from magtwin.author.furniture import read_magnets
-from magtwin.author.lab import read_lab
-from magtwin.author.robot import robot_of
 from magtwin.errors import InputError
 from magtwin.export.attached import attached_sha256
 from magtwin.export.validation.findings import Severity
@@ -33,8 +30,11 @@ from magtwin.export.validation.rule import (
 from magtwin.files import sha256
 from magtwin.usd.attributes import plain_value, target
 from magtwin.usd.earth import read_earth
+from magtwin.usd.furniture import read_magnets
+from magtwin.usd.lab import read_lab
 from magtwin.usd.maps import HEAT_MAP, checksums, heading_variants, read_map
 from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.robot import read_robot
 from magtwin.usd.schema import NOUNS, attribute_name
 from magtwin.usd.sensors import (
     IMU_TYPE,
@@ -405,7 +405,7 @@ def robot_clear(subject: Subject) -> Iterator[Wrong]:
 def figures(subject: Subject) -> Iterator[Wrong]:
     """Lab, Earth's field, sources and robots have all their parts, and no figure is out of its range."""
     looks: list[tuple[Callable[[], object], Usd.Prim]] = []
-    for noun, read in (("lab", read_lab), ("earth", read_earth), ("robot", robot_of)):
+    for noun, read in (("lab", read_lab), ("earth", read_earth), ("robot", read_robot)):
         looks += [(partial(read, prim), prim) for prim in subject.having(noun)]
     if subject.having("source"):
         looks.append((partial(read_magnets, subject.stage), subject.stage.GetPseudoRoot()))

@@ -8,8 +8,8 @@ import numpy as np
 from numba import types
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.errors import InputError
 from magtwin.compiled import compiled, in_threads
+from magtwin.errors import InputError
 from magtwin.field.sources.point_dipoles import MU_0_OVER_4_PI, NT_PER_T
 
 Array = NDArray[np.float64]

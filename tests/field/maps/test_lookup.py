@@ -2,7 +2,6 @@
 
 import copy
 import math
-import os
 import pickle
 import subprocess
 import sys

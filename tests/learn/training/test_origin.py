@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from magtwin import simulate
-from magtwin.author.robot import read_robot
 from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
@@ -19,8 +18,9 @@ from magtwin.sim.session import draw_session
 from magtwin.spec.sensors import MocapSpec
 from magtwin.twin import _platform_sha256, in_session, open_twin, simulate_many
 from magtwin.usd.maps import save_map
+from magtwin.usd.robot import load_robot
 
-ROBOT = read_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
+ROBOT = load_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
 SLOPE = 4000.0
 
 
