@@ -22,7 +22,7 @@ from magtwin.author.scene import check_things
 from magtwin.errors import InputError
 from magtwin.files import existing, from_table, read_toml, refused_at, sha256
 from magtwin.path import resolve_path
-from magtwin.placement import Room, path_in
+from magtwin.path.room import Room, path_in
 from magtwin.spec.base import ZERO3, Vec3
 from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.lab import LabSpec, SurveySpec
