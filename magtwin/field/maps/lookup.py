@@ -73,7 +73,7 @@ class Lookup:
         self.values: Array = self.table[begin:end]
         self.holes: Array | None = self.table[end:] if len(grids) > 1 else None
         self.figures = (*origin_m, *cell_m, first, per_rad, layers, rows, columns)
-        self._plain = memoryview(self.table)  # its entries are plain floats, which Python adds up faster
+        self._plain = memoryview(self.table.data)  # its entries are plain floats, which Python adds up faster
 
     def lookup(self, p: Array, yaw: Array, *, clamp: bool, gradient: bool) -> tuple[Array, Array]:
         """Field at poses, and its gradient.
