@@ -18,7 +18,6 @@ def export(
     out: Path,
     profile: Literal["omniverse", "isaac", "newton", "viewer"] | None = None,
     run: Path | None = None,
-    convert_units: bool = False,
     onnx: bool = True,
     thumbnail: bool = True,
     force: Force = False,
@@ -38,8 +37,6 @@ def export(
         viewers show. omniverse for folders and packages, viewer for the others, unless given.
     run
         A run, in any format that magtwin reads, to play over the stage.
-    convert_units
-        Convert a stage that is not in metres with Z up; it is refused otherwise.
     onnx
         Write networks as ONNX too, beside their weights, where the extra onnx is installed.
     thumbnail
@@ -61,7 +58,6 @@ def export(
         animation=played,
         to_onnx=_write_onnx if onnx and _has_onnx() else None,
         thumbnail=_draw if thumbnail and profile != "viewer" else None,
-        convert_units=convert_units,
         force=force,
         progress=announcer(quiet=json),
     )

@@ -332,12 +332,12 @@ def map_survey(
 
     import numpy as np
 
-    from magtwin.author.scene import read_scene
     from magtwin.files import check_free, sha256
     from magtwin.sim.room_survey import blocked_by
     from magtwin.sim.survey import survey, survey_readings
     from magtwin.usd.layers import layer_files
     from magtwin.usd.obstacles import read_obstacles
+    from magtwin.usd.scene import read_scene
 
     check_suffix(out, (".usdc", ".usd", ".parquet"), "a map layer, or a file of readings,")
     check_free(out, force=force)

@@ -120,7 +120,7 @@ def earth_nt(text: str) -> tuple[float, float, float]:
                 "it in nT, or its place with the day, latitude,longitude,height,date"
             )
         return x, y, z
-    from magtwin.author.scene import read_scene
+    from magtwin.usd.scene import read_scene
 
     if not Path(text).is_file():
         raise InputError(f"--earth is {forms}; there is no file {text!r}")

@@ -255,14 +255,14 @@ def follow(
     stamped_commands
         Send cmd_vel as TwistStamped, and not as Twist.
     """
-    from magtwin.author.robot import read_robot
     from magtwin.files import shipped
     from magtwin.path import resolve_path
     from magtwin.ros.follow import Follower
+    from magtwin.usd.robot import load_robot
 
     tell = announcer(quiet=False)
     way = resolve_path(path)
-    drive = read_robot(robot or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
+    drive = load_robot(robot or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
     with where.bus("magtwin_follow", sim_time=sim_time) as bus:
         node = Follower(
             way,
@@ -328,17 +328,17 @@ def teleop(
     """
     from contextlib import ExitStack
 
-    from magtwin.author.robot import read_robot
     from magtwin.cli.drive import device
     from magtwin.files import existing, shipped
     from magtwin.io.bags.raw import RawBagWriter
     from magtwin.ros.record import Recorder
     from magtwin.ros.teleop import Teleop
     from magtwin.sim.motion.manual import HELP, Gamepad, Hand, Keyboard
+    from magtwin.usd.robot import load_robot
 
     if gamepad is not None:
         existing(gamepad, "gamepad")
-    drive = read_robot(robot or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
+    drive = load_robot(robot or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
     hand: Hand = Keyboard(drive) if gamepad is None else Gamepad(drive)
     with ExitStack() as stack:
         writer = None

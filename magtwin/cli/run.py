@@ -221,8 +221,8 @@ def run(
     json
         Print the summary as JSON.
     """
-    from magtwin.author.scene import robots_in
     from magtwin.files import existing
+    from magtwin.usd.scene import robots_in
 
     existing(scene, "scene")
     given = {"rrd": rrd, "parquet": parquet, "bag": bag, "csv": csv, "usd": usd}

@@ -39,11 +39,11 @@ def scene(
     json
         Print the summary as JSON.
     """
-    from magtwin.author.robot import notes_of
     from magtwin.author.scene import author_scene
     from magtwin.files import check_free, shipped
     from magtwin.twin import scene_from_toml
     from magtwin.usd.info import info_of_stage
+    from magtwin.usd.robot import conversion_notes
 
     file = Path(spec)
     if not file.suffix and not file.is_file():
@@ -64,7 +64,7 @@ def scene(
         built = [
             one.robot for one in scene.robots if one.robot.asset.is_relative_to(Path(workshop).resolve())
         ]
-        notes = {f"notes on {robot.name}": notes_of(robot.asset) for robot in built}
+        notes = {f"notes on {robot.name}": conversion_notes(robot.asset) for robot in built}
     report = info_of_stage(root)
     print_report(replace(report, metadata={**report.metadata, **notes}), json)
     if not json:

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from magtwin.export.validation.findings import Check, Findings, Severity
 
 Validator = Literal["core", "nvidia", "simready", "isaac", "newton", "magtwin"]
-Asked = Literal["map-checksum", "map-file", "network-file"]
 
 MOST = 12
 """Findings of one validator that are shown; the JSON has all."""
@@ -27,7 +26,6 @@ def validate(
     *files: Path,
     against: Annotated[list[Validator] | None, Parameter(consume_multiple=True, negative="")] = None,
     fix: Annotated[bool, Parameter(negative="")] = False,
-    fix_also: Annotated[list[Asked] | None, Parameter(consume_multiple=True, negative="")] = None,
     out: Path | None = None,
     force: Force = False,
     json: Json = False,
@@ -46,9 +44,6 @@ def validate(
         them unless given.
     fix
         Mend first what is safe: the default prim, units that nobody says, absolute paths, extents, bindings.
-    fix_also
-        Mend checksums too, by name: map-checksum, map-file, network-file. They then accept the
-        files as they are.
     out
         Where to write it all, a .json file.
     force
@@ -65,11 +60,14 @@ def validate(
     if out is not None:
         check_suffix(out, (".json",), "a report")
         check_free(out, force=force)
-    fixes = [*(SAFE if fix else ()), *(fix_also or ())]
     wanted = against or AGAINST
     found: list[Findings] = []
     for file in files:
-        found.append(validate(file, wanted, inputs=FEATURES, fix=fixes, progress=_announce(file, quiet=json)))
+        found.append(
+            validate(
+                file, wanted, inputs=FEATURES, fix=SAFE if fix else (), progress=_announce(file, quiet=json)
+            )
+        )
         if not json:
             _print(found[-1])
     if json or out is not None:

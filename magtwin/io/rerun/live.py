@@ -11,7 +11,6 @@ from urllib.parse import urlsplit
 import rerun as rr
 import rerun.blueprint as rrb
 
-from magtwin.author.scene import open_alone
 from magtwin.errors import InputError
 from magtwin.files import check_free
 from magtwin.io.recorder import partial_of
@@ -37,6 +36,7 @@ from magtwin.spec.scene import Scene
 from magtwin.twin import Twin
 from magtwin.usd.geometry import read_links, read_shapes
 from magtwin.usd.maps import HEAT_MAP
+from magtwin.usd.scene import open_alone
 
 Show = Callable[[float, tuple[float, float, float]], None]
 """Takes the time [s] and x [m], y [m], yaw [rad] of base_link."""

@@ -10,7 +10,6 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from magtwin.author.scene import open_alone
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_multiply, rotate, wrap_angle
 from magtwin.io.rerun.layout import Colour
@@ -22,6 +21,7 @@ from magtwin.spec.robot import RobotSpec
 from magtwin.twin import Twin
 from magtwin.usd.geometry import BASE_LINK, Link, Shape, read_links, read_shapes, srgb_from_linear
 from magtwin.usd.maps import HEAT_MAP, HEAT_MAP_HEIGHT_M
+from magtwin.usd.scene import open_alone
 
 Array = NDArray[np.float64]
 

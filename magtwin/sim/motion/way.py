@@ -7,7 +7,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.path import Path, resolve_path
-from magtwin.placement import Room, fitted, path_in
+from magtwin.path.room import Room, fit_path, path_in
 from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands
 
@@ -20,7 +20,7 @@ def way_of(way: Any, room: Room | None = None, *, fit: bool = False) -> Way:
     Args:
         way: The name of a path, a CSV file, or points (N, 2) [m], which become a `Path`; "random", a `Path`,
             `Commands` or a `Run`, which stay as they are.
-        room: Where it is driven: named paths are scaled to its floor, see `magtwin.placement.path_in`.
+        room: Where it is driven: named paths are scaled to its floor, see `magtwin.path.room.path_in`.
             Default: the floor that they are made for.
         fit: Whether a path that does not fit into the room is moved and made smaller until it does.
 
@@ -30,11 +30,11 @@ def way_of(way: Any, room: Room | None = None, *, fit: bool = False) -> Way:
     if isinstance(way, Commands | Run) or (isinstance(way, str) and way == "random"):
         return way
     if isinstance(way, Path):
-        return fitted(way, room) if fit and room is not None else way
+        return fit_path(way, room) if fit and room is not None else way
     if isinstance(way, str | FilePath | list | tuple | np.ndarray):
         named = isinstance(way, str | FilePath) and room is not None
         path = path_in(room, way) if named else resolve_path(way)  # type: ignore[arg-type]
-        return fitted(path, room) if fit and room is not None else path
+        return fit_path(path, room) if fit and room is not None else path
     raise InputError(
         "path must be a name, a CSV file, points (N, 2) [m], a Path, Commands or a Run, got "
         f"{type(way).__name__}"

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.path import CASES, PATHS, Path, check_clear, check_on_floor, path_named
-from magtwin.placement import FLOOR_M, RADIUS_M, Room, fitted, path_in
+from magtwin.path.room import FLOOR_M, RADIUS_M, Room, fit_path, path_in
 from magtwin.spec.obstacles import Obstacles
 from magtwin.twin import open_twin, simulate
 
@@ -70,15 +70,15 @@ def test_a_named_path_passes_what_stands_in_its_way(name, where):
 
 def test_a_path_that_fits_is_not_touched_by_a_fit():
     path = Path("own", np.array([[0.0, 0.0], [1.0, 1.0]]))
-    assert fitted(path, room(4.0, 3.0)) is path
+    assert fit_path(path, room(4.0, 3.0)) is path
 
 
 def test_a_fit_keeps_the_shape_and_only_moves_what_is_small_enough():
     square = Path("own", np.array([[1.0, 1.0], [3.0, 1.0], [3.0, 2.0], [1.0, 2.0]]), closed=True)
-    moved = fitted(square, room(4.0, 3.0))
+    moved = fit_path(square, room(4.0, 3.0))
     assert moved.placing[:2] == (1.0, 1.0)
     np.testing.assert_allclose(np.diff(moved.p_xy, axis=0), np.diff(square.p_xy, axis=0), atol=1e-12)
-    shrunk = fitted(square, room(2.0, 2.0))
+    shrunk = fit_path(square, room(2.0, 2.0))
     assert shrunk.placing[0] == shrunk.placing[1] < 1
     check_on_floor(shrunk, (2.0, 2.0), RADIUS_M)
 
@@ -97,7 +97,7 @@ def test_a_path_that_does_not_fit_is_told_what_would(points, said):
     path = Path("own", np.array(points, float))
     with pytest.raises(InputError, match=said):
         check_on_floor(path, (4.0, 3.0), RADIUS_M)
-    check_on_floor(fitted(path, room(4.0, 3.0)), (4.0, 3.0), RADIUS_M)
+    check_on_floor(fit_path(path, room(4.0, 3.0)), (4.0, 3.0), RADIUS_M)
 
 
 def test_what_the_refusal_says_is_true():

@@ -18,6 +18,7 @@ from magtwin.path import (
     check_on_floor,
     curvilinear,
     lawnmower,
+    path,
     path_named,
     read_path_csv,
     resolve_path,
@@ -378,3 +379,16 @@ def test_a_path_that_passes_at_just_the_robot_s_radius_is_clear():
     check_clear(Path("line", np.array([[-2.0, 0.371], [2.0, 0.371]])), DESK, 0.171)
     with pytest.raises(InputError, match=r"0\.001 m too near"):
         check_clear(Path("line", np.array([[-2.0, 0.37], [2.0, 0.37]])), DESK, 0.171)
+
+
+def test_a_registered_path_has_a_name_like_any_other(monkeypatch):
+    monkeypatch.setattr(PATHS, "_loaded", dict(PATHS._loaded))
+
+    @path("triangle")
+    def triangle() -> Path:
+        return Path("triangle", np.array([[0, 0], [2, 0], [1, 1]], float), closed=True)
+
+    assert path_named("triangle").length == pytest.approx(2 + 2 * math.sqrt(2))
+    assert resolve_path("triangle").name == "triangle"
+    with pytest.raises(UnknownNameError, match="no path 'triangl'; did you mean 'triangle'"):
+        path_named("triangl")

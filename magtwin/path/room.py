@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.path import CASES, PATHS, Path, check_clear, check_on_floor, path_named, resolve_path
+from magtwin.path.curves import CASES, PATHS, path_named
+from magtwin.path.points import resolve_path
+from magtwin.path.polyline import Path
 from magtwin.spec.obstacles import Obstacles
 
 Array = NDArray[np.float64]
@@ -90,7 +92,7 @@ def path_in(room: Room, way: str | os.PathLike[str]) -> Path:
     return _placed(path, room, room.reach_m / made_for, each_way=True)
 
 
-def fitted(path: Path, room: Room) -> Path:
+def fit_path(path: Path, room: Room) -> Path:
     """A path that keeps its shape, moved and if need be made smaller until it fits into a room.
 
     Args:
@@ -108,6 +110,70 @@ def fitted(path: Path, room: Room) -> Path:
     with np.errstate(divide="ignore"):
         whole = min(1.0, float(np.min(room.reach_m / half)))
     return _placed(path, room, np.array([whole, whole]), each_way=False)
+
+
+def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> None:
+    """Whether a round robot on the path stays on a floor that is centred on the world's origin.
+
+    Args:
+        path: Where its centre goes.
+        floor_m: Extent of the floor in x and y [m].
+        footprint_radius_m: Radius of the robot [m].
+
+    Raises:
+        InputError: It does not; the text gives the first such point and how far it is outside.
+    """
+    beyond = np.max(np.abs(path.p_xy) + footprint_radius_m - np.array(floor_m) / 2, axis=1)
+    outside = np.flatnonzero(beyond > 1e-9)
+    if len(outside):
+        i = int(outside[0])
+        x, y = path.p_xy[i]
+        needs = np.ptp(path.p_xy, axis=0) + 2 * footprint_radius_m
+        raise InputError(
+            f"path {path.name} leaves the floor at point {i + 1} of {len(beyond)}, ({x:.3f}, {y:.3f}) m, by "
+            f"{beyond[i]:.3f} m: with a robot of radius {footprint_radius_m:g} m it needs {needs[0]:.2f} x "
+            f"{needs[1]:.2f} m, the floor is {floor_m[0]:g} x {floor_m[1]:g} m; "
+            f"{_what_fits(path, floor_m, footprint_radius_m)}"
+        )
+
+
+def _what_fits(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> str:
+    """What would bring a path onto the floor, in words."""
+    room = np.array(floor_m) - 2 * footprint_radius_m
+    if min(room) <= 0:
+        return "the floor is no wider than the robot; enlarge it"
+    low, high = path.p_xy.min(axis=0), path.p_xy.max(axis=0)
+    with np.errstate(divide="ignore"):
+        scale = float(np.min(room / (high - low)))
+    if scale >= 1:
+        x, y = np.clip(0.0, high - room / 2, low + room / 2) * -1.0 + 0.0
+        return f"moved by ({x:.2f}, {y:.2f}) m it fits: give --fit, or move its points"
+    return f"scaled by {math.floor(scale * 100) / 100:g} it fits: give --fit, or enlarge the floor"
+
+
+def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> None:
+    """Whether a round robot on the path passes all obstacles.
+
+    Args:
+        path: Where its centre goes.
+        obstacles: What it must not touch.
+        footprint_radius_m: Radius of the robot [m].
+
+    Raises:
+        InputError: It touches one; the text gives the first such point and the obstacle.
+    """
+    step = max(footprint_radius_m / 4, path.length / 100_000)  # a straight segment may be long
+    s = np.union1d(np.linspace(0.0, path.length, math.ceil(path.length / step) + 1), path.s)
+    p = path.at(np.minimum(s, path.length))
+    distance, which = obstacles.clearance(p, reach_m=footprint_radius_m)
+    touched = np.flatnonzero(distance < footprint_radius_m - 1e-9)
+    if len(touched):
+        i = int(touched[0])
+        raise InputError(
+            f"path {path.name} runs into {obstacles.names[which[i]]}: {s[i]:.3f} m along it, at "
+            f"({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, a robot of radius {footprint_radius_m:g} m is "
+            f"{footprint_radius_m - distance[i]:.3f} m too near; give --fit, or move the path or the obstacle"
+        )
 
 
 def _too_small(room: Room) -> str:
