@@ -42,7 +42,7 @@ def real_run(tmp_path_factory):
 def test_the_map_column_is_what_scipy_interpolates_and_unknown_beside_latched_nodes(real_run):
     from scipy.interpolate import RegularGridInterpolator
 
-    from magtwin.field.survey.gridded import import_survey
+    from magtwin.field.survey.folder import import_survey
 
     run, real = real_run
     tables = [np.loadtxt(real / "maps" / f"{h}_map.csv", delimiter=",") for h in (0, 90, 180, 270)]

@@ -24,7 +24,7 @@ from magtwin.export.attached import BYTES, SCOPE
 from magtwin.export.glb import corner_normals
 from magtwin.export.package import HOWTO, PLUGIN, export_scene, licence_of
 from magtwin.export.usdz import ALIGNMENT, ALLOWED
-from magtwin.field.survey.gridded import import_survey
+from magtwin.field.survey.folder import import_survey
 from magtwin.files import sha256, shipped
 from magtwin.run.run import Run
 from magtwin.usd.animation import read_animation

@@ -14,7 +14,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.epochs import at_date
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.survey.gridded import import_survey, write_survey
+from magtwin.field.survey.folder import import_survey, write_survey
 from magtwin.io.surveys.readings import read_readings
 from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
 
@@ -155,7 +155,7 @@ def test_any_survey_comes_back_from_csv_and_from_usd_to_the_bit(tmp_path_factory
     folder, made = tmp_path_factory.mktemp("trip"), survey(seed)
     save_map(made, folder / "a.usdc")
     write_survey(load_map(folder / "a.usdc"), folder / "csv")
-    back = import_survey(folder / "csv", keep_latched=True)
+    back = import_survey(folder / "csv", keep_stuck=True)
     for name in ("values_nt", "recorded_yaw", "headings_rad", "origin_m", "cell_m"):
         assert np.array_equal(getattr(back, name), getattr(made, name)), name
     save_map(replace(back, name="made"), folder / "b.usdc")

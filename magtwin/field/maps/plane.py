@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.field.maps.lookup import AS_MANY, LOOPS
 from magtwin.field.sources.bodies import CELL_M, FARTHEST_CELL, Bodies
-from magtwin.field.sources.point_dipoles import dipole_block, in_blocks, in_two_threads
+from magtwin.field.sources.dipoles import dipole_block, in_blocks, in_two_threads
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]

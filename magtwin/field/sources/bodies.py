@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.sources.point_dipoles import (
+from magtwin.field.sources.dipoles import (
     MU_0_OVER_4_PI,
     NT_PER_T,
     dipole_block,

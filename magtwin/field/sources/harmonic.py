@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.summary import Summarized
 
@@ -102,7 +102,7 @@ class HarmonicField(Summarized):
             Field [nT], shape (..., 3), and dB_i/dx_j [nT/m], shape (..., 3, 3), in world axes: symmetric
             and of trace 0, for the field has neither curl nor divergence.
         """
-        from magtwin.field.sources.dipole_sums import dipole_field_and_gradient_nt
+        from magtwin.field.sources.compiled_dipoles import dipole_field_and_gradient_nt
 
         field, gradient = dipole_field_and_gradient_nt(p_world, self.p_world_dipole, self.m_world)
         return field + self.b_uniform_nt, gradient
@@ -139,7 +139,7 @@ class HarmonicField(Summarized):
             Field magnitude [nT], that of `magnitude_nt` but for rounding, shape (...), and its derivatives
             by x, y [nT/m] and yaw [nT/rad], shape (..., 3).
         """
-        from magtwin.field.sources.dipole_sums import dipole_field_and_gradient_nt
+        from magtwin.field.sources.compiled_dipoles import dipole_field_and_gradient_nt
 
         at, turn, place = self._placed(p_xy, yaw, height_m)
         field, change = dipole_field_and_gradient_nt(at, self.p_world_dipole, self.m_world)

@@ -20,7 +20,7 @@ from magtwin.field.sources.bodies import (
     induced_magnetization,
     mesh_moments,
 )
-from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.frames import quat_from_rpy, rotate
 
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float) / 2

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
-from magtwin.field.sources import dipole_sums as dipoles
-from magtwin.field.sources import point_dipoles as sources
-from magtwin.field.sources.dipole_sums import dipole_field_and_gradient_nt, dipole_field_nt
+from magtwin.field.sources import compiled_dipoles as dipoles
+from magtwin.field.sources import dipoles as sources
+from magtwin.field.sources.compiled_dipoles import dipole_field_and_gradient_nt, dipole_field_nt
 from magtwin.field.sources.harmonic import HarmonicField
 
 

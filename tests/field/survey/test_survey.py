@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
-from magtwin.field.survey import gridded as survey
-from magtwin.field.survey.gridded import import_survey, node_map, read_grid, read_survey
+from magtwin.field.survey import folder as survey
+from magtwin.field.survey.folder import import_survey, node_map, read_grid, read_survey
 from magtwin.field.survey.readings import Readings
 from magtwin.files import sha256
 
@@ -78,8 +78,8 @@ def test_headings_need_not_be_four_when_they_are_even_or_named(tmp_path):
 
 
 def test_the_report_tells_the_worst_heading_and_repeated_readings(tmp_path):
-    latched = layer_text(90, (35_600, 35_600, 40_000, 41_000))
-    lines = latched.splitlines(keepends=True)
+    stuck = layer_text(90, (35_600, 35_600, 40_000, 41_000))
+    lines = stuck.splitlines(keepends=True)
     lines[3] = f"0.0,0.5,{np.radians(90 - 20)},40000\n"
     got = figures(read_survey(write_survey(tmp_path, h90="".join(lines)))[1])
     assert got["largest heading deviation"].value == pytest.approx(20, abs=1e-3)
@@ -107,7 +107,7 @@ def test_recorded_headings_are_compared_on_the_circle(tmp_path):
 
 def test_the_real_survey_has_the_published_figures(real_data):
     folder = real_data / "aprilab/maps"
-    field, report = read_survey(folder, name="aprilab", licence="MIT", keep_latched=True)
+    field, report = read_survey(folder, name="aprilab", licence="MIT", keep_stuck=True)
     assert field.valid.all()
     assert field.values_nt.shape == (4, 15, 25)
     assert field.extent == (-3.0, 3.0, -1.75, 1.75)
@@ -127,15 +127,15 @@ def test_the_real_survey_has_the_published_figures(real_data):
     assert got["repeated readings"].value > 10
 
 
-def test_a_surveys_latched_nodes_are_not_valid_unless_they_are_to_be_kept(real_data):
+def test_a_surveys_stuck_nodes_are_not_valid_unless_they_are_to_be_kept(real_data):
     folder = real_data / "aprilab/maps"
     field, report = read_survey(folder)
     assert np.count_nonzero(~field.valid.any(axis=0)) == 17
     assert np.isnan(field.lookup([-1.25, 1.5], [0, np.pi / 2, np.pi])).all()
-    kept, again = read_survey(folder, keep_latched=True)
+    kept, again = read_survey(folder, keep_stuck=True)
     assert kept.valid.all()
     assert_array_equal(kept.values_nt, field.values_nt)
-    assert figures(report)["latched readings"] == figures(again)["latched readings"]
+    assert figures(report)["stuck readings"] == figures(again)["stuck readings"]
 
 
 def test_readings_of_a_grid_stand_on_its_nodes_with_recorded_headings_one_run_a_file(tmp_path):

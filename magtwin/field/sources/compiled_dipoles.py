@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.compiled import compiled, in_threads
 from magtwin.errors import InputError
-from magtwin.field.sources.point_dipoles import MU_0_OVER_4_PI, NT_PER_T
+from magtwin.field.sources.dipoles import MU_0_OVER_4_PI, NT_PER_T
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ _IN_3, _OUT_3 = types.Array(types.float64, 3, "C", readonly=True), types.Array(t
 
 
 def dipole_field_nt(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike) -> Array:
-    """Field of point dipoles: what `magtwin.field.sources.point_dipoles.dipole_field_nt` gives, faster.
+    """Field of point dipoles: what `magtwin.field.sources.dipoles.dipole_field_nt` gives, faster.
 
     Args:
         p_world: Observation points [m], shape (..., 3).

@@ -13,7 +13,7 @@ from magtwin.errors import InputError
 from magtwin.field.grid import Grid
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.header import ERROR, MASKED, header_lines, read_header
-from magtwin.field.survey.reading_errors import node_errors
+from magtwin.field.survey.node_errors import node_errors
 from magtwin.field.survey.readings import Readings
 from magtwin.field.units import check_unit, nt_per
 from magtwin.files import existing, output, sha256
@@ -93,7 +93,7 @@ def node_map(readings: Readings) -> AnomalyMap:
     Returns:
         The map on the survey's grid; nodes with no good reading are not valid, and keep the mean of
         the others, or nan, as their value. The variance is what the survey tells of its errors
-        (`magtwin.field.survey.reading_errors`); a survey of one heading tells nothing.
+        (`magtwin.field.survey.node_errors`); a survey of one heading tells nothing.
 
     Raises:
         InputError: The readings are not gridded.
@@ -200,7 +200,7 @@ def read_survey(
     headings_deg: tuple[float, ...] | None = None,
     unit: str = "nT",
     scale: float | None = None,
-    keep_latched: bool = False,
+    keep_stuck: bool = False,
 ) -> tuple[AnomalyMap, Report]:
     """The map of a survey folder's nodes, and its report.
 
@@ -215,20 +215,20 @@ def read_survey(
         headings_deg: Headings that the survey has [deg].
         unit: Unit of the field, one of `magtwin.field.units.NT_PER`.
         scale: Factor from the file's values to nT, in place of a unit.
-        keep_latched: Whether readings of a sensor that had lost lock stay valid nodes.
+        keep_stuck: Whether readings of a sensor that had lost lock stay valid nodes.
 
     Returns:
-        The map, in which latched nodes are not valid (`magtwin.field.survey.stuck`). A fitted map that
+        The map, in which stuck nodes are not valid (`magtwin.field.survey.stuck`). A fitted map that
         `write_survey` wrote comes back as it was, but for its variance, which is uniform in each heading,
         and its harmonic field, which is left out. And the report: the
         map's figures; the median and the largest deviation of a recorded heading from the nominal
         one, with the worst row; how many readings repeat the one before in their row to the last
-        digit; what was found latched, stuck or outlying.
+        digit; what was found stuck or outlying.
 
     Raises:
         InputError: As `read_grid`, with file and line; or no reading is field.
     """
-    from magtwin.field.survey.stuck import mask_latched
+    from magtwin.field.survey.stuck import mask_stuck
 
     layers = _read(folder, headings_deg, unit, scale)
     about = {"licence": licence, "created": created, "height_m": height_m, "frame": frame, "datum": datum}
@@ -236,13 +236,13 @@ def read_survey(
     if _said(layers, "method") not in ("", METHOD):
         field = _fitted(layers, readings)
         return field, _report(layers, field, folder, Report(""))
-    masked, found = mask_latched(readings)
-    if not (keep_latched or masked.good.any()):
+    masked, found = mask_stuck(readings)
+    if not (keep_stuck or masked.good.any()):
         raise InputError(
             f"{folder}: all {len(readings)} readings are those of a sensor that was stuck; "
-            "survey it again, or import them as they are with keep_latched (--keep-latched)"
+            "survey it again, or import them as they are with keep_stuck (--keep-latched)"
         )
-    field = node_map(readings if keep_latched else masked)
+    field = node_map(readings if keep_stuck else masked)
     field = replace(field, parameters=_said(layers, "parameters") or {})
     return field, _report(layers, field, folder, found)
 
