@@ -45,9 +45,9 @@ def info(file: Path, *, json: Json = False) -> None:
         report = _info_of_usd(file)
     elif file.is_dir() and any(file.glob("*_map.csv")):
         from magtwin.field.maps.statistics import map_metadata
-        from magtwin.field.survey.folder import import_survey
+        from magtwin.field.survey.folder import read_survey
 
-        report = map_metadata(import_survey(file))
+        report = map_metadata(read_survey(file)[0])
     else:
         report = _info_of_run(file)
     print_report(report, json)

@@ -580,11 +580,11 @@ def _joined(report: Any, found: Any) -> Any:
 def _open_map(file: Path, date: str | None = None) -> Any:
     """The map of a layer or stage, of a day where one is given, or of a folder of survey CSVs."""
     if file.is_dir():
-        from magtwin.field.survey.folder import import_survey
+        from magtwin.field.survey.folder import read_survey
 
         if date is not None:
             raise InputError(f"{file}: a folder of CSVs is one survey without a day; leave out --date")
-        return import_survey(file)
+        return read_survey(file)[0]
     from magtwin.usd.maps import load_map
 
     return load_map(file, date)

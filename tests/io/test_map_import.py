@@ -14,7 +14,7 @@ from magtwin.author.scene import read_scene
 from magtwin.cli import main
 from magtwin.cli.map_input import earth_nt
 from magtwin.field.sources.earth import earth_field_nt
-from magtwin.field.survey.folder import import_survey
+from magtwin.field.survey.folder import read_survey
 from magtwin.io.surveys.readings import load_readings, save_readings
 from magtwin.usd.maps import load_map
 
@@ -31,7 +31,7 @@ def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, cap
     assert report["figures"]["stuck at every heading"]["value"] == 17
     assert report["figures"]["masked nodes"]["value"] == np.count_nonzero(~field.valid) > 68
     assert np.isnan(field.lookup([-1.25, 0.75], 0.0))
-    assert_array_equal(field.valid, import_survey(maps).valid)
+    assert_array_equal(field.valid, read_survey(maps)[0].valid)
     run("map", "import", maps, "--out", tmp_path / "b.usdc", "--keep-latched", "--json")
     whole = load_map(tmp_path / "b.usdc")
     assert whole.valid.all()

@@ -1,4 +1,4 @@
-"""Statistics of a map, heading by heading."""
+"""What is known about a map: statistics per heading, metadata, colour limits."""
 
 import re
 from collections.abc import Sequence
@@ -17,13 +17,13 @@ from magtwin.summary import span
 
 @dataclass(frozen=True, kw_only=True)
 class HeadingStatistics:
-    """One heading of a map, over its valid nodes; figures are nan where there is none."""
+    """Statistics of one heading over its valid nodes; nan if there is none."""
 
     heading_deg: float
-    """The heading [deg]."""
+    """Heading [deg]."""
 
     nodes: int
-    """Nodes of the heading."""
+    """Number of nodes."""
 
     masked: int
     """Nodes that are not valid."""
@@ -41,17 +41,17 @@ class HeadingStatistics:
     """Largest value [nT]."""
 
     median_gradient_nt_m: float
-    """Median slope of the magnitude along the floor, by central differences [nT/m]."""
+    """Median horizontal gradient of the magnitude, by central differences [nT/m]."""
 
     greatest_gradient_nt_m: float
-    """Largest slope [nT/m]."""
+    """Largest gradient [nT/m]."""
 
     median_error_nt: float
-    """Median standard deviation of a value, the root of the map's variance [nT]; nan where unknown."""
+    """Median standard deviation of a value [nT]; nan if unknown."""
 
 
 def statistics(field: AnomalyMap) -> tuple[HeadingStatistics, ...]:
-    """The statistics of each heading of a map, in the order of its layers."""
+    """Statistics of each heading of a map, in the order of its layers."""
     found = []
     for h, heading in enumerate(np.degrees(field.headings_rad)):
         valid = field.valid[h]
@@ -82,18 +82,17 @@ _TEXTS = ("method", "frame", "datum", "created", "licence")
 
 
 def map_metadata(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report:
-    """What a map holds, how sure it is, how it came about and from what.
+    """All that is known about a map: statistics, uncertainty, method and source.
 
     Args:
         field: The map.
-        epochs: The days that it is one of, as `magtwin.usd.maps.load_epochs` gives them; their drift is
-            told where there are two or more.
+        epochs: All epochs of the map, from `magtwin.usd.maps.load_epochs`. With two or more, their drift is
+            added.
 
     Returns:
-        The figures of `AnomalyMap.report`, the share of valid nodes, the spread of their standard
-        deviations, the height, mean and range of each heading, those of the harmonic field and of the robot
-        it was surveyed with, and the drift. As metadata its method with its figures, frame, datum, day,
-        licence, and the files that it was made from with their checksums. What is unknown is said to be.
+        Statistics of the map and of each heading, share of valid nodes, standard deviation, height, the
+        harmonic field and the robot of the survey, drift. The metadata: method with its parameters, frame,
+        datum, day, licence, and source files with checksums. Unknown entries are "unknown".
     """
     figures = [*field.report().figures]
     share = 100 * float(field.valid.mean())
@@ -120,11 +119,11 @@ def map_metadata(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report
 
 
 def source_files(source: str) -> dict[str, str]:
-    """Files of a map's source with their SHA-256, by name; none where it names no such files.
+    """Source files of a map with their SHA-256, by name; empty if the source has another format.
 
     Args:
-        source: As `AnomalyMap.source` has it: "name sha256:hex; name sha256:hex". Of files that differ and
-            have one name, as those of two days, the later ones are numbered: "name (2)".
+        source: `AnomalyMap.source`, as "name sha256:hex; name sha256:hex". Different files of one name are
+            numbered: "name (2)".
     """
     files: dict[str, str] = {}
     for part in source.split("; "):
@@ -170,7 +169,7 @@ def _height(field: AnomalyMap) -> Figure:
 
 
 def _harmonic(harmonic: HarmonicField, above: str) -> list[Figure]:
-    """Figures of the sources, below what heights count from, and of the robot."""
+    """Figures of the sources and of the robot; depths count from `above`."""
     depths = -harmonic.p_world_dipole[:, 2]
     below = f"{depths.min():.3g} to {depths.max():.3g} m below the {above}" if len(depths) else ""
     x, y, z = harmonic.p_base_sensor
@@ -200,21 +199,22 @@ def _said(vector: np.ndarray) -> str:
 
 
 COLOUR_MAP = "viridis"
-"""Name of the scale that fields are shown in."""
+"""Name of the colour map for fields."""
 
 OUTER_PERCENT = 0.5
-"""Share of the nodes at either end that a scale leaves out: a few beside a source would flatten the rest."""
+"""Share of nodes left out at either end of a colour scale: a few nodes beside a source would flatten the
+rest."""
 
 
 def colour_limits(values: ArrayLike, outer_percent: float = OUTER_PERCENT) -> tuple[float, float]:
-    """Values at the ends of a scale.
+    """Values at the two ends of a colour scale.
 
     Args:
-        values: What is shown, any shape; what is not finite does not count.
-        outer_percent: Share of them that is left out at either end [%].
+        values: Values to show, any shape; those that are not finite are ignored.
+        outer_percent: Share left out at either end [%].
 
     Returns:
-        The least and the greatest of the rest; 0 and 1 where no value is finite.
+        Least and greatest of the rest; 0 and 1 if no value is finite.
     """
     known = np.asarray(values, float)
     known = known[np.isfinite(known)]

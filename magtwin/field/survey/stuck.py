@@ -43,52 +43,51 @@ FALSE_FROZEN = 0.01
 """Share of frozen stretches that are false, and of sound surveys that show any."""
 
 FALSE_FLAT = 0.01
-"""Flat stretches refuted by their neighbours that a drive with a sound sensor is expected to show."""
+"""Expected number of sound flat stretches per survey that are masked."""
 
 SURE = 0.95
 """Probability from which a reading counts as stuck."""
 
 REACH_M = 0.1
-"""Distance over which the slope of the field is taken to stay the same."""
+"""Distance over which the field's slope is assumed constant."""
 
 BESIDE = 48
-"""Slopes nearest to a stretch that tell how rough the field is there; those of 0 tell nothing."""
+"""Slopes nearest to a stretch from which the field's roughness is estimated; slopes of 0 do not count."""
 
 WIDTH = 12.0
-"""How far from the level stuck readings are looked for, in sds of the frozen stretches' levels."""
+"""Range about the level in which stuck readings are searched, in standard deviations of the level."""
 
 CELL_M = 0.05
-"""Length of a drive whose readings count as one where the field is fitted."""
+"""Length of a drive whose readings are averaged for the fit."""
 
 LEAST_SLOPES = 8
-"""With fewer slopes nothing is known of the field's roughness, and no stretch is called frozen."""
+"""With fewer slopes the roughness is unknown, and no stretch is called frozen."""
 
 FLAT_M = 0.25
-"""Length from which a stretch of a drive without change is suspect."""
+"""Least length of a flat stretch of a drive."""
 
 MOST_TOGETHER = 12
-"""Readings of one place that are asked about together, evenly through it where there are more."""
+"""Most readings of one place that are tested jointly; more are thinned evenly."""
 
 ROUNDS = 4
-"""Rounds in which level, spread and share of stuck readings settle."""
+"""Rounds in which level, spread and share of stuck readings converge."""
 
 SPREAD_ROWS = 51
-"""Readings of a drive from which the usual size of a jump is taken."""
+"""Readings of a drive from which the usual size of a jump is estimated."""
 
 NAMED = 20
-"""Outliers that the report names, the largest first."""
+"""Most outliers listed in the report, the largest first."""
 
 
 def mask_stuck(readings: Readings) -> tuple[Readings, Report]:
-    """Find the readings that are not field, and take them out of the good ones.
+    """Find the readings that are not field, and mark them as not good.
 
     Args:
-        readings: A survey; rows that are not `good` already stay so and count for nothing.
+        readings: A survey; rows that are not `good` stay so and are ignored.
 
     Returns:
-        The readings with frozen and stuck ones no longer good. And what was found: numbers of frozen
-        and of stuck readings, the level, the nodes that are stuck at every heading, the expected
-        number of readings masked falsely, outliers with place and size.
+        The readings with frozen and stuck ones no longer good; and the report: counts, the level, nodes stuck
+        at every heading, the expected number masked falsely, outliers with place and size.
     """
     found = find_stuck(readings)
     good = readings.good & ~found.frozen & ~found.stuck
@@ -103,25 +102,25 @@ class Findings:
     """Repeats to the last digit, shape (N,)."""
 
     stuck: NDArray[np.bool_]
-    """On the level of a sensor that lost lock, shape (N,); a frozen reading may be one as well."""
+    """At the level of a sensor that lost lock, shape (N,); may also be frozen."""
 
     doubt: Array
-    """Probability that a stuck reading is field after all, shape (N,); 0 where it is not stuck."""
+    """Probability that a stuck reading is field, shape (N,); 0 if it is not stuck."""
 
     outlier: Array
-    """Difference from what the others say [nT], shape (N,); 0 where it is nothing unusual."""
+    """Difference from the neighbours' prediction [nT], shape (N,); 0 if it is not unusual."""
 
     level_nt: float | None
-    """Level at which the sensor is stuck; none where no stretches agree on one."""
+    """Level of the stuck sensor; None if no stretches agree on one."""
 
     spread_nt: float
     """Standard deviation of stuck readings about the level [nT]."""
 
     judged: bool
-    """Whether there were readings enough to say what neighbours make likely."""
+    """Whether there were enough readings to compare with neighbours."""
 
     def report(self, readings: Readings) -> Report:
-        """The figures of the findings."""
+        """Counts, level, doubt and outliers of the findings."""
         masked = self.frozen | self.stuck
         figures = [
             Figure("frozen readings", int(self.frozen.sum()), note="repeat to the last digit, robot moving"),
@@ -163,7 +162,7 @@ class Findings:
 
 
 def find_stuck(readings: Readings) -> Findings:
-    """What `mask_stuck` masks and reports, as flags of rows."""
+    """Findings of `mask_stuck`, as flags of rows."""
     count, b = len(readings), readings.b_nt
     stretches = _frozen(readings)
     frozen = np.zeros(count, bool)
@@ -200,7 +199,7 @@ def find_stuck(readings: Readings) -> Findings:
 
 
 def _sequences(readings: Readings) -> list[Rows]:
-    """Good rows in the orders in which neighbours follow each other: rows and columns of nodes, or runs."""
+    """Good rows in orders in which neighbours follow each other: rows and columns of nodes, or runs."""
     good = np.flatnonzero(readings.good)
     if readings.node is None:
         clock = np.zeros(len(readings)) if readings.t is None else readings.t
@@ -217,14 +216,14 @@ def _sequences(readings: Readings) -> list[Rows]:
 
 
 def _moved(readings: Readings, rows: Rows) -> Array:
-    """How far the sensor came from one row to the next [m]; a radian counts as `REACH_M`."""
+    """Distance from one row to the next [m]; a radian counts as `REACH_M`."""
     way = np.diff(readings.p_xy[rows], axis=0)
     turn = wrap_angle(np.diff(readings.yaw[rows]))
     return np.asarray(np.hypot(way[:, 0], way[:, 1]) + REACH_M * np.abs(turn))
 
 
 def _frozen(readings: Readings) -> list[Rows]:
-    """Rows of each stretch that repeats to the last digit too long for chance."""
+    """Rows of each stretch that repeats to the last digit for longer than chance allows."""
     b = readings.b_nt
     gaps = np.diff(np.unique(b[readings.good]))
     sequences = _sequences(readings)
@@ -259,7 +258,7 @@ def _frozen(readings: Readings) -> list[Rows]:
 
 
 def _slopes(readings: Readings, sequences: list[Rows]) -> tuple[Array, Array]:
-    """Places (N, 2) and sizes [nT/m] of the field's slopes along the way, over `REACH_M` or more."""
+    """Places (N, 2) and sizes [nT/m] of the field's slopes along the way, over at least `REACH_M`."""
     places, slopes = [], []
     for rows in sequences:
         moved = _moved(readings, rows)
@@ -276,13 +275,13 @@ def _slopes(readings: Readings, sequences: list[Rows]) -> tuple[Array, Array]:
 
 
 def _stretches(flags: NDArray[np.bool_]) -> list[slice]:
-    """Where flags are true without a break."""
+    """Slices in which flags are true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def _level(levels: Array, b_nt: Array) -> tuple[float | None, float]:
-    """Level that frozen stretches agree on, and its spread [nT]; three of them at least have to."""
+    """Level on which at least three frozen stretches agree, and its spread [nT]; None if there is none."""
     if len(levels) < 3:
         return None, 0.0
     spread = deviation(levels)
@@ -293,7 +292,7 @@ def _level(levels: Array, b_nt: Array) -> tuple[float | None, float]:
 
 
 def _cells(readings: Readings) -> tuple[Readings, Rows]:
-    """The survey with the rows of `CELL_M` of a drive as one reading, their median; and each row's cell."""
+    """The survey with each `CELL_M` of a drive as one reading, its median; and the cell of each row."""
     if readings.node is not None:
         return readings, np.arange(len(readings))
     cell = np.empty(len(readings), np.intp)
@@ -318,12 +317,12 @@ def _cells(readings: Readings) -> tuple[Readings, Rows]:
 
 
 def _driven(readings: Readings, rows: Rows) -> list[Rows]:
-    """The parts of a sequence without a jump: from one to the next the field is like itself."""
+    """Parts of a sequence without a jump."""
     return np.split(rows, np.flatnonzero(_moved(readings, rows) > REACH_M) + 1)
 
 
 def _flats(readings: Readings, sound: NDArray[np.bool_]) -> list[Rows]:
-    """Stretches of a drive that stay within the sensor's noise over `FLAT_M` or more."""
+    """Stretches of a drive that stay within the sensor's noise for `FLAT_M` or more."""
     flats = []
     drives = (_driven(readings, rows) for rows in _sequences(readings.with_(good=sound)))
     for rows in itertools.chain.from_iterable(drives):
@@ -346,7 +345,7 @@ def _flats(readings: Readings, sound: NDArray[np.bool_]) -> list[Rows]:
 
 
 def _refuted(flats: list[Rows], cell: Rows, fit: LocalFit, pool: Rows) -> list[Rows]:
-    """The flat stretches that their neighbours refute."""
+    """Flat stretches that their neighbours refute."""
     from scipy.special import fdtrc
 
     refuted = []
@@ -362,7 +361,7 @@ def _refuted(flats: list[Rows], cell: Rows, fit: LocalFit, pool: Rows) -> list[R
 
 
 def _places(readings: Readings, rows: NDArray[np.bool_]) -> list[Rows]:
-    """Rows that stand or fall together: those at one node, or without a break on a drive."""
+    """Groups of rows that are tested together: those at one node, or consecutive ones of a drive."""
     if readings.node is not None:
         index = np.flatnonzero(rows)
         place = readings.node[index, 1] * (readings.node[:, 2].max() + 1) + readings.node[index, 2]
@@ -380,11 +379,11 @@ def _odds(
     level: float,
     spread: float,
 ) -> tuple[Array, float, float]:
-    """Probability that each place is stuck, and the level and its spread that follow.
+    """Probability that each place is stuck, with the level and its spread.
 
-    Bayes' rule between two densities of a place's readings: Student's t about the level, and about
-    what the neighbours say, with the share of stuck cells as the prior. Share, level and spread
-    are those that the answers give (empirical Bayes), found in `ROUNDS` rounds from the frozen ones.
+    Bayes' rule between two densities of a place's readings: Student's t about the level, and about the
+    neighbours' prediction, with the share of stuck cells as the prior. Share, level and spread are updated
+    from the result (empirical Bayes) in `ROUNDS` rounds, starting from the frozen readings.
     """
     held = [_thinned(cell) for cell in places]
     field = np.array([_log_t(*fit.together(cell, pool)) for cell in held])
@@ -404,13 +403,13 @@ def _odds(
 
 
 def _thinned(rows: Rows) -> Rows:
-    """At most `MOST_TOGETHER` of the rows, evenly through them."""
+    """At most `MOST_TOGETHER` of the rows, evenly spaced."""
     picked = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_TOGETHER)).astype(np.intp))
     return rows[picked]
 
 
 def _log_t(residual: Array, covariance: Array) -> float:
-    """Logarithm of the multivariate t density (Kotz & Nadarajah 2004, eq. 1.1) with `FREEDOM`."""
+    """Logarithm of the multivariate t density with `FREEDOM` (Kotz & Nadarajah 2004, eq. 1.1)."""
     count = len(residual)
     size = residual @ np.linalg.solve(covariance, residual)
     constant = lgamma((FREEDOM + count) / 2) - lgamma(FREEDOM / 2) - count / 2 * np.log(FREEDOM * np.pi)
@@ -419,13 +418,13 @@ def _log_t(residual: Array, covariance: Array) -> float:
 
 
 def _log_t1(z: Array) -> Array:
-    """Logarithm of the t density of each of `z`."""
+    """Logarithm of the univariate t density."""
     constant = lgamma((FREEDOM + 1) / 2) - lgamma(FREEDOM / 2) - np.log(FREEDOM * np.pi) / 2
     return np.asarray(constant - (FREEDOM + 1) / 2 * np.log1p(z**2 / FREEDOM))
 
 
 def _outliers(readings: Readings, cells: Readings, cell: Rows, fit: LocalFit, pool: Rows) -> Array:
-    """Difference of each outlying reading from what the others say [nT], shape (N,); 0 for all others."""
+    """Difference of each outlier from its neighbours' prediction [nT], shape (N,); 0 for other readings."""
     from scipy.special import stdtrit
 
     outlier = np.zeros(len(readings))
@@ -443,10 +442,10 @@ def _outliers(readings: Readings, cells: Readings, cell: Rows, fit: LocalFit, po
 
 
 def _spikes(b: Array) -> Array:
-    """Difference of each spike of a drive from the mean of the readings beside it [nT], 0 for all others.
+    """Difference of each spike of a drive from the mean of its two neighbours [nT]; 0 for other readings.
 
-    Hampel's filter: the scale is the median of such differences over `SPREAD_ROWS`, for they grow with
-    speed and with the field's curvature. Of two side by side the larger is the spike.
+    Hampel's filter: the scale is the median difference over `SPREAD_ROWS`, since differences grow with speed
+    and with the field's curvature. Of two adjacent spikes the larger counts.
     """
     from scipy.ndimage import maximum_filter1d, median_filter
     from scipy.special import stdtrit
@@ -466,7 +465,7 @@ def _spikes(b: Array) -> Array:
 
 
 def _say(readings: Readings, row: int, off_nt: float) -> str:
-    """Where an outlier is and how far it is off."""
+    """Place and size of an outlier, as text."""
     x, y = readings.p_xy[row]
     run = readings.runs[readings.run[row]]
     return (
