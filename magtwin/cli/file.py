@@ -44,10 +44,10 @@ def info(file: Path, *, json: Json = False) -> None:
     elif file.suffix in _STAGES and not file.is_dir():
         report = _info_of_usd(file)
     elif file.is_dir() and any(file.glob("*_map.csv")):
-        from magtwin.field.maps.card import map_card
-        from magtwin.field.survey.gridded import import_survey
+        from magtwin.field.maps.statistics import map_metadata
+        from magtwin.field.survey.folder import read_survey
 
-        report = map_card(import_survey(file))
+        report = map_metadata(read_survey(file)[0])
     else:
         report = _info_of_run(file)
     print_report(report, json)
@@ -203,12 +203,12 @@ def _info_of_map(file: Path) -> Any:
     """The map's card, and below it what any stage holds."""
     from dataclasses import replace
 
-    from magtwin.field.maps.card import map_card
+    from magtwin.field.maps.statistics import map_metadata
     from magtwin.usd.info import info_of_stage
     from magtwin.usd.maps import load_epochs
 
     epochs = load_epochs(file)
-    card = map_card(epochs[-1], epochs)
+    card = map_metadata(epochs[-1], epochs)
     stage = [figure for figure in info_of_stage(file).figures if figure.value != 0]
     return replace(card, title=f"{card.title} ({file})", figures=(*card.figures, *stage))
 

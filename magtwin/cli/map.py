@@ -104,7 +104,7 @@ def map_import(
     json
         Print the summary as JSON.
     """
-    from magtwin.field.survey.gridded import node_map, read_survey
+    from magtwin.field.survey.folder import node_map, read_survey
     from magtwin.files import check_free
 
     check_suffix(out, (".usdc", ".usd", ".parquet"), "a map layer, or a file of readings,")
@@ -117,7 +117,7 @@ def map_import(
             **given,
             unit=columns.unit or "nT",
             scale=columns.scale,
-            keep_latched=keep_latched,
+            keep_stuck=keep_latched,
         )
     else:
         readings, found = read_sources(sources, columns, given, keep_latched, pose_topic, field_topic)
@@ -259,7 +259,7 @@ def map_check(
         Print the summary as JSON.
     """
     from magtwin.field.fit.check import FILLED, check
-    from magtwin.field.fit.fit import METHODS
+    from magtwin.field.fit.methods import METHODS
 
     methods = list(method or METHODS)
     options = {**FILLED, **method_options(methods, kernel, earth)}
@@ -432,15 +432,15 @@ def map_info(file: Path, *, date: str | None = None, json: Json = False) -> None
     json
         Print it as JSON.
     """
-    from magtwin.field.maps.card import map_card
+    from magtwin.field.maps.statistics import map_metadata
 
     if file.is_dir():
-        card = map_card(_open_map(file, date))
+        card = map_metadata(_open_map(file, date))
     else:
         from magtwin.field.maps.epochs import at_date
 
         epochs = _open_epochs(file)
-        card = map_card(epochs[-1] if date is None else at_date(epochs, date), epochs)
+        card = map_metadata(epochs[-1] if date is None else at_date(epochs, date), epochs)
     print_report(card, json)
 
 
@@ -504,8 +504,8 @@ def map_continue(
     json
         Print the summary as JSON.
     """
-    from magtwin.field.maps.card import map_card
     from magtwin.field.maps.continuation import at_height
+    from magtwin.field.maps.statistics import map_metadata
     from magtwin.files import check_free
     from magtwin.usd.maps import save_map
 
@@ -514,7 +514,7 @@ def map_continue(
     step(f"Continuing the field to {height:g} m")
     field = at_height(_open_map(file, date), height)
     save_map(field, out, force=force)
-    print_report(map_card(field), json)
+    print_report(map_metadata(field), json)
     if not json:
         say(f"Wrote {out}")
 
@@ -536,7 +536,7 @@ def map_export(file: Path, *, out: Path, date: str | None = None, force: Force =
     force
         Replace the folder if it exists.
     """
-    from magtwin.field.survey.gridded import write_survey
+    from magtwin.field.survey.folder import write_survey
 
     for written in write_survey(_open_map(file, date), out, force=force):
         say(f"Wrote {written}")
@@ -580,11 +580,11 @@ def _joined(report: Any, found: Any) -> Any:
 def _open_map(file: Path, date: str | None = None) -> Any:
     """The map of a layer or stage, of a day where one is given, or of a folder of survey CSVs."""
     if file.is_dir():
-        from magtwin.field.survey.gridded import import_survey
+        from magtwin.field.survey.folder import read_survey
 
         if date is not None:
             raise InputError(f"{file}: a folder of CSVs is one survey without a day; leave out --date")
-        return import_survey(file)
+        return read_survey(file)[0]
     from magtwin.usd.maps import load_map
 
     return load_map(file, date)

@@ -29,14 +29,14 @@ def read_sources(
 ) -> Any:
     """The readings of the sources, and the report of what was found latched, stuck or outlying in them."""
     from magtwin.field.survey.readings import TAKEN
-    from magtwin.field.survey.stuck import mask_latched
+    from magtwin.field.survey.stuck import mask_stuck
     from magtwin.io.surveys.readings import read_readings
 
     step("Reading the survey")
     readings = read_readings(
         *sources, columns=columns, pose_topic=pose_topic, field_topic=field_topic, **{**about, "name": None}
     )  # refusals name the survey, not the file to be written
-    masked, found = mask_latched(readings)
+    masked, found = mask_stuck(readings)
     taken = [part for part in readings.source.split("; ") if part.startswith(TAKEN)]
     if taken:
         found = replace(

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
-from magtwin.field.maps.colours import COLOUR_MAP, colour_limits
 from magtwin.field.maps.difference import TOLD, MapDifference
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.files import output
 
 if TYPE_CHECKING:

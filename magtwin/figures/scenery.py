@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.maps.colours import COLOUR_MAP, colour_limits
+from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.figures.cutaway import Cutaway
 from magtwin.figures.pictures import (
     BACKGROUND,

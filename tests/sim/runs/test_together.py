@@ -12,7 +12,7 @@ from magtwin.author.scene import author_scene
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.files import shipped
 from magtwin.io.provenance import repeat
 from magtwin.io.tables import read_parquet

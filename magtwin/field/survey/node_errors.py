@@ -1,4 +1,4 @@
-"""Errors: how far readings on a grid are from the field of their nodes, told by the survey itself."""
+"""Errors of gridded readings about the field of their nodes, estimated from the survey itself."""
 
 from dataclasses import dataclass
 
@@ -12,19 +12,19 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 PLACE_M = 0.01
-"""Standard deviation of a robot's place about its node, along x and y, where nothing tells it [m]."""
+"""Standard deviation of the robot's position about its node, in x and in y, if it cannot be estimated [m]."""
 
 FEWEST = 24
-"""Fewer differences than this tell no errors apart."""
+"""Fewest differences from which errors are estimated."""
 
 GROSS = 4.0
-"""Standard deviations beyond which a difference counts as one of so many."""
+"""Standard deviations at which a difference is clipped."""
 
 MEDIAN = 0.4549
 """Median of the square of a standard normal."""
 
 ROUNDS = 8
-"""Times that the two variances are fitted, each time weighed by the last fit."""
+"""Rounds of the weighted fit of the two variances."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,41 +32,41 @@ class NodeErrors:
     """Variance of the reading of a node about the field there, at the node's nominal heading."""
 
     variance_nt2: Array
-    """Of each node's reading [nT^2], shape (H, Y, X); the mean of the others where there is no reading."""
+    """Variance of each node's reading [nT^2], shape (H, Y, X); the mean of the others at nodes without one.
+    """
 
     mean_nt2: float
-    """Its mean over the readings [nT^2]."""
+    """Mean variance over the readings [nT^2]."""
 
     place_m: float
-    """Standard deviation of where the robot stood about its nodes, along x and along y [m]."""
+    """Standard deviation of the robot's position about its nodes, in x and in y [m]."""
 
     noise_nt: float
-    """Standard deviation of what differs from reading to reading whatever the gradient [nT]."""
+    """Standard deviation of the errors that do not depend on the gradient [nT]."""
 
     told: bool
-    """Whether the survey told these two; else they are `PLACE_M` and 0."""
+    """Whether place_m and noise_nt were estimated; otherwise they are `PLACE_M` and 0."""
 
 
 def node_errors(readings: Readings, grid: Grid, values_nt: Array, read: Flags) -> NodeErrors:
-    """Variance of readings on a grid: of headings off the nominal ones, places off the nodes, and noise.
+    """Variance of gridded readings: from headings off nominal, positions off the nodes, and noise.
 
-    A reading at yaw t + e of a node whose nominal heading is t misses its field there by dB/dyaw e. Recorded
-    headings tell e, the waves cos and sin (and cos 2, sin 2 from five headings on) through a node's
-    readings tell dB/dyaw.
+    A reading at yaw t + e, at a node of nominal heading t, misses the node's field by dB/dyaw e. Recorded
+    headings give e; the waves cos and sin (and cos 2, sin 2 from five headings on) through a node's readings
+    give dB/dyaw.
 
-    Two headings or more tell the rest: what is left of a node's readings beside what they have in common
-    (from four headings on beside a wave too, from six beside two) has the errors of single readings in
-    full, and of the field only its heading dependence, which is smooth over the floor. So its second
-    differences along rows and columns, (c_- - 2 c + c_+) / sqrt(6), have the variance s^2 + p^2 |grad B|^2 of
-    a reading with noise s, taken p off its node; s and p are fitted to their squares, none below 0. Of
-    simulated surveys p comes out within a tenth. With one heading nothing tells errors from the
-    field's own bends, and p is taken to be a centimetre.
+    With two headings or more, subtract from a node's readings what they have in common (from four headings on
+    also a wave, from six on two). The rest has the full errors of single readings, but of the field only its
+    heading dependence, which is smooth over the floor. So its second differences along rows and columns, (c_-
+    - 2 c + c_+) / sqrt(6), have the variance s^2 + p^2 |grad B|^2, for noise s and position error p. Both are
+    fitted to the squared differences, not below 0; on simulated surveys p is right within a tenth. With one
+    heading, errors cannot be told from the field's curvature, and p is 1 cm.
 
     Args:
         readings: A gridded survey.
         grid: Its nodes.
-        values_nt: Mean reading of each node [nT], shape (H, Y, X), bridged where there is none; nan where
-            that was not possible.
+        values_nt: Mean reading of each node [nT], shape (H, Y, X), interpolated at nodes without one, else
+            nan.
         read: Nodes with a good reading, shape (H, Y, X).
     """
     headings = np.asarray(grid.headings_rad)
@@ -97,7 +97,7 @@ def node_errors(readings: Readings, grid: Grid, values_nt: Array, read: Flags) -
 
 
 def _waves(headings: Array, order: int) -> tuple[Array, Array]:
-    """1, cos, sin, ... of the headings, shape (H, 2 order + 1), and what each changes by a radian."""
+    """1, cos, sin, ... of the headings, shape (H, 2 order + 1), and their derivatives."""
     waves, slopes = [np.ones_like(headings)], [np.zeros_like(headings)]
     for k in range(1, order + 1):
         waves += [np.cos(k * headings), np.sin(k * headings)]
@@ -106,7 +106,7 @@ def _waves(headings: Array, order: int) -> tuple[Array, Array]:
 
 
 def _deviation(readings: Readings, grid: Grid) -> Array:
-    """Recorded heading less the nominal one, root of mean square over a node's readings [rad], (H, Y, X)."""
+    """Recorded minus nominal heading, RMS over a node's readings [rad], shape (H, Y, X)."""
     node = np.asarray(readings.node)[readings.good]
     yaw = readings.yaw[readings.good]
     off = np.angle(np.exp(1j * (yaw - np.asarray(grid.headings_rad)[node[:, 0]])))
@@ -128,7 +128,7 @@ def _steepness(grid: Grid, values: Array) -> Array:
 
 
 def _fitted(left: Array, values: Array, steep: Array) -> tuple[float, float] | None:
-    """Standard deviations of place [m] and noise [nT] from what no wave explains; none from too little."""
+    """Standard deviations of position [m] and noise [nT] from what no wave explains; None from too little."""
     from scipy.optimize import nnls
 
     rest = np.tensordot(left, values, axes=1)

@@ -1,4 +1,4 @@
-"""LocalFit: a Gaussian process on the nearest readings, what a reading's neighbours say it should be."""
+"""LocalFit: predict a reading from its neighbours, with a Gaussian process on the nearest readings."""
 
 from dataclasses import dataclass
 
@@ -10,17 +10,17 @@ from magtwin.field.survey.readings import Readings
 Array = NDArray[np.float64]
 
 FREEDOM = 4.0
-"""Degrees of freedom of Student's t that a residual divided by its sd is taken to follow: real surveys
-have tails, for a field is rougher in some places than in others (Lange et al. 1989, section 2)."""
+"""Degrees of freedom of Student's t for standardised residuals: real surveys have heavy tails, since a field
+is rougher in some places than in others (Lange et al. 1989, section 2)."""
 
 LEAST = 48
-"""Fewer readings than this are too few to learn the field's spread and reach from."""
+"""Fewest readings from which the field's spread and reach are learnt."""
 
 TRIED = 512
-"""Readings on which the figures are learnt, evenly through the survey; fewer of larger neighbourhoods."""
+"""Readings from which the parameters are learnt, evenly spaced; fewer for larger neighbourhoods."""
 
 WIDEST = np.log(50)
-"""How far the figures may lie from their first guess, as a logarithm."""
+"""Largest change of the parameters from their first guess, as a logarithm."""
 
 BLOCK = 64
 """Neighbourhoods solved at a time: their matrices stay in the second-level cache."""
@@ -28,36 +28,35 @@ BLOCK = 64
 
 @dataclass(frozen=True)
 class LocalFit:
-    """A prior of the field, and the readings that it is conditioned on, a neighbourhood at a time.
+    """A prior of the field, conditioned on the readings around each point.
 
-    The field is a trend over heading (a + c cos + s sin + c2 cos 2 yaw + s2 sin 2 yaw) and a Gaussian
-    process of covariance k(d) (v0 + v1 cos Dyaw + v2 cos 2 Dyaw), with k the Matern 5/2 function of
-    the distance (Rasmussen & Williams 2006, eq. 4.17), plus noise: the terms in Dyaw are a platform's
-    hard and soft iron where the field is not the same everywhere.
+    The field is a trend over heading (a + c cos + s sin + c2 cos 2 yaw + s2 sin 2 yaw) and a Gaussian process
+    of covariance k(d) (v0 + v1 cos Dyaw + v2 cos 2 Dyaw) plus noise. k is the Matern 5/2 function of distance
+    (Rasmussen & Williams 2006, eq. 4.17). The terms in Dyaw are a platform's hard and soft iron in a field
+    that varies over the floor.
     """
 
     p_xy: Array
-    """Where the readings are [m], shape (N, 2)."""
+    """Positions of the readings [m], shape (N, 2)."""
 
     yaw: Array
     """Their headings [rad], shape (N,)."""
 
     residual_nt: Array
-    """What is left of them without the trend [nT], shape (N,)."""
+    """Readings minus the trend [nT], shape (N,)."""
 
     log_figures: Array
     """Logarithms of the reach [m], the sd of the three terms [nT] and the noise's sd [nT], shape (5,)."""
 
     count: int
-    """Neighbours in a neighbourhood."""
+    """Neighbours per reading."""
 
     @classmethod
     def to(cls, readings: Readings, rows: NDArray[np.intp]) -> "LocalFit":
         """Learn the prior from some of the readings, `LEAST` or more.
 
-        The figures are those under which the readings are likeliest, each given its neighbours without
-        itself, under Student's t (leave-one-out predictive probability, Rasmussen & Williams 2006,
-        eq. 5.11).
+        The parameters maximise the leave-one-out predictive probability under Student's t (Rasmussen &
+        Williams 2006, eq. 5.11).
         """
         from scipy.optimize import minimize
 
@@ -86,11 +85,11 @@ class LocalFit:
         return cls(readings.p_xy, readings.yaw, whole, best.x, count)
 
     def left_out(self, rows: NDArray[np.intp], pool: NDArray[np.intp]) -> tuple[Array, Array]:
-        """How far readings are from what their neighbours say.
+        """Compare readings with the prediction from their neighbours.
 
         Args:
-            rows: Readings to hold against their neighbours, shape (R,).
-            pool: Readings that count as neighbours; a reading never counts for itself.
+            rows: Readings to predict, shape (R,).
+            pool: Readings that count as neighbours; a reading never predicts itself.
 
         Returns:
             Residuals over their standard deviation, and residuals [nT], each of shape (R,).
@@ -100,14 +99,14 @@ class LocalFit:
         return residual / np.sqrt(variance), residual
 
     def together(self, rows: NDArray[np.intp], pool: NDArray[np.intp]) -> tuple[Array, Array]:
-        """What neighbours say of a few readings at once.
+        """Predict a few readings jointly from their neighbours.
 
         Args:
             rows: Readings, none of them in `pool`.
             pool: Readings that count as neighbours.
 
         Returns:
-            Residuals from the mean [nT], shape (R,), and its covariance with noise [nT^2], (R, R).
+            Residuals [nT], shape (R,), and their covariance with noise [nT^2], shape (R, R).
         """
         far = np.linalg.norm(self.p_xy[pool] - self.p_xy[rows].mean(axis=0), axis=1)
         near = pool[np.argsort(far, kind="stable")[: self.count + len(rows)]]
@@ -131,7 +130,7 @@ class LocalFit:
         return np.asarray((1 + r + r * r / 3) * np.exp(-r) * angular)
 
     def _neighbours(self, rows: NDArray[np.intp], pool: NDArray[np.intp]) -> NDArray[np.intp]:
-        """The readings of `pool` nearest to each of `rows`, itself left out, shape (len(rows), K)."""
+        """The readings of `pool` nearest to each of `rows`, without itself, shape (len(rows), K)."""
         from scipy.spatial import cKDTree
 
         count = min(self.count, len(pool) - 1)
@@ -143,7 +142,7 @@ class LocalFit:
         return np.asarray(near[kept].reshape(len(rows), count))
 
     def _given(self, near: NDArray[np.intp], rows: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Mean and variance, noise included, of each of `rows` given the readings `near` it."""
+        """Mean and variance, with noise, of each of `rows` given the readings `near` it."""
         noise = np.exp(2 * self.log_figures[4])
         mean, variance = np.empty(len(rows)), np.empty(len(rows))
         for start in range(0, len(rows), BLOCK):
@@ -161,7 +160,7 @@ def _waves(yaw: Array) -> Array:
 
 
 def _trend(yaw: Array, b: Array) -> Array:
-    """Coefficients of the trend over heading by least squares with Huber's weights, shape (5,)."""
+    """Coefficients of the trend, by least squares with Huber's weights, shape (5,)."""
     waves, weight = _waves(yaw), np.ones_like(b)
     for _ in range(10):
         root = np.sqrt(weight)
@@ -172,5 +171,5 @@ def _trend(yaw: Array, b: Array) -> Array:
 
 
 def deviation(values: Array) -> float:
-    """Standard deviation of the normal distribution that has the median absolute deviation of `values`."""
+    """Standard deviation of a normal distribution with the median absolute deviation of `values`."""
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))

@@ -1,4 +1,4 @@
-"""A gridded survey on disk: one CSV a heading, as the APRILab's, read into Readings; the map of its nodes."""
+"""Survey folders: one CSV per heading, as the APRILab's, read as Readings and as the map of their nodes."""
 
 import math
 import os
@@ -13,7 +13,7 @@ from magtwin.errors import InputError
 from magtwin.field.grid import Grid
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.header import ERROR, MASKED, header_lines, read_header
-from magtwin.field.survey.reading_errors import node_errors
+from magtwin.field.survey.node_errors import node_errors
 from magtwin.field.survey.readings import Readings
 from magtwin.field.units import check_unit, nt_per
 from magtwin.files import existing, output, sha256
@@ -26,74 +26,72 @@ COLUMNS = ("x", "y", "theta", "scalar_mag")
 SUFFIX = "_map.csv"
 
 WIDEST_DEG = 90.0
-"""Headings farther apart than this are taken for an incomplete survey unless the caller names them."""
+"""Widest angle between headings of a complete survey, if the caller does not give the headings."""
 
 GRAIN_M = 1e-6
-"""Coordinates closer than this are one."""
+"""Coordinates closer than this are equal."""
 
 METHOD = "survey, one reading a node and heading, the robot at rest"
 """Method of a map whose values are readings."""
 
-SAID = 60
-"""Characters of a file's own text that a refusal quotes."""
+QUOTED = 60
+"""Characters of a file that an error quotes."""
 
 
-def read_grid(
+def read_grid(folder: str | os.PathLike[str], **options: Any) -> Readings:
+    """Read a survey folder, such as `0_map.csv`, `90_map.csv`, `180_map.csv`, `270_map.csv`.
+
+    Each file begins with the line `# x,y,theta,scalar_mag` and has one row per node, in any order: x and y in
+    world [m], the recorded heading [rad], the total field [nT]. The file's name gives the nominal heading.
+    Further comment lines, as `write_survey` writes them, supply metadata that the options do not, and the
+    rows that are not field.
+
+    Args:
+        folder: Folder of the files. Other files in it are ignored.
+        **options: `name`, `licence`, `created`, `height_m`, `frame`, `datum`: fields of the result.
+            `headings_deg`: the headings of the survey [deg]; by default the files must be evenly spaced on
+            the circle and at most 90 deg apart, so that a missing file is noticed. `unit`: one of
+            `magtwin.field.units.NT_PER`; or `scale`: factor from the file's values to nT.
+
+    Returns:
+        Readings by heading and row, one run per file, with `grid` and `node`. All are good except those that
+        the files mark; `magtwin.field.survey.stuck` finds others.
+
+    Raises:
+        InputError: A file or heading is missing, a row or value is invalid, the grid has a hole or a
+            duplicate node, the headings' grids differ, or the unit is wrong; with file and line.
+    """
+    return _opened(folder, **options)[1]
+
+
+def _opened(
     folder: str | os.PathLike[str],
     *,
     name: str | None = None,
+    headings_deg: tuple[float, ...] | None = None,
+    unit: str = "nT",
+    scale: float | None = None,
     licence: str = "",
     created: str = "",
     height_m: float | None = None,
     frame: str = "",
     datum: str = "",
-    headings_deg: tuple[float, ...] | None = None,
-    unit: str = "nT",
-    scale: float | None = None,
-) -> Readings:
-    """The readings of a survey folder, `0_map.csv`, `90_map.csv`, `180_map.csv`, `270_map.csv`.
-
-    Each file begins with the line `# x,y,theta,scalar_mag` and has one row a node, in any order:
-    x and y in world [m], the recorded heading [rad], the total field [nT]. A node's heading is the
-    nominal one of the file's name; the reading's `yaw` is the recorded one. Further comment lines, as
-    `write_survey` writes them, give what the arguments leave open, and the rows that are not field.
-
-    Args:
-        folder: Folder that holds the files. Other files in it are left alone.
-        name: Name of the survey. Default: the one in the files, else that of the folder.
-        licence: SPDX name of the survey's licence.
-        created: Day of the survey, YYYY-MM-DD.
-        height_m: Height of the sensor above the floor [m].
-        frame: Axes that x, y and heading are in, in words.
-        datum: Where that frame lies, in words.
-        headings_deg: Headings that the survey has [deg]. Unless given, the files must be evenly
-            spaced on the circle and at most 90 deg apart, so that a lost file is noticed.
-        unit: Unit of the field, one of `magtwin.field.units.NT_PER`.
-        scale: Factor from the file's values to nT, in place of a unit.
-
-    Returns:
-        Readings in the order of the rows, heading after heading, one run a file, with `grid` and
-        `node`; all good but those that the files mark: `magtwin.field.survey.stuck` finds others that are
-        not.
-
-    Raises:
-        InputError: A file or a heading is missing, a row or a value is none, the grid has a hole or
-            a node two values, the headings' grids differ, or the unit cannot be; with file and line.
-    """
+) -> "tuple[list[_Layer], Readings]":
     about = {"licence": licence, "created": created, "height_m": height_m, "frame": frame, "datum": datum}
-    return _readings(_read(folder, headings_deg, unit, scale), Path(folder), name, about)
+    layers = _read(folder, headings_deg, unit, scale)
+    return layers, _readings(layers, Path(folder), name, about)
 
 
 def node_map(readings: Readings) -> AnomalyMap:
     """The map whose values are the readings themselves, each at its node.
 
     Args:
-        readings: A gridded survey. Of several good readings at one node the mean counts.
+        readings: A gridded survey. Several good readings at one node are averaged.
 
     Returns:
-        The map on the survey's grid; nodes with no good reading are not valid, and keep the mean of
-        the others, or nan, as their value. The variance is what the survey tells of its errors
-        (`magtwin.field.survey.reading_errors`); a survey of one heading tells nothing.
+        The map on the survey's grid. Nodes without a good reading are not valid; their value is the mean of
+        the others, or nan. The variance is estimated from the survey (`magtwin.field.survey.node_errors`); it
+        is None for a survey of one heading.
 
     Raises:
         InputError: The readings are not gridded.
@@ -134,7 +132,7 @@ def node_map(readings: Readings) -> AnomalyMap:
 
 
 def _recorded_yaw(readings: Readings, flat: NDArray[np.intp], grid: Grid) -> Array | None:
-    """Yaw of the one reading of each node, shape (H, Y, X); none where a node has several or none."""
+    """Yaw of each node's reading, shape (H, Y, X); None unless every node has exactly one."""
     if len(np.unique(flat)) < len(flat) or len(flat) < np.prod(grid.shape):
         return None
     yaw = np.empty(len(flat))
@@ -143,24 +141,22 @@ def _recorded_yaw(readings: Readings, flat: NDArray[np.intp], grid: Grid) -> Arr
 
 
 def write_survey(field: AnomalyMap, folder: str | os.PathLike[str], *, force: bool = False) -> list[Path]:
-    """Write a map as a survey folder, one CSV per heading, as `read_survey` takes it.
+    """Write a map as a survey folder, one CSV per heading, for `read_survey`.
 
-    Comment lines keep name, method and its figures, frame, day, licence, height, spacing, statistics and
-    masked rows; `read_survey` restores them. Below them is a row per node, x fastest: x and y in world [m],
-    the heading that was recorded there, else the map's own [rad], and the field [nT], each the number itself
-    and not a rounded one. So the CSVs of a survey come back from its map row by row.
+    Comment lines hold the metadata, statistics and masked rows. Below them is one row per node, x fastest: x
+    and y in world [m], the recorded heading, else the nominal one [rad], and the field [nT], all without
+    rounding. So the CSVs of a survey are restored from its map row by row.
 
     Args:
         field: The map. Of its variance only the median per heading is kept, and no harmonic field.
-        folder: Folder to make.
-        force: Whether one that exists is replaced.
+        folder: Folder to create.
+        force: Whether to replace an existing one.
 
     Returns:
-        The files, a heading each.
+        The files, one per heading.
 
     Raises:
-        InputError: A node has no value, which a survey must have; or the folder exists and `force` was not
-            given.
+        InputError: A node has no value, or the folder exists and `force` is not set.
     """
     lost = int(np.count_nonzero(~np.isfinite(field.values_nt)))
     if lost:
@@ -184,107 +180,79 @@ def write_survey(field: AnomalyMap, folder: str | os.PathLike[str], *, force: bo
 
 
 def _degrees(heading_rad: float) -> str:
-    """A heading in degrees, as a survey's file is named."""
+    """A heading in degrees, as in file names."""
     return np.format_float_positional(round(math.degrees(heading_rad), 9), trim="-")
 
 
 def read_survey(
-    folder: str | os.PathLike[str],
-    *,
-    name: str | None = None,
-    licence: str = "",
-    created: str = "",
-    height_m: float | None = None,
-    frame: str = "",
-    datum: str = "",
-    headings_deg: tuple[float, ...] | None = None,
-    unit: str = "nT",
-    scale: float | None = None,
-    keep_latched: bool = False,
+    folder: str | os.PathLike[str], *, keep_stuck: bool = False, **options: Any
 ) -> tuple[AnomalyMap, Report]:
     """The map of a survey folder's nodes, and its report.
 
     Args:
-        folder: As `read_grid` takes it, and so all others but the last.
-        name: Name of the map. Default: the one in the files, else that of the folder.
-        licence: SPDX name of the survey's licence.
-        created: Day of the survey, YYYY-MM-DD.
-        height_m: Height of the sensor above the floor [m].
-        frame: Axes that x, y and heading are in, in words.
-        datum: Where that frame lies, in words.
-        headings_deg: Headings that the survey has [deg].
-        unit: Unit of the field, one of `magtwin.field.units.NT_PER`.
-        scale: Factor from the file's values to nT, in place of a unit.
-        keep_latched: Whether readings of a sensor that had lost lock stay valid nodes.
+        folder: A survey folder. This and the options are those of `read_grid`.
+        keep_stuck: Whether readings of a stuck sensor stay valid nodes.
+        **options: Metadata, headings and unit.
 
     Returns:
-        The map, in which latched nodes are not valid (`magtwin.field.survey.stuck`). A fitted map that
-        `write_survey` wrote comes back as it was, but for its variance, which is uniform in each heading,
-        and its harmonic field, which is left out. And the report: the
-        map's figures; the median and the largest deviation of a recorded heading from the nominal
-        one, with the worst row; how many readings repeat the one before in their row to the last
-        digit; what was found latched, stuck or outlying.
+        The map, in which stuck nodes are not valid (`magtwin.field.survey.stuck`). A fitted map from
+        `write_survey` is restored as it was, except that its variance is uniform per heading and its harmonic
+        field is lost. And the report: statistics of the map, deviation of recorded from nominal headings,
+        repeated readings, and what was found stuck or outlying.
 
     Raises:
         InputError: As `read_grid`, with file and line; or no reading is field.
     """
-    from magtwin.field.survey.stuck import mask_latched
+    from magtwin.field.survey.stuck import mask_stuck
 
-    layers = _read(folder, headings_deg, unit, scale)
-    about = {"licence": licence, "created": created, "height_m": height_m, "frame": frame, "datum": datum}
-    readings = _readings(layers, Path(folder), name, about)
-    if _said(layers, "method") not in ("", METHOD):
+    layers, readings = _opened(folder, **options)
+    if _common(layers, "method") not in ("", METHOD):
         field = _fitted(layers, readings)
         return field, _report(layers, field, folder, Report(""))
-    masked, found = mask_latched(readings)
-    if not (keep_latched or masked.good.any()):
+    masked, found = mask_stuck(readings)
+    if not (keep_stuck or masked.good.any()):
         raise InputError(
             f"{folder}: all {len(readings)} readings are those of a sensor that was stuck; "
-            "survey it again, or import them as they are with keep_latched (--keep-latched)"
+            "survey it again, or import them as they are with keep_stuck (--keep-latched)"
         )
-    field = node_map(readings if keep_latched else masked)
-    field = replace(field, parameters=_said(layers, "parameters") or {})
+    field = node_map(readings if keep_stuck else masked)
+    field = replace(field, parameters=_common(layers, "parameters") or {})
     return field, _report(layers, field, folder, found)
 
 
 def _fitted(layers: "list[_Layer]", readings: Readings) -> AnomalyMap:
-    """A map that was no survey when it was written: its values are not searched for what a sensor does."""
+    """A map that was fitted before it was written: its values are not tested for a stuck sensor."""
     field = node_map(readings)
-    sd = [layer.said.get(ERROR, math.nan) for layer in layers]
+    sd = [layer.metadata.get(ERROR, math.nan) for layer in layers]
     variance = np.broadcast_to(np.square(sd)[:, None, None], field.values_nt.shape)
     return replace(
         field,
         variance_nt2=variance if np.isfinite(variance).all() else None,
         recorded_yaw=None,
-        method=_said(layers, "method"),
-        parameters=_said(layers, "parameters") or {},
+        method=_common(layers, "method"),
+        parameters=_common(layers, "parameters") or {},
     )
 
 
-def _said(layers: "list[_Layer]", key: str) -> Any:
-    """What the files' comment lines say of the map; "" where none does.
+def _common(layers: "list[_Layer]", key: str) -> Any:
+    """Metadata from the files' comment lines; "" if there is none.
 
     Raises:
-        InputError: Two of them differ.
+        InputError: Two files differ.
     """
-    told = [layer for layer in layers if key in layer.said]
-    for other in told[1:]:
-        if other.said[key] != told[0].said[key]:
+    given = [layer for layer in layers if key in layer.metadata]
+    for other in given[1:]:
+        if other.metadata[key] != given[0].metadata[key]:
             raise InputError(
-                f"{other.path}: its {key} is {str(other.said[key])[:SAID]!r}, in {told[0].path.name} it is "
-                f"{str(told[0].said[key])[:SAID]!r}; these are files of two maps"
+                f"{other.path}: {key} is {str(other.metadata[key])[:QUOTED]!r}, but "
+                f"{str(given[0].metadata[key])[:QUOTED]!r} in {given[0].path.name}; they are of two maps"
             )
-    return told[0].said[key] if told else ""
-
-
-def import_survey(folder: str | os.PathLike[str], **options: Any) -> AnomalyMap:
-    """The map alone of `read_survey`, with its arguments and refusals."""
-    return read_survey(folder, **options)[0]
+    return given[0].metadata[key] if given else ""
 
 
 @dataclass(frozen=True)
 class _Layer:
-    """The rows of one file."""
+    """Rows of one file."""
 
     path: Path
     heading_deg: float
@@ -294,8 +262,8 @@ class _Layer:
     theta: Array
     field: Array
     sha256: str
-    said: dict[str, Any]
-    """What its comment lines say; see `magtwin.field.survey.header`."""
+    metadata: dict[str, Any]
+    """Metadata of its comment lines; see `magtwin.field.survey.header`."""
 
 
 def _read(
@@ -368,19 +336,21 @@ def _read_layer(path: Path, heading_deg: float, unit: str, scale: float | None) 
         raise InputError(f"{path}: empty; expected the line '# {','.join(COLUMNS)}' and a row a node")
     first, *rest = text.splitlines()
     if tuple(word.strip() for word in first.lstrip("#").split(",")) != COLUMNS:
-        raise InputError(f"{path}:1: must be the header '# {','.join(COLUMNS)}', got {first[:SAID]!r}")
+        raise InputError(f"{path}:1: must be the header '# {','.join(COLUMNS)}', got {first[:QUOTED]!r}")
     numbered = [(number, line) for number, line in enumerate(rest, 2) if line.strip()]
-    said = read_header(path, [(number, line) for number, line in numbered if line.startswith("#")])
+    metadata = read_header(path, [(number, line) for number, line in numbered if line.startswith("#")])
     lines = [(number, line) for number, line in numbered if not line.startswith("#")]
     if not lines:
         raise InputError(f"{path}: no rows below the header; expected one a node")
     table = np.array([_row(path, number, line) for number, line in lines])
     x, y, theta, field = table.T
     field = nt_per(unit, scale) * field
-    beyond = max(said.get(MASKED, []), default=0)
+    beyond = max(metadata.get(MASKED, []), default=0)
     if beyond >= len(x):
         raise InputError(f"{path}: {MASKED} names row {beyond}, and it has {len(x)}, counted from 0")
-    layer = _Layer(path, heading_deg, np.array([n for n, _ in lines]), x, y, theta, field, sha256(path), said)
+    layer = _Layer(
+        path, heading_deg, np.array([n for n, _ in lines]), x, y, theta, field, sha256(path), metadata
+    )
     check_unit(field, str(path), "scalar_mag", unit, lambda k: f"{path}:{layer.lines[k]}", scale)
     return layer
 
@@ -397,7 +367,7 @@ def _row(path: Path, number: int, line: str) -> list[float]:
             value = float(word)
         except ValueError:
             raise InputError(
-                f"{path}:{number}: {column} must be a number, got {word.strip()[:SAID]!r}"
+                f"{path}:{number}: {column} must be a number, got {word.strip()[:QUOTED]!r}"
             ) from None
         if not math.isfinite(value):
             raise InputError(
@@ -427,9 +397,9 @@ def _readings(layers: list[_Layer], folder: Path, name: str | None, about: dict[
         columns=len(x),
     )
     run = np.repeat(np.arange(len(layers)), [len(s.x) for s in layers])
-    good = np.concatenate([~np.isin(np.arange(len(s.x)), s.said.get(MASKED, [])) for s in layers])
-    given = {key: _said(layers, key) if value in ("", None) else value for key, value in about.items()}
-    if given.get("height_m") == "":
+    good = np.concatenate([~np.isin(np.arange(len(s.x)), s.metadata.get(MASKED, [])) for s in layers])
+    given = {key: _common(layers, key) if value in ("", None) else value for key, value in about.items()}
+    if given["height_m"] == "":
         given["height_m"] = None
     return Readings(
         p_xy=np.concatenate([np.column_stack([s.x, s.y]) for s in layers]),
@@ -440,14 +410,14 @@ def _readings(layers: list[_Layer], folder: Path, name: str | None, about: dict[
         grid=grid,
         node=np.column_stack([run, np.concatenate([_nodes(s, x, y) for s in layers])]),
         good=good,
-        name=(_said(layers, "name") or folder.resolve().name) if name is None else name,
+        name=(_common(layers, "name") or folder.resolve().name) if name is None else name,
         source="; ".join(f"{s.path.name} sha256:{s.sha256}" for s in layers),
         **given,
     )
 
 
 def _report(layers: list[_Layer], field: AnomalyMap, folder: str | os.PathLike[str], found: Report) -> Report:
-    """What the survey holds, and how well its headings were kept."""
+    """Statistics of the survey, and how well its headings were kept."""
     deviation = [np.degrees(np.abs(wrap_angle(s.theta - np.radians(s.heading_deg)))) for s in layers]
     worst = max(range(len(layers)), key=lambda k: deviation[k].max())
     row = int(deviation[worst].argmax())
@@ -497,7 +467,7 @@ def _span(axis: Array) -> str:
 
 
 def _nodes(layer: _Layer, x: Array, y: Array) -> NDArray[np.intp]:
-    """Row and column of each reading's node, shape (N, 2); every node once."""
+    """Row and column of each reading's node, shape (N, 2); refuses holes and duplicates."""
     i = np.rint((layer.x - x[0]) / (x[1] - x[0])).astype(int)
     j = np.rint((layer.y - y[0]) / (y[1] - y[0])).astype(int)
     node = j * len(x) + i

@@ -1,7 +1,6 @@
-"""Sums over dipoles, compiled: for loops that ask for the same dipoles again and again, and for gradients.
+"""Compiled sums over dipoles: for fields computed again and again, and for gradients.
 
-`sources.py` needs no compiled code and is the door for everyday use. Importing this module opens numba,
-which costs half a second where its machine code was kept from an earlier time, else a few.
+Importing this module opens numba (see `magtwin.compiled`). `magtwin.field.sources.dipoles` does not need it.
 """
 
 import numpy as np
@@ -9,13 +8,12 @@ from numba import types
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.compiled import compiled, in_threads
-from magtwin.errors import InputError
-from magtwin.field.sources.point_dipoles import MU_0_OVER_4_PI, NT_PER_T
+from magtwin.field.sources.dipoles import MU_0_OVER_4_PI, NT_PER_T, checked
 
 Array = NDArray[np.float64]
 
 BLOCK = 256
-"""Points worked on at a time, all dipoles for each block: their sums stay in the first-level cache."""
+"""Points worked on at a time, with all dipoles: their sums stay in the first-level cache."""
 
 SHARE = 262_144
 """Pairs of a point and a dipole that a thread takes at a time."""
@@ -26,19 +24,10 @@ _IN_3, _OUT_3 = types.Array(types.float64, 3, "C", readonly=True), types.Array(t
 
 
 def dipole_field_nt(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike) -> Array:
-    """Field of point dipoles: what `magtwin.field.sources.point_dipoles.dipole_field_nt` gives, faster.
+    """Field of point dipoles, faster than `magtwin.field.sources.dipoles.dipole_field_nt`, with its
+    arguments.
 
-    Args:
-        p_world: Observation points [m], shape (..., 3).
-        p_world_dipole: Dipole positions [m], shape (D, 3).
-        m_world: Dipole moments [A m^2], shape (D, 3).
-
-    Returns:
-        Field in world axes [nT], shape (..., 3); not finite at a dipole itself, zero for no dipoles. The
-        dipoles are added up in their order, whatever the number of points and threads.
-
-    Raises:
-        InputError: A shape is not as above.
+    The dipoles are summed in their order, whatever the number of points and threads.
     """
     return _sum(p_world, p_world_dipole, m_world, gradient=False)[0]
 
@@ -46,13 +35,13 @@ def dipole_field_nt(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: Arra
 def dipole_field_and_gradient_nt(
     p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike
 ) -> tuple[Array, Array]:
-    """Field of point dipoles and how it changes in space.
+    """Field of point dipoles and its gradient in space.
 
     dB_i/dx_j = mu_0 / 4 pi * sum_d 3 / |r|^5 *
                 (m_j r_i + m_i r_j + (m . r) delta_ij - 5 (m . r) r_i r_j / |r|^2),  r = p - p_d
 
-    which is the derivative of Jackson, Classical Electrodynamics, 3rd ed. 1999, eq. 5.56: symmetric, as
-    curl B = 0, and of trace 0, as div B = 0.
+    (Jackson, Classical Electrodynamics, 3rd ed. 1999, the derivative of eq. 5.56): symmetric, as curl B = 0,
+    and of trace 0, as div B = 0.
 
     Args:
         p_world: Observation points [m], shape (..., 3).
@@ -60,11 +49,11 @@ def dipole_field_and_gradient_nt(
         m_world: Dipole moments [A m^2], shape (D, 3).
 
     Returns:
-        Field [nT], the same bytes as `dipole_field_nt` gives, shape (..., 3), and dB_i/dx_j [nT/m], shape
-        (..., 3, 3), all in world axes.
+        Field [nT], the same bytes as from `dipole_field_nt`, shape (..., 3), and dB_i/dx_j [nT/m], shape
+        (..., 3, 3), in world axes.
 
     Raises:
-        InputError: A shape is not as above.
+        InputError: A shape is wrong.
     """
     field, five = _sum(p_world, p_world_dipole, m_world, gradient=True)
     xx, xy, xz, yy, yz = np.moveaxis(five, -1, 0)
@@ -76,14 +65,9 @@ def _sum(
     p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike, *, gradient: bool
 ) -> tuple[Array, Array]:
     """Field, shape (..., 3), and its gradient's xx, xy, xz, yy, yz, shape (..., 5), or empty."""
-    p = np.require(p_world, float, ["C", "A"])
-    place, moment = (np.require(array, float, ["C", "A"]) for array in (p_world_dipole, m_world))
-    if p.ndim == 0 or p.shape[-1] != 3:
-        raise InputError(f"p_world must have shape (..., 3), got {p.shape}")
-    if place.ndim != 2 or place.shape[1] != 3 or moment.shape != place.shape:
-        raise InputError(
-            f"p_world_dipole and m_world must have one shape (D, 3), got {place.shape} and {moment.shape}"
-        )
+    p, place, moment = (
+        np.require(array, requirements=["C", "A"]) for array in checked(p_world, p_world_dipole, m_world)
+    )
     points = p.reshape(-1, 3)
     field = np.empty(points.shape)
     five = np.empty((len(points) if gradient else 0, 5))
@@ -99,14 +83,14 @@ def _sum(
 
 
 def moment_rows(p_world: Array, p_world_dipole: Array, ways: Array, out: Array) -> None:
-    """Derivatives of parts of the field by every dipole's moment.
+    """Derivatives of components of the field by every dipole's moment.
 
     w . dB/dm = mu_0 / 4 pi * (3 (w . r) r / |r|^5 - w / |r|^3),  r = p - p_d
 
     Args:
         p_world: Observation points [m], shape (N, 3).
         p_world_dipole: Dipole positions [m], shape (D, 3).
-        ways: The w of each point: C directions along which the field is read, shape (N, C, 3).
+        ways: Directions w of each point's components, shape (N, C, 3).
         out: Takes the derivatives [nT/(A m^2)], dipole by dipole, in its first 3 D columns, shape (N, C, P).
     """
     _moment_rows(p_world, p_world_dipole, np.ascontiguousarray(ways), MU_0_OVER_4_PI * NT_PER_T, out)
@@ -114,7 +98,7 @@ def moment_rows(p_world: Array, p_world_dipole: Array, ways: Array, out: Array) 
 
 @compiled(_IN, _IN, _IN_3, types.float64, _OUT_3)
 def _moment_rows(p: Array, place: Array, ways: Array, factor: float, out: Array) -> None:
-    """See `moment_rows`; places of the dipoles are taken apart so that the inner loop has no stride."""
+    """See `moment_rows`; coordinates of the dipoles are separated so that the inner loop has stride 1."""
     count = place.shape[0]
     rx, ry, rz, cubed = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
     px, py, pz = place[:, 0].copy(), place[:, 1].copy(), place[:, 2].copy()
@@ -138,7 +122,9 @@ def _moment_rows(p: Array, place: Array, ways: Array, factor: float, out: Array)
 
 @compiled(_IN, _IN, _IN, _OUT, _OUT)
 def _dipoles(p: Array, place: Array, moment: Array, field: Array, gradient: Array) -> None:
-    """Sums of p (N, 3) over dipoles (D, 3) without their factor; `gradient` is (N, 5), or (0, 5) unasked."""
+    """Sums at p (N, 3) over dipoles (D, 3) without their factor; `gradient` is (N, 5), or (0, 5) if not
+    wanted.
+    """
     x, y, z = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
     b, g = np.empty((3, BLOCK)), np.empty((5, BLOCK))
     for start in range(0, p.shape[0], BLOCK):

@@ -1,4 +1,4 @@
-"""Magnetised things, seen as point dipoles."""
+"""The field of point dipoles."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,13 +17,14 @@ MU_0_OVER_4_PI = 1.00000000055e-7
 NT_PER_T = 1e9
 
 SHARED = 16
-"""Blocks from which on a second thread is worth its start; which thread works on a row changes no byte."""
+"""Blocks from which a second thread pays; the results do not depend on it."""
 
 PAIRS = 32_768
-"""Point-dipole pairs worked on at a time: a few arrays of them stay in the second-level cache."""
+"""Pairs of a point and a dipole worked on at a time: their arrays stay in the second-level cache."""
 
 CLOSE = 1e-4
-"""Part of the squares of the distances from the origin below which |r|^2 is formed without cancelling."""
+"""Pairs whose squared distance is below this share of their squared distances from the origin are computed
+again without cancellation."""
 
 T = TypeVar("T")
 
@@ -44,7 +45,7 @@ def dipole_field_nt(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: Arra
     Raises:
         InputError: A shape is not as above.
     """
-    p, place, moment = _checked(p_world, p_world_dipole, m_world)
+    p, place, moment = checked(p_world, p_world_dipole, m_world)
     points = p.reshape(-1, 3)
     field = np.zeros(points.shape)
 
@@ -58,12 +59,10 @@ def dipole_field_nt(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: Arra
 def dipole_field_and_rate_nt(
     p_world: ArrayLike, v_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike
 ) -> tuple[Array, Array]:
-    """Field of point dipoles at points that move, and how fast it changes there.
+    """Field of point dipoles at moving points, and its rate of change.
 
     dB/dt = (v . grad) B = mu_0 / 4 pi * sum_d 3 / |r|^5 *
             ((m_d . v) r + (m_d . r) v + (v . r) m_d - 5 (m_d . r) (v . r) r / |r|^2),  r = p - p_d
-
-    which is the derivative of `dipole_field_nt`'s sum along v.
 
     Args:
         p_world: Observation points [m], shape (..., 3).
@@ -72,13 +71,13 @@ def dipole_field_and_rate_nt(
         m_world: Dipole moments [A m^2], shape (D, 3).
 
     Returns:
-        Field in world axes [nT], the same bytes as `dipole_field_nt` gives, and its rate of change at
-        the moving point [nT/s], each of shape (..., 3).
+        Field in world axes [nT], the same bytes as from `dipole_field_nt`, and its rate of change at the
+        moving point [nT/s], each of shape (..., 3).
 
     Raises:
-        InputError: A shape is not as above.
+        InputError: A shape is wrong.
     """
-    p, place, moment = _checked(p_world, p_world_dipole, m_world)
+    p, place, moment = checked(p_world, p_world_dipole, m_world)
     v = np.asarray(v_world, float)
     if v.shape != p.shape:
         raise InputError(f"v_world must have the shape of p_world, {p.shape}, got {v.shape}")
@@ -92,7 +91,8 @@ def dipole_field_and_rate_nt(
     return field.reshape(p.shape), rate.reshape(p.shape)
 
 
-def _checked(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike) -> tuple[Array, Array, Array]:
+def checked(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike) -> tuple[Array, Array, Array]:
+    """Points (..., 3), positions and moments (D, 3) as arrays; InputError if a shape is wrong."""
     p = np.asarray(p_world, float)
     place, moment = np.asarray(p_world_dipole, float), np.asarray(m_world, float)
     if p.ndim == 0 or p.shape[-1] != 3:
@@ -105,13 +105,13 @@ def _checked(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: ArrayLike) 
 
 
 def in_blocks(points: int, dipoles: int) -> list[slice]:
-    """Rows of points to be worked on at a time: about `PAIRS` pairs of a point and a dipole."""
+    """Slices of points, each with about `PAIRS` pairs of a point and a dipole."""
     block = max(1, PAIRS // max(1, dipoles))
     return [slice(start, start + block) for start in range(0, points, block)]
 
 
 def in_two_threads(work: Callable[[T], None], tasks: Sequence[T], *, pairs: int) -> None:
-    """Have tasks worked on that share no rows; by a second thread too where there are `pairs` enough."""
+    """Work on tasks that share no rows, in two threads if there are enough `pairs`."""
 
     def several(some: Sequence[T]) -> None:
         for task in some:
@@ -125,20 +125,20 @@ def in_two_threads(work: Callable[[T], None], tasks: Sequence[T], *, pairs: int)
 
 
 def dipole_block(p: Array, v: Array | None, place: Array, moment: Array) -> tuple[Array, Array]:
-    """Field and rate of dipoles at some points, as products of matrices of a few columns.
+    """Field and rate of dipoles at some points, as products of narrow matrices.
 
-    With r = p - p_d, every scalar product of a pair is a point's product with a dipole's, less that of the
-    dipole's own: |r|^2 = |p|^2 - 2 p . p_d + |p_d|^2. Sums over dipoles are products too. That loses digits
-    where r is much shorter than p, so |r|^2 of close pairs is formed again.
+    With r = p - p_d, |r|^2 = |p|^2 - 2 p . p_d + |p_d|^2, and other scalar products likewise. Sums over
+    dipoles are matrix products too. This loses digits if r is much shorter than p, so |r|^2 of close pairs is
+    computed again.
 
     Args:
         p: Points [m], shape (N, 3).
-        v: Their velocities [m/s], shape (N, 3); none where no rate is wanted.
-        place: Dipoles [m], shape (D, 3).
+        v: Their velocities [m/s], shape (N, 3); None for no rate.
+        place: Dipole positions [m], shape (D, 3).
         moment: Their moments [A m2], shape (D, 3).
 
     Returns:
-        Field [nT] and its rate [nT/s], each of shape (N, 3); the rate is of zeros without `v`.
+        Field [nT] and its rate [nT/s], each of shape (N, 3); the rate is 0 without `v`.
     """
     scale = MU_0_OVER_4_PI * NT_PER_T
     home = place.mean(axis=0) if len(place) else np.zeros(3)
@@ -176,7 +176,6 @@ def dipole_block(p: Array, v: Array | None, place: Array, moment: Array) -> tupl
 
 
 def _mend(square: Array, p: Array, place: Array, own: Array, size: Array) -> None:
-    """Form |r|^2 of pairs much closer than they are far from the origin without its loss of digits."""
     if square.size and square.min() < CLOSE * (own.max() + size.max()):
         n, d = np.nonzero(square < CLOSE * (own + size))
         square[n, d] = np.square(p[n] - place[d]).sum(axis=1)
