@@ -53,15 +53,15 @@ def magtwins() -> dict[str, Callable[[], int]]:
     import numpy as np
 
     from magtwin.path import path_named
-    from magtwin.sim.motion import course, loop
-    from magtwin.sim.motion.follow import course_along
+    from magtwin.sim.motion import closed_loop, loop
+    from magtwin.sim.motion.follow import loop_along
     from magtwin.spec.scene import DriveSpec
 
     course.warm_up()
     room = walls()
 
-    def planned() -> course.Course:
-        return course_along(
+    def planned() -> course.ClosedLoop:
+        return loop_along(
             path_named("figure8"),
             DriveSpec(),
             speed=SPEED,
@@ -85,7 +85,7 @@ def magtwins() -> dict[str, Callable[[], int]]:
         return COUNT
 
     def whole() -> int:
-        return len(course.run_courses([planned()], room)[0].v)
+        return len(course.run_loops([planned()], room)[0].v)
 
     return {OURS: steps, "magtwin, planned and told": whole}
 

@@ -1,4 +1,4 @@
-"""Way: what is to be driven, from whatever a user names it by."""
+"""DriveInput: what a robot can be told to drive, from a name, a file, points, a path, commands or a run."""
 
 from pathlib import Path as FilePath
 from typing import Any
@@ -11,55 +11,57 @@ from magtwin.placement import Room, fitted, path_in
 from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands
 
-Way = Path | Commands | Run | str
+DriveInput = Path | Commands | Run | str
+"""A path, commands, a run to drive again, or "random"."""
 
 
-def way_of(way: Any, room: Room | None = None, *, fit: bool = False) -> Way:
-    """What is to be driven, from all that `magtwin.simulate` takes as its path.
+def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> DriveInput:
+    """Resolve the `path` argument of `magtwin.simulate`.
 
     Args:
-        way: The name of a path, a CSV file, or points (N, 2) [m], which become a `Path`; "random", a `Path`,
-            `Commands` or a `Run`, which stay as they are.
+        path: The name of a path, a CSV file, or points (N, 2) [m], which become a `Path`. "random", a `Path`,
+            `Commands` and a `Run` stay as they are.
         room: Where it is driven: named paths are scaled to its floor, see `magtwin.placement.path_in`.
-            Default: the floor that they are made for.
-        fit: Whether a path that does not fit into the room is moved and made smaller until it does.
+            Default: the floor for which they were designed.
+        fit: Whether a path that does not fit into the room is moved and shrunk until it does.
 
     Raises:
-        InputError: There is no such path, no room for it, or it is nothing that can be driven.
+        InputError: There is no such path, no room for it, or it cannot be driven.
     """
-    if isinstance(way, Commands | Run) or (isinstance(way, str) and way == "random"):
-        return way
-    if isinstance(way, Path):
-        return fitted(way, room) if fit and room is not None else way
-    if isinstance(way, str | FilePath | list | tuple | np.ndarray):
-        named = isinstance(way, str | FilePath) and room is not None
-        path = path_in(room, way) if named else resolve_path(way)  # type: ignore[arg-type]
+    if isinstance(path, Commands | Run) or (isinstance(path, str) and path == "random"):
+        return path
+    if isinstance(path, Path):
         return fitted(path, room) if fit and room is not None else path
+    if isinstance(path, str | FilePath | list | tuple | np.ndarray):
+        named = isinstance(path, str | FilePath) and room is not None
+        resolved = path_in(room, path) if named else resolve_path(path)  # type: ignore[arg-type]
+        return fitted(resolved, room) if fit and room is not None else resolved
     raise InputError(
         "path must be a name, a CSV file, points (N, 2) [m], a Path, Commands or a Run, got "
-        f"{type(way).__name__}"
+        f"{type(path).__name__}",
+        parameter="path",
     )
 
 
-def ways_of(paths: Any, room: Room | None = None) -> Way | list[Way]:
-    """One way for several runs, or a way for each; a name or file that comes again is read once.
+def drive_inputs(paths: Any, room: Room | None = None) -> DriveInput | list[DriveInput]:
+    """One input for all runs, or a list with one for each; a repeated name or file is read once.
 
     Args:
-        paths: What `way_of` takes, or an iterable of it. Points (N, 2) are one path.
-        room: As for `way_of`.
+        paths: What `drive_input` takes, or an iterable of it. Points (N, 2) are one path.
+        room: As for `drive_input`.
     """
     single = isinstance(paths, str | FilePath | Path | Commands | Run)
     if single or not hasattr(paths, "__iter__"):
-        return way_of(paths, room)
-    given = list(paths)
-    if _are_points(given):
-        return way_of(given, room)
-    known: dict[Any, Way] = {}
-    for path in given:
-        key = path if isinstance(path, str | FilePath) else id(path)
+        return drive_input(paths, room)
+    listed = list(paths)
+    if _are_points(listed):
+        return drive_input(listed, room)
+    known: dict[Any, DriveInput] = {}
+    keys = [path if isinstance(path, str | FilePath) else id(path) for path in listed]
+    for key, path in zip(keys, listed, strict=True):
         if key not in known:
-            known[key] = way_of(path, room)
-    return [known[path if isinstance(path, str | FilePath) else id(path)] for path in given]
+            known[key] = drive_input(path, room)
+    return [known[key] for key in keys]
 
 
 def _are_points(values: list[Any]) -> bool:

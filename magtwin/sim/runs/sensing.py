@@ -104,7 +104,7 @@ class Sensing:
         robot = scene.robot
         spec = robot.magnetometer
         self.scene, self.rate_hz, self.wanted = scene, rate_hz, frozenset(wanted)
-        self._map, self._outside, self._network = anomaly_map, outside, network
+        self._map, self._outside, self.network = anomaly_map, outside, network
         terms = [INTERFERENCE[term] if isinstance(term, str) else term for term in interference]
         self._terms = list(zip(terms, draws["interference"].spawn(len(terms)), strict=True))
         self._custom = start_sensors(sensors, scene, draws["sensors"])

@@ -103,7 +103,7 @@ class Battery(SampledSensor):
         super().__init__(noise, spent=0.0, initial=spec.initial_fraction)
         if spec.model == "linear":
             spec = replace(spec, model="power", resistance_ohm=0.0, lidar_w=0.0, drag_n=0.0, mass_kg=0.0)
-        self._spec, self._drive, self._lidar_on = spec, drive, lidar_on
+        self.spec, self._drive, self._lidar_on = spec, drive, lidar_on
         self.clock = SampleClock(spec.rate_hz, spec.latency_s, spec.jitter_s, delays)
         self._first, self._done = 0, 0
         self._history: Array | None = None  # voltage, current and charge after step `_first` and later ones
@@ -124,7 +124,7 @@ class Battery(SampledSensor):
             lidar_on: Whether the LiDAR spins in each step, of the same shape.
             step_s: Length of a step [s].
         """
-        spec = self._spec
+        spec = self.spec
         power = self._power(energy_j / step_s, lidar_on)
         per_watt = step_s / (spec.capacity_wh * SECONDS_PER_HOUR)
         spent = np.broadcast_to(self.state["spent"], (len(power) + 1, *power.shape[1:]))
@@ -139,7 +139,7 @@ class Battery(SampledSensor):
 
     def readings(self, steps: Discharge) -> Columns:
         """What the battery reports of states of the pack, shape (K,) or (K, R): voltage with noise."""
-        noise = self._spec.voltage_noise_std_v * self.normal(len(steps.voltage_v), 1)[..., 0]
+        noise = self.spec.voltage_noise_std_v * self.normal(len(steps.voltage_v), 1)[..., 0]
         return {
             "battery_v": steps.voltage_v + noise,
             "battery_a": steps.current_a,
@@ -171,7 +171,7 @@ class Battery(SampledSensor):
         times = np.arange(self._done, last + 1) * STEP_S
         self._done = last
         if len(times) > 1:
-            energy = wheels_energy_j(self._spec, self._drive, motion.at(times))
+            energy = wheels_energy_j(self.spec, self._drive, motion.at(times))
             steps = self.draw(energy, self._lidar_on(times[:-1]), STEP_S)
             rows = np.column_stack([steps.power_w, steps.fraction, steps.voltage_v, steps.current_a])
             self._history = np.concatenate([self._history, rows])
@@ -186,7 +186,7 @@ class Battery(SampledSensor):
         return np.maximum(self.state["initial"] - spent, 0.0)
 
     def _power(self, motors_w: Array, lidar_on: ArrayLike) -> Array:
-        spec = self._spec
+        spec = self.spec
         power = motors_w + spec.load_w + spec.lidar_w * np.asarray(lidar_on, float)
         if spec.resistance_ohm > 0:
             power = np.minimum(power, spec.voltage_empty_v**2 / (4 * spec.resistance_ohm))
@@ -195,6 +195,6 @@ class Battery(SampledSensor):
     def _loaded(self, motors_w: Array, lidar_on: ArrayLike, before: Array, after: Array) -> Discharge:
         """Steps with a charge before and after."""
         power = self._power(motors_w, lidar_on)
-        current = current_a(self._spec, power, before)
-        voltage = open_voltage(self._spec, before) - self._spec.resistance_ohm * current
+        current = current_a(self.spec, power, before)
+        voltage = open_voltage(self.spec, before) - self.spec.resistance_ohm * current
         return Discharge(power, after, voltage, current)

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.sim.motion.sampling import check_count, moment_at
-from magtwin.sim.motion.sampling import Moving
 from magtwin.sim.motion.drive import Moment
+from magtwin.sim.motion.sampling import Moving, check_count, moment_at
 from magtwin.sim.sensors.stateful import Stateful
 
 Array = NDArray[np.float64]

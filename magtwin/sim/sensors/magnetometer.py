@@ -156,9 +156,7 @@ class Magnetometer(Stateful):
         flicker = self.state["flicker"].copy()
         for k, corner in enumerate(self._corners_hz):
             time_s = 1 / (2 * math.pi * corner)
-            process, flicker[..., k] = gauss_markov(
-                white[..., 1 + k], flicker[..., k], time_s, self._rate
-            )
+            process, flicker[..., k] = gauss_markov(white[..., 1 + k], flicker[..., k], time_s, self._rate)
             noise += std * process
         self.state["flicker"] = flicker
         return noise

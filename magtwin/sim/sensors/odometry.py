@@ -20,9 +20,7 @@ class Odometry(SampledSensor):
     Columns: odom_p, odom_q_xyzw, odom_v, odom_w.
     """
 
-    def __init__(
-        self, drive: DriveSpec, rng: np.random.Generator, *, rate_hz: float | None = None
-    ) -> None:
+    def __init__(self, drive: DriveSpec, rng: np.random.Generator, *, rate_hz: float | None = None) -> None:
         """Begin at the origin.
 
         Args:

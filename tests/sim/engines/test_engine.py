@@ -19,7 +19,7 @@ from magtwin.sim.motion.commands import Commands, read_commands, write_commands
 from magtwin.sim.motion.controllers import guide_by_commands
 from magtwin.sim.motion.driver import Driver
 from magtwin.sim.motion.engine import Kinematic
-from magtwin.sim.motion.follow import course_along, follow, play
+from magtwin.sim.motion.follow import loop_along, follow, play
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import DriveSpec
 from magtwin.twin import open_twin, simulate
@@ -276,7 +276,7 @@ def physics(test):
 def by_equal_commands(twin, path, wheel_errors=(0.0, 0.0)):
     """What both engines make of the commands of a drive without slip, at the same times."""
     drive = replace(twin.scene.robot.drive, slip_s2_m=0.0, yaw_slip=0.0)
-    course = replace(course_along(path, drive, speed=0.2), wheel_errors=wheel_errors)
+    course = replace(loop_along(path, drive, speed=0.2), wheel_errors=wheel_errors)
     want = Kinematic().drive(course, None, None)
     rows = np.column_stack([np.arange(len(want.v)) * course.dt, want.v_cmd, want.w_cmd])
     scripted = replace(course, guide=guide_by_commands(rows, drive), steps=len(want.v))

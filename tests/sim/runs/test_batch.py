@@ -12,7 +12,7 @@ from magtwin.errors import InputError
 from magtwin.learn.models.network import FieldNet
 from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.motion.commands import Commands
-from magtwin.sim.runs import many
+from magtwin.sim.runs import batch
 from magtwin.sim.session import draw_session
 from magtwin.twin import Twin, open_twin
 

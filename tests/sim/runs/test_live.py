@@ -1,4 +1,4 @@
-"""Online: a robot that is commanded as it goes on reads what `simulate` gives for the same commands."""
+"""LiveRobot: a robot that is commanded as it goes on reads what `simulate` gives for the same commands."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 from magtwin.errors import InputError
 from magtwin.run.run import Run
 from magtwin.sim.motion.sampling import held
-from magtwin.sim.runs.online import STANDS_S, Online
+from magtwin.sim.runs.live import STANDS_S, LiveRobot
 from magtwin.sim.runs.simulate import simulate, streams
 from magtwin.sim.sensors.lidar import scans_of
 from magtwin.sim.sensors.magnetometer import sense_magnetometer
@@ -37,7 +37,7 @@ def twin(request: pytest.FixtureRequest, lab_scene: Path) -> Twin:
     return replace(twin, scene=replace(twin.scene, robot=robot))
 
 
-def online_of(twin: Twin) -> Online:
+def online_of(twin: Twin) -> LiveRobot:
     net = twin.magnetometer
 
     def network(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -45,7 +45,7 @@ def online_of(twin: Twin) -> Online:
         (read,) = net.read([run])
         return read.disturbance_nt, read.sd_nt, read.outside
 
-    return Online(
+    return LiveRobot(
         twin.scene,
         anomaly_map=twin.field,
         rng=np.random.default_rng(SEED),

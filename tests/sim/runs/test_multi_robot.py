@@ -19,9 +19,9 @@ from magtwin.io.tables import read_parquet
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive import Motion
-from magtwin.sim.runs.companions import Companion, approaches, companions_field_nt, iron_moments
+from magtwin.sim.runs.neighbours import Companion, approaches, companions_field_nt, iron_moments
 from magtwin.sim.runs.simulate import simulate
-from magtwin.sim.runs.together import simulate_together
+from magtwin.sim.runs.multi_robot import simulate_robots
 from magtwin.spec.scene import (
     DriveSpec,
     EarthFieldSpec,
@@ -87,7 +87,7 @@ def rngs(*names: str) -> dict[str, np.random.Generator]:
 
 def drive(scene: Scene = SCENE, ways: dict | None = None, **options) -> dict[str, Run]:
     ways = {"ann": EAST, "bob": WEST} if ways is None else ways
-    return simulate_together(
+    return simulate_robots(
         scene, ways, **{"anomaly_map": FLAT, "rngs": rngs(*ways), "rate_hz": RATE_HZ} | options
     )
 

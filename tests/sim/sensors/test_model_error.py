@@ -162,7 +162,7 @@ def test_a_vector_of_robots_has_an_error_and_draws_the_rest_as_without(twin):
         rows = []
         for _ in range(3):
             env.step(np.tile([0.2, 0.0], (200, 1)))
-            rows.append({name: values.copy() for name, values in env.fleet.columns.items()})
+            rows.append({name: values.copy() for name, values in env.stepped.columns.items()})
         seen[model_error] = rows
     for a, b in zip(seen[True], seen[False], strict=True):
         assert_array_equal(a["b_total_nt"], b["b_total_nt"])
