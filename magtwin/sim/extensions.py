@@ -6,10 +6,11 @@ Each kind has a protocol, a registry, and a decorator that registers an entry un
 |---|---|---|---|
 | sensor | `Sensor` | `@sensor("sonar")` | `simulate(..., sensors=["sonar"])` |
 | interference | `Interference` | `@interference("pump")` | `simulate(..., interference=["pump"])` |
-| controller | `magtwin.sim.motion.controllers.Controller` | none | `simulate(..., controller=MyController())` |
-| engine | `magtwin.sim.motion.engine.Engine` | none | `simulate(..., engine=MyEngine())` |
+| controller | `motion.controllers.Controller` | `@controller("mine")` | `simulate(..., controller="mine")` |
+| engine | `motion.engine.Engine` | `@engine("mine")` | `simulate(..., engine="mine")` |
 
-An installed package registers an entry by an entry point of group `magtwin.sensors` or `magtwin.interference`.
+Functions and objects can be given in place of names. An installed package registers an entry by an entry point
+of group `magtwin.sensors`, `magtwin.interference`, `magtwin.controllers` or `magtwin.engines`.
 
     @sensor("speedometer")
     class Speedometer:

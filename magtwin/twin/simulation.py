@@ -215,7 +215,7 @@ def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Sc
         run: A run with t, p_world_base, yaw and lidar_on.
         seed: Seed of the noise.
     """
-    from magtwin.sim.runs.simulate import streams
+    from magtwin.sim.runs.sensing import streams
     from magtwin.sim.sensors.lidar import scans_of
 
     if not isinstance(twin, Twin):

@@ -170,7 +170,7 @@ class LiveRobot:
                 command_timeout_s is over. In the first step the robot stands.
 
         Returns:
-            The readings from the step's begin to before its end, every column of `COLUMNS`; there may be none.
+            The readings in the step's time, every column of `COLUMNS`; there may be none.
 
         Raises:
             InputError: The command is not finite.

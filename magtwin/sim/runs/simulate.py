@@ -157,7 +157,7 @@ def travel(
     if isinstance(path, Commands):
         motion = play(path.rows, robot.drive, start=scene.start, **room)
         return motion, {"path": path.name, "controller": "commands", **metadata}
-    if path != "random":
+    if not isinstance(path, str) or path != "random":
         raise InputError(f'path must be a Path, Commands, a Run or "random", got {path!r}', parameter="path")
     room["duration_s"] = RANDOM_S if duration_s is None else duration_s
     driver = Driver(

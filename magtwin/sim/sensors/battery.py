@@ -31,7 +31,7 @@ def open_voltage(spec: BatterySpec, fraction: ArrayLike) -> Array:
 def current_a(spec: BatterySpec, power_w: ArrayLike, fraction: ArrayLike) -> Array:
     """Current of a pack that delivers a power through its inner resistance [A].
 
-    The smaller solution of U I = (U_0 - R I) I = P, for a power that the pack can deliver: at most U_0^2 / 4 R.
+    The smaller solution of U I = (U_0 - R I) I = P, for a power of at most U_0^2 / 4 R.
 
     Args:
         spec: Discharge curve and resistance R.
@@ -161,7 +161,7 @@ class Battery(SampledSensor):
         return self._states(t)[:, 3]
 
     def _discharge(self, motion: Moving, until_s: float) -> None:
-        """Discharge the pack in the steps that end before a time, and keep the states that may be asked for."""
+        """Discharge the pack in the steps that end before a time, and keep their states."""
         if self._history is None:
             start = self.rest(self._lidar_on(np.zeros(1)))
             self._history = np.column_stack([start.power_w, start.fraction, start.voltage_v, start.current_a])

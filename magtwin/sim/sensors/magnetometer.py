@@ -36,8 +36,8 @@ FLICKER_STEP = 5.0
 class Magnetometer(Stateful):
     """A magnetometer that reads a field in pieces of any length.
 
-    For each piece call `axes`, then `read`. If the clock is behind (`clock_offset_s` below 0), a reading needs
-    the field after it: the last reading of a piece stands for all that follow.
+    For each piece call `axes`, then `read`. If the clock is behind (`clock_offset_s` below 0), a reading is
+    of a later field: the last of a piece stands for all that follow.
     """
 
     def __init__(self, spec: MagnetometerSpec, rate_hz: float, rng: np.random.Generator) -> None:
@@ -90,7 +90,7 @@ class Magnetometer(Stateful):
         held = np.empty(measured.shape)
         for k in range(3):
             held[:, k] = _hold(np.where(fine & (axis == k), read, np.nan), self._held_axes[k])
-        self._held_axes = held[-1] if len(held) else self._held_axes
+        self._held_axes = held[-1].copy() if len(held) else self._held_axes
         held = held[before:]
         held[self._dropped] = np.nan
         return held
@@ -117,14 +117,10 @@ class Magnetometer(Stateful):
         if spec.clock_offset_s or spec.bandwidth_hz:
             b = self._low_passed(self._late(self._filled(b)))
         read = b + self._noise_nt(len(b))
-        begins = lost & ~np.concatenate([[self._was_lost], lost[:-1]])
         if len(lost):
-            self._was_lost = bool(lost[-1])
-        if lost.any():
-            drawn = self._stuck_rng.standard_normal(np.count_nonzero(begins))
-            values = np.concatenate([[self._stuck], spec.latched_nt + spec.latched_std_nt * drawn])
-            read[lost] = values[np.cumsum(begins)][lost]
-            self._stuck = float(values[-1])
+            stuck = stuck_nt(spec, lost, self._stuck_rng, was_lost=self._was_lost, before=self._stuck)
+            read = np.where(lost, stuck, read)
+            self._was_lost, self._stuck = bool(lost[-1]), float(stuck[-1])
         read = rounded(read, spec.resolution_nt)
         read[~known] = np.nan
         read[self._dropped] = np.nan
@@ -235,6 +231,31 @@ def lost_in(spec: MagnetometerSpec, gradient_nt_m: ArrayLike, *, before: bool = 
         return np.zeros(gradient.shape, bool)
     found = np.where(gradient < spec.gradient_relock_nt_m, 0.0, np.nan)
     return _hold(np.where(gradient > spec.gradient_max_nt_m, 1.0, found), float(before)) > 0
+
+
+def stuck_nt(
+    spec: MagnetometerSpec,
+    lost: Flags,
+    rng: np.random.Generator,
+    *,
+    was_lost: bool = False,
+    before: float = math.nan,
+) -> Array:
+    """The value at which readings are stuck, drawn anew each time that lock is lost.
+
+    Args:
+        spec: Its mean and spread.
+        lost: Whether lock is lost, in the order of time, shape (N,).
+        rng: Source of the values.
+        was_lost: Whether lock was lost before the first.
+        before: The value then [nT].
+
+    Returns:
+        Readings [nT], shape (N,); meaningful if lock is lost.
+    """
+    begins = lost & ~np.concatenate([[was_lost], lost[:-1]])
+    drawn = spec.latched_nt + spec.latched_std_nt * rng.standard_normal(np.count_nonzero(begins))
+    return np.concatenate([[before], drawn])[np.cumsum(begins)]
 
 
 def rounded(b_nt: Array, resolution_nt: float) -> Array:

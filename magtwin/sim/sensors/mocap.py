@@ -49,7 +49,7 @@ class Mocap(SampledSensor):
 
 
 def markers_p_world(spec: MocapSpec, pose: Array, height_m: float) -> Array:
-    """Where motion capture takes base_link to be in world [m], shape (N, 3), for true poses x, y, yaw (N, 3)."""
+    """Where motion capture sees base_link in world [m], for true poses x, y, yaw; (N, 3) -> (N, 3)."""
     forward, left = spec.offset_m
     cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     x, y = pose[:, 0] - forward * cos + left * sin, pose[:, 1] - forward * sin - left * cos

@@ -12,10 +12,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.errors import InputError
 from magtwin.path import Path, path_named
 from magtwin.sim.motion import closed_loop as courses
-from magtwin.sim.motion.controllers import CONTROLLERS, guide_by_commands
 from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop, run_loops
+from magtwin.sim.motion.controllers import CONTROLLERS, guide_by_commands
 from magtwin.sim.motion.drive import Motion, draw_wheel_errors
-from magtwin.sim.motion.follow import loop_along, follow, play
+from magtwin.sim.motion.follow import follow, loop_along, play
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import DriveSpec
 
@@ -50,9 +50,9 @@ ROOM = Obstacles(
 
 @pytest.fixture(params=["plain", "compiled"])
 def way(request, monkeypatch):
-    """Each way of running the loop."""
-    monkeypatch.setattr(courses._Loop, "compiled", None)
-    monkeypatch.setattr(courses, "PAYS", math.inf)
+    """Plain and compiled."""
+    monkeypatch.setattr(courses.LOOPS, "code", None)
+    monkeypatch.setattr(courses.LOOPS, "pays", math.inf)
     if request.param == "compiled":
         courses.warm_up()
     return request.param
@@ -62,9 +62,11 @@ def way(request, monkeypatch):
 def both(monkeypatch):
     """A function that runs courses in both ways."""
 
-    def run(chosen: list[ClosedLoop], obstacles: Obstacles | None = None) -> tuple[list[Motion], list[Motion]]:
-        monkeypatch.setattr(courses, "PAYS", math.inf)
-        monkeypatch.setattr(courses._Loop, "compiled", None)
+    def run(
+        chosen: list[ClosedLoop], obstacles: Obstacles | None = None
+    ) -> tuple[list[Motion], list[Motion]]:
+        monkeypatch.setattr(courses.LOOPS, "pays", math.inf)
+        monkeypatch.setattr(courses.LOOPS, "code", None)
         plain = run_loops(chosen, obstacles)
         courses.warm_up()
         return plain, run_loops(chosen, obstacles)
@@ -114,13 +116,13 @@ def test_any_script_among_obstacles_is_driven_to_the_same_bits(seed):
     rng = np.random.default_rng(seed)
     t = np.cumsum(rng.exponential(0.3, 60))
     script = np.column_stack([t, rng.uniform(-0.6, 0.6, 60), rng.uniform(-3, 3, 60)])
-    kept, courses._Loop.compiled = courses._Loop.compiled, None
+    kept, courses.LOOPS.code = courses.LOOPS.code, None
     try:
         plain = play(script, REAL, start=(-1.0, 0.5, 0.3), obstacles=ROOM, footprint_radius_m=RADIUS)
         courses.warm_up()
         compiled = play(script, REAL, start=(-1.0, 0.5, 0.3), obstacles=ROOM, footprint_radius_m=RADIUS)
     finally:
-        courses._Loop.compiled = kept
+        courses.LOOPS.code = kept
     assert_same(plain, compiled)
     distance, _ = ROOM.clearance(plain.poses[:, :2])
     assert distance.min() > RADIUS - 1e-5
@@ -162,28 +164,15 @@ def test_courses_are_not_changed_by_running_them(way):
 
 
 def test_the_loop_opens_its_machine_code_when_that_has_paid(monkeypatch):
-    monkeypatch.setattr(courses._Loop, "compiled", None)
-    monkeypatch.setattr(courses._Loop, "made", 0)
-    monkeypatch.setattr(courses.lookup.LOOPS, "code", None)
-    monkeypatch.setattr(courses, "PAYS", 6000)
-    path = path_named("figure8")
-    first = follow(path, REAL, speed=0.2, duration_s=60.0)
-    assert courses._Loop.compiled is None
-    second = follow(path, REAL, speed=0.2, duration_s=60.0)
-    assert courses._Loop.compiled is not None
-    assert courses.lookup.LOOPS.code is not None  # which costs little more then
+    monkeypatch.setattr(courses.LOOPS, "code", None)
+    monkeypatch.setattr(courses.LOOPS, "done", 0)
+    steps = 20 * 4500  # numba is open here, so a twentieth pays
+    monkeypatch.setattr(courses.LOOPS, "pays", steps)
+    first = follow(path_named("figure8"), REAL, speed=0.2, duration_s=60.0)
+    assert courses.LOOPS.code is None
+    second = follow(path_named("figure8"), REAL, speed=0.2, duration_s=60.0)
+    assert courses.LOOPS.code is not None
     assert_same(first, second)
-
-
-def test_with_other_machine_code_open_the_loops_pays_sooner(monkeypatch):
-    monkeypatch.setattr(courses._Loop, "compiled", None)
-    monkeypatch.setattr(courses._Loop, "made", 0)
-    monkeypatch.setattr(courses, "PAYS", 60_000)
-    courses.lookup.warm_up()
-    follow(path_named("figure8"), REAL, speed=0.2, duration_s=50.0)
-    assert courses._Loop.compiled is None
-    follow(path_named("figure8"), REAL, speed=0.2, duration_s=60.0)
-    assert courses._Loop.compiled is not None
 
 
 # --- the drive --------------------------------------------------------------------------------------------
