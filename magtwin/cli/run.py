@@ -377,7 +377,7 @@ def _drive(
     """
     from magtwin.io.formats import read_run
     from magtwin.sim.motion.commands import read_commands
-    from magtwin.sim.motion.way import way_of
+    from magtwin.sim.motion.drive_input import drive_input
     from magtwin.twin import in_session, open_twin, room_of, scan, simulate
 
     planned: Any = None
@@ -387,11 +387,11 @@ def _drive(
     elif replay is not None:
         what = read_run(replay)
     else:
-        way_of(path)  # refuses a name or file that is none before the scene is opened
+        drive_input(path)  # refuses a name or file that is none before the scene is opened
     twin = open_twin(scene_file, network=network, magnetometer=magnetometer, model_error=model_error)
     twin = in_session(twin, session, seed=seed)
     if commands is None and replay is None and path != "random":
-        what = planned = way_of(path, room_of(twin), fit=fit)
+        what = planned = drive_input(path, room_of(twin), fit=fit)
         _say_placing(planned, steps)
     if commands is not None and what.beyond(twin.scene.robot.drive):
         print(f"  {what.beyond(twin.scene.robot.drive)}", file=sys.stderr)  # noqa: T201
@@ -435,7 +435,7 @@ def _run_together(
     from magtwin.path import Path as Planned
     from magtwin.report import Report
     from magtwin.sim.motion.commands import read_commands
-    from magtwin.sim.motion.way import way_of
+    from magtwin.sim.motion.drive_input import drive_input
     from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots
 
     steps = announcer(quiet=quiet)
@@ -448,7 +448,7 @@ def _run_together(
     if robot is not None and (commands or replay or path):
         ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path
     ways = {
-        name: way_of(way, room_of(led_by(twin, name)), fit=fit and name == robot)
+        name: drive_input(way, room_of(led_by(twin, name)), fit=fit and name == robot)
         for name, way in ways.items()
     }
     names = list(ways) if robot is None else [robot]

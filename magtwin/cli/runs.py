@@ -89,7 +89,7 @@ def runs(
         Print the summary as JSON.
     """
     from magtwin.files import check_free, existing
-    from magtwin.sim.motion.way import way_of
+    from magtwin.sim.motion.drive_input import drive_input
     from magtwin.twin import MIXTURE, open_twin, room_of, sweep
 
     existing(scene, "scene")
@@ -100,14 +100,14 @@ def runs(
         raise InputError("--session survey is one session; drop --sessions")
     check_free(out, force=force)
     for name in path or MIXTURE:
-        way_of(name)  # refuses a wrong name before the scene is opened
+        drive_input(name)  # refuses a wrong name before the scene is opened
     steps = announcer(quiet=json)
     steps("Opening the scene")
     twin = open_twin(scene, network=net, magnetometer=magnetometer, model_error=model_error)
     steps(f"Driving {count} runs")
     made = sweep(
         twin,
-        [way_of(name, room_of(twin), fit=fit) for name in path or MIXTURE],
+        [drive_input(name, room_of(twin), fit=fit) for name in path or MIXTURE],
         count,
         seed=seed,
         sessions=session or sessions or max(1, round(count / RUNS_A_SESSION)),

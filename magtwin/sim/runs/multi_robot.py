@@ -1,7 +1,8 @@
-"""Together: several robots that drive in one lab at one time, a Run each.
+"""Several robots that drive in one lab at the same time, a Run each.
 
-Each is driven as if it were alone, on random numbers of its own. Then it is seen how near they came, and each
-one's sensors are read with the others beside it: their iron in its magnetometer, their footprints at its own.
+Each is driven as if it were alone, with its own random numbers. Then the least distances are found, and each
+robot's sensors are read with the others beside it: their iron at its magnetometer, their footprints at its
+own.
 """
 
 from collections.abc import Iterable, Mapping
@@ -11,22 +12,20 @@ import numpy as np
 
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.path import Path
 from magtwin.run.run import Run
-from magtwin.sim.motion.commands import Commands
+from magtwin.sim.motion.drive_input import DriveInput
 from magtwin.sim.motion.engine import Kinematic
-from magtwin.sim.runs.companions import Approach, Companion, approaches
-from magtwin.sim.runs.simulate import Predict, check_run, sense, streams, travel
+from magtwin.sim.runs.neighbours import Approach, Neighbour, approaches
+from magtwin.sim.runs.sensing import LidarMode, Outside, Sensing, streams
+from magtwin.sim.runs.simulate import Predict, check_run, sense_all, travel
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
 
-Way = Path | Commands | Run | str
 
-
-def simulate_together(
+def simulate_robots(
     scene: Scene,
-    ways: Mapping[str, Way],
+    paths: Mapping[str, DriveInput],
     *,
     anomaly_map: AnomalyMap,
     rngs: Mapping[str, np.random.Generator],
@@ -39,51 +38,50 @@ def simulate_together(
     controller: str = "follower",
     disturbances_nt: Mapping[str, Predict | None] | None = None,
     model_errors: Mapping[str, ModelError | None] | None = None,
-    outside: Literal["nan", "clamp", "raise"] = "nan",
-    lidar: Literal["schedule", "on", "off"] = "schedule",
+    outside: Outside = "nan",
+    lidar: LidarMode = "schedule",
 ) -> dict[str, Run]:
-    """Drive robots of a scene at one time; each is moved by the kinematic engine.
+    """Drive robots of a scene at the same time, each with the kinematic engine.
 
-    A robot's Run is that of `simulate` in `scene.led_by(name)` with the same generator, but for what the
-    others do to its magnetometer, and the bumps.
+    A robot's Run is that of `simulate` in `scene.led_by(name)` with the same generator, except for the
+    field of the others at its magnetometer, and the bumps.
 
     Args:
         scene: Lab and robots.
-        ways: What each robot drives, by its name, as for `simulate`; those that are not named are not there.
-        anomaly_map: What `scene.map_layer` holds.
-        rngs: Source of all noise of each, by name.
-        wanted: Names of the robots whose sensors are read; all unless given. The others drive nevertheless.
-        meet: What becomes of robots whose footprints overlap: a refusal with time and place, or flag_bump in
-            both while it lasts; they drive through each other.
+        paths: What each robot drives, by its name, as for `simulate`. Robots without a path are absent.
+        anomaly_map: The map of `scene.map_layer`.
+        rngs: Source of all noise of each robot, by name.
+        wanted: Names of the robots whose sensors are read. Default: all. The others drive nevertheless.
+        meet: What happens if footprints overlap: a refusal with time and place, or flag_bump in both Runs
+            while it lasts; they drive through each other.
         speed: As for `simulate`, of each.
         duration_s: As for `simulate`, of each.
         rate_hz: As for `simulate`.
         obstacles: As for `simulate`.
         controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`.
         disturbances_nt: What predicts the disturbance of each robot with a neural magnetometer, by name.
-        model_errors: Statistics of the errors of these predictions, by name; None draws none.
+        model_errors: Statistics of the errors of these predictions, by name; None draws no error.
         outside: As for `simulate`.
         lidar: As for `simulate`.
 
     Returns:
-        A Run for each that is wanted, by name. Its metadata name the robot, and of the others the one that
-        came nearest, how near [m] and when [s].
+        A Run for each wanted robot, by name. Its metadata name the robot, and the robot that came nearest,
+        with clearance [m] and time [s].
 
     Raises:
         InputError: Robots would meet, or `simulate` would refuse one; the text names it.
     """
-    if not ways:
-        raise InputError("no robot is to drive; name one at least")
+    if not paths:
+        raise InputError("no robot is to drive; name one at least", parameter="paths")
     find("way of robots to meet", meet, {"refuse": None, "flag": None})
-    predicts = {name: (disturbances_nt or {}).get(name) for name in ways}
-    led = {name: scene.led_by(name) for name in ways}
-    names = tuple(ways) if wanted is None else tuple(wanted)
+    predicts = {name: (disturbances_nt or {}).get(name) for name in paths}
+    led = {name: scene.led_by(name) for name in paths}
     rates, draws, robots, metadata = {}, {}, {}, {}
-    for name, way in ways.items():
+    for name, path in paths.items():
         try:
             rates[name] = check_run(
                 led[name],
-                way,
+                path,
                 anomaly_map=anomaly_map,
                 rate_hz=rate_hz,
                 duration_s=duration_s,
@@ -93,7 +91,7 @@ def simulate_together(
             draws[name] = streams(rngs[name])
             motion, metadata[name] = travel(
                 led[name],
-                way,
+                path,
                 draws[name],
                 speed,
                 duration_s,
@@ -102,38 +100,36 @@ def simulate_together(
                 Kinematic(),
             )
         except InputError as error:
-            raise InputError(f"robot {name!r}: {error}") from error
-        robots[name] = Companion(led[name].robot, motion)
+            raise InputError(f"robot {name!r}: {error}", parameter=error.parameter) from error
+        robots[name] = Neighbour(led[name].robot, motion)
     near = list(approaches(robots))
     if meet == "refuse":
         _check_apart(near)
     runs = {}
-    for name in names:
-        robot = find("robot", name, robots)
-        sensed = sense(
+    for name in paths if wanted is None else wanted:
+        robot, predict = find("robot", name, robots), predicts[name]
+        sensing = Sensing(
             led[name],
-            robot.motion,
             draws[name],
             anomaly_map=anomaly_map,
             rate_hz=rates[name],
-            duration_s=duration_s,
             outside=outside,
             lidar=lidar,
-            metadata=metadata[name],
-            network=predicts[name] is not None,
-            companions=[other for key, other in robots.items() if key != name],
+            network=predict is not None,
+            neighbours=[other for key, other in robots.items() if key != name],
         )
-        predict = predicts[name]
+        how = {**metadata[name], "outside": outside, "lidar": lidar}
+        sensed = sense_all(sensing, robot.motion, duration_s, how)
         run = sensed.read(None if predict is None else predict(sensed.run), (model_errors or {}).get(name))
         runs[name] = run.with_metadata(robot=name, **_nearest(name, near))
     return runs
 
 
 def _check_apart(near: Iterable[Approach]) -> None:
-    """Refuse robots that meet; the first two of them."""
-    met = [one for one in near if one.meet_s is not None]
+    """Refuse robots that meet; the text names the first two."""
+    met = [approach for approach in near if approach.meet_s is not None]
     if met:
-        first = min(met, key=lambda one: one.meet_s or 0.0)
+        first = min(met, key=lambda approach: approach.meet_s or 0.0)
         a, b = first.names
         x, y = first.p_meet
         raise InputError(
@@ -144,12 +140,12 @@ def _check_apart(near: Iterable[Approach]) -> None:
 
 
 def _nearest(name: str, near: Iterable[Approach]) -> dict[str, str | float]:
-    """Metadata of the approach that was the nearest of a robot's; none of one that drove alone."""
-    own = [one for one in near if name in one.names]
+    """Metadata of a robot's nearest approach; empty if it drove alone."""
+    own = [approach for approach in near if name in approach.names]
     if not own:
         return {}
-    least = min(own, key=lambda one: one.clearance_m)
-    other = next(n for n in least.names if n != name)
+    least = min(own, key=lambda approach: approach.clearance_m)
+    other = next(other for other in least.names if other != name)
     return {
         "nearest_robot": other,
         "nearest_clearance_m": round(least.clearance_m, 6),

@@ -1,4 +1,4 @@
-"""Companions: the other robots in a lab, as a robot's magnetometer and its bumper meet them.
+"""Neighbours: the other robots in a lab, as a robot's magnetometer and its bumper meet them.
 
 A robot feels the iron of another one as a point dipole at the other's base_link: the moment that makes the
 permanent and the induced part of the other's platform at the other's own magnetometer, so that what is known
@@ -30,14 +30,14 @@ MU_0_NT = 4 * math.pi * 1e2
 """Magnetic constant [nT m/A]."""
 
 RATE_STEP_S = 1e-3
-"""Half of the time over which a companion's field is differenced [s]; robots go 0.3 mm in it."""
+"""Half of the time over which a neighbour's field is differenced [s]; robots go 0.3 mm in it."""
 
 SEEN_HZ = 50.0
 """How often it is looked how far robots are apart [Hz]: every 12 mm of two that drive at each other."""
 
 
 @dataclass(frozen=True, eq=False)
-class Companion:
+class Neighbour:
     """Another robot, and what it did."""
 
     robot: RobotSpec
@@ -97,8 +97,8 @@ def iron_moments(robot: RobotSpec, b_base_nt: ArrayLike) -> Array:
     return np.asarray(4 * math.pi * r**3 / MU_0_NT * (1.5 * (iron @ u)[:, None] * u - iron))
 
 
-def companions_field_nt(
-    scene: Scene, companions: Sequence[Companion], motion: Moving, t: ArrayLike, true: Moment
+def neighbours_field_nt(
+    scene: Scene, neighbours: Sequence[Neighbour], motion: Moving, t: ArrayLike, true: Moment
 ) -> Array:
     """What other robots add to the field at a robot's magnetometer.
 
@@ -107,7 +107,7 @@ def companions_field_nt(
 
     Args:
         scene: A scene whose Earth's field is known, and its first robot, which reads.
-        companions: The other robots.
+        neighbours: The other robots.
         motion: What the first robot did.
         t: Times of the readings, ascending [s], shape (N,).
         true: Its motion at these times.
@@ -116,9 +116,9 @@ def companions_field_nt(
         Field in base_link axes [nT], shape (N, 3).
     """
     t = np.asarray(t, float)
-    later, sooner = (_at_sensor(scene, companions, motion, t + dt) for dt in (RATE_STEP_S, -RATE_STEP_S))
+    later, sooner = (_at_sensor(scene, neighbours, motion, t + dt) for dt in (RATE_STEP_S, -RATE_STEP_S))
     yaw = true.pose[:, 2]
-    b = _turned(_at_sensor(scene, companions, motion, t), -yaw)
+    b = _turned(_at_sensor(scene, neighbours, motion, t), -yaw)
     rate = _turned((later - sooner) / (2 * RATE_STEP_S), -yaw)
     rate[:, 0] += true.w * b[:, 1]
     rate[:, 1] -= true.w * b[:, 0]
@@ -128,12 +128,12 @@ def companions_field_nt(
     return np.asarray(b + np.einsum("nk,jk->nj", b, soft) + np.einsum("nk,jk->nj", rate, eddy))
 
 
-def _at_sensor(scene: Scene, companions: Sequence[Companion], motion: Moving, t: Array) -> Array:
-    """The companions' field at the first robot's magnetometer at times [s], in world axes [nT], (N, 3)."""
+def _at_sensor(scene: Scene, neighbours: Sequence[Neighbour], motion: Moving, t: Array) -> Array:
+    """The neighbours' field at the first robot's magnetometer at times [s], in world axes [nT], (N, 3)."""
     assert scene.earth is not None
     p_sensor = sensor_places(scene.robot, moment_at(motion, t).pose)
     field = np.zeros((len(t), 3))
-    for other in companions:
+    for other in neighbours:
         pose = moment_at(other.motion, t).pose
         earth = np.broadcast_to(scene.earth.b_world_nt, (len(t), 3))
         m_world = _turned(iron_moments(other.robot, _turned(earth, -pose[:, 2])), pose[:, 2])
@@ -149,7 +149,7 @@ def _dipole_each_nt(r: Array, m: Array) -> Array:
     return np.asarray(MU_0_NT / (4 * math.pi) * (along - m / d**3))
 
 
-def approaches(travels: Mapping[str, Companion]) -> Iterator[Approach]:
+def approaches(travels: Mapping[str, Neighbour]) -> Iterator[Approach]:
     """How near each two of some robots came, from the start to the end of the last; who has arrived stands.
 
     Args:
@@ -176,12 +176,12 @@ def approaches(travels: Mapping[str, Companion]) -> Iterator[Approach]:
 
 
 def touching(
-    t: Array, motion: Moving, robot: RobotSpec, companions: Sequence[Companion]
+    t: Array, motion: Moving, robot: RobotSpec, neighbours: Sequence[Neighbour]
 ) -> NDArray[np.bool_]:
     """Whether a robot's footprint overlaps another's at times [s], shape (N,)."""
     here = motion.at(t).pose[:, :2]
     touches = np.zeros(len(t), bool)
-    for other in companions:
+    for other in neighbours:
         there = other.motion.at(t).pose[:, :2]
         reach = robot.footprint_radius_m + other.robot.footprint_radius_m
         touches |= np.hypot(*(here - there).T) < reach

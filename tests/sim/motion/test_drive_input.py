@@ -14,7 +14,7 @@ from magtwin.io.formats import read_run, write_run
 from magtwin.path import Path, path_named, path_of_points, read_path_csv
 from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands
-from magtwin.sim.motion.way import way_of, ways_of
+from magtwin.sim.motion.drive_input import drive_input, drive_inputs
 from magtwin.twin import open_twin, scan, scene_from_toml, simulate, simulate_robots, sweep
 from magtwin.usd.scene import read_scene
 
@@ -113,15 +113,15 @@ def test_points_close_as_a_csv_does(closed, tmp_path):
 
 def test_ways_are_one_for_all_or_one_each(tmp_path):
     file = csv_of(POINTS, tmp_path / "a.csv")
-    assert isinstance(ways_of(POINTS), Path)
-    assert isinstance(ways_of(np.array(POINTS)), Path)
-    assert ways_of("random") == "random"
-    a, b, c = ways_of([file, "random", file])
+    assert isinstance(drive_inputs(POINTS), Path)
+    assert isinstance(drive_inputs(np.array(POINTS)), Path)
+    assert drive_inputs("random") == "random"
+    a, b, c = drive_inputs([file, "random", file])
     assert (a is c, b) == (True, "random")
-    drawn = ways_of(np.stack([POINTS, POINTS]))
+    drawn = drive_inputs(np.stack([POINTS, POINTS]))
     assert [path.name for path in drawn] == ["points", "points"]
     path = path_named("sine")
-    assert (way_of(path), ways_of(iter([path]))) == (path, [path])
+    assert (drive_input(path), drive_inputs(iter([path]))) == (path, [path])
 
 
 @pytest.mark.parametrize(

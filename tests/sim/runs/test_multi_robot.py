@@ -19,9 +19,9 @@ from magtwin.io.tables import read_parquet
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive import Motion
-from magtwin.sim.runs.companions import Companion, approaches, companions_field_nt, iron_moments
+from magtwin.sim.runs.multi_robot import simulate_robots as run_robots
+from magtwin.sim.runs.neighbours import Neighbour, approaches, iron_moments, neighbours_field_nt
 from magtwin.sim.runs.simulate import simulate
-from magtwin.sim.runs.together import simulate_together
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec
 from magtwin.spec.robot import PlacedRobot, RobotSpec
@@ -83,9 +83,7 @@ def rngs(*names: str) -> dict[str, np.random.Generator]:
 
 def drive(scene: Scene = SCENE, ways: dict | None = None, **options) -> dict[str, Run]:
     ways = {"ann": EAST, "bob": WEST} if ways is None else ways
-    return simulate_together(
-        scene, ways, **{"anomaly_map": FLAT, "rngs": rngs(*ways), "rate_hz": RATE_HZ} | options
-    )
+    return run_robots(scene, ways, **{"anomaly_map": FLAT, "rngs": rngs(*ways), "rate_hz": RATE_HZ} | options)
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +106,8 @@ def test_a_robot_at_rest_feels_another_as_the_dipole_that_this_is():
     here, there = (0.2, -0.3, 0.7), (0.9, 0.4, -2.0)
     still = [Motion(EXACT, 0.02, np.zeros(5), np.zeros(5), pose) for pose in (here, there)]
     t = np.array([0.02, 0.05])
-    field = companions_field_nt(
-        SCENE, [Companion(SCENE.robots[1].robot, still[1])], still[0], t, still[0].at(t)
+    field = neighbours_field_nt(
+        SCENE, [Neighbour(SCENE.robots[1].robot, still[1])], still[0], t, still[0].at(t)
     )
     turn = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in (0.7, -2.0)]
     m_world = turn[1] @ iron_moments(SCENE.robots[1].robot, (turn[1].T @ EARTH_NT)[None])[0]
@@ -123,11 +121,11 @@ def test_what_a_robot_drives_past_adds_eddy_currents_by_the_rate_of_its_field():
     t = np.arange(0.5, 4, 1e-3)
     ahead = Motion(EXACT, 0.02, np.full(250, 0.3), np.full(250, 0.4), (-0.5, 0.0, 0.0))
     back = Motion(EXACT, 0.02, np.full(250, 0.2), np.zeros(250), (0.8, 0.7, np.pi))
-    others, true = [Companion(SCENE.robots[1].robot, back)], ahead.at(t)
+    others, true = [Neighbour(SCENE.robots[1].robot, back)], ahead.at(t)
 
     def seen(platform: PlatformFieldSpec) -> np.ndarray:
         scene = replace(SCENE, robot=robot("ann", platform=platform))
-        return companions_field_nt(scene, others, ahead, t, true)
+        return neighbours_field_nt(scene, others, ahead, t, true)
 
     plain = seen(replace(IRON, soft_iron=(0.0,) * 9, eddy_s=(0.0,) * 9))
     with_eddy = seen(replace(IRON, soft_iron=(0.0,) * 9))
@@ -201,7 +199,7 @@ def test_bumps_are_flagged_in_both_while_they_overlap_where_that_is_asked_for():
 def test_who_arrives_stands_where_it_is_and_is_still_met():
     stands = Motion(EXACT, 0.02, np.full(10, 0.1), np.zeros(10), (0.0, 0.0, 0.0))
     comes = Motion(EXACT, 0.02, np.full(1000, 0.1), np.zeros(1000), (-1.0, 0.0, 0.0))
-    (near,) = approaches({"a": Companion(robot("a"), stands), "b": Companion(robot("b"), comes)})
+    (near,) = approaches({"a": Neighbour(robot("a"), stands), "b": Neighbour(robot("b"), comes)})
     assert near.meet_s == pytest.approx((1.02 - 0.342) / 0.1, abs=0.021)
     assert near.p_meet == pytest.approx((0.02 - 0.171, 0.0), abs=0.003)
     assert near.clearance_m == pytest.approx(-0.342, abs=0.002)

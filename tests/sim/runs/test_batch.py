@@ -11,8 +11,9 @@ from magtwin import simulate, sweep
 from magtwin.errors import InputError
 from magtwin.learn.models.network import FieldNet
 from magtwin.run.run import COLUMNS, Run
+from magtwin.sim.motion import closed_loop
 from magtwin.sim.motion.commands import Commands
-from magtwin.sim.runs import many
+from magtwin.sim.runs import batch
 from magtwin.sim.session import draw_session
 from magtwin.twin import Twin, open_twin
 
@@ -137,7 +138,7 @@ def test_whole_paths_end_when_each_robot_stands(physical, tmp_path):
 
 
 def test_the_compiled_loop_gives_the_bits_of_plain_python(neural, alone, monkeypatch):
-    monkeypatch.setattr(many, "PAYS", 0)  # opens it
+    monkeypatch.setattr(closed_loop.LOOPS, "pays", 0)  # opens it
     for run, own in zip(sweep(neural, PATHS, SEEDS, speeds=SPEEDS, **SHORT), alone, strict=True):
         assert_same(run, own)
 
@@ -181,8 +182,8 @@ def test_columns_that_are_kept_are_those_named_and_t_in_the_tables_order(neural,
 
 def test_no_more_than_two_blocks_are_made_ahead(neural, monkeypatch):
     made = []
-    sense = many.sense
-    monkeypatch.setattr(many, "sense", lambda *a, **k: made.append(1) or sense(*a, **k))
+    sense = batch.sense_all
+    monkeypatch.setattr(batch, "sense_all", lambda *a, **k: made.append(1) or sense(*a, **k))
     runs = iter(sweep(neural, "figure8", range(50), block=2, **SHORT))
     list(itertools.islice(runs, 1))
     assert len(made) <= 4

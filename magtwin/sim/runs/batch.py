@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from typing import Any, Literal, overload
+from typing import Any, overload
 
 import numpy as np
 
@@ -19,12 +19,13 @@ from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.path import Path
 from magtwin.run.run import COLUMNS, Metadata, Run
+from magtwin.sim.motion.closed_loop import LOOPS, ClosedLoop, run_loops, warm_up
 from magtwin.sim.motion.commands import Commands
-from magtwin.sim.motion.course import PAYS, Course, run_courses, warm_up
 from magtwin.sim.motion.drive import Motion, Pose, draw_wheel_errors
 from magtwin.sim.motion.engine import Kinematic, Travel
-from magtwin.sim.motion.follow import check_arrived, course_along, course_by
-from magtwin.sim.runs.simulate import Sensed, check_run, sense, streams, travel
+from magtwin.sim.motion.follow import check_arrived, loop_along, loop_by_commands
+from magtwin.sim.runs.sensing import LidarMode, Outside, Sensing, streams
+from magtwin.sim.runs.simulate import Sensed, check_run, sense_all, travel
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
@@ -70,8 +71,8 @@ class Conditions:
     duration_s: float | None = None
     rate_hz: float | None = None
     controller: str = "follower"
-    lidar: Literal["schedule", "on", "off"] = "schedule"
-    outside: Literal["nan", "clamp", "raise"] = "nan"
+    lidar: LidarMode = "schedule"
+    outside: Outside = "nan"
 
 
 class Runs(Summarized, Sequence[Run]):
@@ -112,8 +113,8 @@ class Runs(Summarized, Sequence[Run]):
         self._columns = frozenset(COLUMNS if columns is None else {"t", *columns})
         for name in sorted(self._columns):
             find("column", name, COLUMNS)
-        self._planned: dict[tuple[Path | Commands, float, DriveSpec, float, Pose], Course] = {}
-        self._courses: list[Course | None] = []
+        self._planned: dict[tuple[Path | Commands, float, DriveSpec, float, Pose], ClosedLoop] = {}
+        self._courses: list[ClosedLoop | None] = []
         checked = set()
         steps = 0
         for i in range(len(jobs)):
@@ -126,7 +127,7 @@ class Runs(Summarized, Sequence[Run]):
                 course = self._course(job)
                 steps += course.least_steps if course else 0
                 self._courses.append(course)
-        if steps >= PAYS:
+        if steps >= LOOPS.pays:
             with suppress(ImportError):  # plain Python gives the same bits
                 warm_up()
 
@@ -168,14 +169,14 @@ class Runs(Summarized, Sequence[Run]):
     def _sensed(self, numbers: Sequence[int]) -> list[Sensed]:
         """Drive and sense some runs."""
         draws = {i: streams(np.random.default_rng(self._jobs[i].seed)) for i in numbers}
-        courses: dict[int, Course] = {}
+        courses: dict[int, ClosedLoop] = {}
         for i in numbers:
             if (course := self._courses[i]) is not None:
                 drive = self._jobs[i].scene.robot.drive
                 errors = draw_wheel_errors(drive, draws[i]["drive"])
                 courses[i] = replace(course, drive=drive, wheel_errors=errors)
         together = dict(
-            zip(courses, run_courses(list(courses.values()), self._conditions.obstacles), strict=True)
+            zip(courses, run_loops(list(courses.values()), self._conditions.obstacles), strict=True)
         )
         done = []
         for i in numbers:
@@ -187,7 +188,7 @@ class Runs(Summarized, Sequence[Run]):
                 done.append(self._sense(self._jobs[i], draws[i], motion, metadata))
         return done
 
-    def _travelled(self, job: Job, course: Course, motion: Motion) -> tuple[Travel, Metadata]:
+    def _travelled(self, job: Job, course: ClosedLoop, motion: Motion) -> tuple[Travel, Metadata]:
         """What a robot did that was driven among others."""
         common = self._conditions
         if isinstance(job.path, Commands):
@@ -217,20 +218,19 @@ class Runs(Summarized, Sequence[Run]):
     ) -> Sensed:
         common = self._conditions
         rate = job.scene.robot.magnetometer.rate_hz if common.rate_hz is None else common.rate_hz
-        return sense(
+        sensing = Sensing(
             job.scene,
-            motion,
             draws,
             anomaly_map=common.anomaly_map,
             rate_hz=rate,
-            duration_s=common.duration_s,
             outside=common.outside,
             lidar=common.lidar,
-            metadata=metadata,
             network=common.network,
             wanted=self._columns,
             inputs=common.inputs,
         )
+        how = {**metadata, "outside": common.outside, "lidar": common.lidar}
+        return sense_all(sensing, motion, common.duration_s, how)
 
     def _finished(self, numbers: Sequence[int], sensed: list[Sensed]) -> list[Run]:
         """Whole runs of what was sensed."""
@@ -248,7 +248,7 @@ class Runs(Summarized, Sequence[Run]):
             network=common.network,
         )
 
-    def _course(self, job: Job) -> Course | None:
+    def _course(self, job: Job) -> ClosedLoop | None:
         """The course of a job, without its wheels' errors: planned once for all who drive alike.
 
         None where it is not known beforehand: where somebody drives, or a run is driven once more.
@@ -265,14 +265,16 @@ class Runs(Summarized, Sequence[Run]):
             odometry_noise_std=0.0,
         )
         if isinstance(job.path, str):
-            still = course_by([[0.0, 0.0, 0.0]], alike, start=job.scene.start, footprint_radius_m=radius)
+            still = loop_by_commands(
+                [[0.0, 0.0, 0.0]], alike, start=job.scene.start, footprint_radius_m=radius
+            )
             still.check(common.obstacles)
             return None
         key = (job.path, job.speed, alike, radius, job.scene.start)
         if key in self._planned:
             return self._planned[key]
         if isinstance(job.path, Path):
-            course = course_along(
+            course = loop_along(
                 job.path,
                 alike,
                 speed=job.speed,
@@ -282,7 +284,7 @@ class Runs(Summarized, Sequence[Run]):
                 footprint_radius_m=radius,
             )
         else:
-            course = course_by(
+            course = loop_by_commands(
                 job.path.rows,
                 alike,
                 start=job.scene.start,

@@ -1,16 +1,14 @@
-"""Course: a robot's closed loop, ready to be run, alone or with many others, in plain Python or compiled."""
+"""ClosedLoop: the closed loop of one robot or many, in plain Python or compiled."""
 
 import math
-import os
 from array import array
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.compiled import Loops, in_threads
 from magtwin.errors import InputError
 from magtwin.field.maps import lookup
 from magtwin.sim.motion import loop
@@ -21,11 +19,8 @@ from magtwin.spec.obstacles import Obstacles
 
 Array = NDArray[np.float64]
 
-PAYS = 140_000
-"""Steps in plain Python that take as long as opening the compiled loop; whoever had as many has more."""
-
-NUMBA = 20
-"""How much less that is where numba is open already, for lookups of fields."""
+LOOPS = Loops("magtwin.sim.motion.compiled", pays=140_000)
+"""The compiled loop, and the steps of plain Python that take as long as opening it."""
 
 BLOCK = 8192
 """Steps that are recorded at a time, as most courses end long before their last step."""
@@ -34,36 +29,26 @@ RECORDED = 40_000_000
 """Numbers that the records and tables of robots driven at once may hold: 0.3 GB."""
 
 SHARE = 200_000
-"""Steps from which on a thread of compiled code is worth its start."""
+"""Steps for which a thread of compiled code is worth its start."""
 
 TOUCH_M = 1e-9
 """Rounding that a start beside an obstacle is forgiven [m]."""
 
 
-class _Loop:
-    """Which loop runs."""
-
-    compiled: ModuleType | None = None
-    made: int = 0
-
-
 def warm_up() -> None:
-    """Have every course run compiled from now on, as pays before runs of hours, or of many robots.
+    """Open the compiled loop and the compiled look-ups of fields, as pays before long jobs.
 
-    Lookups of fields are so too: with numba open that is a fiftieth of a second. All of it takes a second
-    where the machine code has been kept from an earlier time, else some. It gives the same bits.
+    This takes about a second if the machine code is cached, else a few. The bytes of a run stay the same.
 
     Raises:
-        ImportError: numba does not work here. Courses stay in plain Python then.
+        ImportError: numba does not work here. The loop stays in plain Python then.
     """
-    from magtwin.sim.motion import compiled
-
-    _Loop.compiled = compiled
+    LOOPS.open()
     lookup.warm_up()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Course:
+class ClosedLoop:
     """What one robot's closed loop needs."""
 
     drive: DriveSpec
@@ -142,7 +127,7 @@ class Course:
             )
 
 
-def run_courses(courses: Sequence[Course], obstacles: Obstacles | None = None) -> list[Motion]:
+def run_loops(courses: Sequence[ClosedLoop], obstacles: Obstacles | None = None) -> list[Motion]:
     """Drive robots, each as if it were alone: the same bits whatever their number, order and way of running.
 
     Args:
@@ -161,41 +146,20 @@ def run_courses(courses: Sequence[Course], obstacles: Obstacles | None = None) -
         course.check(obstacles)
     if len({course.dt for course in courses}) > 1:
         raise InputError("courses that are run at once must have the same length of a step")
-    if _opened(courses) is None:
-        return [_alone(course, obstacles) for course in courses]
+    code = LOOPS.after(sum(course.least_steps for course in courses))
+    if code is None:
+        return [_in_python(course, obstacles) for course in courses]
     motions: list[Motion] = []
-    group: list[Course] = []
+    group: list[ClosedLoop] = []
     size = 0
     for course in courses:
         own = min(course.steps, BLOCK) * loop.RECORD + course.guide.table.size
         if group and size + own > RECORDED:
-            motions += _together(group, obstacles)
+            motions += _compiled(group, obstacles)
             group, size = [], 0
         group.append(course)
         size += own
-    return motions + (_together(group, obstacles) if group else [])
-
-
-def _opened(courses: Sequence[Course]) -> ModuleType | None:
-    """The compiled loop, if it is open or is now worth opening."""
-    if _Loop.compiled is not None:
-        return _Loop.compiled
-    pays = PAYS if lookup.LOOPS.code is None else PAYS / NUMBA
-    if _Loop.made + sum(course.least_steps for course in courses) >= pays:
-        try:
-            warm_up()
-        except ImportError:
-            _Loop.made = -(2**62)  # there is no compiled loop here
-    return _Loop.compiled
-
-
-def compiled_robots() -> Callable[..., None]:
-    """The compiled `loop.robots`, for those who lay out its arrays themselves; opened by `warm_up`."""
-    if _Loop.compiled is None:
-        warm_up()
-    assert _Loop.compiled is not None
-    robots: Callable[..., None] = _Loop.compiled.robots
-    return robots
+    return motions + (_compiled(group, obstacles) if group else [])
 
 
 def fence_of(obstacles: Obstacles) -> tuple[Array, Array, NDArray[np.int64]]:
@@ -206,7 +170,7 @@ def fence_of(obstacles: Obstacles) -> tuple[Array, Array, NDArray[np.int64]]:
     return np.ascontiguousarray(edges.T), np.ascontiguousarray(box.T), begins.astype(np.int64)
 
 
-def _alone(course: Course, obstacles: Obstacles) -> Motion:
+def _in_python(course: ClosedLoop, obstacles: Obstacles) -> Motion:
     """One course in plain Python."""
     edges, boxes, begins = fence_of(obstacles)
     fence, spans = [*edges.tolist(), *boxes.tolist()], begins.tolist()
@@ -221,11 +185,10 @@ def _alone(course: Course, obstacles: Obstacles) -> Motion:
         first += made
         if made < steps:
             break
-    _Loop.made += first
     return _motion(course, np.concatenate(records, axis=1))
 
 
-def _together(courses: Sequence[Course], obstacles: Obstacles) -> list[Motion]:
+def _compiled(courses: Sequence[ClosedLoop], obstacles: Obstacles) -> list[Motion]:
     """Courses in the compiled loop."""
     room = fence_of(obstacles)
     figures = np.array([course.figures() for course in courses])
@@ -261,7 +224,7 @@ def _block(
     Returns:
         What happened, shape (N, RECORD, steps), and how many steps each made, shape (N,).
     """
-    robots, count = compiled_robots(), len(guides)
+    robots, count = LOOPS.open().robots, len(guides)
     distinct = {id(guide.table): guide.table for guide in guides}  # those on one path share its table
     ends = np.cumsum([table.shape[1] for table in distinct.values()])
     places = dict(zip(distinct, ends, strict=True))
@@ -271,21 +234,15 @@ def _block(
     laws = np.array([guide.law for guide in guides], np.int64)
     record, made = np.empty((count, loop.RECORD, steps)), np.empty(count, np.int64)
 
-    def work(a: int, b: int) -> None:
-        mine = laws[a:b], figures[a:b], tables, begin[a:b], last[a:b]
-        robots(*mine, *room, state[a:b], first, steps, record[a:b], made[a:b])
+    def work(rows: slice) -> None:
+        drives = laws[rows], figures[rows], tables, begin[rows], last[rows]
+        robots(*drives, *room, state[rows], first, steps, record[rows], made[rows])
 
-    threads = max(1, min(os.cpu_count() or 1, count, count * steps // SHARE))
-    cuts = [count * k // threads for k in range(threads + 1)]
-    if threads == 1:
-        work(0, count)
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(work, cuts[:-1], cuts[1:]))
+    in_threads(work, count, math.ceil(SHARE / steps))
     return record, made
 
 
-def _motion(course: Course, record: Array) -> Motion:
+def _motion(course: ClosedLoop, record: Array) -> Motion:
     """What a record of `loop.drive_on` tells, shape (RECORD, K)."""
     x, y, yaw, v, w, wheel_v, wheel_w, v_cmd, w_cmd, bump = record
     poses = np.empty((len(x) + 1, 3))
@@ -309,7 +266,7 @@ def _motion(course: Course, record: Array) -> Motion:
 class Chassis:
     """A robot that is commanded step by step: by a controller of one's own, a keyboard, a learner."""
 
-    def __init__(self, course: Course, obstacles: Obstacles | None = None) -> None:
+    def __init__(self, course: ClosedLoop, obstacles: Obstacles | None = None) -> None:
         """Put a robot at the beginning of a course, whose guide is not asked.
 
         Raises:
