@@ -12,7 +12,7 @@ from magtwin.version import __version__ as __version__
 if TYPE_CHECKING:
     from magtwin.errors import InputError, MismatchWarning
     from magtwin.field.maps.map import AnomalyMap
-    from magtwin.figures.plotting import plot
+    from magtwin.figures.plot import plot
     from magtwin.path import Path
     from magtwin.run.run import COLUMNS, Run
     from magtwin.spec.scene import Scene
@@ -37,7 +37,7 @@ _HOME = {
     "Twin": "magtwin.twin",
     "author_scene": "magtwin.twin",
     "open_twin": "magtwin.twin",
-    "plot": "magtwin.figures.plotting",
+    "plot": "magtwin.figures.plot",
     "scene_from_toml": "magtwin.twin",
     "simulate": "magtwin.twin",
     "simulate_many": "magtwin.twin",
