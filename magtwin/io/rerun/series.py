@@ -320,7 +320,7 @@ class Flags:
         send(self.rec, "events", at, rr.TextLog, text=named, level=list(levels))
 
 
-def _place(run: Run, row: int) -> str:
+def _place(run: Run, row: np.intp) -> str:
     """Position of the robot at a row, as text."""
     if "p_world_base" not in run.columns:
         return ""
