@@ -53,14 +53,15 @@ def compare(
     step("Writing the comparison")
     names = (a.name, b.name) if a.name != b.name else (str(a), str(b))
     if out is not None and out.suffix in (".png", ".svg"):
-        from magtwin.figures.charts import plot_comparison
+        from magtwin.figures.comparisons import plot_comparison
 
         plot_comparison(*runs, found, out, names=names, force=force)
     elif out is not None:
-        from magtwin.figures.pages import Told, page_of_comparison, write_page
+        from magtwin.figures.page import write_page
+        from magtwin.figures.reports import NamedRun, page_of_comparison
 
-        told = Told(names[0], runs[0]), Told(names[1], runs[1])
-        write_page(page_of_comparison(*told, found), out, force=force)
+        named = NamedRun(names[0], runs[0]), NamedRun(names[1], runs[1])
+        write_page(page_of_comparison(*named, found), out, force=force)
     if json:
         say(found.to_json())
         return

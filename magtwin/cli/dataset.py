@@ -178,7 +178,7 @@ def correlate(
     step("Ranking the inputs")
     result = correlations(rows.x, rows.y, rows.features, groups)
     if out is not None:
-        from magtwin.figures.correlations import plot_correlations
+        from magtwin.figures.training import plot_correlations
 
         plot_correlations(result, out, title=f"{dataset}", force=force)
     print_report(result.report(f"Correlation with the disturbance in {dataset}"), json)

@@ -12,7 +12,7 @@ from magtwin.cli.terminal import Force, Json, Seed, progress, say, stdout_consol
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
-    from magtwin.figures.pages import Section
+    from magtwin.figures.page import Section
     from magtwin.learn.data.dataset import Dataset
     from magtwin.learn.evaluation.evaluate import Chart, Contender, Evaluation, Trial
     from magtwin.run.run import Run
@@ -134,7 +134,7 @@ def evaluate(
     page = page_of_evaluation(found, curves=curves, more=sections, data=data)
     write_evaluation(page, out, force=force)
     if json:
-        from magtwin.figures.pages import to_json
+        from magtwin.figures.page import to_json
 
         say(to_json(page).rstrip())
         return
@@ -255,7 +255,7 @@ def _traversals(
     found: "Evaluation", scene: Path | None, against: Path | None, engine: str | None
 ) -> "tuple[Section, dict[str, Any]]":
     """One path driven twice, as a section and in figures."""
-    from magtwin.figures.traversals import section_of_traversals
+    from magtwin.figures.comparisons import section_of_traversals
     from magtwin.io.formats import read_run
     from magtwin.io.provenance import made_again
     from magtwin.run.compare import traversals

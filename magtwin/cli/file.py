@@ -267,32 +267,22 @@ def _note(text: str) -> None:
 
 
 def _view_run(file: Path, scene: Path | None) -> None:
-    import tempfile
-
     from magtwin.files import existing
     from magtwin.io.formats import read_run
-    from magtwin.io.rerun.file import view as view_recording
-    from magtwin.io.rerun.file import write_rrd
+    from magtwin.io.rerun.file import show_run
     from magtwin.io.rerun.viewer import show
 
     existing(file, "run")
     if file.suffix == ".rrd" and scene is None:
         with silence():
-            view_recording(file)
+            show(file)
         return
     step("Reading the run")
     run = read_run(file)
     twin = _twin(run, file, scene)
-    if twin is None:
-        with silence():
-            view_recording(file)
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        rrd = Path(folder) / f"{file.stem}.rrd"
-        step("Writing a recording for the viewer")
-        write_rrd(run, rrd, twin)
-        with silence():
-            show(rrd, shown=file)
+    step("Writing a recording for the viewer")
+    with silence():
+        show_run(run, twin, file=file)
 
 
 def _view_together(files: tuple[Path, ...], scene: Path | None, offsets: list[float]) -> None:
@@ -311,7 +301,7 @@ def _view_together(files: tuple[Path, ...], scene: Path | None, offsets: list[fl
         rrd = Path(folder) / "runs.rrd"
         write_comparison(runs, rrd, twin, offsets_s=dict(zip(runs, offsets, strict=True)))
         with silence():
-            show(rrd, shown=files[0])
+            show(rrd, source=files[0])
 
 
 def _view_stage(file: Path) -> None:

@@ -408,7 +408,7 @@ def map_plot(
     force
         Replace the picture if it exists.
     """
-    from magtwin.figures.plots import plot_map
+    from magtwin.figures.maps import plot_map
     from magtwin.files import check_free
 
     check_suffix(out, (".png", ".svg"), "a picture")
@@ -472,7 +472,7 @@ def map_diff(
     step("Comparing the maps")
     found = difference(_open_map(before), _open_map(after))
     if out is not None:
-        from magtwin.figures.plots import plot_difference
+        from magtwin.figures.maps import plot_difference
 
         plot_difference(found, out, force=force)
     report = found.report()

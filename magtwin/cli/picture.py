@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -93,19 +93,19 @@ def film(
     scene: Path | None = None,
     force: Force = False,
 ) -> None:
-    """Draw a run in its lab as a film, or a stage on a turntable.
+    """Draw a run in its lab as a film.
 
     What stands between the camera and the map or the robot is drawn as a veil.
 
     Parameters
     ----------
     file
-        A run, in any format that magtwin reads; or, for a turntable, a stage.
+        A run, in any format that magtwin reads.
     out
         MP4 or GIF to write.
     camera
-        orbit, slowly round the lab; top, straight from above; chase, from behind the robot; x,y,z:x,y,z, the
-        camera's place and its target in metres; or turntable, once round a stage as it stands, in 10 s.
+        orbit, slowly round the lab; top, straight from above; chase, from behind the robot; or
+        x,y,z:x,y,z, the camera's place and its target in metres.
     fps
         Frames per second.
     speed
@@ -117,35 +117,16 @@ def film(
     force
         Replace what exists.
     """
-    from magtwin.figures.films import film_of_run, film_of_stage
+    from magtwin.figures.films import film_of_run
     from magtwin.files import check_free, existing
 
-    existing(file, "stage" if camera == "turntable" else "run")
+    existing(file, "run")
     check_free(out, force=force)
     pixels = None if size is None else _size(size)
-    turned = camera == "turntable"
-    if turned and (speed is not None or scene is not None):
-        raise InputError("a turntable shows a stage as it stands: it takes no --speed and no --scene")
-    run, stage = (None, file) if turned else _run_and_scene(file, scene)
+    run, stage = _run_and_scene(file, scene)
     with progress("Filming", "frames") as advance:
-
-        def told(k: int, n: int) -> None:
-            advance(k, n)
-
-        if run is None:
-            film_of_stage(stage, out, fps=fps, size=pixels, force=force, advance=told)
-        else:
-            film_of_run(
-                run,
-                stage,
-                out,
-                fps=fps,
-                speed=speed,
-                camera=camera,
-                size=pixels,
-                force=force,
-                advance=told,
-            )
+        options: dict[str, Any] = {"fps": fps, "speed": speed, "camera": camera, "size": pixels}
+        film_of_run(run, stage, out, **options, force=force, advance=advance)
     say(f"Wrote {out}")
 
 

@@ -37,14 +37,15 @@ def report(
         Replace what exists.
     """
     from magtwin.errors import InputError
-    from magtwin.figures.pages import WRITERS, Told, page_of_runs, write_page
+    from magtwin.figures.page import WRITERS, write_page
+    from magtwin.figures.reports import NamedRun, page_of_runs
     from magtwin.files import check_free
     from magtwin.io.formats import read_run
     from magtwin.io.provenance import map_of, planned_of
 
     check_suffix(out, tuple(WRITERS), "a report")
     check_free(out, force=force)
-    told = []
+    named = []
     files = [file for given in runs for file in _files(given)]
     names = [file.name for file in files]
     with progress("Reading", "runs") as advance:
@@ -57,15 +58,15 @@ def report(
             except InputError as error:
                 note = f"Its map is not shown: {error}."
             name = file.name if names.count(file.name) == 1 else str(file)
-            told.append(Told(name, run, field, planned_of(run, near=file), note))
+            named.append(NamedRun(name, run, field, planned_of(run, near=file), note))
     with progress("Drawing", "runs") as advance:
-        advance(0, len(told))
+        advance(0, len(named))
         page = page_of_runs(
-            told,
-            pictures=out.suffix == ".html" and len(told) <= MOST_PICTURED,
-            advance=lambda done: advance(done, len(told)),
+            named,
+            pictures=out.suffix == ".html" and len(named) <= MOST_PICTURED,
+            advance=lambda done: advance(done, len(named)),
         )
-    if out.suffix == ".html" and len(told) > MOST_PICTURED:
+    if out.suffix == ".html" and len(named) > MOST_PICTURED:
         page = replace(page, lead=f"{page.lead} Pictures are left out of more than {MOST_PICTURED} runs.")
     write_page(page, out, force=force)
     say(f"Wrote {out}")

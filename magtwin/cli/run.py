@@ -593,7 +593,7 @@ class _Outputs:
                         **options,
                     )
         if self.folder:
-            from magtwin.figures.plotting import plot_run
+            from magtwin.figures.runs import plot_run
 
             planned = driven.planned
             plot_run(

@@ -120,12 +120,9 @@ def train(
     """
     import numpy as np
 
-    from magtwin.figures.learning_curves import (
-        plot_learning_curve,
-        record_learning_curve,
-        write_learning_curve,
-    )
+    from magtwin.figures.training import plot_learning_curve, write_learning_curve
     from magtwin.files import check_free, output, sha256
+    from magtwin.io.rerun.learning import record_learning_curve
     from magtwin.learn.data.dataset import open_dataset
     from magtwin.learn.data.split import split as split_of
     from magtwin.learn.training.config import TrainConfig, read_config

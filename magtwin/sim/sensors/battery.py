@@ -169,12 +169,12 @@ class Battery(SampledSensor):
         else:
             self._history, self._first = self._history[-1:], self._done
         last = max(int(np.ceil((until_s - 1e-9) / STEP_S)) - 1, self._done)
-        times: Array = np.arange(self._done, last + 1) * STEP_S
+        times = np.asarray(np.arange(self._done, last + 1) * STEP_S, np.float64)
         self._done = last
         if len(times) > 1:
-            energy: Array = np.asarray(wheels_energy_j(self.spec, self._drive, motion.at(times)), float)
+            energy = wheels_energy_j(self.spec, self._drive, motion.at(times))
             steps = self.draw(energy, self._lidar_on(times[:-1]), STEP_S)
-            rows: Array = np.column_stack([steps.power_w, steps.fraction, steps.voltage_v, steps.current_a])
+            rows = np.column_stack([steps.power_w, steps.fraction, steps.voltage_v, steps.current_a])
             self._history = np.concatenate([self._history, rows])
 
     def _states(self, t: Array) -> Array:
