@@ -11,33 +11,33 @@ from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 from magtwin.errors import InputError
 from magtwin.files import check_free, output, sha256
 from magtwin.spec.scene import DriveSpec
-from magtwin.urdf.description.control import define_differential, define_safety, read_commands, read_drive
 from magtwin.urdf.description.description import Description, origin_of, read_description
-from magtwin.urdf.description.gazebo import (
+from magtwin.urdf.description.tag import Tags
+from magtwin.urdf.layout import GEOMETRIES, PAYLOADS, check_payloads, write_layers
+from magtwin.urdf.lint import lint
+from magtwin.urdf.material import LOOKS
+from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
+from magtwin.urdf.meshes.texture import TEXTURES
+from magtwin.urdf.options import DEFAULTS, Options
+from magtwin.urdf.physics.control import define_differential, define_safety, read_commands, read_drive
+from magtwin.urdf.physics.drive import NO_WHEELS, WheelDrive, check_rules
+from magtwin.urdf.physics.gazebo import (
     Surface,
     define_springs,
     define_weightless,
     read_surfaces,
     self_collides,
 )
-from magtwin.urdf.description.tag import Tags
-from magtwin.urdf.drive import NO_WHEELS, WheelDrive, check_rules
-from magtwin.urdf.joint import define_joint, define_mimic, define_root_joint
-from magtwin.urdf.layout import GEOMETRIES, PAYLOADS, check_payloads, write_layers
-from magtwin.urdf.link import Rider, define_body, define_frame, is_marker
-from magtwin.urdf.lint import lint
-from magtwin.urdf.material import LOOKS
-from magtwin.urdf.mechanism import Mechanism, read_mechanism
-from magtwin.urdf.merge import WORLD, Place, carried, place_links, riders
-from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
-from magtwin.urdf.meshes.texture import TEXTURES
-from magtwin.urdf.options import DEFAULTS, Options
+from magtwin.urdf.physics.joint import define_joint, define_mimic, define_root_joint
+from magtwin.urdf.physics.link import Rider, define_body, define_frame, is_marker
+from magtwin.urdf.physics.mechanism import Mechanism, read_mechanism
+from magtwin.urdf.physics.merge import WORLD, Place, carried, place_links, riders
+from magtwin.urdf.physics.wheel import find_wheels, fit_wheels, grip, not_on
 from magtwin.urdf.report import ConversionReport, Ledger, make_report
 from magtwin.urdf.sensor import define_sensors
 from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_visual, pose_of
 from magtwin.urdf.simready import check_metadata, metadata
 from magtwin.urdf.source.source import read_source
-from magtwin.urdf.wheel import find_wheels, fit_wheels, grip, not_on
 from magtwin.usd.layers import describe_stage, open_stage
 from magtwin.usd.sensors import write_pose
 

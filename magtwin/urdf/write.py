@@ -22,8 +22,8 @@ from magtwin.errors import InputError
 from magtwin.files import check_free, output
 from magtwin.frames import matrix_from_quat
 from magtwin.report import Figure, Report
-from magtwin.urdf.joint import AXIS
-from magtwin.urdf.link import SITE_API
+from magtwin.urdf.physics.joint import AXIS
+from magtwin.urdf.physics.link import SITE_API
 from magtwin.usd.geometry import SHOWN, Shape, read_shapes, srgb_from_linear
 from magtwin.usd.layers import open_stage
 from magtwin.usd.schema import place

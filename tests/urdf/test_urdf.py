@@ -13,8 +13,8 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.description.description import read_description
-from magtwin.urdf.inertia import principal_axes, quaternion
 from magtwin.urdf.meshes.mesh import corner_normals, read_mesh
+from magtwin.urdf.physics.inertia import principal_axes, quaternion
 from magtwin.usd.geometry import read_links, read_shapes
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'

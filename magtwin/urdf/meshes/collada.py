@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.urdf.meshes.mesh import Paint, Piece, Rgba
+from magtwin.urdf.meshes.mesh import GREY, Paint, Piece, Rgba
 from magtwin.urdf.meshes.polygon import cut_polygons
 from magtwin.urdf.meshes.reading import Reading, numbers
 from magtwin.urdf.meshes.texture import Image, read_image
@@ -22,9 +22,6 @@ from magtwin.urdf.source.markup import parse_markup
 from magtwin.usd.geometry import linear_from_srgb
 
 Element = ElementTree.Element
-
-GREY: Rgba = (0.5, 0.5, 0.5, 1.0)
-"""What a colour that cannot be read is taken for."""
 
 SHADERS = ("phong", "lambert", "blinn", "constant")
 

@@ -16,6 +16,9 @@ SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
 
 Rgba = tuple[float, float, float, float]
 
+GREY: Rgba = (0.5, 0.5, 0.5, 1.0)
+"""Colour of a surface without a material (sRGB)."""
+
 CREASE = np.radians(35)
 """Faces that meet at a smaller angle than this are shaded as one smooth surface [rad]."""
 

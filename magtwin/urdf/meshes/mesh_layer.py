@@ -15,9 +15,8 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.model import Mesh as UrdfMesh
-from magtwin.urdf.material import GREY
 from magtwin.urdf.meshes.collider import Solid, solids_of
-from magtwin.urdf.meshes.mesh import SUFFIXES, Mesh, Paint, distinct, face_normals, read_mesh
+from magtwin.urdf.meshes.mesh import GREY, SUFFIXES, Mesh, Paint, distinct, face_normals, read_mesh
 from magtwin.urdf.meshes.texture import Textures
 from magtwin.urdf.options import DEFAULTS, Collision, Options
 from magtwin.urdf.source.source import MissingFileError

@@ -11,8 +11,8 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, wxyz_from_xyzw
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Link
-from magtwin.urdf.inertia import MassProperties, combined, principal_axes
-from magtwin.urdf.meshes.solid import read_solid
+from magtwin.urdf.physics.inertia import MassProperties, combined, principal_axes
+from magtwin.urdf.physics.solid import read_solid
 
 LINK_API, SITE_API = "IsaacLinkAPI", "IsaacSiteAPI"
 """Isaac Sim's applied schemas, by name: their plugins live in Omniverse, not here."""

@@ -14,10 +14,10 @@ from pxr import Gf, Sdf, Usd, UsdPhysics
 from magtwin.frames import wxyz_from_xyzw
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.model import Joint
-from magtwin.urdf.drive import NO_WHEELS, WheelDrive, choose_drive, define_drive
-from magtwin.urdf.inertia import quaternion
-from magtwin.urdf.mechanism import Mechanism
 from magtwin.urdf.options import DEFAULTS, Options
+from magtwin.urdf.physics.drive import NO_WHEELS, WheelDrive, choose_drive, define_drive
+from magtwin.urdf.physics.inertia import quaternion
+from magtwin.urdf.physics.mechanism import Mechanism
 
 JOINT_API, NEWTON_API, NEWTON_MIMIC_API = "IsaacJointAPI", "NewtonJointAPI", "NewtonMimicAPI"
 PHYSX_API, PHYSX_AXIS_API, PHYSX_MIMIC_API = "PhysxJointAPI", "PhysxJointAxisAPI", "PhysxMimicJointAPI"

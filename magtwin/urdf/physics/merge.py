@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from magtwin.urdf.description.description import origin_of
 from magtwin.urdf.description.model import Shape
-from magtwin.urdf.link import is_marker
-from magtwin.urdf.mechanism import Mechanism
+from magtwin.urdf.physics.link import is_marker
+from magtwin.urdf.physics.mechanism import Mechanism
 
 Place = tuple[str, NDArray[np.float64]]
 """Name of a body, and a pose in it, shape (4, 4)."""

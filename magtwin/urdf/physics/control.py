@@ -15,9 +15,9 @@ from magtwin.errors import InputError, hint
 from magtwin.spec.scene import DriveSpec
 from magtwin.urdf.description.model import Link
 from magtwin.urdf.description.tag import Element, Tags
-from magtwin.urdf.drive import POSITION_STIFFNESS, WHEEL_DAMPING
-from magtwin.urdf.mechanism import Mechanism
 from magtwin.urdf.options import DriveRule
+from magtwin.urdf.physics.drive import POSITION_STIFFNESS, WHEEL_DAMPING
+from magtwin.urdf.physics.mechanism import Mechanism
 from magtwin.usd.sensors import define_drive
 
 PLUGINS = ("diff_drive", "diff-drive", "diffdrive")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Usd, UsdGeom
 
-from magtwin.urdf.inertia import MassProperties
+from magtwin.urdf.physics.inertia import MassProperties
 
 Array = NDArray[np.float64]
 

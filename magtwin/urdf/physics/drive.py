@@ -15,8 +15,8 @@ from pxr import Usd, UsdPhysics
 from magtwin.errors import InputError, hint
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.model import Joint
-from magtwin.urdf.mechanism import SINGLE, Mechanism
 from magtwin.urdf.options import DriveRule, Options
+from magtwin.urdf.physics.mechanism import SINGLE, Mechanism
 
 WHEEL_DAMPING = 5.0
 """Gain of a continuous joint's velocity drive [N m s/rad], for want of a better. Newton 1.8 follows it with

@@ -10,11 +10,11 @@ from pxr import Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description, origin_of
-from magtwin.urdf.description.gazebo import Surface
 from magtwin.urdf.description.model import Joint, Link
-from magtwin.urdf.drive import WheelDrive
-from magtwin.urdf.mechanism import Mechanism
 from magtwin.urdf.options import DriveRule
+from magtwin.urdf.physics.drive import WheelDrive
+from magtwin.urdf.physics.gazebo import Surface
+from magtwin.urdf.physics.mechanism import Mechanism
 
 WHEEL_FRICTION, CASTER_FRICTION = 1.0, 0.05
 """Friction of driven wheels and of what slides, where the URDF gives none: rubber, and a polished ball."""
