@@ -555,7 +555,7 @@ def test_diff_drive_drives_the_wheels_frees_the_casters_and_welds_the_dead_suspe
         drive, stiffness, damping = drive_of(robot, name)
         assert (stiffness, damping) == (0, 0)
         assert np.isfinite(drive.GetMaxForceAttr().Get())
-        assert f"joint {name!r} is no driven wheel: it turns freely" in notes
+        assert f"joint {name!r} is not a driven wheel: it turns freely" in notes
     assert prim(robot, "spring").IsA(UsdPhysics.FixedJoint)
     assert "joint 'spring' (prismatic) is a suspension without effort or speed: welded" in notes
     found = [friction(robot, link) for link in ("left_wheel", "right_wheel", "skid", "base_link")]
@@ -580,7 +580,7 @@ def test_all_wheels_that_a_plugin_names_are_driven_not_the_first_of_each_side(tm
     assert len(joints) == 4
     assert all(UsdPhysics.DriveAPI(joint, "angular").GetDampingAttr().Get() > 0 for joint in joints)
     assert not any("caster" in note or "freely" in note for note in notes)
-    assert "drive plugin: of 2 <left_joint> the first is the drive's" in notes
+    assert "drive plugin: the first of 2 <left_joint> is used" in notes
 
 
 def test_what_the_urdf_says_of_its_wheels_wins_over_the_profile(tmp_path):

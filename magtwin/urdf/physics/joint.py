@@ -1,7 +1,7 @@
 """Joint: how one body holds another, and how it may move.
 
-URDF's joint frame is the child link's; UsdPhysics wants an axis X, Y or Z of a frame on each body, so
-an oblique axis turns both frames. URDF's radians are degrees in UsdPhysics.
+URDF's joint frame is the frame of the child link. UsdPhysics needs an axis X, Y or Z of a frame on each
+body, so an oblique axis turns both frames. Angles are radians in URDF and degrees in UsdPhysics.
 """
 
 from collections.abc import Mapping
@@ -21,10 +21,10 @@ from magtwin.urdf.physics.mechanism import Mechanism
 
 JOINT_API, NEWTON_API, NEWTON_MIMIC_API = "IsaacJointAPI", "NewtonJointAPI", "NewtonMimicAPI"
 PHYSX_API, PHYSX_AXIS_API, PHYSX_MIMIC_API = "PhysxJointAPI", "PhysxJointAxisAPI", "PhysxMimicJointAPI"
-"""Applied schemas of Isaac Sim, Newton and PhysX, by name: their plugins live elsewhere."""
+"""Applied schemas of Isaac Sim, Newton and PhysX; their plugins are not installed here."""
 
 AXIS = "magtwin:axis"
-"""Key of a joint's customData: its axis in the child's body in double precision, where it is oblique."""
+"""Key of a joint's customData: an oblique axis in the child's body in double precision."""
 
 KINDS = {
     "revolute": UsdPhysics.RevoluteJoint,
@@ -32,16 +32,16 @@ KINDS = {
     "prismatic": UsdPhysics.PrismaticJoint,
     "planar": UsdPhysics.Joint,
 }
-"""UsdPhysics' joints by URDF's types; floating is none at all."""
+"""UsdPhysics' joints by URDF type; a floating joint has no prim."""
 
 LOCKED = (1.0, -1.0)
-"""Limits of an axis that cannot move: UsdPhysics has the lower one above the upper."""
+"""Limits of an axis that cannot move: in UsdPhysics, the lower limit is above the upper."""
 
 WHEEL_SPEED = 30.0
-"""Highest speed of a driven wheel where the URDF gives none [rad/s]: some 1 m/s at the rim of a small one."""
+"""Default maximum speed of a driven wheel [rad/s]: about 1 m/s at the rim of a small wheel."""
 
 MIMIC_FREQUENCY = 100.0
-"""Natural frequency of PhysX's mimic [1/s]; with a damping ratio of 0 the coupling is hard whatever it is."""
+"""Natural frequency of PhysX's mimic [1/s]; it has no effect, since a damping ratio of 0 is a hard coupling."""
 
 
 def define_joint(
@@ -54,85 +54,69 @@ def define_joint(
     options: Options = DEFAULTS,
     wheels: Mapping[str, WheelDrive] = NO_WHEELS,
 ) -> Usd.Prim:
-    """Author a joint between two bodies; its mimic comes later, see `define_mimic`.
+    """Author a joint between two bodies; `define_mimic` adds its mimic later.
 
-    A planar joint is a plain PhysicsJoint whose slide along the axis and whose turns across it are
-    locked, the other three axes being limited to -inf..inf, since Newton takes an axis for free only
-    where it says so. PhysX holds such a joint outside its reduced coordinates.
+    A planar joint is a PhysicsJoint whose slide along the axis and whose rotations across it are locked.
+    The other three axes have limits of -inf..inf, because Newton needs explicit limits on free axes. PhysX
+    holds such a joint outside its reduced coordinates.
 
     Args:
-        stage: Written to in its edit target.
+        stage: Stage; its edit target is written to.
         path: Path of the joint's prim.
-        joint: The joint; not a floating one.
+        joint: A joint that is not floating.
         ends: Paths of the parent's and the child's body.
-        T: Pose in the parent's body of the joint at 0, or at rest if it is welded, shape (4, 4).
-        mechanism: Joints of the description; its description takes notes of what was guessed.
+        T: Pose of the joint in the parent's body, at 0, or at rest if welded, shape (4, 4).
+        mechanism: Joints of the description, which receives notes.
         options: Drives and profile.
-        wheels: Joints of driven wheels by name, see `choose_drive`.
+        wheels: Drives of driven wheels by joint name, see `choose_drive`.
 
     Raises:
-        InputError: A limit is missing; the text gives the line.
+        InputError: A limit is missing; the message gives the line.
     """
-    description, reason = mechanism.description, mechanism.welded.get(joint.name)
-    made = (UsdPhysics.FixedJoint if reason is not None else KINDS[joint.type]).Define(stage, path)
-    made.CreateBody0Rel().SetTargets([ends[0]])
-    made.CreateBody1Rel().SetTargets([ends[1]])
-    turn = np.eye(3)
-    if reason is None:
-        token, turn = _axis(joint.axis)
-        length = float(np.linalg.norm(joint.axis))
-        if not np.array_equal(np.abs(turn), np.abs(np.round(turn))):  # single precision would turn it by 1e-7
-            unit = np.asarray(joint.axis, float) / length
-            made.GetPrim().SetCustomDataByKey(AXIS, Gf.Vec3d(*map(float, unit)))
-        if abs(length - 1) > 1e-3:
-            description.note(f"joint {joint.name!r} has an axis of length {length:.3g}: taken as a direction")
-        axes = _free_axes(made, joint, token, description)
-        drive = choose_drive(joint, mechanism, options, wheels)
-        if drive is not None:
-            for axis in axes:
-                define_drive(made.GetPrim(), axis, drive)
-        _tune(made.GetPrim(), joint, axes, joint.name in wheels, description)
-    made.CreateLocalPos0Attr(Gf.Vec3f(*(round(float(v), 12) + 0.0 for v in T[:3, 3])))
-    made.CreateLocalRot0Attr(_quatf(T[:3, :3] @ turn))
-    made.CreateLocalPos1Attr(Gf.Vec3f(0))
-    made.CreateLocalRot1Attr(_quatf(turn))
-    made.GetPrim().AddAppliedSchema(JOINT_API)
-    return made.GetPrim()
+    if joint.name in mechanism.welded:
+        return _define(UsdPhysics.FixedJoint, stage, path, ends, T).GetPrim()
+    description = mechanism.description
+    token, turn = _axis(joint.axis)
+    made = _define(KINDS[joint.type], stage, path, ends, T, turn)
+    prim, length = made.GetPrim(), float(np.linalg.norm(joint.axis))
+    if not np.array_equal(np.abs(turn), np.abs(np.round(turn))):  # single precision would be off by 1e-7
+        prim.SetCustomDataByKey(AXIS, Gf.Vec3d(*map(float, np.asarray(joint.axis, float) / length)))
+    if abs(length - 1) > 1e-3:
+        description.note(f"joint {joint.name!r} has an axis of length {length:.3g}: used as a direction")
+    axes = _free_axes(made, joint, token, description)
+    drive = choose_drive(joint, mechanism, options, wheels)
+    if drive is not None:
+        for axis in axes:
+            define_drive(prim, axis, drive)
+    _tune(prim, joint, axes, joint.name in wheels, description)
+    return prim
 
 
 def define_root_joint(
     stage: Usd.Stage, path: Sdf.Path, ends: tuple[Sdf.Path, Sdf.Path], T: NDArray
 ) -> Usd.Prim:
-    """Bolt a robot's base to the world, where the robot's prim stands.
+    """Fix a robot's base to the world at the robot's prim.
 
     Args:
-        stage: Written to in its edit target.
+        stage: Stage; its edit target is written to.
         path: Path of the joint's prim.
-        ends: Paths of the robot's prim, which is no body, and of the base.
+        ends: Paths of the robot's prim, which is not a body, and of the base.
         T: Pose of the base in the robot's prim, shape (4, 4).
     """
-    made = UsdPhysics.FixedJoint.Define(stage, path)
-    made.CreateBody0Rel().SetTargets([ends[0]])
-    made.CreateBody1Rel().SetTargets([ends[1]])
-    made.CreateLocalPos0Attr(Gf.Vec3f(*(round(float(v), 12) + 0.0 for v in T[:3, 3])))
-    made.CreateLocalRot0Attr(_quatf(T[:3, :3]))
-    made.CreateLocalPos1Attr(Gf.Vec3f(0))
-    made.CreateLocalRot1Attr(Gf.Quatf(1))
-    made.GetPrim().AddAppliedSchema(JOINT_API)
-    return made.GetPrim()
+    return _define(UsdPhysics.FixedJoint, stage, path, ends, T).GetPrim()
 
 
 def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Joint, lead: Joint, mechanism: Mechanism) -> None:
     """Author that a joint follows another, for Newton and for PhysX.
 
-    Newton: q = coef0 + coef1 q_leader, coef0 in degrees where the follower turns. PhysX, until it reads
-    Newton's: q + gearing q_leader + offset = 0, all in degrees or metres; it needs limits on a joint
-    that turns. The follower has no drive of its own, so that the coupling owns it; a runtime that knows
-    neither lets it swing.
+    Newton: q = coef0 + coef1 q_leader, with coef0 in degrees if the follower rotates. PhysX, until it reads
+    Newton's attributes: q + gearing q_leader + offset = 0, in degrees or metres, with limits on a joint
+    that rotates. The follower has no drive, so that the coupling alone moves it; a runtime that supports
+    neither lets it move freely.
 
     Args:
-        prim: The follower's.
-        leader: The leader's.
+        prim: Prim of the follower.
+        leader: Prim of the leader.
         joint: The follower.
         lead: The leader.
         mechanism: Joints of the description.
@@ -141,11 +125,11 @@ def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Joint, lead: Joint, me
     unit, lead_unit = _unit(joint), _unit(lead)
     prim.AddAppliedSchema(NEWTON_MIMIC_API)
     prim.CreateRelationship("newton:mimicJoint", custom=False).SetTargets([leader.GetPath()])
-    _write(prim, "newton:mimicCoef0", kinds.Float, mimic.offset * unit)
-    _write(prim, "newton:mimicCoef1", kinds.Float, mimic.multiplier)
+    _write(prim, "newton:mimicCoef0", mimic.offset * unit)
+    _write(prim, "newton:mimicCoef1", mimic.multiplier)
     if joint.type == "continuous" or lead.type == "continuous":
         mechanism.description.note(
-            f"joint {joint.name!r} follows {lead.name!r} without limits: for Newton, not for older PhysX"
+            f"joint {joint.name!r} follows {lead.name!r} without limits: Newton reads it, older PhysX does not"
         )
         return
     instance, lead_axis = f"rot{_axis(joint.axis)[0]}", f"rot{_axis(lead.axis)[0]}"
@@ -154,14 +138,35 @@ def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Joint, lead: Joint, me
     prim.CreateRelationship(f"{space}:referenceJoint", custom=False).SetTargets([leader.GetPath()])
     axis = prim.CreateAttribute(f"{space}:referenceJointAxis", kinds.Token, False, Sdf.VariabilityUniform)
     axis.Set(lead_axis)
-    _write(prim, f"{space}:gearing", kinds.Float, -mimic.multiplier * unit / lead_unit)
-    _write(prim, f"{space}:offset", kinds.Float, -mimic.offset * unit)
-    _write(prim, f"{space}:naturalFrequency", kinds.Float, MIMIC_FREQUENCY)
-    _write(prim, f"{space}:dampingRatio", kinds.Float, 0.0)
+    _write(prim, f"{space}:gearing", -mimic.multiplier * unit / lead_unit)
+    _write(prim, f"{space}:offset", -mimic.offset * unit)
+    _write(prim, f"{space}:naturalFrequency", MIMIC_FREQUENCY)
+    _write(prim, f"{space}:dampingRatio", 0.0)
+
+
+def _define(
+    schema: Any,
+    stage: Usd.Stage,
+    path: Sdf.Path,
+    ends: tuple[Sdf.Path, Sdf.Path],
+    T: NDArray,
+    turn: NDArray | None = None,
+) -> Any:
+    """A joint of a schema whose frames are turned by `turn`, shape (3, 3), on both bodies."""
+    turn = np.eye(3) if turn is None else turn
+    made = schema.Define(stage, path)
+    made.CreateBody0Rel().SetTargets([ends[0]])
+    made.CreateBody1Rel().SetTargets([ends[1]])
+    made.CreateLocalPos0Attr(Gf.Vec3f(*(round(float(v), 12) + 0.0 for v in T[:3, 3])))
+    made.CreateLocalRot0Attr(_quatf(T[:3, :3] @ turn))
+    made.CreateLocalPos1Attr(Gf.Vec3f(0))
+    made.CreateLocalRot1Attr(_quatf(turn))
+    made.GetPrim().AddAppliedSchema(JOINT_API)
+    return made
 
 
 def _free_axes(made: Any, joint: Joint, token: str, description: Description) -> list[str]:
-    """Author axis and limits of a joint that moves; returns the names of the axes that are free."""
+    """Author axis and limits of a joint that moves; returns the names of the free axes."""
     if joint.type != "planar":
         made.CreateAxisAttr(token)
         _limit(made, joint, description)
@@ -191,17 +196,17 @@ def _quatf(R: NDArray) -> Gf.Quatf:
 
 
 def _unit(joint: Joint) -> float:
-    """UsdPhysics' measure of a joint's value, over URDF's."""
+    """UsdPhysics' unit of a joint's value, over URDF's."""
     return 1.0 if joint.type == "prismatic" else 180 / np.pi
 
 
-def _write(prim: Usd.Prim, name: str, kind: Sdf.ValueTypeName, value: object) -> None:
-    """Author an attribute of a schema whose plugin is not here."""
-    prim.CreateAttribute(name, kind, custom=False).Set(value)
+def _write(prim: Usd.Prim, name: str, value: float) -> None:
+    """Author a number of a schema whose plugin is not installed."""
+    prim.CreateAttribute(name, Sdf.ValueTypeNames.Float, custom=False).Set(value)
 
 
 def _limit(made: Any, joint: Joint, description: Description) -> None:
-    """Range of a revolute or prismatic joint; a continuous one has none."""
+    """Range of a revolute or prismatic joint; a continuous joint has none."""
     if joint.type == "continuous":
         return
     limit = joint.limit
@@ -217,33 +222,31 @@ def _limit(made: Any, joint: Joint, description: Description) -> None:
 
 
 def _tune(prim: Usd.Prim, joint: Joint, axes: list[str], wheel: bool, description: Description) -> None:
-    """Highest speed, damping and friction of a joint, as Newton and PhysX read them."""
-    names, unit = Sdf.ValueTypeNames.Float, _unit(joint)
-    damping, friction = (
-        float(getattr(joint.dynamics, name, None) or 0.0) for name in ("damping", "friction")
-    )
-    speed = _speed(joint, wheel, description)
+    """Maximum speed, damping and friction of a joint, for Newton and PhysX."""
+    unit = _unit(joint)
+    speed = None if joint.type == "planar" else _speed(joint, wheel, description)
     prim.AddAppliedSchema(NEWTON_API)
-    if speed is not None and joint.type != "planar":
-        _write(prim, "newton:velocityLimit", names, speed * unit)
+    if speed is not None:
+        _write(prim, "newton:velocityLimit", speed * unit)
         prim.AddAppliedSchema(PHYSX_API)
-        _write(prim, "physxJoint:maxJointVelocity", names, speed * unit)
+        _write(prim, "physxJoint:maxJointVelocity", speed * unit)
     if joint.dynamics is None:
         return
-    _write(prim, "newton:damping", names, damping / unit)
-    _write(prim, "newton:friction", names, friction)
+    damping, friction = float(joint.dynamics.damping or 0.0), float(joint.dynamics.friction or 0.0)
+    _write(prim, "newton:damping", damping / unit)
+    _write(prim, "newton:friction", friction)
     for axis in axes if damping or friction else ():
         prim.AddAppliedSchema(f"{PHYSX_AXIS_API}:{axis}")
-        per = 1.0 if axis.startswith(("linear", "trans")) else 180 / np.pi
-        _write(prim, f"physxJointAxis:{axis}:staticFrictionEffort", names, friction)
-        _write(prim, f"physxJointAxis:{axis}:dynamicFrictionEffort", names, friction)
-        _write(prim, f"physxJointAxis:{axis}:viscousFrictionCoefficient", names, damping / per)
-        if speed is not None and joint.type != "planar":
-            _write(prim, f"physxJointAxis:{axis}:maxJointVelocity", names, speed * unit)
+        space, per = f"physxJointAxis:{axis}", 1.0 if axis.startswith(("linear", "trans")) else 180 / np.pi
+        _write(prim, f"{space}:staticFrictionEffort", friction)
+        _write(prim, f"{space}:dynamicFrictionEffort", friction)
+        _write(prim, f"{space}:viscousFrictionCoefficient", damping / per)
+        if speed is not None:
+            _write(prim, f"{space}:maxJointVelocity", speed * unit)
 
 
 def _speed(joint: Joint, wheel: bool, description: Description) -> float | None:
-    """The URDF's highest speed [rad/s or m/s]; None if it gives none, but for a driven wheel."""
+    """The URDF's maximum speed [rad/s or m/s]; None if it gives none, except for a driven wheel."""
     speed = None if joint.limit is None else joint.limit.velocity
     if speed and np.isfinite(speed):
         return float(speed)
