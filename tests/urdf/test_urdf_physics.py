@@ -146,7 +146,7 @@ def test_without_a_density_a_link_without_inertial_is_left_to_the_engine_and_not
     assert not robot.GetPrimAtPath("hand").HasAPI(UsdPhysics.MassAPI)
     assert "link 'hand' has no <inertial>: engines take its mass from its colliders" in notes
     _stage, robot, notes = convert(arm(tmp_path, "fixed|", f"<visual>{BALL}</visual>"))
-    assert any("with no collider either, it has no mass" in note for note in notes)
+    assert any("without a collider, engines cannot find its mass" in note for note in notes)
 
 
 @pytest.mark.parametrize(
@@ -427,7 +427,7 @@ def test_what_follows_a_welded_joint_is_welded_too(tmp_path):
     ("mimic", "kind", "message"),
     [
         ('<mimic joint="lead" multiplier="0"/>', "revolute", "mimics with multiplier 0; make it fixed"),
-        ('<mimic joint="lead"/>', "planar", "is planar and has no one value with which to mimic 'lead'"),
+        ('<mimic joint="lead"/>', "planar", "is planar and has no single value to mimic 'lead' with"),
     ],
 )
 def test_impossible_mimics_are_refused_with_their_line(tmp_path, mimic, kind, message):
@@ -600,7 +600,7 @@ def test_the_general_profile_keeps_a_suspension_that_is_not_quite_dead(tmp_path)
 
 
 def test_a_robot_without_two_wheels_is_no_diff_drive(tmp_path):
-    with pytest.raises(InputError, match=r"profile diff-drive wants two wheels, .* found none"):
+    with pytest.raises(InputError, match=r"profile diff-drive needs two wheels, .* found none"):
         convert(arm(tmp_path, f'revolute|<axis xyz="0 1 0"/>{LIMIT}'), profile="diff-drive")
 
 

@@ -75,10 +75,39 @@ class Geometry:
 
     @property
     def empty(self) -> bool:
-        """Whether it is a primitive without any size; a capsule may be a ball."""
+        """Whether it is a primitive of size 0; a capsule of length 0 is a ball."""
         sizes = [] if self.box is None else [*self.box.size]
         sizes += [form.radius for form in (self.capsule, self.cylinder, self.sphere) if form]
         return 0 in sizes or (self.cylinder is not None and self.cylinder.length == 0)
+
+    @property
+    def volume(self) -> float:
+        """Volume of a primitive [m3]."""
+        if self.box is not None:
+            return float(np.prod(self.box.size))
+        form = self.sphere or self.cylinder or self.capsule
+        assert form is not None
+        ball = 0.0 if self.cylinder else 4 / 3 * np.pi * form.radius**3
+        return ball + np.pi * form.radius**2 * getattr(form, "length", 0.0)
+
+    def half_extents(self, R: Array) -> Array:
+        """Half the edges of the axis-aligned box around a primitive at the origin [m], shape (3,).
+
+        A disc of radius r with normal n reaches r sqrt(1 - n_i^2) along axis i.
+
+        Args:
+            R: Rotation of the primitive, shape (3, 3).
+        """
+        if self.box is not None:
+            return np.abs(R) @ (self.box.size / 2)
+        if self.sphere is not None:
+            return np.full(3, self.sphere.radius)
+        n = R[:, 2]
+        if self.cylinder is not None:
+            rim = self.cylinder.radius * np.sqrt(np.clip(1 - n**2, 0, 1))
+            return rim + np.abs(n) * self.cylinder.length / 2
+        assert self.capsule is not None
+        return self.capsule.radius + np.abs(n) * self.capsule.length / 2
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Wheel: what the profile diff-drive finds on a robot, its driven wheels and what slides on the floor."""
+"""Wheel: for the profile diff-drive, the driven wheels of a robot and the parts that slide on the floor."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -17,57 +17,60 @@ from magtwin.urdf.physics.gazebo import Surface
 from magtwin.urdf.physics.mechanism import Mechanism
 
 WHEEL_FRICTION, CASTER_FRICTION = 1.0, 0.05
-"""Friction of driven wheels and of what slides, where the URDF gives none: rubber, and a polished ball."""
+"""Default friction of driven wheels (rubber) and of sliding parts (a polished ball)."""
 
 RESPONSE = 0.007
-"""Time in which a wheel's drive takes on a speed [s]."""
+"""Response time of a wheel's velocity drive [s]."""
 
 GRAVITY = 9.81
 """[m/s2]."""
 
 CASTER_NAMES = ("caster", "castor")
-"""What links that slide are called."""
+"""Words in the names of links that slide."""
 
 FLOOR = 0.002
-"""Distance from the lowest point of the wheels within which something else touches the floor too [m]."""
+"""Height above the lowest point of the wheels within which other parts touch the floor [m]."""
 
 
 def find_wheels(mechanism: Mechanism, named: Iterable[str] = ()) -> tuple[str, ...]:
     """Names of the joints of a robot's driven wheels.
 
-    Those that a drive plugin names, or else the continuous joints about a level axis, but those of
-    casters: called so, or below a joint that swivels about the vertical.
+    These are the joints that a drive plugin names. Without a plugin, they are the continuous joints about a
+    horizontal axis, except casters: joints with such a name, or below a joint that swivels.
 
     Args:
         mechanism: Joints of the description.
-        named: Names of joints that a drive plugin gives.
+        named: Joints that a drive plugin names.
 
     Raises:
         InputError: There are fewer than two.
     """
     description, poses = mechanism.description, mechanism.poses()
     joints = {joint.name: joint for joint in description.joints.values()}
-    wheels = tuple(
-        name for name in named if name in joints and joints[name].type in ("continuous", "revolute")
-    )
+    wheels = tuple(n for n in named if n in joints and joints[n].type in ("continuous", "revolute"))
     if not wheels:
+        slopes = {
+            name: abs(poses[joint.child][2, :3] @ joint.axis) / np.linalg.norm(joint.axis)
+            for name, joint in joints.items()
+            if joint.type == "continuous"
+        }
         wheels = tuple(
             name
-            for name, joint in joints.items()
-            if _rolls(joint, poses)
-            and not any(word in f"{name} {joint.child}".lower() for word in CASTER_NAMES)
-            and not any(_swivels(above, poses) for above in _above(joint, description))
+            for name, slope in slopes.items()
+            if slope < 0.5  # within 30 degrees of the horizontal
+            and not any(word in f"{name} {joints[name].child}".lower() for word in CASTER_NAMES)
+            and not any(slopes.get(above.name, 0) >= 0.5 for above in _above(joints[name], description))
         )
     if len(wheels) < 2:
         raise InputError(
-            f"{description.path}: profile diff-drive wants two wheels, continuous joints about a level axis; "
-            f"found {', '.join(wheels) or 'none'}; convert with the profile general"
+            f"{description.path}: profile diff-drive needs two wheels, continuous joints about a horizontal "
+            f"axis; found {', '.join(wheels) or 'none'}; convert with the profile general"
         )
     return wheels
 
 
 def not_on(wheels: Iterable[str], rules: Iterable[DriveRule]) -> tuple[DriveRule, ...]:
-    """The rules that fit no driven wheel: this profile knows better than an interface without gains."""
+    """The rules that match no driven wheel; the profile's gains replace those of an interface."""
     names = tuple(wheels)
     return tuple(rule for rule in rules if not any(fnmatchcase(name, rule.joints) for name in names))
 
@@ -75,20 +78,20 @@ def not_on(wheels: Iterable[str], rules: Iterable[DriveRule]) -> tuple[DriveRule
 def fit_wheels(
     mechanism: Mechanism, wheels: Iterable[str], bodies: Mapping[str, Usd.Prim]
 ) -> dict[str, WheelDrive]:
-    """What the wheels need to drive this robot, from its mass m, their number n and their radius r.
+    """Drives of the wheels, from the robot's mass m, the number of wheels n and their radius r.
 
-    Gain kd = m r^2 / (n t): the robot takes on a commanded speed within some t = RESPONSE. Torque
-    mu m g r / n: what the rim can pass on to the floor. Measured in Newton 1.8 with a 5.4 kg robot at
-    120 to 500 steps a second, a step of the command is followed to 3 %; ten times the gain needs 500
-    steps, since its solver holds a saturated drive back by kd dt as if that were inertia.
+    Gain kd = m r^2 / (n t): the robot reaches a commanded speed within about t = RESPONSE. Torque
+    mu m g r / n: the most that the floor can take. In Newton 1.8, a robot of 5.4 kg at 120 to 500 steps a
+    second follows a step of the command to 3 %. Ten times the gain needs 500 steps, because the solver
+    slows a saturated drive by kd dt as if that were inertia.
 
     Args:
         mechanism: Joints of the description.
-        wheels: Names of the joints of driven wheels.
-        bodies: Prims of the bodies by name of their link, with masses and shapes.
+        wheels: Joints of driven wheels.
+        bodies: Prims of the bodies by link name, with masses and shapes.
 
     Returns:
-        Drives by name of the joint; the usual one where a wheel has no shape or the robot no mass.
+        Drives by joint name; the default where a wheel has no shape or the robot no mass.
     """
     masses = [
         UsdPhysics.MassAPI(p).GetMassAttr().Get() for p in bodies.values() if p.HasAPI(UsdPhysics.MassAPI)
@@ -108,15 +111,14 @@ def fit_wheels(
 
 
 def grip(mechanism: Mechanism, wheels: Iterable[str], surfaces: Mapping[str, Surface]) -> dict[str, Surface]:
-    """Surfaces by link, with friction for wheels and casters that have none of their own.
+    """Surfaces by link, with default friction for wheels and casters.
 
-    A caster is a link with a collider that is called one, or whose primitive touches the floor on which
-    the wheels stand.
+    A caster is a link with a collider that has such a name, or whose primitive touches the floor.
 
     Args:
-        mechanism: Joints of the description; its description takes notes of what was guessed.
-        wheels: Names of the joints of driven wheels.
-        surfaces: Those that the URDF gives; they win.
+        mechanism: Joints of the description, which receives notes.
+        wheels: Joints of driven wheels.
+        surfaces: Surfaces from the URDF; they override the defaults.
     """
     description, poses = mechanism.description, mechanism.poses()
     given, driven = dict(surfaces), {j.child for j in description.joints.values() if j.name in wheels}
@@ -124,10 +126,12 @@ def grip(mechanism: Mechanism, wheels: Iterable[str], surfaces: Mapping[str, Sur
     for name, link in description.links.items():
         if name in given or not link.collisions:
             continue
-        called = any(word in name.lower() for word in CASTER_NAMES)
         if name in driven:
             friction, what = WHEEL_FRICTION, "a driven wheel"
-        elif called or abs(_lowest(link, poses[name]) - floor) < FLOOR:
+        elif (
+            any(word in name.lower() for word in CASTER_NAMES)
+            or abs(_lowest(link, poses[name]) - floor) < FLOOR
+        ):
             friction, what = CASTER_FRICTION, "a caster"
         else:
             continue
@@ -137,27 +141,12 @@ def grip(mechanism: Mechanism, wheels: Iterable[str], surfaces: Mapping[str, Sur
 
 
 def _radius(body: Usd.Prim, axis: NDArray) -> float:
-    """Half of the largest extent of a wheel across its axis [m]; 0 if it has no shape."""
+    """Half the largest extent of a wheel across its axis [m]; 0 if it has no shape."""
     purposes = [UsdGeom.Tokens.guide, UsdGeom.Tokens.default_, UsdGeom.Tokens.render]
     cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes)
     extent = cache.ComputeUntransformedBound(body).ComputeAlignedRange()
     across = np.abs(axis) / np.linalg.norm(axis) < 0.7
     return 0.0 if extent.IsEmpty() else float(np.max(np.asarray(extent.GetSize())[across]) / 2)
-
-
-def _rolls(joint: Joint, poses: Mapping[str, NDArray]) -> bool:
-    """Whether a joint turns for ever about an axis within 30 degrees of level."""
-    return joint.type == "continuous" and abs(_axis(joint, poses)[2]) < 0.5
-
-
-def _swivels(joint: Joint, poses: Mapping[str, NDArray]) -> bool:
-    """Whether a joint turns for ever about an axis that is not level."""
-    return joint.type == "continuous" and abs(_axis(joint, poses)[2]) >= 0.5
-
-
-def _axis(joint: Joint, poses: Mapping[str, NDArray]) -> NDArray[np.float64]:
-    """Unit axis of a joint in the root link's frame, shape (3,)."""
-    return np.asarray(poses[joint.child][:3, :3] @ joint.axis / np.linalg.norm(joint.axis))
 
 
 def _above(joint: Joint, description: Description) -> Iterable[Joint]:
@@ -168,22 +157,7 @@ def _above(joint: Joint, description: Description) -> Iterable[Joint]:
 
 
 def _lowest(link: Link, pose: NDArray) -> float:
-    """Height of the lowest point of a link's primitive colliders in the root link's frame [m].
-
-    A primitive reaches down by its support in the direction of gravity; inf where there is none.
-    """
-    heights = [np.inf]
-    for collision in link.collisions:
-        T, geometry = pose @ origin_of(collision), collision.geometry
-        down = np.abs(T[2, :3])  # of the primitive's axes, their slope
-        if geometry.sphere is not None:
-            reach = geometry.sphere.radius
-        elif geometry.box is not None:
-            reach = float(down @ np.asarray(geometry.box.size, float) / 2)
-        elif geometry.cylinder is not None:
-            level = np.sqrt(max(0.0, 1 - down[2] ** 2))
-            reach = geometry.cylinder.length / 2 * down[2] + geometry.cylinder.radius * level
-        else:
-            continue
-        heights.append(T[2, 3] - reach)
-    return float(min(heights))
+    """Height of the lowest point of a link's primitive colliders in the root link's frame [m]; inf for none."""
+    poses = ((pose @ origin_of(part), part.geometry) for part in link.collisions)
+    heights = [T[2, 3] - form.half_extents(T[:3, :3])[2] for T, form in poses if form.mesh is None]
+    return float(min(heights, default=np.inf))
