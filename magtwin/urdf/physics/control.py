@@ -132,7 +132,9 @@ def _commands(tags: Tags) -> Iterator[tuple[str, str]]:
                 tags.findall(joint, "state_interface")
                 text = [e.get("name", "") for e in interfaces]
                 if tag == "transmission":
-                    text = [kind for kind in COMMANDS if kind in tags.text(joint, "hardwareInterface").lower()]
+                    text = [
+                        kind for kind in COMMANDS if kind in tags.text(joint, "hardwareInterface").lower()
+                    ]
                 name = _known(tags, joint.get("name", ""), joint)
                 kind = next((kind for kind in COMMANDS if kind in text), None)
                 if kind is not None:
@@ -167,9 +169,7 @@ def _from_plugin(tags: Tags, plugin: Element, mechanism: Mechanism, driven: list
     )
 
 
-def _from_settings(
-    tags: Tags, plugin: Element, mechanism: Mechanism, driven: list[str]
-) -> DriveSpec | None:
+def _from_settings(tags: Tags, plugin: Element, mechanism: Mechanism, driven: list[str]) -> DriveSpec | None:
     """The drive of a diff_drive_controller in the settings that a plugin names; None if there is none."""
     for element in plugin.findall("parameters"):
         where = tags.description.where(element)
@@ -252,7 +252,9 @@ def _spec(
         radius = _radius(description.links[left.child])
         if radius is not None:
             given["wheel_radius_m"] = radius
-            description.note(f"drive: no wheel radius given: {radius:g} m from the left wheel's shape is used")
+            description.note(
+                f"drive: no wheel radius given: {radius:g} m from the left wheel's shape is used"
+            )
     if "v_max" not in given and left.limit is not None and left.limit.velocity:
         given["v_max"] = float(left.limit.velocity) * given.get("wheel_radius_m", DriveSpec.wheel_radius_m)
     if "w_max" not in given and "v_max" in given:

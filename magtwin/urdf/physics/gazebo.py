@@ -100,7 +100,9 @@ def define_weightless(tags: Tags, prim_of: Callable[[str], Usd.Prim]) -> None:
             continue
         prim = prim_of(link)
         if not prim.HasAPI(UsdPhysics.RigidBodyAPI):
-            tags.description.note(f"link {link!r} has no gravity, but is part of a body with gravity", lost=True)
+            tags.description.note(
+                f"link {link!r} has no gravity, but is part of a body with gravity", lost=True
+            )
             continue
         prim.AddAppliedSchema(RIGID_BODY_API)
         kind = Sdf.ValueTypeNames.Bool

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Joint
@@ -46,7 +46,7 @@ class Mechanism:
     def pose(self, joint: Joint) -> NDArray[np.float64]:
         """T_parent_child of a joint's links at rest, shape (4, 4)."""
         T, rest = origin_of(joint), self.rests.get(joint.name, 0.0)
-        return T @ displacement(joint, rest) if rest else T
+        return T @ displacement(joint.axis, rest, slides=joint.type == "prismatic") if rest else T
 
     def poses(self) -> dict[str, NDArray[np.float64]]:
         """T_root_link of each link at rest, shape (4, 4)."""
@@ -82,7 +82,9 @@ def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mec
             if rest:
                 rests[name] = rest
             if joint.mimic is not None:
-                description.note(f"joint {name!r} cannot move: its mimic of {joint.mimic.joint!r} is left out")
+                description.note(
+                    f"joint {name!r} cannot move: its mimic of {joint.mimic.joint!r} is left out"
+                )
             continue
         if joint.mimic is None:
             continue
@@ -98,16 +100,16 @@ def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mec
     return Mechanism(description, welded, mimics, rests)
 
 
-def displacement(joint: Joint, value: float) -> NDArray[np.float64]:
+def displacement(axis: ArrayLike, value: float, *, slides: bool) -> NDArray[np.float64]:
     """Motion of a joint's child from its place at 0: a rotation about the axis, or a slide along it, (4, 4).
 
     R = 1 + sin(q) K + (1 - cos(q)) K^2, with K the cross product with the unit axis (Rodrigues).
     """
-    T, axis = np.eye(4), np.asarray(joint.axis, float) / np.linalg.norm(joint.axis)
-    if joint.type == "prismatic":
-        T[:3, 3] = value * axis
+    T, unit = np.eye(4), np.asarray(axis, float) / np.linalg.norm(axis)
+    if slides:
+        T[:3, 3] = value * unit
         return T
-    K = np.cross(np.eye(3), axis)
+    K = np.cross(np.eye(3), unit)
     T[:3, :3] += np.sin(value) * K + (1 - np.cos(value)) * K @ K
     return T
 
@@ -120,7 +122,9 @@ def _weld_reason(joint: Joint, options: Options) -> str | None:
     if limit is None:
         return None
     powerless = limit.effort == 0 and limit.velocity == 0 and joint.type != "continuous"
-    closed = joint.type in ("revolute", "prismatic") and limit.lower is not None and limit.lower == limit.upper
+    closed = (
+        joint.type in ("revolute", "prismatic") and limit.lower is not None and limit.lower == limit.upper
+    )
     if powerless or closed:
         return "cannot move by its own limits"
     if options.profile == "diff-drive" and joint.type == "prismatic" and 0 in (limit.effort, limit.velocity):
