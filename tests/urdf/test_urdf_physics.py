@@ -11,8 +11,8 @@ from validators import assert_valid
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf import convert_urdf, read_notes
-from magtwin.urdf.physics import solid as solids
 from magtwin.urdf.options import DriveRule, Options
+from magtwin.urdf.physics import solid as solids
 from magtwin.urdf.physics.inertia import MassProperties, combined
 
 LIMIT = '<limit effort="3" velocity="2" lower="-1" upper="0.5"/>'

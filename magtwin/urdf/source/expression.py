@@ -87,7 +87,21 @@ PYTHON: Mapping[str, Any] = {
     "isinstance": isinstance,
 }
 
-_BARE = "bool dict float int len list map max min range round sorted str".split()
+_BARE = [
+    "bool",
+    "dict",
+    "float",
+    "int",
+    "len",
+    "list",
+    "map",
+    "max",
+    "min",
+    "range",
+    "round",
+    "sorted",
+    "str",
+]
 
 GLOBALS: Mapping[str, Any] = {
     **MATH,
@@ -99,8 +113,24 @@ GLOBALS: Mapping[str, Any] = {
 
 METHODS: Mapping[type, frozenset[str]] = {
     str: frozenset(
-        "capitalize count endswith find index isdigit join lower lstrip replace rstrip split startswith strip "
-        "title upper".split()
+        [
+            "capitalize",
+            "count",
+            "endswith",
+            "find",
+            "index",
+            "isdigit",
+            "join",
+            "lower",
+            "lstrip",
+            "replace",
+            "rstrip",
+            "split",
+            "startswith",
+            "strip",
+            "title",
+            "upper",
+        ]
     ),
     list: frozenset({"count", "index"}),
     tuple: frozenset({"count", "index"}),

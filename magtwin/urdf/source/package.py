@@ -12,7 +12,10 @@ MANIFEST = "package.xml"
 DEPTH, FOLDERS = 3, 5_000
 """Depth of the search for packages below a folder, and most folders searched."""
 
-MARKS = (MANIFEST, *"CMakeLists.txt launch mesh meshes model.config models robots urdf xacro".split())
+MARKS = (
+    MANIFEST,
+    *["CMakeLists.txt", "launch", "mesh", "meshes", "model.config", "models", "robots", "urdf", "xacro"],
+)
 """Contents, any of which marks a folder without a manifest as a package."""
 
 
