@@ -97,7 +97,8 @@ def _frames_outside(description: Description, shapes: dict[str, list[Array]]) ->
         p = poses[name][:3, 3]
         off = float(np.linalg.norm(p - np.clip(p, low, high)))
         if not shapes[name] and off > margin:
-            yield f"link {name!r} at ({', '.join(f'{round(float(v), 4) + 0.0:g}' for v in p)}) m lies {off:.3g} m outside of the body"
+            at = ", ".join(f"{round(float(v), 4) + 0.0:g}" for v in p)
+            yield f"link {name!r} at ({at}) m lies {off:.3g} m outside of the body"
 
 
 def _swapped_sides(description: Description) -> Iterator[str]:

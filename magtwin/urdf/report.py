@@ -24,8 +24,8 @@ BOX_TOLERANCE = 1e-5
 """Allowed error of a box relative to its diagonal, for vertices in single precision."""
 
 ROUND_TOLERANCE = 0.01
-"""The same for a sphere, cylinder or capsule, which the stage shows as a polygon of 32 sides: 1 - cos(pi / 32)
-is 0.5 % of its radius."""
+"""The same for a sphere, cylinder or capsule, which the stage shows as a polygon of 32 sides:
+1 - cos(pi / 32) is 0.5 % of its radius."""
 
 
 @dataclass(frozen=True)

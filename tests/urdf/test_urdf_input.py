@@ -19,12 +19,12 @@ URDF = DATA / "urdf"
 XACRO = '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">\n{}\n</robot>\n'
 
 REFUSED = {
-    "link_twice.urdf": r":3: link 'base_link' is there twice, first on line 2; rename one",
-    "joint_twice.urdf": r":9: joint 'j' is there twice, first on line 5; rename one",
+    "link_twice.urdf": r":3: link 'base_link' exists twice, first on line 2; rename one",
+    "joint_twice.urdf": r":9: joint 'j' exists twice, first on line 5; rename one",
     "link_without_name.urdf": r":2: a <link> has no name",
     "robot_without_name.urdf": r":1: <robot> has no name",
     "no_link.urdf": r":1: the robot has no <link>",
-    "two_roots.urdf": r":3: link 'hand' hangs in the air: a robot has one root, this has base_link, hand",
+    "two_roots.urdf": r":3: link 'hand' is not connected: a robot has one root, this has base_link, hand",
     "circle_without_root.urdf": r":4: joint 'j' closes a circle: no link is the root; remove one joint",
     "circle_beside_root.urdf": r":5: joint 'j' closes a circle; remove one joint of it",
     "held_twice.urdf": r":8: joint 'k' holds 'hand', which 'j' holds already",
@@ -363,7 +363,7 @@ def test_slips_are_repaired_and_noted():
     ]
     assert description.dropped == dropped
     assert description.notes[:2] == [
-        "link 'base_link': rgba of <color> is above 1 in '255 0 0': brought down to it",
+        "link 'base_link': rgba of <color> is above 1 in '255 0 0': reduced to it",
         "link 'base_link': rgba of <color> has 3 numbers in '255 0 0': completed by 1",
     ]
 

@@ -205,7 +205,7 @@ def test_a_range_that_is_half_told_ends_at_0_and_one_of_an_endless_joint_is_note
     joint = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath("/arm/joints/j"))
     assert (joint.GetLowerLimitAttr().Get(), joint.GetUpperLimitAttr().Get()) == (0, pytest.approx(57.29578))
     assert UsdPhysics.DriveAPI(joint, "angular").GetMaxForceAttr().Get() == np.inf
-    assert "joint 'j' gives no lower limit: 0, as URDF has it" in notes
+    assert "joint 'j' gives no lower limit: 0, URDF's default" in notes
     _, _, notes = convert(arm(tmp_path, f"continuous|{limit}"))
     assert any("is continuous, which has no range: upper 1 of its <limit>" in n for n in notes)
 

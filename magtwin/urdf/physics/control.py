@@ -18,7 +18,6 @@ from magtwin.urdf.description.tag import Element, Tags
 from magtwin.urdf.options import DriveRule
 from magtwin.urdf.physics.drive import POSITION_STIFFNESS, WHEEL_DAMPING
 from magtwin.urdf.physics.mechanism import Mechanism
-from magtwin.urdf.source.settings import read_settings
 from magtwin.usd.sensors import define_drive
 
 PLUGINS = ("diff_drive", "diff-drive", "diffdrive")
@@ -171,6 +170,8 @@ def _from_plugin(tags: Tags, plugin: Element, mechanism: Mechanism, driven: list
 
 def _from_settings(tags: Tags, plugin: Element, mechanism: Mechanism, driven: list[str]) -> DriveSpec | None:
     """The drive of a diff_drive_controller in the settings that a plugin names; None if there is none."""
+    from magtwin.urdf.source.settings import read_settings  # needs yaml
+
     for element in plugin.findall("parameters"):
         where = tags.description.where(element)
         try:

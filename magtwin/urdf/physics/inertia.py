@@ -1,4 +1,4 @@
-"""Inertia: mass properties of bodies, and inertia tensors as principal moments and axes, as USD stores them."""
+"""Inertia: mass properties of bodies, and inertia tensors as principal moments and axes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

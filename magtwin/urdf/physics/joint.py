@@ -41,7 +41,7 @@ WHEEL_SPEED = 30.0
 """Default maximum speed of a driven wheel [rad/s]: about 1 m/s at the rim of a small wheel."""
 
 MIMIC_FREQUENCY = 100.0
-"""Natural frequency of PhysX's mimic [1/s]; it has no effect, since a damping ratio of 0 is a hard coupling."""
+"""Natural frequency of PhysX's mimic [1/s]; without effect at a damping ratio of 0 (hard coupling)."""
 
 
 def define_joint(
@@ -129,7 +129,7 @@ def define_mimic(prim: Usd.Prim, leader: Usd.Prim, joint: Joint, lead: Joint, me
     _write(prim, "newton:mimicCoef1", mimic.multiplier)
     if joint.type == "continuous" or lead.type == "continuous":
         mechanism.description.note(
-            f"joint {joint.name!r} follows {lead.name!r} without limits: Newton reads it, older PhysX does not"
+            f"joint {joint.name!r} follows {lead.name!r} without limits: read by Newton, not by older PhysX"
         )
         return
     instance, lead_axis = f"rot{_axis(joint.axis)[0]}", f"rot{_axis(lead.axis)[0]}"

@@ -157,7 +157,7 @@ def _above(joint: Joint, description: Description) -> Iterable[Joint]:
 
 
 def _lowest(link: Link, pose: NDArray) -> float:
-    """Height of the lowest point of a link's primitive colliders in the root link's frame [m]; inf for none."""
+    """Height of the lowest point of a link's primitive colliders in the root's frame [m]; inf for none."""
     poses = ((pose @ origin_of(part), part.geometry) for part in link.collisions)
     heights = [T[2, 3] - form.half_extents(T[:3, :3])[2] for T, form in poses if form.mesh is None]
     return float(min(heights, default=np.inf))

@@ -87,25 +87,11 @@ PYTHON: Mapping[str, Any] = {
     "isinstance": isinstance,
 }
 
-_BARE = [
-    "bool",
-    "dict",
-    "float",
-    "int",
-    "len",
-    "list",
-    "map",
-    "max",
-    "min",
-    "range",
-    "round",
-    "sorted",
-    "str",
-]
+_BARE = (bool, dict, float, int, len, list, map, max, min, range, round, sorted, str)
 
 GLOBALS: Mapping[str, Any] = {
     **MATH,
-    **{name: PYTHON[name] for name in _BARE},
+    **{f.__name__: PYTHON[f.__name__] for f in _BARE},
     "math": dict(MATH),
     "python": dict(PYTHON),
 }
@@ -113,24 +99,10 @@ GLOBALS: Mapping[str, Any] = {
 
 METHODS: Mapping[type, frozenset[str]] = {
     str: frozenset(
-        [
-            "capitalize",
-            "count",
-            "endswith",
-            "find",
-            "index",
-            "isdigit",
-            "join",
-            "lower",
-            "lstrip",
-            "replace",
-            "rstrip",
-            "split",
-            "startswith",
-            "strip",
-            "title",
-            "upper",
-        ]
+        (
+            *("capitalize", "count", "endswith", "find", "index", "isdigit", "join", "lower", "lstrip"),
+            *("replace", "rstrip", "split", "startswith", "strip", "title", "upper"),
+        )
     ),
     list: frozenset({"count", "index"}),
     tuple: frozenset({"count", "index"}),
@@ -334,9 +306,9 @@ class _Interpreter:
             for values, times in ((left, right), (right, left)):
                 if isinstance(values, str | list | tuple) and isinstance(times, int):
                     _check_length(len(values) * times)
-        if isinstance(kind, ast.Pow) and isinstance(left, int) and isinstance(right, int):
-            if left.bit_length() * abs(right) > BITS:
-                raise ExpressionError(f"an integer of over {BITS} bits")
+        integers = isinstance(left, int) and isinstance(right, int)
+        if isinstance(kind, ast.Pow) and integers and left.bit_length() * abs(right) > BITS:
+            raise ExpressionError(f"an integer of over {BITS} bits")
         if isinstance(kind, ast.Mod) and isinstance(left, str) and _WIDE.search(left):
             raise ExpressionError("a format of over two digits is not allowed")
         return check_size(OPERATORS[type(kind)](left, right), self._budget)
