@@ -1,4 +1,4 @@
-"""Link: a rigid body with its mass, or a frame that only marks a place."""
+"""Link: a rigid body with its mass, or a frame without mass and shape."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,11 +11,11 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, wxyz_from_xyzw
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Link
-from magtwin.urdf.inertia import MassProperties, combined, principal_axes
-from magtwin.urdf.meshes.solid import read_solid
+from magtwin.urdf.physics.inertia import MassProperties, combined, principal_axes
+from magtwin.urdf.physics.solid import read_solid
 
 LINK_API, SITE_API = "IsaacLinkAPI", "IsaacSiteAPI"
-"""Isaac Sim's applied schemas, by name: their plugins live in Omniverse, not here."""
+"""Isaac Sim's applied schemas; their plugins are not installed here."""
 
 
 @dataclass(frozen=True)
@@ -23,46 +23,41 @@ class Rider:
     """A link that is a body or part of one."""
 
     link: Link
-    """The link."""
 
     pose: NDArray[np.float64]
-    """Its pose in the body, shape (4, 4)."""
+    """Pose of the link in the body, shape (4, 4)."""
 
     colliders: list[Usd.Prim] = field(default_factory=list)
-    """What it touches with, below the body's prim."""
+    """Its colliders below the body's prim."""
 
     visuals: list[Usd.Prim] = field(default_factory=list)
-    """What it shows, below the body's prim."""
+    """Its visuals below the body's prim."""
 
 
 def is_marker(link: Link) -> bool:
-    """Whether a link only names a place: it has neither mass nor shape."""
+    """Whether a link is only a frame, without mass and shape."""
     return link.inertial is None and not link.visuals and not link.collisions
 
 
 def define_body(
     prim: Usd.Prim, parts: Sequence[Rider], description: Description, density: float | None = None
 ) -> Usd.Prim:
-    """Make an Xform a rigid body, with the mass, centre and principal inertia of its links together.
+    """Make an Xform a rigid body with the total mass, centre and principal inertia of its links.
 
     Args:
         prim: The Xform, with its shapes below it.
-        parts: The body's own link, and those that are merged into it.
-        description: Takes notes of what was repaired or guessed.
+        parts: The body's own link, and links merged into it.
+        description: Receives notes of repairs and guesses.
         density: Density of links without mass [kg/m3]; None leaves them without.
 
     Raises:
-        InputError: A mass is not above 0, or no body has such an inertia; the text gives the line.
+        InputError: A mass is not above 0, or an inertia is impossible; the message gives the line.
     """
     prim.AddAppliedSchema(LINK_API)
     UsdPhysics.RigidBodyAPI.Apply(prim).CreateRigidBodyEnabledAttr(True)
     parts = [part for part in parts if part is parts[0] or not is_marker(part.link)]
-    alone = len(parts) == 1
-    known = []
-    for part in parts:
-        properties = _mass_properties(part, prim, description, density, alone)
-        if properties is not None:
-            known.append(properties)
+    properties = [_mass_properties(part, prim, description, density, len(parts) == 1) for part in parts]
+    known = [each for each in properties if each is not None]
     if not known:
         return prim
     whole = known[0] if len(known) == 1 else combined(known)
@@ -70,7 +65,7 @@ def define_body(
     mass.CreateMassAttr(whole.mass)
     mass.CreateCenterOfMassAttr(Gf.Vec3f(*(round(float(v), 12) + 0.0 for v in whole.centre)))
     if not np.isfinite(whole.inertia).all():
-        return prim  # left to the engine, with a note
+        return prim  # the engine computes it, see the note
     tensor = whole.inertia.copy()
     tensor[np.abs(tensor) < 1e-9 * np.abs(tensor).max()] = 0.0
     moments, q, _ = principal_axes(tensor)
@@ -80,7 +75,7 @@ def define_body(
 
 
 def define_frame(prim: Usd.Prim) -> Usd.Prim:
-    """Make an Xform a site: a named frame on the body that it lies under."""
+    """Make an Xform a site: a named frame on the body above it."""
     prim.AddAppliedSchema(SITE_API)
     return prim
 
@@ -88,33 +83,31 @@ def define_frame(prim: Usd.Prim) -> Usd.Prim:
 def _mass_properties(
     part: Rider, body: Usd.Prim, description: Description, density: float | None, alone: bool
 ) -> MassProperties | None:
-    """Mass, centre and inertia of a link in its body's frame; None if nothing says.
+    """Mass properties of a link in its body's frame; None if unknown.
 
-    Where a link that is its own body has a mass and no inertia, the inertia is NaN: engines find it.
+    If a link is a body of its own and has a mass but no inertia, the inertia is NaN: the engine computes it.
     """
     link, inertial = part.link, part.link.inertial
     if inertial is None:
-        return _of_shapes(part, body, description, density, alone)
+        return _from_shapes(part, body, description, density, alone)
     if inertial.mass is None or not (np.isfinite(inertial.mass) and inertial.mass > 0):
         raise description.refused("link", link.name, f"has a mass of {inertial.mass!r} kg; give one above 0")
-    pose = part.pose @ origin_of(inertial)
+    mass, centre = float(inertial.mass), (part.pose @ origin_of(inertial))[:3, 3]
     if inertial.inertia is not None:
         tensor = _checked(link, np.asarray(inertial.inertia, float), origin_of(inertial), description)
-        turned = part.pose[:3, :3] @ tensor @ part.pose[:3, :3].T
-        return MassProperties(float(inertial.mass), pose[:3, 3], turned)
+        return MassProperties(mass, centre, part.pose[:3, :3] @ tensor @ part.pose[:3, :3].T)
     if alone:
         description.note(f"link {link.name!r} has no <inertia>: engines take it from its colliders")
-        return MassProperties(float(inertial.mass), pose[:3, 3], np.full((3, 3), np.nan))
+        return MassProperties(mass, centre, np.full((3, 3), np.nan))
     solid = read_solid(part.colliders or part.visuals, body)
     if solid is None:
         description.note(f"link {link.name!r} has no <inertia> and no shape: its mass counts as a point")
-        return MassProperties(float(inertial.mass), pose[:3, 3], np.zeros((3, 3)))
+        return MassProperties(mass, centre, np.zeros((3, 3)))
     description.note(f"link {link.name!r} has no <inertia>: taken from its shape, filled evenly")
-    filled = solid.mass_properties(inertial.mass / solid.volume)
-    return MassProperties(float(inertial.mass), pose[:3, 3], filled.inertia)
+    return MassProperties(mass, centre, solid.mass_properties(mass / solid.volume).inertia)
 
 
-def _of_shapes(
+def _from_shapes(
     part: Rider, body: Usd.Prim, description: Description, density: float | None, alone: bool
 ) -> MassProperties | None:
     """Mass properties of a link without `<inertial>`: its shapes at a density, if one is given."""
@@ -122,7 +115,7 @@ def _of_shapes(
     if density is None:
         lacks = "engines take its mass from its colliders" if alone else "it adds none to its body's"
         if alone and not part.colliders:
-            lacks = "with no collider either, it has no mass for an engine to find; give a density"
+            lacks = "without a collider, engines cannot find its mass; give a density"
         description.note(f"link {name!r} has no <inertial>: {lacks}")
         return None
     used, solid = "colliders", read_solid(part.colliders, body)
@@ -139,13 +132,13 @@ def _of_shapes(
 
 
 def _checked(link: Link, tensor: NDArray, origin: NDArray, description: Description) -> NDArray[np.float64]:
-    """An inertia in its link's axes, repaired where it just missed being one.
+    """An inertia in its link's axes, repaired if slightly impossible.
 
     Args:
         link: The link.
         tensor: In the axes of the `<inertial>`, shape (3, 3).
         origin: Pose of the `<inertial>` in the link, shape (4, 4).
-        description: Takes a note of a repair.
+        description: Receives a note of a repair.
     """
     turned = origin[:3, :3] @ tensor @ origin[:3, :3].T
     cleared = np.where(np.abs(turned) < 1e-9 * np.abs(turned).max(), 0.0, turned)
@@ -156,8 +149,7 @@ def _checked(link: Link, tensor: NDArray, origin: NDArray, description: Descript
     if not repaired:
         return turned
     description.note(
-        f"link {link.name!r}: its largest moment of inertia exceeded the sum of the others; "
-        "brought down to it"
+        f"link {link.name!r}: its largest moment of inertia exceeded the sum of the others; reduced to it"
     )
     R = matrix_from_quat(q)
     return R @ np.diag(moments) @ R.T

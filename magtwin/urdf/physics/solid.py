@@ -1,4 +1,4 @@
-"""Solid: volume, centre and second moment of shapes filled evenly, from which mass and inertia follow."""
+"""Solid: volume, centre and second moment of evenly filled shapes, for mass and inertia."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Usd, UsdGeom
 
-from magtwin.urdf.inertia import MassProperties
+from magtwin.urdf.meshes.collider import hull_faces
+from magtwin.urdf.physics.inertia import MassProperties
 
 Array = NDArray[np.float64]
 
@@ -29,12 +30,12 @@ class Solid:
         """The solid after x -> A x + t: volumes scale by |det A|, second moments by |det A| A (.) A^T.
 
         Args:
-            A: Turn and stretch, shape (3, 3).
-            t: Shift [m], shape (3,).
+            A: Linear map, shape (3, 3).
+            t: Translation [m], shape (3,).
         """
         A, t = np.asarray(A, float), np.asarray(t, float)
-        grown = abs(float(np.linalg.det(A)))
-        return Solid(self.volume * grown, A @ self.centre + t, grown * A @ self.second @ A.T)
+        factor = abs(float(np.linalg.det(A)))
+        return Solid(self.volume * factor, A @ self.centre + t, factor * A @ self.second @ A.T)
 
     def mass_properties(self, density: float) -> MassProperties:
         """Mass, centre and inertia at a density [kg/m3]: I = density (tr(C) 1 - C), C the second moment."""
@@ -43,34 +44,35 @@ class Solid:
 
 
 def box(size: ArrayLike) -> Solid:
-    """A box about the origin with edges `size` [m], shape (3,)."""
+    """A box at the origin with edges `size` [m], shape (3,)."""
     edges = np.asarray(size, float)
     volume = float(edges.prod())
     return Solid(volume, np.zeros(3), volume / 12 * np.diag(edges**2))
 
 
 def sphere(radius: float) -> Solid:
-    """A ball about the origin [m]."""
+    """A ball at the origin [m]."""
     volume = 4 / 3 * np.pi * radius**3
     return Solid(volume, np.zeros(3), volume * radius**2 / 5 * np.eye(3))
 
 
 def cylinder(radius: float, length: float) -> Solid:
-    """A cylinder along z about the origin [m]."""
+    """A cylinder along z at the origin [m]."""
     volume = np.pi * radius**2 * length
     return Solid(volume, np.zeros(3), volume * np.diag([radius**2 / 4, radius**2 / 4, length**2 / 12]))
 
 
 def capsule(radius: float, length: float) -> Solid:
-    """A cylinder along z about the origin with half a ball on each end; `length` is the cylinder's [m]."""
+    """A cylinder along z at the origin with half a ball on each end; `length` is the cylinder's [m]."""
     middle, ends = cylinder(radius, length), sphere(radius)
-    along = ends.volume * (length**2 / 4 + 3 / 8 * length * radius)  # the halves stand apart
-    second = middle.second + ends.second + np.diag([0, 0, along])
-    return Solid(middle.volume + ends.volume, np.zeros(3), second)
+    along = ends.volume * (length**2 / 4 + 3 / 8 * length * radius)  # the halves are apart
+    return Solid(
+        middle.volume + ends.volume, np.zeros(3), middle.second + ends.second + np.diag([0, 0, along])
+    )
 
 
 def polyhedron(points: ArrayLike, faces: ArrayLike) -> Solid:
-    """What a closed surface of triangles encloses, as a sum of tetrahedra from its middle.
+    """The volume inside a closed surface of triangles, as a sum of tetrahedra from its middle.
 
     With corners a, b, c and the apex at 0: v = a . (b x c) / 6, centre (a + b + c) / 4, and
     second moment v / 20 (a a^T + b b^T + c c^T + s s^T), s = a + b + c (Tonon 2005).
@@ -92,7 +94,7 @@ def polyhedron(points: ArrayLike, faces: ArrayLike) -> Solid:
 
 
 def total(solids: Iterable[Solid]) -> Solid:
-    """Several solids as one; where they overlap, the overlap counts twice."""
+    """Several solids as one; overlaps count twice."""
     solids = list(solids)
     volume = sum(s.volume for s in solids)
     centre = sum((s.volume * s.centre for s in solids), np.zeros(3)) / volume
@@ -102,13 +104,13 @@ def total(solids: Iterable[Solid]) -> Solid:
 
 
 def read_solid(prims: Iterable[Usd.Prim], frame: Usd.Prim) -> Solid | None:
-    """What gprims fill, in the frame of a prim above them; None if they fill nothing.
+    """The total solid of gprims in the frame of a prim above them; None if they have no volume.
 
     A mesh that is not closed counts as its convex hull.
 
     Args:
         prims: Gprims, or prims above gprims.
-        frame: Prim whose frame is meant.
+        frame: Prim whose frame is used.
     """
     cache, solids = UsdGeom.XformCache(), []
     to_frame = cache.GetLocalToWorldTransform(frame).GetInverse()
@@ -122,16 +124,16 @@ def read_solid(prims: Iterable[Usd.Prim], frame: Usd.Prim) -> Solid | None:
 
 
 def _read_gprim(prim: Usd.Prim) -> Solid | None:
-    """What one gprim fills in its own frame."""
+    """The solid of a gprim in its own frame."""
     if prim.IsA(UsdGeom.Cube):
         return box(np.full(3, UsdGeom.Cube(prim).GetSizeAttr().Get()))
     if prim.IsA(UsdGeom.Sphere):
         return sphere(UsdGeom.Sphere(prim).GetRadiusAttr().Get())
     for schema, shape in ((UsdGeom.Cylinder, cylinder), (UsdGeom.Capsule, capsule)):
         if prim.IsA(schema):
-            round_one = schema(prim)
-            turn = np.roll(np.eye(3), {"X": 1, "Y": 2, "Z": 0}[round_one.GetAxisAttr().Get()], axis=0)
-            solid = shape(round_one.GetRadiusAttr().Get(), round_one.GetHeightAttr().Get())
+            gprim = schema(prim)
+            turn = np.roll(np.eye(3), {"X": 1, "Y": 2, "Z": 0}[gprim.GetAxisAttr().Get()], axis=0)
+            solid = shape(gprim.GetRadiusAttr().Get(), gprim.GetHeightAttr().Get())
             return solid.mapped(turn, np.zeros(3))
     if prim.IsA(UsdGeom.Mesh):
         return _read_mesh(UsdGeom.Mesh(prim))
@@ -139,9 +141,7 @@ def _read_gprim(prim: Usd.Prim) -> Solid | None:
 
 
 def _read_mesh(mesh: UsdGeom.Mesh) -> Solid | None:
-    """What a mesh of triangles encloses, or its hull does; None if that is flat."""
-    from scipy.spatial import ConvexHull, QhullError
-
+    """The solid of a closed mesh of triangles, or of its hull; None if that is flat."""
     points = np.array(mesh.GetPointsAttr().Get() or [], float).reshape(-1, 3)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [])
     index = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [])
@@ -151,19 +151,12 @@ def _read_mesh(mesh: UsdGeom.Mesh) -> Solid | None:
         solid = polyhedron(points, index.reshape(-1, 3))
         if solid.volume > 0:
             return solid
-    try:
-        hull = ConvexHull(points)
-    except QhullError:
-        return None
-    faces = hull.simplices.copy()
-    a, b, c = np.moveaxis(points[faces], 1, 0)
-    inwards = np.einsum("fi,fi->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces[inwards] = faces[inwards][:, ::-1]
-    return polyhedron(points, faces)
+    faces = hull_faces(points)
+    return None if faces is None else polyhedron(points, faces)
 
 
 def _is_closed(points: Array, faces: NDArray) -> bool:
-    """Whether each edge is run through once each way; points at one place count as one."""
+    """Whether each edge occurs once in each direction; equal points count as one."""
     _, same = np.unique(np.round(points, 7), axis=0, return_inverse=True)
     edges = same.reshape(-1)[faces][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     there, times = np.unique(edges, axis=0, return_counts=True)

@@ -1,9 +1,9 @@
-"""Gazebo: what `<gazebo>` tags say of how links touch and of springs in joints.
+"""Gazebo: contact of links and springs of joints from `<gazebo>` tags.
 
-After SDFormat's URDF extensions (sdformat.org, "SDFormat extensions to URDF").
+Follows SDFormat's URDF extensions (sdformat.org, "SDFormat extensions to URDF").
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
@@ -15,24 +15,24 @@ from magtwin.urdf.description.tag import Tags
 from magtwin.urdf.options import Options
 
 RIGID_BODY_API = "PhysxRigidBodyAPI"
-"""PhysX's applied schema, by name: its plugin lives elsewhere."""
+"""PhysX's applied schema; its plugin is not installed here."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """How a link's colliders touch."""
+    """Contact of a link's colliders."""
 
     friction: float = 0.5
-    """Coulomb friction, static and sliding; USD's and Gazebo's engines differ in their own default."""
+    """Coulomb friction, static and dynamic; USD's and Gazebo's engines have different defaults."""
 
     restitution: float = 0.0
-    """Part of the speed that comes back from a bounce."""
+    """Coefficient of restitution."""
 
     stiffness: float | None = None
-    """Stiffness of the contact [N/m]; None for as rigid as the engine makes it."""
+    """Contact stiffness [N/m]; None for a rigid contact."""
 
     damping: float | None = None
-    """Damping of the contact [N s/m]; None for the engine's own."""
+    """Contact damping [N s/m]; None for the engine's default."""
 
 
 FRICTION = ("mu1", "mu", "collision/surface/friction/ode/mu")
@@ -40,41 +40,37 @@ ACROSS = ("mu2", "collision/surface/friction/ode/mu2")
 STIFFNESS = ("kp", "collision/surface/contact/ode/kp")
 DAMPING = ("kd", "collision/surface/contact/ode/kd")
 BOUNCE = ("collision/surface/bounce/restitution_coefficient",)
-"""Where a figure may stand in `<gazebo reference="LINK">`."""
+"""Paths of each value in `<gazebo reference="LINK">`."""
 
 SATISFIED = ("preserveFixedJoint", "disableFixedJointLumping")
-"""Tags of joints that ask for what is done anyway: fixed joints stay unless `Options.merge_fixed`."""
+"""Tags of joints that ask for the default: fixed joints stay unless `Options.merge_fixed`."""
 
 
 def read_surfaces(tags: Tags) -> dict[str, Surface]:
     """Surfaces by link, from `<gazebo reference="LINK">`.
 
-    mu1 becomes the friction; mu2, which is that across it, has no place in UsdPhysics. kp and kd become
-    PhysX's compliant contact, the bounce UsdPhysics' restitution.
+    mu1 becomes the friction; UsdPhysics has no attribute for mu2. kp and kd become PhysX's compliant
+    contact, and the bounce becomes UsdPhysics' restitution.
 
     Raises:
-        InputError: A figure is not a number, or below 0; the text gives the line.
+        InputError: A value is not a number, or is below 0; the message gives the line.
     """
     surfaces: dict[str, Surface] = {}
-    known = {*tags.description.links, *(joint.name for joint in tags.description.joints.values())}
+    description = tags.description
+    known = {*description.links, *(joint.name for joint in description.joints.values())}
     for block in tags.blocks("gazebo"):
         link = block.get("reference", "")
         if link and link not in known:
-            where = tags.description.where(block).rpartition("/")[2]
-            tags.description.note(
-                f"{where}: <gazebo> is about {link!r}, which is no link or joint; {hint(link, known)}; "
-                "kept as text",
-                lost=True,
-            )
-        if link not in tags.description.links:
+            where = description.where(block).rpartition("/")[2]
+            text = f"{where}: <gazebo> is about {link!r}, which is no link or joint; {hint(link, known)}"
+            description.note(f"{text}; kept as text", lost=True)
+        if link not in description.links:
             continue
         friction = tags.number(block, *FRICTION, least=0.0)
         across = tags.number(block, *ACROSS, least=0.0)
         if across is not None and across != (across if friction is None else friction):
-            tags.description.note(
-                f"link {link!r}: friction {friction:g} is taken for that across it too, mu2 {across:g}",
-                lost=True,
-            )
+            text = f"link {link!r}: friction {friction:g} is used across too, in place of mu2 {across:g}"
+            description.note(text, lost=True)
         figures = {
             "friction": across if friction is None else friction,
             "restitution": tags.number(block, *BOUNCE, least=0.0),
@@ -88,19 +84,16 @@ def read_surfaces(tags: Tags) -> dict[str, Surface]:
 
 
 def self_collides(tags: Tags) -> bool:
-    """Whether a link is told to touch others of its robot; one switch for all in UsdPhysics' engines."""
-    asked = [
-        block.get("reference", "")
-        for block in tags.blocks("gazebo")
-        if tags.flag(block, "selfCollide", "self_collide")
-    ]
-    if asked:
-        tags.description.note(f"link {asked[0]!r} touches its own robot: so do all others, but neighbours")
-    return bool(asked)
+    """Whether any link collides with its own robot; UsdPhysics' engines have one switch for all links."""
+    blocks = [block for block in tags.blocks("gazebo") if tags.flag(block, "selfCollide", "self_collide")]
+    if blocks:
+        name = blocks[0].get("reference", "")
+        tags.description.note(f"link {name!r} collides with its own robot: so do all links but neighbours")
+    return bool(blocks)
 
 
 def define_weightless(tags: Tags, prim_of: Callable[[str], Usd.Prim]) -> None:
-    """Let bodies float that are told to know no gravity, in PhysX, which alone has a switch for it."""
+    """Disable gravity for links with `<gravity>false`, in PhysX, the only engine with a switch for it."""
     for block in tags.blocks("gazebo"):
         link = block.get("reference", "")
         if link not in tags.description.links or tags.flag(block, "gravity") is not False:
@@ -108,25 +101,25 @@ def define_weightless(tags: Tags, prim_of: Callable[[str], Usd.Prim]) -> None:
         prim = prim_of(link)
         if not prim.HasAPI(UsdPhysics.RigidBodyAPI):
             tags.description.note(
-                f"link {link!r} knows no gravity, but is part of a body that does", lost=True
+                f"link {link!r} has no gravity, but is part of a body with gravity", lost=True
             )
             continue
         prim.AddAppliedSchema(RIGID_BODY_API)
         kind = Sdf.ValueTypeNames.Bool
         prim.CreateAttribute("physxRigidBody:disableGravity", kind, custom=False).Set(True)
-        tags.description.note(f"link {link!r} knows no gravity in PhysX; other engines have no such switch")
+        tags.description.note(f"link {link!r} has no gravity in PhysX; other engines have no such switch")
 
 
 def define_springs(tags: Tags, joint_of: Callable[[str], Usd.Prim | None], options: Options) -> None:
-    """Make springs of `<springStiffness>` and `<springReference>` the position drives of their joints.
+    """Author `<springStiffness>` and `<springReference>` as position drives of their joints.
 
     Args:
-        tags: Read.
-        joint_of: Gives the prim of a joint by its name; none where it has none.
-        options: Its rules for drives win.
+        tags: Tags of the description.
+        joint_of: Returns the prim of a joint by its name, or None.
+        options: Drive rules, which override springs.
 
     Raises:
-        InputError: A figure is not a number, or a stiffness is below 0; the text gives the line.
+        InputError: A value is not a number, or a stiffness is below 0; the message gives the line.
     """
     names = {joint.name for joint in tags.description.joints.values()}
     for block in tags.blocks("gazebo"):
@@ -139,7 +132,7 @@ def define_springs(tags: Tags, joint_of: Callable[[str], Usd.Prim | None], optio
             continue
         prim = joint_of(name)
         axis = next((a for a in ("angular", "linear") if prim and prim.HasAPI(UsdPhysics.DriveAPI, a)), "")
-        if prim is None or not axis or _ruled(name, options):
+        if prim is None or not axis or any(fnmatchcase(name, rule.joints) for rule in options.drives):
             why = "a rule drives it" if axis else "it cannot move"
             tags.description.note(f"joint {name!r}: its spring is kept as text, since {why}")
             continue
@@ -148,10 +141,5 @@ def define_springs(tags: Tags, joint_of: Callable[[str], Usd.Prim | None], optio
         unit = np.pi / 180 if axis == "angular" else 1.0  # gains are per degree in UsdPhysics
         drive = UsdPhysics.DriveAPI(prim, axis)
         drive.CreateStiffnessAttr(round(float(stiffness or 0.0) * unit, 9))
-        drive.CreateDampingAttr(0.0)  # its damping is the joint's own, of <dynamics>
+        drive.CreateDampingAttr(0.0)  # the damping is the joint's own, from <dynamics>
         drive.CreateTargetPositionAttr(rest / unit)
-
-
-def _ruled(name: str, options: Options) -> bool:
-    rules: Iterable[str] = (rule.joints for rule in options.drives)
-    return any(fnmatchcase(name, pattern) for pattern in rules)

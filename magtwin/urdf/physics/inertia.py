@@ -1,4 +1,4 @@
-"""Inertia: what bodies weigh, together too, and a tensor as USD has it, principal moments and their axes."""
+"""Inertia: mass properties of bodies, and inertia tensors as principal moments and axes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from magtwin.errors import InputError
 from magtwin.frames import canonical
 
 NEAR_MISS = 0.02
-"""Part of the largest moment by which it may exceed the sum of the others and still be repaired."""
+"""Relative excess of the largest moment over the sum of the others that is still repaired."""
 
 
 @dataclass(frozen=True)
 class MassProperties:
-    """Mass, centre and inertia of a body in some frame."""
+    """Mass, centre of mass and inertia of a body in some frame."""
 
     mass: float
     """Mass [kg]."""
@@ -28,14 +28,14 @@ class MassProperties:
     """Tensor about the centre of mass, in the frame's axes [kg m2], shape (3, 3)."""
 
     def moved(self, T: ArrayLike) -> "MassProperties":
-        """The body seen from the frame in which its own stands at T, shape (4, 4)."""
+        """The body in another frame, in which its present frame has pose T, shape (4, 4)."""
         T = np.asarray(T, float)
         R = T[:3, :3]
         return MassProperties(self.mass, R @ self.centre + T[:3, 3], R @ self.inertia @ R.T)
 
 
 def combined(bodies: Sequence[MassProperties]) -> MassProperties:
-    """Bodies of one frame as one, by the parallel axis theorem (Goldstein 2002, section 5.3).
+    """Bodies in one frame joined to one, by the parallel axis theorem (Goldstein 2002, section 5.3).
 
     I = sum_b I_b + m_b (|d_b|^2 1 - d_b d_b^T), d_b = c_b - c, c the common centre.
     """
@@ -49,21 +49,21 @@ def combined(bodies: Sequence[MassProperties]) -> MassProperties:
 
 
 def principal_axes(inertia: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], bool]:
-    """Principal moments of an inertia tensor, and the rotation from its axes to the principal ones.
+    """Principal moments of an inertia tensor, and the rotation to its principal axes.
 
-    I = R diag(I_1, I_2, I_3) R^T, the columns of R being the principal axes. Among the 24 ways to
-    order and sign them, R is the one nearest to the identity, so that a diagonal tensor keeps its axes.
-    Real bodies have I_i > 0 and I_i + I_j >= I_k (Goldstein 2002, section 5.4).
+    I = R diag(I_1, I_2, I_3) R^T, with the principal axes as columns of R. Of the 24 orders and signs, R is
+    the one nearest to the identity, so that a diagonal tensor keeps its axes. Real bodies have I_i > 0
+    and I_i + I_j >= I_k (Goldstein 2002, section 5.4).
 
     Args:
         inertia: Tensor about the centre of mass [kg m2], shape (3, 3).
 
     Returns:
-        Moments [kg m2], shape (3,); the quaternion xyzw of R, shape (4,); and whether a moment that
-        exceeded the sum of the others by less than NEAR_MISS of itself was brought down to that sum.
+        Moments [kg m2], shape (3,); the quaternion xyzw of R, shape (4,); and whether a moment was
+        reduced to the sum of the others, which it exceeded by less than NEAR_MISS.
 
     Raises:
-        InputError: No body has such a tensor; the text gives the moments.
+        InputError: No body has such a tensor; the message gives the moments.
     """
     tensor = np.asarray(inertia, float)
     tensor = (tensor + tensor.T) / 2
@@ -78,13 +78,11 @@ def principal_axes(inertia: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.
             R[:, np.argmin(np.diag(R))] *= -1
     largest = int(np.argmax(moments))
     others = moments.sum() - moments[largest]
-    text = ", ".join(f"{m:.3g}" for m in moments)
+    start = f"no body has principal moments of inertia {', '.join(f'{m:.3g}' for m in moments)} kg m2"
     if not (np.isfinite(moments).all() and moments.min() > 0):
-        raise InputError(f"no body has principal moments of inertia {text} kg m2; all must be above 0")
+        raise InputError(f"{start}; all must be above 0")
     if moments[largest] > others * (1 + NEAR_MISS):
-        raise InputError(
-            f"no body has principal moments of inertia {text} kg m2; none may exceed the sum of the others"
-        )
+        raise InputError(f"{start}; none may exceed the sum of the others")
     repaired = bool(moments[largest] > others * (1 + 1e-6))
     moments[largest] = min(moments[largest], others)
     return moments, quaternion(R), repaired

@@ -1,4 +1,4 @@
-"""Merge: which body each link is, or rides on; links on welded joints can become part of the body above."""
+"""Merge: the body that each link is or rides on; welded links can become part of the body above."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -8,26 +8,26 @@ from numpy.typing import NDArray
 
 from magtwin.urdf.description.description import origin_of
 from magtwin.urdf.description.model import Shape
-from magtwin.urdf.link import is_marker
-from magtwin.urdf.mechanism import Mechanism
+from magtwin.urdf.physics.link import is_marker
+from magtwin.urdf.physics.mechanism import Mechanism
 
 Place = tuple[str, NDArray[np.float64]]
 """Name of a body, and a pose in it, shape (4, 4)."""
 
 WORLD = ""
-"""Name of what is no body: joints on it hold the robot to its prim's frame, and so to the world."""
+"""Name of the world, which is not a body; joints to it hold the robot at its prim's frame."""
 
 
 def place_links(mechanism: Mechanism, *, merge: bool = False) -> dict[str, Place]:
-    """The body that each link is, or rides on, with its pose in it; parents before children.
+    """The body that each link is or rides on, with its pose in it; parents before children.
 
-    Links that only name a place ride on the nearest body above them; those above the first body, such
-    as base_footprint, on that. Under a root without mass from which a joint moves the rest, such as the
-    rail of a slide, is the world.
+    Links that are only frames ride on the nearest body above; those above the first body, such as
+    base_footprint, on that. If a joint moves everything relative to a root without mass, such as the rail of
+    a slide, the root is the world.
 
     Args:
         mechanism: Joints of the description.
-        merge: Whether links with mass or shape ride too, where they cannot move against the body above.
+        merge: Whether links with mass or shape that cannot move also ride on the body above.
     """
     description = mechanism.description
     base, above = _base(mechanism)
@@ -41,13 +41,11 @@ def place_links(mechanism: Mechanism, *, merge: bool = False) -> dict[str, Place
             continue
         joint = description.joints[name]
         body, pose = places[joint.parent]
-        rides = is_marker(link) or (merge and body != WORLD)
-        if rides and joint.name in mechanism.welded:
+        if joint.name in mechanism.welded and (is_marker(link) or (merge and body != WORLD)):
             places[name] = (body, pose @ mechanism.pose(joint))
         else:
             places[name] = (name, np.eye(4))
-    order = {name: i for i, name in enumerate(description.links)}
-    return dict(sorted(places.items(), key=lambda item: order[item[0]]))
+    return {name: places[name] for name in description.links}
 
 
 def riders(places: dict[str, Place], body: str) -> Iterator[tuple[str, NDArray[np.float64]]]:
@@ -59,13 +57,13 @@ def riders(places: dict[str, Place], body: str) -> Iterator[tuple[str, NDArray[n
 
 
 def carried(shapes: Iterable[Shape], pose: NDArray, link: str, body: str) -> list[Shape]:
-    """Visuals or colliders of a link as those of the body that it is part of.
+    """Visuals or colliders of a link as shapes of its body.
 
     Args:
         shapes: Visuals or collisions.
-        pose: Of the link in the body, shape (4, 4).
-        link: Name of the link, which its shapes without a name get on another's body.
-        body: Name of the body's own link, whose shapes stay as they are.
+        pose: Pose of the link in the body, shape (4, 4).
+        link: Name of the link; shapes without a name get it.
+        body: Name of the body's own link, whose shapes stay unchanged.
     """
     if link == body:
         return list(shapes)
@@ -73,7 +71,7 @@ def carried(shapes: Iterable[Shape], pose: NDArray, link: str, body: str) -> lis
 
 
 def _base(mechanism: Mechanism) -> tuple[str, list[str]]:
-    """The robot's first body, or the world, and the links above it, which only name places."""
+    """The robot's first body, or the world; and the links above it, which are only frames."""
     description = mechanism.description
     above, pending = {description.root: [description.root]}, [description.root]
     while pending:
@@ -84,12 +82,10 @@ def _base(mechanism: Mechanism) -> tuple[str, list[str]]:
             if joint.parent == link and joint.name in mechanism.welded:
                 above[child] = [*above[link], child]
                 pending.append(child)
-    moving = [
-        child for child, joint in description.joints.items() if joint.parent in above and child not in above
-    ]
+    joints = description.joints
+    moving = [child for child, joint in joints.items() if joint.parent in above and child not in above]
     if not moving:
         return description.root, []
-    first = moving[0]
-    if len(moving) == 1 and description.joints[first].type == "floating":
-        return first, above[description.joints[first].parent]
+    if len(moving) == 1 and joints[moving[0]].type == "floating":
+        return moving[0], above[joints[moving[0]].parent]
     return WORLD, list(above)
