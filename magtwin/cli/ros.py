@@ -329,7 +329,7 @@ def teleop(
     from contextlib import ExitStack
 
     from magtwin.author.robot import read_robot
-    from magtwin.cli.drive import device
+    from magtwin.cli.runs.drive import device
     from magtwin.files import existing, shipped
     from magtwin.io.bags.raw import RawBagWriter
     from magtwin.ros.record import Recorder

@@ -283,7 +283,7 @@ def test_json_stays_json_while_progress_goes_to_stderr(tmp_path):
     slow = f"""
 import sys, time
 from magtwin.cli import main
-from magtwin.cli import file
+from magtwin.cli.runs import file
 whole = file._info_of_run
 file._info_of_run = lambda path: time.sleep(2.2) or whole(path)
 main(["info", {str(tmp_path / "run.parquet")!r}, "--json"])

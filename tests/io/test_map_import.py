@@ -12,7 +12,7 @@ from test_rosbag import at_middle, drive, write_bag
 
 from magtwin.author.scene import read_scene
 from magtwin.cli import main
-from magtwin.cli.map_input import earth_nt
+from magtwin.cli.maps.map_input import earth_nt
 from magtwin.field.sources.earth import earth_field_nt
 from magtwin.field.survey.gridded import import_survey
 from magtwin.io.surveys.readings import load_readings, save_readings

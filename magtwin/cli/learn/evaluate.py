@@ -144,7 +144,7 @@ def evaluate(
 
 def _charts(maps: Sequence[Path] | None, scene: Path | None) -> "list[Chart]":
     """The maps at hand; of a scene its own."""
-    from magtwin.cli.map import _open_map
+    from magtwin.cli.maps.map import _open_map
     from magtwin.files import existing, sha256
     from magtwin.learn.evaluation.evaluate import chart_of
 
@@ -178,7 +178,7 @@ def _trials(
     runs: Sequence[Path] | None, dataset: Path | None, train: Path | None, own: "Sequence[Contender]"
 ) -> "tuple[list[Trial], list[tuple[Dataset, tuple[str, ...]]]]":
     """Recordings to judge by; and the data set that baselines are fitted to, with its recordings for that."""
-    from magtwin.cli.dataset import _files, _sources
+    from magtwin.cli.learn.dataset import _files, _sources
     from magtwin.learn.data.dataset import open_dataset
     from magtwin.learn.evaluation.evaluate import Trial, check_apart, trials_of, unlearned, unseen
 

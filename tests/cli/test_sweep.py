@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from magtwin.cli import main
-from magtwin.cli.runs import MIXTURE
+from magtwin.cli.runs.sweep import MIXTURE
 from magtwin.io.tables import read_parquet
 from magtwin.path import path_named
 from magtwin.twin import in_session, open_twin, simulate

@@ -76,8 +76,8 @@ def build(
     json
         Print the summary as JSON.
     """
-    from magtwin.cli.file import _named
-    from magtwin.cli.map import _open_map
+    from magtwin.cli.maps.map import _open_map
+    from magtwin.cli.runs.file import _named
     from magtwin.files import check_free, sha256
     from magtwin.learn.data.dataset import build_dataset
     from magtwin.learn.data.labels import Alignment

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.map_input import (
+from magtwin.cli.maps.map_input import (
     headings_rad,
     is_survey_folder,
     method_options,

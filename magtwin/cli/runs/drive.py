@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magtwin.cli.app import app
-from magtwin.cli.run import write_run
+from magtwin.cli.runs.run import write_run
 from magtwin.cli.terminal import Force, Json, Seed, Session, announcer, print_report, say, silence
 from magtwin.errors import InputError
 
