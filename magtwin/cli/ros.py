@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Seed, Session, Whole, announcer, progress, say, silence, step
+from magtwin.cli.options import Force, Seed, Session, Whole
+from magtwin.cli.terminal import announce, progress, say, silence, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -136,7 +137,7 @@ def sim(
     from magtwin.ros.simulate import Simulator
     from magtwin.twin import open_twin
 
-    tell = announcer(quiet=False)
+    tell = announce
     tell(f"opening {scene}")
     twin = open_twin(scene, net=net, model_error=model_error)
     with where.bus("magtwin_sim", duration=duration) as bus:
@@ -203,7 +204,7 @@ def magnetometer(
     from magtwin.twin import open_twin
 
     values = settings_of(PARAMETERS, (f"units:={UNITS[profile]}", *settings))
-    tell = announcer(quiet=False)
+    tell = announce
     tell(f"opening {scene}")
     twin = open_twin(scene, net=net, model_error=False)  # it predicts, for a robot that reads
     sim_time = values["use_sim_time"]
@@ -260,7 +261,7 @@ def follow(
     from magtwin.path import resolve_path
     from magtwin.ros.follow import Follower
 
-    tell = announcer(quiet=False)
+    tell = announce
     way = resolve_path(path)
     drive = read_robot(robot or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
     with where.bus("magtwin_follow", sim_time=sim_time) as bus:
@@ -348,7 +349,7 @@ def teleop(
         bus = stack.enter_context(where.bus("magtwin_teleop", sim_time=sim_time))
         recorder = None if writer is None else Recorder(bus, writer, say=_warn, sim_time=sim_time)
         source = stack.enter_context(device(gamepad))
-        announcer(quiet=False)(HELP if gamepad is None else "left stick drives, Start ends")
+        announce(HELP if gamepad is None else "left stick drives, Start ends")
         node = Teleop(bus, hand, source, stamped_commands=stamped_commands)
         with silence(), suppress(KeyboardInterrupt):
             node.run(recorder.step if recorder else lambda: None)
@@ -391,7 +392,7 @@ def record(
     writer = RawBagWriter(out, force=force)
     try:
         with where.bus("magtwin_record", sim_time=sim_time, duration=duration) as bus:
-            announcer(quiet=False)(f"recording by {bus.backend}; Ctrl-C ends")
+            announce(f"recording by {bus.backend}; Ctrl-C ends")
             recorder = Recorder(bus, writer, topic, sim_time=sim_time, say=_warn)
             with progress("Recording", "messages") as advance:
                 recorder.run(lambda: advance(sum(writer.counts.values()), None), duration_s=duration)
@@ -442,9 +443,7 @@ def replay(
     twin = None if scene is None else open_twin(scene, model_error=False)
     with where.bus("magtwin_replay") as bus:
         player = Player(whole, bus, twin, units=units, topics=topic)
-        announcer(quiet=False)(
-            f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends"
-        )
+        announce(f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends")
         step("Replaying")
         count = player.run(speed=speed)
     say(f"{count} messages")
@@ -461,4 +460,4 @@ def spin(bus: "Bus", duration_s: float | None) -> None:
 
 
 def _warn(text: str) -> None:
-    announcer(quiet=False)(f"warning: {text}")
+    announce(f"warning: {text}")

@@ -6,7 +6,8 @@ from typing import Annotated
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say, step
+from magtwin.cli.options import Force, Json
+from magtwin.cli.terminal import check_suffix, print_report, say, step
 
 compensate_app = App(name="compensate", help="Take the platform's field out of a run (Tolles-Lawson).")
 app.command(compensate_app)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, print_report, progress, say, step
+from magtwin.cli.options import Force, Json
+from magtwin.cli.terminal import print_report, progress, say, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -76,9 +77,9 @@ def build(
     json
         Print the summary as JSON.
     """
-    from magtwin.cli.maps.map import _open_map
     from magtwin.cli.runs.file import _named
     from magtwin.files import check_free, sha256
+    from magtwin.io.surveys.maps import open_map
     from magtwin.learn.data.dataset import build_dataset
     from magtwin.learn.data.labels import Alignment
 
@@ -96,7 +97,7 @@ def build(
     with progress("Labelling", "recordings") as advance:
         made = build_dataset(
             sources,
-            _open_map(map),
+            open_map(map),
             out,
             alignment=alignment,
             map_sha256=sha256(map) if map.is_file() else "",

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, Seed, progress, say, stdout_console, step
+from magtwin.cli.options import Force, Json, Seed
+from magtwin.cli.terminal import progress, say, stdout_console, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -144,8 +145,8 @@ def evaluate(
 
 def _charts(maps: Sequence[Path] | None, scene: Path | None) -> "list[Chart]":
     """The maps at hand; of a scene its own."""
-    from magtwin.cli.maps.map import _open_map
     from magtwin.files import existing, sha256
+    from magtwin.io.surveys.maps import open_map
     from magtwin.learn.evaluation.evaluate import chart_of
 
     files = list(maps or ())
@@ -159,7 +160,7 @@ def _charts(maps: Sequence[Path] | None, scene: Path | None) -> "list[Chart]":
         )
     found = []
     for path, name in zip(files, _short(files), strict=True):
-        field = _open_map(existing(path, "map"))
+        field = open_map(existing(path, "map"))
         found.append(chart_of(name, field, *([sha256(path)] if path.is_file() else [])))
     return found
 

@@ -5,7 +5,8 @@ from pathlib import Path
 from cyclopts import App
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say, step
+from magtwin.cli.options import Force, Json
+from magtwin.cli.terminal import check_suffix, print_report, say, step
 
 net_app = App(name="net", help="Work with networks.")
 app.command(net_app)

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, Whole, check_suffix, print_report, progress, say, step
+from magtwin.cli.options import Force, Json, Whole
+from magtwin.cli.terminal import check_suffix, print_report, progress, say, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:

@@ -4,7 +4,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, say, stdout_console, step
+from magtwin.cli.options import Force, Json
+from magtwin.cli.terminal import check_suffix, say, stdout_console, step
 
 if TYPE_CHECKING:
     from magtwin.run.compare import Comparison

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magtwin.cli.app import app
+from magtwin.cli.options import Force, Json, Seed, Session
 from magtwin.cli.runs.run import write_run
-from magtwin.cli.terminal import Force, Json, Seed, Session, announcer, print_report, say, silence
+from magtwin.cli.terminal import announce, print_report, say, silence
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ def drive(
             folder,
             commands=folder / "commands.csv",
             metadata={"commands_file": "commands.csv"},
-            steps=announcer(quiet=json),
+            steps=announce,
             net=net,
             model_error=model_error,
             seed=seed,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, print_report, progress, say, silence, step
+from magtwin.cli.options import Force, Json
+from magtwin.cli.terminal import print_report, progress, say, silence, step
 from magtwin.errors import InputError, hint
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, announcer, progress, say, step
+from magtwin.cli.options import Force
+from magtwin.cli.terminal import announce, progress, say, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def picture(
 
     existing(file, "run, stage or recording")
     check_free(check_png(out), force=force)
-    pixels, steps = _size(size), announcer(quiet=False)
+    pixels, steps = _size(size), announce
     if file.suffix == ".rrd" and camera is None and scene is None:
         from magtwin.io.rerun.viewer import screenshot
 

@@ -7,7 +7,8 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, check_suffix, progress, say
+from magtwin.cli.options import Force
+from magtwin.cli.terminal import check_suffix, progress, say
 
 MOST_PICTURED = 60
 """Runs of a page with pictures: 0.4 MB and a second each."""

@@ -5,7 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, announcer, print_report, say
+from magtwin.cli.options import Force, Json
+from magtwin.cli.terminal import announce, print_report, say
 
 
 @app.command
@@ -42,7 +43,7 @@ def rerun_of(
 
     if out is not None:
         check_free(out, force=force)
-    steps = announcer(quiet=json)
+    steps = announce
     steps("Making it once more")
     found = repeat_of(file, scene)
     if out is not None:

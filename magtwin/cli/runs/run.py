@@ -11,19 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import (
-    Force,
-    Json,
-    Seed,
-    Session,
-    announcer,
-    check_suffix,
-    print_report,
-    progress,
-    say,
-    silence,
-    step,
-)
+from magtwin.cli.options import Force, Json, Seed, Session
+from magtwin.cli.terminal import announce, check_suffix, print_report, progress, say, silence, step
 from magtwin.errors import InputError, find
 
 if TYPE_CHECKING:
@@ -67,7 +56,7 @@ def demo(
     from magtwin.files import output, shipped
     from magtwin.twin import scene_from_toml
 
-    steps = announcer(quiet=json)
+    steps = announce
     with output(out, force=force) as folder:
         steps("Authoring the TurtleBot 4 from its URDF")
         source = shipped("robots", "turtlebot4")
@@ -301,10 +290,10 @@ def run(
     step("Opening the scene")
     with ExitStack() as stack:
         written = wanted.begun() if shown else stack.enter_context(wanted.aside())
-        what = _drive(scene, way, steps=announcer(quiet=json), scans=scans, fit=fit, **options)
+        what = _drive(scene, way, steps=announce, scans=scans, fit=fit, **options)
         if shown:
             what = _show(what, shown, written, quiet=json)
-        written.write(what, steps=announcer(quiet=json), recorded=shown is not None)
+        written.write(what, steps=announce, recorded=shown is not None)
     print_report(what.run.report(f"{way} in {scene}"), json)
     if not json:
         say("Wrote " + ", ".join(map(str, targets)))
@@ -438,7 +427,7 @@ def _run_together(
     from magtwin.sim.motion.way import way_of
     from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots
 
-    steps = announcer(quiet=quiet)
+    steps = announce
     if options.pop("engine") == "newton":
         raise InputError(f"--engine newton drives one robot by itself, and {scene_file} has several; drop it")
     commands, replay = options.pop("commands"), options.pop("replay")

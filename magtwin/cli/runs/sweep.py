@@ -8,7 +8,8 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, Seed, Whole, announcer, print_report, progress, say
+from magtwin.cli.options import Force, Json, Seed, Whole
+from magtwin.cli.terminal import announce, print_report, progress, say
 
 Names = Annotated[list[str] | None, Parameter(consume_multiple=True, negative="")]
 
@@ -111,7 +112,7 @@ def runs(
         raise InputError("--session survey is one session; drop --sessions")
     for name in path or MIXTURE:
         way_of(name)  # refuses a name or file that is none before the scene is opened
-    steps = announcer(quiet=json)
+    steps = announce
     with output(out, force=force) as folder:
         steps("Opening the scene")
         twin = open_twin(scene, net=net, magnetometer=magnetometer, model_error=model_error)

@@ -4,7 +4,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, announcer, print_report, say
+from magtwin.cli.options import Force, Json
+from magtwin.cli.terminal import announce, print_report, say
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ def export(
         thumbnail=_draw if thumbnail and profile != "viewer" else None,
         convert_units=convert_units,
         force=force,
-        progress=announcer(quiet=json),
+        progress=announce,
     )
     print_report(made.report(), json)
     if not json:

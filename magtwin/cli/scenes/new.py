@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, check_suffix, say
+from magtwin.cli.options import Force
+from magtwin.cli.terminal import check_suffix, say
 
 
 @app.command

@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, check_suffix, print_report, say, step
+from magtwin.cli.options import Force, Json
+from magtwin.cli.terminal import check_suffix, print_report, say, step
 from magtwin.errors import InputError
 
 

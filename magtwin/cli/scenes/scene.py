@@ -5,7 +5,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, announcer, print_report, progress, say
+from magtwin.cli.options import Force, Json
+from magtwin.cli.terminal import announce, print_report, progress, say
 
 
 @app.command
@@ -52,7 +53,7 @@ def scene(
         file = find("scene", spec, {f.stem: f for f in sorted(shipped("scenes").glob("*.toml"))})
     check_free(out, force=force)
     told: list[str] = []
-    steps = announcer(quiet=json)
+    steps = announce
     with TemporaryDirectory() as workshop:
         steps(f"Reading {file}")
         with progress("Reading the scene", "headings") as advance:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Json, announcer, check_suffix, printable, say, stdout_console
+from magtwin.cli.options import Force, Json
+from magtwin.cli.terminal import announce, check_suffix, printable, say, stdout_console
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def validate(
 
 def _announce(file: Path, *, quiet: bool) -> Any:
     """A function that says which validator looks at a file."""
-    steps = announcer(quiet=quiet)
+    steps = announce
     return lambda name: steps(f"{file.name}: {name}")
 
 
