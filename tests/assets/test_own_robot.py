@@ -45,7 +45,7 @@ def test_a_scene_that_names_a_urdf_is_driven_in_two_commands(tmp_path, capsys):
     main(["scene", str(scene(tmp_path)), "--out", str(tmp_path / "mine")])
     main(
         [
-            *("run", str(tmp_path / "mine" / "mine.usda"), "--duration", "3", "--json"),
+            *("run", str(tmp_path / "mine" / "mine.usda"), "--duration-s", "3", "--json"),
             *("--parquet", str(tmp_path / "run.parquet"), "--rrd", str(tmp_path / "run.rrd")),
         ]
     )

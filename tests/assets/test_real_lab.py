@@ -30,7 +30,7 @@ def real_run(tmp_path_factory):
     )
     magtwin(
         *("scene", "aprilab", "--out", out / "scene"),
-        *("--map", out / "aprilab.usdc", "--net", out / "released.safetensors"),
+        *("--map", out / "aprilab.usdc", "--network", out / "released.safetensors"),
     )
     magtwin(
         *("run", out / "scene" / "aprilab.usda", "--path", real / "paths" / "figure8_path.csv"),

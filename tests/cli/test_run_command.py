@@ -16,11 +16,11 @@ from magtwin.twin import open_twin
 def written(lab_scene, tmp_path_factory):
     """Everything that one run can leave."""
     folder = tmp_path_factory.mktemp("all")
-    arguments = ["run", str(lab_scene), "--net", "none", "--duration", "3", "--seed", "5", "--json"]
+    arguments = ["run", str(lab_scene), "--network", "none", "--duration-s", "3", "--seed", "5", "--json"]
     files = {kind: folder / f"a{end}" for kind, end in (("rrd", ".rrd"), ("bag", ".mcap"), ("csv", ".csv"))}
     files |= {"usd": folder / "deep" / "a.usda", "parquet": folder / "a.parquet"}
     named = [text for kind, file in files.items() for text in (f"--{kind}", str(file))]
-    main([*arguments, "--out", str(folder / "out"), *named, "--usd-fps", "0", "--units", "nT"])
+    main([*arguments, "--out", str(folder / "out"), *named, "--usd-fps", "0", "--out-unit", "nT"])
     return folder, files
 
 
@@ -61,7 +61,7 @@ def test_the_layer_names_its_scene_from_where_it_lies(written, lab_scene):
 
 def test_outputs_that_cannot_all_be_written_leave_none(lab_scene, tmp_path, capsys):
     (tmp_path / "file").touch()
-    arguments = ["run", str(lab_scene), "--net", "none", "--duration", "1", "--rrd", str(tmp_path / "a.rrd")]
+    arguments = ["run", str(lab_scene), "--network", "none", "--duration-s", "1", "--rrd", str(tmp_path / "a.rrd")]
     for option, name, said in (
         ("--usd", "file/a.usd", "cannot be written"),
         ("--bag", "file/a.mcap", "cannot be written"),

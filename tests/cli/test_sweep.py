@@ -1,4 +1,4 @@
-"""`magtwin runs`: the data set that it writes, its seeds and sessions, and what it refuses."""
+"""`magtwin sweep`: the data set that it writes, its seeds and sessions, and what it refuses."""
 
 import csv
 import json
@@ -12,7 +12,7 @@ from magtwin.io.tables import read_parquet
 from magtwin.path import path_named
 from magtwin.twin import in_session, open_twin, simulate
 
-SHORT = ("--duration", "1", "--magnetometer", "physical")
+SHORT = ("--duration-s", "1", "--magnetometer", "physical")
 
 
 def listed(folder):
@@ -24,7 +24,7 @@ def test_each_file_is_the_run_of_its_seed_and_path_to_the_last_bit(lab_scene, tm
     out = tmp_path / "set"
     main(
         [
-            "runs",
+            "sweep",
             str(lab_scene),
             "--out",
             str(out),
@@ -59,7 +59,7 @@ def test_a_random_driver_is_dealt_like_a_path(lab_scene, tmp_path):
     out = tmp_path / "set"
     options = ["--out", str(out), "--count", "3", "--path", "random", "figure8", "--session", "survey"]
     options += ["--json", *SHORT]
-    main(["runs", str(lab_scene), *options])
+    main(["sweep", str(lab_scene), *options])
     assert [row["path"] for row in listed(out)] == ["random", "figure8", "random"]
     own = simulate(
         open_twin(lab_scene, magnetometer="physical"), "random", seed=2, session="survey", duration_s=1.0
@@ -69,9 +69,9 @@ def test_a_random_driver_is_dealt_like_a_path(lab_scene, tmp_path):
 
 
 def test_sessions_differ_and_their_runs_share_what_a_session_has(lab_scene, tmp_path):
-    options = ["--count", "4", "--sessions", "2", "--columns", "battery_fraction", "b_measured_nt", *SHORT]
+    options = ["--count", "4", "--sessions", "2", "--keep", "battery_fraction", "b_measured_nt", *SHORT]
     for name in ("a", "b"):
-        main(["runs", str(lab_scene), "--out", str(tmp_path / name), *options])
+        main(["sweep", str(lab_scene), "--out", str(tmp_path / name), *options])
     runs = [read_parquet(tmp_path / "a" / row["file"]) for row in listed(tmp_path / "a")]
     charges = [run["battery_fraction"][0] for run in runs]
     assert charges[0] == charges[1] != charges[2] == charges[3]
@@ -85,7 +85,7 @@ def test_sessions_differ_and_their_runs_share_what_a_session_has(lab_scene, tmp_
 
 def test_the_default_is_a_mixture_of_paths_in_sessions_that_each_drive_all_of_them(lab_scene, tmp_path):
     out = tmp_path / "set"
-    main(["runs", str(lab_scene), "--out", str(out), "--count", "10", *SHORT])
+    main(["sweep", str(lab_scene), "--out", str(out), "--count", "10", *SHORT])
     rows = listed(out)
     driven = {s: {row["path"] for row in rows if row["session"] == s} for s in ("0", "1")}
     assert driven["0"] == driven["1"] == set(MIXTURE)
@@ -102,7 +102,7 @@ def test_the_default_is_a_mixture_of_paths_in_sessions_that_each_drive_all_of_th
 
 
 def test_the_summary_is_json_where_that_is_asked_for(lab_scene, tmp_path, capsys):
-    main(["runs", str(lab_scene), "--out", str(tmp_path / "set"), "--count", "2", "--json", *SHORT])
+    main(["sweep", str(lab_scene), "--out", str(tmp_path / "set"), "--count", "2", "--json", *SHORT])
     figures = json.loads(capsys.readouterr().out)["figures"]
     assert figures["runs"]["value"] == 2
     assert figures["readings"]["value"] == 2 * 135
@@ -116,13 +116,13 @@ def test_the_summary_is_json_where_that_is_asked_for(lab_scene, tmp_path, capsys
         (("--sessions", "2", "--session", "survey"), "--session survey is one session; drop --sessions"),
         (("--seed", "-1"), "--seed must be a whole number from 0 up"),
         (("--path", "figure9"), "did you mean 'figure8'"),
-        (("--columns", "yaww"), "did you mean 'yaw'"),
+        (("--keep", "yaww"), "did you mean 'yaw'"),
         (("--speed", "0"), "speed must be above 0"),
     ],
 )
 def test_what_cannot_be_driven_is_refused_and_leaves_nothing(lab_scene, tmp_path, capsys, options, text):
     with pytest.raises(SystemExit) as end:
-        main(["runs", str(lab_scene), "--out", str(tmp_path / "set"), *SHORT, *options])
+        main(["sweep", str(lab_scene), "--out", str(tmp_path / "set"), *SHORT, *options])
     assert end.value.code == 1
     assert text in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
@@ -131,6 +131,6 @@ def test_what_cannot_be_driven_is_refused_and_leaves_nothing(lab_scene, tmp_path
 def test_a_folder_that_exists_is_kept_unless_forced(lab_scene, tmp_path, capsys):
     (tmp_path / "set").mkdir()
     with pytest.raises(SystemExit):
-        main(["runs", str(lab_scene), "--out", str(tmp_path / "set"), "--count", "1", *SHORT])
+        main(["sweep", str(lab_scene), "--out", str(tmp_path / "set"), "--count", "1", *SHORT])
     assert "--force" in capsys.readouterr().err
     assert list((tmp_path / "set").iterdir()) == []

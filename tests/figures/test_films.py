@@ -193,7 +193,7 @@ def test_a_long_run_is_shown_in_half_a_minute_and_a_short_one_as_it_happened(run
 def test_the_commands_draw_a_moment_a_film_and_a_stage(run, lab_scene, tmp_path, capsys):
     file = tmp_path / "run.parquet"
     write_parquet(run, file)
-    main(["picture", str(file), "--out", str(tmp_path / "run.png"), "--size", "160x90", "--time", "2"])
+    main(["picture", str(file), "--out", str(tmp_path / "run.png"), "--size", "160x90", "--time-s", "2"])
     view = ["--size", "160x90", "--camera", "top"]
     main(["picture", str(lab_scene), "--out", str(tmp_path / "stage.png"), *view])
     for name in ("run", "stage"):
@@ -234,7 +234,7 @@ def test_the_command_turns_a_stage_and_refuses_what_only_a_run_has(lab_scene, tm
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames == 4
     with pytest.raises(SystemExit):
-        main(["film", str(lab_scene), "--out", str(tmp_path / "b.gif"), *view, "--speed", "2"])
+        main(["film", str(lab_scene), "--out", str(tmp_path / "b.gif"), *view, "--pace", "2"])
     assert "takes no --speed" in capsys.readouterr().err
     assert not (tmp_path / "b.gif").exists()
 

@@ -328,7 +328,7 @@ def test_convert_makes_a_table_of_a_robots_own_bag(tmp_path, capsys):
     from magtwin.io.formats import read_run
 
     bag, out = record(tmp_path / "bag", {MAG: readings(), "/vrpn/pose": poses()}), tmp_path / "run.parquet"
-    main(["convert", str(bag), str(out), "--topic", f"{POSE}=/vrpn/pose", "--field-unit", "nT"])
+    main(["convert", str(bag), str(out), "--topic", f"{POSE}=/vrpn/pose", "--unit", "nT"])
     assert "p_world_base" in read_run(out)
     for topic, text in {
         "/vrpn/pose": "--topic takes NAME=THEIRS, such as /robot/enu/pose=/vrpn/pose, got '/vrpn/pose'",

@@ -197,7 +197,7 @@ def test_the_shipped_scene_s_network_belongs_to_its_map_and_robot(lab_scene):
 
 def test_a_command_says_each_mismatch_once_on_stderr_and_info_shows_it(lab_scene, strange, tmp_path, capsys):
     out = tmp_path / "run"
-    main(["run", str(lab_scene), "--net", str(strange), "--duration", "1", "--out", str(out)])
+    main(["run", str(lab_scene), "--network", str(strange), "--duration-s", "1", "--out", str(out)])
     shown = capsys.readouterr()
     lines = [line for line in shown.err.splitlines() if "warning" in line]
     assert len(lines) == 2
