@@ -16,14 +16,14 @@ from cyclopts.exceptions import CycloptsError
 from magtwin.cli.options import Json, Quiet
 from magtwin.cli.progress import watched
 from magtwin.cli.renamed import renamed
-from magtwin.cli.terminal import Done, output_mode
+from magtwin.cli.terminal import Done, output_mode, print_error
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.version import __version__
 
 app = App(
     name="magtwin",
-    help="Author magnetic digital twins of labs and robots in USD, simulate what a robot's magnetometer reads, "
-    "fit field maps and train neural magnetometers.",
+    help="Author magnetic digital twins of labs and robots in USD, simulate what a robot's magnetometer "
+    "reads, fit field maps and train neural magnetometers.",
     version=__version__,
     config=[Env("MAGTWIN_", show=False), Toml("magtwin.toml", search_parents=False)],
     default_parameter=Parameter(negative_iterable="", negative_none=""),
@@ -77,9 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
             _fail(error.in_flags(_flags))
         if isinstance(error, OSError | MemoryError):
             _fail(f"{error} ({type(error).__name__})")
-        _fail(
-            f"a fault in magtwin, {type(error).__name__}: {error}; please report it with the output of --debug"
-        )
+        _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
 
 
 def share_options(group: App = app) -> None:
@@ -145,19 +143,12 @@ def _warnings_in_lines() -> Iterator[None]:
                 show(message, category, *where, **more)
             elif str(message) not in printed:
                 printed.add(str(message))
-                _print_error(f"warning: {message}", style="1;33")
+                print_error(f"warning: {message}", style="1;33")
 
         warnings.showwarning = line
         yield
 
 
 def _fail(text: str, status: int = 1) -> None:
-    _print_error(text, style="1;31" if status == 2 else "")
+    print_error(text, style="1;31" if status == 2 else "")
     sys.exit(status)
-
-
-def _print_error(text: str, style: str) -> None:
-    """Print one line on stderr, in colour on a terminal."""
-    text = f"magtwin: {' '.join(text.split())}"
-    coloured = style and sys.stderr.isatty()
-    print(f"\033[{style}m{text}\033[0m" if coloured else text, file=sys.stderr)  # noqa: T201

@@ -46,7 +46,7 @@ Session = Annotated[
     Parameter(
         converter=_session,
         help="Session to draw from the seed: charge, IMU offsets, wheels, odometry and the robot's own "
-        "field differ between sessions. survey: the robot as it was during the survey of the map. Default: 0.",
+        "field differ between sessions. survey: the robot as it was when the map was surveyed. Default: 0.",
     ),
 ]
 Network = Annotated[
@@ -60,7 +60,7 @@ Network = Annotated[
 Magnetometer = Annotated[
     Literal["physical", "neural", "map-only"] | None,
     Parameter(
-        help="What the magnetometer reads: the exact field (physical), the map and the prediction of a network "
+        help="What the magnetometer reads: the exact field (physical), the map and a network's prediction "
         "(neural), or the map alone (map-only). Default: the scene's."
     ),
 ]

@@ -1,7 +1,7 @@
 """Progress of commands on stderr: a bar on a terminal, else a line now and then.
 
-A thread watches each command. After `FIRST_S` of silence, and then every `EVERY_S`, it prints the current step
-with counts, rate and time left. So progress appears even while a library reports none.
+A thread watches each command. After `FIRST_S` of silence, and then every `EVERY_S`, it prints the current
+step with counts, rate and time left. So progress appears even while a library reports none.
 """
 
 import sys

@@ -96,6 +96,13 @@ def note(text: str) -> None:
         print(f"  {text}", file=sys.stderr)  # noqa: T201
 
 
+def print_error(text: str, style: str = "") -> None:
+    """Print one line on stderr, in colour on a terminal; --quiet prints it too."""
+    text = f"magtwin: {' '.join(text.split())}"
+    coloured = style and sys.stderr.isatty()
+    print(f"\033[{style}m{text}\033[0m" if coloured else text, file=sys.stderr)  # noqa: T201
+
+
 class _Trimmed(io.TextIOBase):
     """Stdout without the spaces that rich fills up lines with."""
 

@@ -801,8 +801,8 @@ def test_a_twin_is_opened_with_other_weights_or_none_where_the_scenes_own_are_go
     root = author_scene(full_scene(parts), tmp_path / "s")
     (tmp_path / "s" / "weights" / "net.pth").unlink()
     others = shipped("weights", "turtlebot4_hybrid.safetensors")
-    assert open_twin(root, net=others).scene.robot.magnetometer.network == others
-    assert open_twin(root, net="none").magnetometer is None
+    assert open_twin(root, network=others).scene.robot.magnetometer.network == others
+    assert open_twin(root, network="none").magnetometer is None
     with pytest.raises(InputError, match=r"net\.pth, which is not there"):
         open_twin(root)
 
@@ -837,9 +837,9 @@ def test_a_twin_loads_a_network_only_for_a_neural_magnetometer(lab_scene, tmp_pa
         twin = open_twin(lab_scene, magnetometer=kind)
         assert twin.magnetometer is None
         assert twin.scene.robot.magnetometer.kind == kind
-    assert open_twin(lab_scene, net="none").scene.robot.magnetometer.kind == "physical"
-    with pytest.raises(InputError, match="a neural magnetometer that names no network"):
-        open_twin(lab_scene, net="none", magnetometer="neural")
+    assert open_twin(lab_scene, network="none").scene.robot.magnetometer.kind == "physical"
+    with pytest.raises(InputError, match="a neural magnetometer without a network"):
+        open_twin(lab_scene, network="none", magnetometer="neural")
     with pytest.raises(InputError, match=r"kind of MagnetometerSpec must be a known kind .*'physical'"):
         open_twin(lab_scene, magnetometer="physicall")  # type: ignore[arg-type]
     run = simulate(open_twin(lab_scene, magnetometer="map-only"), duration_s=1.0)

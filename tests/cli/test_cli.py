@@ -224,8 +224,10 @@ def test_run_takes_the_kind_of_magnetometer(lab_scene, tmp_path, capsys):
         assert run.metadata["magnetometer"] == kind
         assert (run["b_disturbance_nt"] == 0).all() == (kind == "map-only")
     capsys.readouterr()
-    line = refused(capsys, "run", lab_scene, "--network", "none", "--magnetometer", "neural", "--duration-s", "1")
-    assert "a neural magnetometer that names no network" in line
+    line = refused(
+        capsys, "run", lab_scene, "--network", "none", "--magnetometer", "neural", "--duration-s", "1"
+    )
+    assert "a neural magnetometer without a network" in line
 
 
 def test_options_come_from_the_environment_and_from_magtwin_toml(tmp_path, monkeypatch, capsys, lab_scene):
@@ -268,7 +270,16 @@ def test_a_seed_that_is_no_whole_number_from_0_up_is_refused(lab_scene, tmp_path
 )
 def test_weights_that_are_no_file_are_refused(lab_scene, tmp_path, capsys, net, said):
     with pytest.raises(SystemExit):
-        main(["run", str(lab_scene), "--network", str(tmp_path / net), "--parquet", str(tmp_path / "a.parquet")])
+        main(
+            [
+                "run",
+                str(lab_scene),
+                "--network",
+                str(tmp_path / net),
+                "--parquet",
+                str(tmp_path / "a.parquet"),
+            ]
+        )
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 

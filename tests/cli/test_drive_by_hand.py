@@ -138,7 +138,7 @@ def test_a_folder_is_no_gamepad(tmp_path, lab_scene, capsys):
 
 
 def test_a_viewer_that_listens_shows_the_drive_while_it_goes_on(lab_scene):
-    scene = open_twin(lab_scene, net="none").scene
+    scene = open_twin(lab_scene, network="none").scene
     try:
         with live_viewer(headless=True) as (address, client), streamed(scene, lab_scene, address) as show:
             for k in range(20):

@@ -61,7 +61,16 @@ def test_the_layer_names_its_scene_from_where_it_lies(written, lab_scene):
 
 def test_outputs_that_cannot_all_be_written_leave_none(lab_scene, tmp_path, capsys):
     (tmp_path / "file").touch()
-    arguments = ["run", str(lab_scene), "--network", "none", "--duration-s", "1", "--rrd", str(tmp_path / "a.rrd")]
+    arguments = [
+        "run",
+        str(lab_scene),
+        "--network",
+        "none",
+        "--duration-s",
+        "1",
+        "--rrd",
+        str(tmp_path / "a.rrd"),
+    ]
     for option, name, said in (
         ("--usd", "file/a.usd", "cannot be written"),
         ("--bag", "file/a.mcap", "cannot be written"),
@@ -78,7 +87,7 @@ def test_outputs_that_cannot_all_be_written_leave_none(lab_scene, tmp_path, caps
 
 
 def test_a_run_that_lacks_columns_is_shown_in_its_lab_all_the_same(lab_scene, tmp_path):
-    twin = open_twin(lab_scene, net="none")
+    twin = open_twin(lab_scene, network="none")
     t = np.arange(200) / 50
     posed = {
         "p_world_base": np.column_stack([t / 10, t / 20, 0 * t]),

@@ -77,7 +77,7 @@ def build(
     json
         Print the summary as JSON.
     """
-    from magtwin.cli.runs.file import _named
+    from magtwin.cli.runs.file import pairs
     from magtwin.files import check_free, sha256
     from magtwin.io.surveys.maps import open_map
     from magtwin.learn.data.dataset import build_dataset
@@ -87,7 +87,7 @@ def build(
     given = lever_arm is not None or latency is not None
     if given and align == "fit":
         raise InputError("--align fit finds lever arm and latency; drop it, or --lever-arm and --latency")
-    options: dict[str, Any] = {"topics": _named(topic) if topic else None, "unit": field_unit}
+    options: dict[str, Any] = {"topics": pairs("topic", topic) if topic else None, "unit": field_unit}
     options["columns"] = _columns(column) if column else None
     options = {name: value for name, value in options.items() if value is not None}
     sources = _sources(_files(run), session_by, path_by, options)

@@ -28,8 +28,8 @@ def map_plot(
     out
         Picture to write (.png or .svg).
     quantity
-        The field, its gradient along the floor, its standard deviation (variance), the masked nodes (mask), or
-        each heading minus the mean of all headings (headings).
+        The field, its gradient along the floor, its standard deviation (variance), the masked nodes (mask),
+        or each heading minus the mean of all headings (headings).
     headings_deg
         Headings to draw [deg], such as 0,90,180,270. Default: the map's, or four of them if it has more than
         eight.

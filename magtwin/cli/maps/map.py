@@ -33,8 +33,8 @@ Earth = Annotated[
     str | None,
     Parameter(
         help="The Earth's field for the harmonic fit: a scene; latitude,longitude,height,date [deg, deg, m, "
-        "YYYY-MM-DD] if the world's y is true north; or x,y,z in the world [nT]. Default: that of the survey, "
-        "if it is a twin's."
+        "YYYY-MM-DD] if the world's y is true north; or x,y,z in the world [nT]. Default: that of the "
+        "survey, if it is a twin's."
     ),
 ]
 Date = Annotated[

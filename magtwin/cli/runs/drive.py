@@ -1,4 +1,4 @@
-"""`magtwin drive`: drive a scene's robot by hand, in real time, and record it."""
+"""`magtwin drive`."""
 
 import os
 import select
@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Json, Seed, Session
-from magtwin.cli.runs.run import write_run
-from magtwin.cli.terminal import announce, print_report, say, silence
+from magtwin.cli.options import Force, Gamepad, ModelError, Network, Seed, Session
+from magtwin.cli.runs.run import draw_run
+from magtwin.cli.terminal import Done, announce, note, silence
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
     from magtwin.sim.motion.manual import Hand, Recorder
 
 STATUS_HZ = 10.0
-"""Lines about pose and speed a second [Hz]."""
+"""Rate of the line about pose and speed [Hz]."""
 
 
 @app.command
@@ -27,20 +27,19 @@ def drive(
     scene: Path,
     *,
     out: Path = Path("drive"),
-    gamepad: Path | None = None,
-    net: Path | None = None,
-    model_error: bool = True,
+    gamepad: Gamepad = None,
+    network: Network = None,
+    model_error: ModelError = True,
     seed: Seed = 0,
     session: Session = None,
-    view: bool = True,
+    live: bool = True,
     force: Force = False,
-    json: Json = False,
-) -> None:
-    """Drive a scene's robot by hand, in real time, and write what happened.
+) -> Done:
+    """Drive a scene's robot by hand, in real time, and write the run.
 
     The kinematic engine moves it from the scene's start. Keys: w/s or up/down for speed, a/d or left/right
-    for turning, x to go straight on, space to stop, q to end. Writes run.rrd, run.parquet, run.png and
-    commands.csv, which magtwin run --commands drives again to the last bit.
+    for turning, x to go straight on, space to stop, q to end. It writes run.rrd, run.parquet, run.png and
+    commands.csv, which `magtwin run --commands` drives again to the last bit.
 
     Parameters
     ----------
@@ -48,27 +47,14 @@ def drive(
         USD stage to drive in.
     out
         Folder to make.
-    gamepad
-        A gamepad of Linux to drive with, such as /dev/input/js0, in place of the keyboard: the left stick
-        drives, Start ends.
-    net
-        Weights to use in place of the scene's; "none" for a physical magnetometer.
-    model_error
-        As for `magtwin run`.
-    seed
-        Seed of all noise, and of the wheels' errors.
-    session
-        As for `magtwin run`.
-    view
-        Show the drive in a Rerun viewer while it goes on, where a window can be opened.
-    force
-        Replace the folder if it exists.
-    json
-        Print the summary as JSON.
+    live
+        Show the drive in a Rerun viewer while it goes on, if a window can be opened.
     """
     import numpy as np
 
     from magtwin.files import existing, output
+    from magtwin.io.outputs import Outputs
+    from magtwin.io.outputs import drive as drive_again
     from magtwin.sim.motion.commands import write_commands
     from magtwin.sim.motion.drive import draw_wheel_errors
     from magtwin.sim.motion.follow import CONTROL_RATE_HZ
@@ -80,7 +66,7 @@ def drive(
     if gamepad is not None and existing(gamepad, "gamepad").is_dir():
         raise InputError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
     with output(out, force=force) as folder:
-        twin = in_session(open_twin(scene, net=net, model_error=model_error), session, seed=seed)
+        twin = in_session(open_twin(scene, network=network, model_error=model_error), session, seed=seed)
         robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
         errors = draw_wheel_errors(robot.drive, streams(np.random.default_rng(seed))["drive"])
         chassis = at_start(
@@ -90,40 +76,37 @@ def drive(
         recorder = Recorder(chassis, hand, dt)
         with ExitStack() as stack:
             show = None
-            if view:
+            if live:
                 from magtwin.io.rerun.live import live_view
 
                 try:
                     show = stack.enter_context(live_view(twin.scene, scene))
                 except InputError as error:
-                    print(f"  no view: {error}", file=sys.stderr)  # noqa: T201
+                    note(f"no view: {error}")
             source = stack.enter_context(device(gamepad))
-            print(f"  {HELP if gamepad is None else 'left stick drives, Start ends'}\r", file=sys.stderr)  # noqa: T201
+            note(f"{HELP if gamepad is None else 'left stick drives, Start ends'}\r")
             with silence():
                 _drive(recorder, hand, source, dt, show)
         folder.mkdir()
         write_commands(recorder.commands("commands.csv"), folder / "commands.csv")
-        report = write_run(
+        driven = drive_again(
             scene,
-            "commands.csv",
-            folder,
             commands=folder / "commands.csv",
-            metadata={"commands_file": "commands.csv"},
-            steps=announce,
-            net=net,
+            network=network,
             model_error=model_error,
             seed=seed,
             session=session,
-            title=f"Manual drive in {scene}",
+            metadata={"commands_file": "commands.csv"},
+            report=announce,
         )
-    print_report(report, json)
-    if not json:
-        again = "" if session is None else f" --session {session}"
-        say(f"Wrote {out}; again: magtwin run {scene} --commands {out / 'commands.csv'} --seed {seed}{again}")
+        Outputs(folder, picture=draw_run).write(driven)
+    again = f"magtwin run {scene} --commands {out / 'commands.csv'} --seed {seed}"
+    again += "" if session is None else f" --session {session}"
+    return Done(driven.run.report(f"Manual drive in {scene}"), out, text=f"Wrote {out}; again: {again}")
 
 
 def _drive(recorder: "Recorder", hand: "Hand", device: int, dt: float, show: object) -> None:
-    """Drive in real time until the hand has done; a machine too slow for that drives in slow motion."""
+    """Drive in real time until the hand is done; a slow machine drives in slow motion."""
     due, step, told = time.monotonic(), 0, ""
     try:
         while not hand.done:
@@ -149,7 +132,7 @@ def _drive(recorder: "Recorder", hand: "Hand", device: int, dt: float, show: obj
 
 @contextmanager
 def device(gamepad: Path | None) -> Iterator[int]:
-    """A gamepad, or the terminal, whose keys come one by one; it is as it was before at any end."""
+    """A gamepad, or the terminal with its keys one by one; the terminal is restored at the end."""
     if gamepad is not None:
         try:
             pad = os.open(gamepad, os.O_RDONLY | os.O_NONBLOCK)

@@ -1,79 +1,91 @@
-"""`magtwin report`: a run, or a set of runs, as one page."""
+"""`magtwin report` and `magtwin compare`."""
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force
-from magtwin.cli.terminal import check_suffix, progress, say
+from magtwin.cli.options import Force, RunScene
+from magtwin.cli.terminal import Done, check_output, progress, stdout_console, step
 
-MOST_PICTURED = 60
-"""Runs of a page with pictures: 0.4 MB and a second each."""
+if TYPE_CHECKING:
+    from magtwin.run.compare import Comparison
 
 
 @app.command
 def report(
     *runs: Annotated[Path, Parameter(required=True)],
     out: Path = Path("report.html"),
-    scene: Path | None = None,
+    scene: RunScene = None,
     force: Force = False,
-) -> None:
-    """Write what happened in a run, or in a set of runs, as one page with its pictures inside.
+) -> Done:
+    """Write one page about a run or a set of runs, with its pictures inside.
 
-    What was run, the map with the path, time series, errors by source, events, and provenance.
-    Several runs get an overview first.
+    It has what was run, the map with the path, time series, errors by source, events and provenance. Several
+    runs get an overview first.
 
     Parameters
     ----------
     runs
-        Runs, in any format that magtwin reads; or the folder of a data set, for all of its runs.
+        Runs in any format that magtwin reads; a folder that `magtwin sweep` made stands for all of its runs.
     out
-        Page to write: .html, which needs nothing else to be shown; .md; or .json.
-    scene
-        Where the scene lies whose map is drawn below the paths; looked for where each run says unless given.
-    force
-        Replace what exists.
+        Page to write: .html, which needs no other file, .md or .json.
     """
-    from magtwin.errors import InputError
-    from magtwin.figures.pages import WRITERS, Told, page_of_runs, write_page
-    from magtwin.files import check_free
-    from magtwin.io.formats import read_run
-    from magtwin.io.provenance import map_of, planned_of
+    from magtwin.figures.reports import report_runs
 
-    check_suffix(out, tuple(WRITERS), "a report")
-    check_free(out, force=force)
-    told = []
-    files = [file for given in runs for file in _files(given)]
-    names = [file.name for file in files]
-    with progress("Reading", "runs") as advance:
-        for k, file in enumerate(files):
-            advance(k, len(files), file.name)
-            run = read_run(file)
-            note, field = "", None
-            try:
-                field = map_of(run, scene, near=file)
-            except InputError as error:
-                note = f"Its map is not shown: {error}."
-            name = file.name if names.count(file.name) == 1 else str(file)
-            told.append(Told(name, run, field, planned_of(run, near=file), note))
-    with progress("Drawing", "runs") as advance:
-        advance(0, len(told))
-        page = page_of_runs(
-            told,
-            pictures=out.suffix == ".html" and len(told) <= MOST_PICTURED,
-            advance=lambda done: advance(done, len(told)),
-        )
-    if out.suffix == ".html" and len(told) > MOST_PICTURED:
-        page = replace(page, lead=f"{page.lead} Pictures are left out of more than {MOST_PICTURED} runs.")
-    write_page(page, out, force=force)
-    say(f"Wrote {out}")
+    check_output(out, (".html", ".md", ".json"), "a report", force=force)
+    with progress("Reporting", "runs") as advance:
+        report_runs(runs, out, scene=scene, force=force, progress=advance)
+    return Done(wrote=out)
 
 
-def _files(given: Path) -> list[Path]:
-    """The runs of a data set that `magtwin runs` made, or the one run that a name is of."""
-    if not (given / "runs.csv").is_file():
-        return [given]
-    return sorted(given.glob("run_*.parquet"))
+@app.command
+def compare(
+    a: Path,
+    b: Path,
+    *,
+    align: Literal["time", "path", "none"] = "time",
+    out: Path | None = None,
+    force: Force = False,
+) -> Done:
+    """Compare two runs: how far apart they are in pose and in field.
+
+    Parameters
+    ----------
+    a
+        A run in any format that magtwin reads.
+    b
+        The run to compare with it.
+    align
+        time: shift the clocks so that the positions agree best. path: align by distance driven, for runs of
+        different speeds. none: keep the clocks.
+    out
+        Page (.html, .md, .json) or picture (.png, .svg) to write: readings as recorded and aligned, the
+        distance between the runs, and both paths.
+    """
+    from magtwin.figures.reports import compare_files, names_of
+
+    check_output(out, (".html", ".md", ".json", ".png", ".svg"), "a comparison", force=force)
+    step("Comparing the runs")
+    comparison = compare_files(a, b, align=align, out=out, force=force)
+    return Done(comparison, out or (), table=lambda: _print(comparison, names_of(a, b)))
+
+
+def _print(comparison: "Comparison", names: tuple[str, str]) -> None:
+    """Print the agreements as a table."""
+    from rich.table import Table
+    from rich.text import Text
+
+    shift = f"moved by {comparison.shift:+.4f} {comparison.unit}"
+    how = "clocks as recorded" if comparison.align == "none" else shift
+    console = stdout_console()
+    console.print(Text(f"{names[1]} less {names[0]}, {how}; {len(comparison.at):,} readings", style="bold"))
+    table = Table(box=None, pad_edge=False)
+    for column in ("", "unit", "mean", "RMS", "mean abs.", "greatest", "correlation"):
+        table.add_column(column, justify="left" if column in ("", "unit") else "right", no_wrap=True)
+    for row in comparison.agreements():
+        correlation = "" if row.correlation is None else f"{row.correlation:.4f}"
+        numbers = (f"{value:,.4g}" for value in (row.mean, row.rms, row.mae, row.greatest))
+        table.add_row(row.name, row.unit, *numbers, correlation)
+    console.print(table)

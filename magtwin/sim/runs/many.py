@@ -1,15 +1,17 @@
-"""simulate_many: thousands of robots, each as if it were alone, driven at once and read in blocks.
+"""sweep: thousands of robots, each as if it were alone, driven at once and read in blocks.
 
 A robot's bits depend on nothing but its own scene, path and seed: the closed loop drives each as it would
 alone, sensors draw from generators of its own, and a network gives a row the same whatever is beside it. So
 runs can be made in any order, in blocks of any size, and any of them anew.
 """
 
+import importlib
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from typing import Literal, overload
+from typing import Any, Literal, overload
 
 import numpy as np
 
@@ -144,6 +146,10 @@ class Runs(Summarized, Sequence[Run]):
 
     def __iter__(self) -> Iterator[Run]:
         return self._made(range(len(self)))
+
+    def save(self, out: str | os.PathLike[str], **options: Any) -> Any:
+        """Write the runs to a folder as Parquet files; see `magtwin.io.sweeps.save_runs`."""
+        return importlib.import_module("magtwin").save_runs(self, out, **options)
 
     def _made(self, numbers: Sequence[int]) -> Iterator[Run]:
         """Runs by number, in their order."""

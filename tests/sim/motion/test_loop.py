@@ -482,7 +482,7 @@ def test_a_shipped_scene_refuses_a_path_through_its_wall_or_its_furniture():
     from magtwin.files import shipped
     from magtwin.twin import open_twin, simulate
 
-    twin = open_twin(shipped("scenes", "lab", "lab.usda"), net="none")
+    twin = open_twin(shipped("scenes", "lab", "lab.usda"), network="none")
     desk = next(i for i, name in enumerate(twin.obstacles.names) if "desk" in name)
     x, y = twin.obstacles.outlines[desk].mean(axis=0)
     scene = dataclasses.replace(twin.scene, lab=dataclasses.replace(twin.scene.lab, floor_m=(40.0, 40.0)))
@@ -497,7 +497,7 @@ def test_a_run_tells_which_controller_drove(name):
     from magtwin.twin import open_twin, simulate
 
     run = simulate(
-        open_twin(shipped("scenes", "lab", "lab.usda"), net="none"), duration_s=5.0, controller=name
+        open_twin(shipped("scenes", "lab", "lab.usda"), network="none"), duration_s=5.0, controller=name
     )
     assert run.metadata["controller"] == name
     assert not run["flag_bump"].any()
