@@ -12,6 +12,7 @@ COMMANDS = {
 """Commands by the words of their old name."""
 
 OPTIONS = {
+    **dict.fromkeys(("--rrd", "--parquet", "--bag", "--csv", "--usd"), "--out FILE"),
     "--columns": "--keep",
     "--dest": "--out",
     "--duration": "--duration-s",

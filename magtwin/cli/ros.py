@@ -169,8 +169,8 @@ def magnetometer(
 
     It reads pose (/robot/enu/pose), odometry, IMU, battery and scans, as far as the network needs them. It
     publishes qtfm/magnitude and qtfm/total_field_nt while its inputs are fresh, and its state in
-    /diagnostics. Inputs may come and go. Settings have the form of ROS, name:=value: rate_hz (135), units (T or nT),
-    use_sim_time, max_age_s (0.5), battery_max_age_s (30), lidar (scan, on or off), outside (silent or clamp).
+    /diagnostics. Inputs may come and go. Settings have the form of ROS, name:=value: rate_hz (135),
+    units (T or nT), use_sim_time, max_age_s (0.5), battery_max_age_s (30), lidar (scan, on, off), outside (silent, clamp).
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ def test_a_scene_that_names_a_urdf_is_driven_in_two_commands(tmp_path, capsys):
     main(
         [
             *("run", str(tmp_path / "mine" / "mine.usda"), "--duration-s", "3", "--json"),
-            *("--parquet", str(tmp_path / "run.parquet"), "--rrd", str(tmp_path / "run.rrd")),
+            *("--out", str(tmp_path / "run.parquet"), "--out", str(tmp_path / "run.rrd")),
         ]
     )
     out = capsys.readouterr().out

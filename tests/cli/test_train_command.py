@@ -146,7 +146,7 @@ def test_a_simulation_runs_the_trained_network(trained, lab_scene, tmp_path, cap
             str(trained),
             "--duration-s",
             "1",
-            "--parquet",
+            "--out",
             str(out),
             "--json",
         ]

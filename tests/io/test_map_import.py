@@ -12,7 +12,7 @@ from test_rosbag import at_middle, drive, write_bag
 
 from magtwin.author.scene import read_scene
 from magtwin.cli import main
-from magtwin.cli.maps.map_input import earth_nt
+from magtwin.author.earth import earth_of
 from magtwin.field.sources.earth import earth_field_nt
 from magtwin.field.survey.gridded import import_survey
 from magtwin.io.surveys.readings import load_readings, save_readings
@@ -157,7 +157,15 @@ def test_a_fit_and_a_check_run_from_readings_with_latched_ones_out(tmp_path, cap
 @pytest.mark.parametrize("headings", ["", "north", "0,nan", "0;90"])
 def test_headings_that_are_none_are_refused(tmp_path, capsys, headings):
     save_readings(gridded(0), tmp_path / "a.parquet")
-    arguments = ("map", "fit", tmp_path / "a.parquet", "--out", tmp_path / "a.usdc", "--headings-deg", headings)
+    arguments = (
+        "map",
+        "fit",
+        tmp_path / "a.parquet",
+        "--out",
+        tmp_path / "a.usdc",
+        "--headings-deg",
+        headings,
+    )
     assert "headings are degrees with commas between" in refused(capsys, *arguments)
 
 
@@ -214,10 +222,10 @@ def test_runs_under_several_licences_keep_all_of_them(tmp_path, capsys):
 
 
 def test_the_earths_field_is_taken_from_a_place_and_day_as_numbers_or_from_a_scene(lab_scene):
-    place = earth_nt("29.64, -82.35, 50, 2024-06-01")
+    place = earth_of("29.64, -82.35, 50, 2024-06-01")
     assert place == earth_field_nt(29.64, -82.35, 50.0, "2024-06-01")
-    assert earth_nt("-2700,24000,-38400") == (-2700.0, 24000.0, -38400.0)
-    assert earth_nt(str(lab_scene)) == read_scene(lab_scene, check_network=False).earth.b_world_nt
+    assert earth_of("-2700,24000,-38400") == (-2700.0, 24000.0, -38400.0)
+    assert earth_of(str(lab_scene)) == read_scene(lab_scene, check_network=False).earth.b_world_nt
 
 
 def test_a_survey_of_a_twin_knows_the_earths_field_and_keeps_it(tmp_path, capsys, lab_scene):

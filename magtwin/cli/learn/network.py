@@ -8,7 +8,7 @@ from magtwin.cli.app import app
 from magtwin.cli.options import Force, Json
 from magtwin.cli.terminal import check_suffix, print_report, say, step
 
-net_app = App(name="net", help="Work with networks.")
+net_app = App(name="network", help="Convert and export networks.")
 app.command(net_app)
 
 
