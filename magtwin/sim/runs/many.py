@@ -25,8 +25,9 @@ from magtwin.sim.motion.drive import Motion, Pose, draw_wheel_errors
 from magtwin.sim.motion.engine import Kinematic, Travel
 from magtwin.sim.motion.follow import check_arrived, course_along, course_by
 from magtwin.sim.runs.simulate import Sensed, check_run, sense, streams, travel
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec, Scene
+from magtwin.spec.scene import Scene
 from magtwin.summary import Summarized, Summary, listed
 
 BLOCK = 16
