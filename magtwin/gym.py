@@ -31,7 +31,7 @@ from magtwin.spec.scene import Scene
 from magtwin.twin import Kind, Twin, open_twin, room_of, without_model_error
 
 if TYPE_CHECKING:
-    from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 
 Array = NDArray[np.float64]
 

@@ -33,7 +33,7 @@ Metadata = dict[str, str | int | float | bool]
 if TYPE_CHECKING:
     from tempfile import TemporaryDirectory
 
-    from magtwin.learn.magnetometer import NeuralMagnetometer, Read
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer, Read
     from magtwin.placement import Room
     from magtwin.sim.motion.commands import Commands
     from magtwin.sim.motion.controllers import Controller
@@ -538,7 +538,7 @@ def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
             f"scene {scene.name!r} has a neural magnetometer that names no network; name one "
             'with net, or take the kind "physical" or "map-only"'
         )
-    from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 
     magnetometer = NeuralMagnetometer.load(spec.network, sha256=spec.network_sha256)
     if spec.inputs and spec.inputs != magnetometer.features:

@@ -19,7 +19,7 @@ from magtwin.learn.data.dataset import build_dataset
 from magtwin.learn.data.labels import Alignment
 from magtwin.learn.data.split import split
 from magtwin.learn.evaluation.evaluate import Contender, Mean, Trial, chart_of, evaluate
-from magtwin.learn.magnetometer import NeuralMagnetometer
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.learn.training.config import TrainConfig
 from magtwin.learn.training.result import fit as train

@@ -55,7 +55,7 @@ def fit(
     """
     from magtwin.files import check_free, output
     from magtwin.io.tables import read_parquet
-    from magtwin.learn.tolles_lawson import fit_run
+    from magtwin.learn.compensation.tolles_lawson import fit_run
 
     check_suffix(out, (".json",), "a Tolles-Lawson model")
     check_free(out, force=force)
@@ -94,7 +94,7 @@ def apply(run: Path, model: Path, *, out: Path, force: Force = False, json: Json
     """
     from magtwin.files import check_free
     from magtwin.io.tables import read_parquet, write_parquet
-    from magtwin.learn.tolles_lawson import TollesLawson, compensate_run
+    from magtwin.learn.compensation.tolles_lawson import TollesLawson, compensate_run
 
     check_suffix(out, (".parquet",), "a run")
     check_free(out, force=force)

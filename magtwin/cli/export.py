@@ -100,7 +100,7 @@ def _read(run: Path) -> "Run":
 
 
 def _write_onnx(weights: Path, out: Path) -> None:
-    from magtwin.learn.models.onnx import export_onnx
+    from magtwin.learn.inference.onnx import export_onnx
 
     export_onnx(weights, out)
 

@@ -235,7 +235,7 @@ def _info_of_run(file: Path) -> Any:
 
 def _info_of_net(file: Path) -> Any:
     if file.suffix == ".onnx":
-        from magtwin.learn.models.onnx import report_onnx
+        from magtwin.learn.inference.onnx import report_onnx
 
         return report_onnx(file)
     from magtwin.learn.models.predictor import load_predictor

@@ -54,7 +54,7 @@ def net_export(weights: Path, *, onnx: Path, force: Force = False, json: Json = 
     json
         Print what it holds as JSON.
     """
-    from magtwin.learn.models.onnx import export_onnx
+    from magtwin.learn.inference.onnx import export_onnx
 
     check_suffix(onnx, (".onnx",), "an ONNX file")
     step("Exporting the network")

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from magtwin.run.run import Run
 
 if TYPE_CHECKING:
-    from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 
 
 class Following:

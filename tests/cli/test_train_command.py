@@ -16,7 +16,7 @@ from magtwin.io.formats import read_run
 from magtwin.learn.data.dataset import build_dataset, open_dataset
 from magtwin.learn.data.features import features
 from magtwin.learn.data.split import LEAK
-from magtwin.learn.magnetometer import NeuralMagnetometer
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.models.descent import _Descent
 from magtwin.learn.models.network import load_net
 from magtwin.learn.models.predictor import load_predictor

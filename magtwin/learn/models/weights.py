@@ -18,7 +18,7 @@ from magtwin.learn.data.features import FEATURES, feature_names
 
 Fact = str | int | float | bool
 
-VERSIONS = {"mlp": 1, "linear": 2, "hybrid": 2, "ensemble": 2, "tcn": 2}
+VERSIONS = {"mlp": 1, "linear": 2, "hybrid": 2}
 """Version of the file by the kind of predictor it holds; a reader refuses another."""
 
 _ZIP = b"PK\x03\x04"

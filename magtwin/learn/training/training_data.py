@@ -14,7 +14,7 @@ from magtwin.learn.data.features import CIRCULAR, FEATURES, features
 from magtwin.learn.data.inputs import Array
 from magtwin.learn.data.recording import Recording, Rows
 from magtwin.learn.data.split import PARTS, Part, Split
-from magtwin.learn.magnetometer import STEPS_ALIKE
+from magtwin.learn.inference.magnetometer import STEPS_ALIKE
 from magtwin.learn.models.calibration import Yardstick, yardstick
 from magtwin.learn.models.linear import Fitted, fit_linear
 from magtwin.learn.models.predictor import Predictor

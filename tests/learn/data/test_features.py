@@ -13,7 +13,7 @@ from magtwin.learn.data.features import (
     feature_names,
     features,
 )
-from magtwin.learn.tolles_lawson import design_matrix
+from magtwin.learn.compensation.tolles_lawson import design_matrix
 from magtwin.run.run import COLUMNS, Run
 
 

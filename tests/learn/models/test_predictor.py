@@ -15,7 +15,7 @@ from test_network import RELEASED, a_net
 from magtwin.errors import InputError
 from magtwin.learn.data.features import SETS, features
 from magtwin.learn.data.inputs import inputs_of
-from magtwin.learn.magnetometer import NeuralMagnetometer
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.ensemble import Ensemble, Members
 from magtwin.learn.models.hybrid import Hybrid

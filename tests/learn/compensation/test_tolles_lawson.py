@@ -15,7 +15,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import shipped
 from magtwin.io.tables import write_parquet
-from magtwin.learn.tolles_lawson import (
+from magtwin.learn.compensation.tolles_lawson import (
     TollesLawson,
     compensate_run,
     design_matrix,

@@ -13,7 +13,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.features import FEATURES, FULL, SETS, features
 from magtwin.learn.models.network import load_net
-from magtwin.learn.reading import POSE, Reader
+from magtwin.learn.inference.reader import POSE, Reader
 from magtwin.run.run import COLUMNS
 
 
@@ -173,8 +173,8 @@ def test_signals_that_are_missing_or_of_another_width_are_refused(field, run, wr
 def test_without_numba_a_reading_is_the_same_and_takes_longer(field, run, monkeypatch):
     net = a_net(FULL, (16, 8))
     quick = Reader(net, field)
-    monkeypatch.setitem(sys.modules, "magtwin.learn.models.compiled", None)
-    monkeypatch.delattr("magtwin.learn.models.compiled", raising=False)
+    monkeypatch.setitem(sys.modules, "magtwin.learn.inference.compiled_row", None)
+    monkeypatch.delattr("magtwin.learn.inference.compiled_row", raising=False)
     slow = Reader(net, field)
     signals = signals_of(quick, run, 5)
     assert_allclose(slow.read((0.5, 0.5), 1.0, signals), quick.read((0.5, 0.5), 1.0, signals), atol=1e-3)

@@ -15,7 +15,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.files import sha256
 from magtwin.learn.data.features import FEATURES, FULL, SETS
-from magtwin.learn.models.onnx import export_onnx, model_of, report_onnx
+from magtwin.learn.inference.onnx import export_onnx, model_of, report_onnx
 from magtwin.learn.models.predictor import load_predictor
 
 
