@@ -164,14 +164,14 @@ def test_courses_are_not_changed_by_running_them(way):
 def test_the_loop_opens_its_machine_code_when_that_has_paid(monkeypatch):
     monkeypatch.setattr(courses._Loop, "compiled", None)
     monkeypatch.setattr(courses._Loop, "made", 0)
-    monkeypatch.setattr(courses.Lookup, "compiled", None)
+    monkeypatch.setattr(courses.lookup.LOOPS, "code", None)
     monkeypatch.setattr(courses, "PAYS", 6000)
     path = path_named("figure8")
     first = follow(path, REAL, speed=0.2, duration_s=60.0)
     assert courses._Loop.compiled is None
     second = follow(path, REAL, speed=0.2, duration_s=60.0)
     assert courses._Loop.compiled is not None
-    assert courses.Lookup.compiled is not None  # which costs little more then
+    assert courses.lookup.LOOPS.code is not None  # which costs little more then
     assert_same(first, second)
 
 
