@@ -160,7 +160,7 @@ class Magnetometer:
             self._timer = self._bus.timer(1 / self._rate, self._read)
         self._noise_nt = float(robot.magnetometer.noise_density_nt * np.sqrt(self._rate / 2))
         network = self._twin.magnetometer
-        alone = network is not None and not network.net.context and settings["outside"] == "silent"
+        alone = network is not None and settings["outside"] == "silent"
         if not alone:
             self._reader = None
         elif self._reader is None and network is not None:

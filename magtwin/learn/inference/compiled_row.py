@@ -4,17 +4,17 @@ A unit that is 0 after ReLU adds nothing to the next layer and is skipped; nan s
 may use fused multiplications.
 """
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
-from numba import njit, types
+from numba import types
 from numpy.typing import NDArray
+
+from magtwin.compiled import compiled
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
 
-OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+FUSED = {"contract"}
+"""Allows fused multiplications."""
 
 _ARRAY = types.Array(types.float64, 1, "C")
 _RANGES = types.Array(types.float64, 2, "C", readonly=True)
@@ -23,19 +23,7 @@ _TABLE = types.Array(types.float32, 1, "C", readonly=True)
 _WORK = types.Array(types.float32, 1, "C")
 
 
-def compiled(*signature: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compile for one signature at import, or load cached machine code."""
-
-    def compile_or_load(function: Callable[..., Any]) -> Any:
-        try:
-            return njit(signature, cache=True, **OPTIONS)(function)
-        except (RuntimeError, OSError):  # the cache folder is not writable or full
-            return njit(signature, **OPTIONS)(function)
-
-    return compile_or_load
-
-
-@compiled(_ARRAY, _RANGES, _ARRAY)
+@compiled(_ARRAY, _RANGES, _ARRAY, fastmath=FUSED)
 def scaled(x: Array, ranges: Array, z: Array) -> bool:
     """Scale a row, z = (x clipped to bounds - mean) / scale.
 
@@ -56,7 +44,7 @@ def scaled(x: Array, ranges: Array, z: Array) -> bool:
     return outside
 
 
-@compiled(_ARRAY, _RANGES, _WIDTHS, _TABLE, _ARRAY, _WORK, _ARRAY)
+@compiled(_ARRAY, _RANGES, _WIDTHS, _TABLE, _ARRAY, _WORK, _ARRAY, fastmath=FUSED)
 def perceptron(
     x: Array, ranges: Array, widths: NDArray[np.int64], table: Floats, z: Array, work: Floats, out: Array
 ) -> bool:

@@ -13,12 +13,13 @@ from magtwin.errors import InputError
 from magtwin.learn.data.features import columns_of, features
 from magtwin.learn.models.predictor import Predictor, load_predictor
 from magtwin.learn.models.regressor import summary_of
-from magtwin.learn.models.weights import Fact
+from magtwin.learn.models.weights import MetadataValue
 from magtwin.run.run import Run
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True, repr=False)
 class Read(Summarized):
@@ -62,7 +63,8 @@ class NeuralMagnetometer(Summarized):
         checksum = files.sha256(path)
         if sha256 and checksum != sha256.lower():
             raise InputError(
-                f"{path}: its sha256 is {checksum}, expected {sha256}; get the file again or change the checksum"
+                f"{path}: its sha256 is {checksum}, expected {sha256}; get the file again "
+                "or change the checksum"
             )
         return cls(load_predictor(path), name=path.name, sha256=checksum)
 
@@ -99,12 +101,12 @@ class NeuralMagnetometer(Summarized):
         return ModelError(*figures)
 
     @property
-    def metadata(self) -> Mapping[str, Fact]:
+    def metadata(self) -> Mapping[str, MetadataValue]:
         """Metadata of a run about its network: file, checksum, layers and parameters.
 
         The mean training label is included if known, and the kind if it is not a perceptron.
         """
-        metadata: dict[str, Fact] = {
+        metadata: dict[str, MetadataValue] = {
             "network": self.name,
             "network_sha256": self.sha256,
             "network_layers": self.net.layers_text,

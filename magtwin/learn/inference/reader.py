@@ -1,7 +1,7 @@
 """Reader: one reading at a time, for a robot that drives now.
 
-Features are plain numbers here, and the map and the network run in compiled code. A predictor without a compiled
-path predicts its one row as usual, which gives the same numbers more slowly.
+Features are plain numbers here, and the map and the network run in compiled code. A predictor without a
+compiled path predicts its one row as usual, which gives the same numbers more slowly.
 """
 
 import math
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from magtwin.compiled import Loops
 from magtwin.errors import InputError, hint
 from magtwin.field.maps import lookup
 from magtwin.field.maps.map import AnomalyMap
@@ -36,7 +37,10 @@ from magtwin.run.run import COLUMNS
 Array = NDArray[np.float64]
 Signals = Mapping[str, Any]
 PredictRow = Callable[[Array], tuple[float, float, bool]]
-"""From features, shape (F,), to disturbance [nT], its standard deviation [nT], and whether the row is outside."""
+"""From features, shape (F,), to disturbance [nT], its standard deviation [nT], and whether the row is
+outside."""
+
+LOOPS = Loops("magtwin.learn.inference.compiled_row", pays=0)
 
 POSE = ("yaw", "b_map_gradient_nt_m")
 """Columns that follow from the pose and the map; all others are signals of the robot."""
@@ -85,9 +89,7 @@ class Reader:
         self._predict_row: PredictRow | None = None
         try:
             lookup.warm_up()
-            from magtwin.learn.inference import compiled_row
-
-            self._predict_row = _compiled_path(predictor, compiled_row)
+            self._predict_row = _compiled_path(predictor, LOOPS.open())
         except ImportError:  # without numba: the same numbers, in numpy and torch
             pass
 
@@ -101,8 +103,8 @@ class Reader:
         """One reading.
 
         Args:
-            p_xy: Position of base_link in world when the field was measured [m]. If the labels have a latency,
-                that is the position of that time ago.
+            p_xy: Position of base_link in world when the field was measured [m]. If the labels have a
+                latency, that is the position of that time ago.
             yaw: Heading then [rad].
             signals: Latest values by column name, at least those of `Reader.signals`: a number, or one number
                 for each part of the column, in its unit and frame.

@@ -131,8 +131,8 @@ def _load(path: Path) -> dict[str, Any]:
         text = str(error)
         if match := re.search(r"(?:GLOBAL|function|class) ([\w.]+)", text):
             raise InputError(
-                f"{path}: its pickle asks for {match[1]}, which no network needs; nothing of it was executed, "
-                "do not load this file with other programs"
+                f"{path}: its pickle asks for {match[1]}, which no network needs; nothing of it was "
+                "executed, do not load this file with other programs"
             ) from None
         reason = next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
         raise InputError(f"{path}: damaged checkpoint ({ascii(reason)[:120]}); get the file again") from None

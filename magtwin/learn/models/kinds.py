@@ -1,6 +1,5 @@
 """The kinds of predictors that magtwin has: multilayer perceptron, linear model and hybrid of the two."""
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
@@ -14,33 +13,16 @@ from magtwin.learn.models.descent import Epoch
 from magtwin.learn.models.fit_network import train
 from magtwin.learn.models.hybrid import Hybrid, hybrid_of
 from magtwin.learn.models.linear import FittedLinear, Linear, fit_linear, linear_of
-from magtwin.learn.models.network import FieldNet, net_of, net_of_checkpoint
-from magtwin.learn.models.predictor import PREDICTORS, Array, Choice, Fit, FitTask, Predictor
-from magtwin.learn.models.weights import Weights, is_checkpoint, read_weights
+from magtwin.learn.models.network import FieldNet, net_of
+from magtwin.learn.models.predictor import Array, Choice, Fit, FitTask
+from magtwin.learn.models.weights import Weights
 
 DESCENT: Mapping[str, Any] = MappingProxyType({"epochs": 20, "batch": 1024, "lr": 1e-3, "patience": None})
 TORCH: Mapping[str, Any] = MappingProxyType({"threads": None, "device": "auto", "freeze": ()})
 RIDGE: Mapping[str, Any] = MappingProxyType({"penalty": None, "weighting": "auto"})
 
 
-def load_predictor(path: str | os.PathLike[str]) -> Predictor:
-    """Load a predictor of any kind: magtwin's safetensors, or a released `.pth`.
-
-    Raises:
-        InputError: Neither of the two, damaged, or its parts do not fit each other.
-    """
-    if is_checkpoint(path):
-        return net_of_checkpoint(path)
-    weights = read_weights(path)
-    try:
-        kind = PREDICTORS[weights.kind]
-    except InputError as error:
-        raise InputError(f"{path}: {error}; update magtwin or install the package of this kind") from error
-    return kind.load(weights)
-
-
-@PREDICTORS.register("mlp")
-class PerceptronKind:
+class Perceptrons:
     """The paper's multilayer perceptron."""
 
     description = "A multilayer perceptron, float32"
@@ -48,25 +30,29 @@ class PerceptronKind:
         {"features": "full", "layers": (512, 512, 512, 512), "dropout": 0.3, **DESCENT, **TORCH}
     )
 
-    def fit(self, task: FitTask) -> Fit:
+    @staticmethod
+    def fit(task: FitTask) -> Fit:
         """Fit by Adam; the best epoch on the validation rows is kept."""
         learned, stops = task.train, task.validation
-        net, history = _train(task, learned.x, learned.y, stops.x, stops.y, init=task.init, freeze=task.freeze)
+        net, history = _train(
+            task, learned.x, learned.y, stops.x, stops.y, init=task.init, freeze=task.freeze
+        )
         return Fit(net, history)
 
-    def load(self, weights: Weights) -> FieldNet:
+    @staticmethod
+    def load(weights: Weights) -> FieldNet:
         """The network of a weights file."""
         return net_of(weights)
 
 
-@PREDICTORS.register("linear")
-class LinearKind:
+class Linears:
     """Tolles and Lawson's terms by ridge regression."""
 
     description = "A linear model by ridge regression"
     options = MappingProxyType({"features": "circular", **RIDGE})
 
-    def fit(self, task: FitTask) -> Fit:
+    @staticmethod
+    def fit(task: FitTask) -> Fit:
         """Fit by ridge regression and calibrate the spread."""
         if task.resume:
             raise InputError("a linear model is fitted at once; there is no checkpoint to resume from")
@@ -76,13 +62,13 @@ class LinearKind:
         model = replace(model, spread=model.spread.scaled(scale))
         return Fit(model, held_out_nt=_left_out(fitted))
 
-    def load(self, weights: Weights) -> Linear:
+    @staticmethod
+    def load(weights: Weights) -> Linear:
         """The linear model of a weights file."""
         return linear_of(weights)
 
 
-@PREDICTORS.register("hybrid")
-class HybridKind:
+class Hybrids:
     """A linear base and a small network for its residual, kept only if it does better on validation."""
 
     description = "A linear base by ridge regression and a small network for what it leaves"
@@ -90,7 +76,8 @@ class HybridKind:
         {"features": "platform", **RIDGE, "layers": (64, 64), "dropout": 0.1, **DESCENT, **TORCH}
     )
 
-    def fit(self, task: FitTask) -> Fit:
+    @staticmethod
+    def fit(task: FitTask) -> Fit:
         """Fit the base, then the network to what the base leaves."""
         learned, stops, init = task.train, task.validation, task.init
         known = {"base", *(f"layers.{i}" for i in range(len(init.net.linears) if init and init.net else 0))}
@@ -125,7 +112,8 @@ class HybridKind:
         model.sd_factor = transferred_factor(error, base_sd, task.validation_groups, reference)
         return Fit(model, history, choice, _left_out(base) if "base" not in task.freeze else None)
 
-    def load(self, weights: Weights) -> Hybrid:
+    @staticmethod
+    def load(weights: Weights) -> Hybrid:
         """The hybrid of a weights file."""
         return hybrid_of(weights)
 

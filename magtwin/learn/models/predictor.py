@@ -1,13 +1,21 @@
 """Predictors: models of the disturbance that a robot adds to the map, and the registry of their kinds.
 
-To add a kind, write a `Predictor` (subclass `magtwin.learn.models.regressor.Regressor`) and a `PredictorKind` that
-fits and loads it, and register the latter:
+To add a kind, write a `Predictor` (subclass `magtwin.learn.models.regressor.Regressor`) and a
+`PredictorKind`, and register the latter under the predictor's `kind`:
 
     @PREDICTORS.register("forest")
-    class Forest: ...
+    class ForestKind:
+        description = "A random forest"
+        options = {"features": "circular"}
 
-or name it in the entry point group `magtwin.predictors` of a package. `magtwin train --model forest` then trains it,
-and every command reads its weights.
+        @staticmethod
+        def fit(task: FitTask) -> Fit: ...
+
+        @staticmethod
+        def load(weights: Weights) -> Forest: ...
+
+A package registers it by an entry point of the group `magtwin.predictors`. Then `magtwin train --model
+forest` trains it, and every command reads its weights.
 """
 
 import os
@@ -18,9 +26,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.errors import InputError
 from magtwin.learn.data.recording import Rows
 from magtwin.learn.models.descent import Epoch
-from magtwin.learn.models.weights import MetadataValue, Weights
+from magtwin.learn.models.network import net_of_checkpoint
+from magtwin.learn.models.weights import MetadataValue, Weights, is_checkpoint, read_weights
+from magtwin.registry import Registry
 from magtwin.report import Report
 
 Array = NDArray[np.float64]
@@ -162,16 +173,46 @@ class PredictorKind(Protocol):
     """Options of `magtwin.learn.training.config.TrainConfig` that it reads, with their defaults; at least
     `features`."""
 
-    def fit(self, task: FitTask) -> Fit:
+    @staticmethod
+    def fit(task: FitTask) -> Fit:
         """Fit a predictor to training rows and calibrate it by validation rows.
 
         Raises:
             InputError: The task cannot be fitted.
         """
 
-    def load(self, weights: Weights) -> Predictor:
+    @staticmethod
+    def load(weights: Weights) -> Predictor:
         """The predictor of a weights file.
 
         Raises:
             InputError: The parts of the file do not fit each other.
         """
+
+
+PREDICTORS: Registry[PredictorKind] = Registry(
+    "predictor kind",
+    "predictors",
+    {
+        "mlp": "magtwin.learn.models.kinds:Perceptrons",
+        "linear": "magtwin.learn.models.kinds:Linears",
+        "hybrid": "magtwin.learn.models.kinds:Hybrids",
+    },
+)
+"""Kinds of predictors by name."""
+
+
+def load_predictor(path: str | os.PathLike[str]) -> Predictor:
+    """Load a predictor of any kind: magtwin's safetensors, or a released `.pth`.
+
+    Raises:
+        InputError: Neither of the two, damaged, or its parts do not fit each other.
+    """
+    if is_checkpoint(path):
+        return net_of_checkpoint(path)
+    weights = read_weights(path)
+    try:
+        kind = PREDICTORS[weights.kind]
+    except InputError as error:
+        raise InputError(f"{path}: {error}; update magtwin, or install the package of this kind") from error
+    return kind.load(weights)

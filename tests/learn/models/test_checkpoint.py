@@ -8,6 +8,7 @@ import sys
 import types
 import zipfile
 from collections import OrderedDict
+from itertools import pairwise
 from unittest import mock
 
 import numpy as np
@@ -34,7 +35,7 @@ def scaler(mean, scale):
 
 def layers(*widths):
     torch.manual_seed(0)
-    pairs = enumerate(zip(widths[:-1], widths[1:], strict=True))
+    pairs = enumerate(pairwise(widths))
     state = [(f"layer{i}.{part}", value) for i, (a, b) in pairs
              for part, value in (("weight", torch.randn(b, a)), ("bias", torch.randn(b)))]  # fmt: skip
     return OrderedDict(state)
@@ -159,7 +160,9 @@ def test_the_hostile_pickles_do_execute_under_pickle(tmp_path):
     assert (tmp_path / "executed").exists()
 
 
-@pytest.mark.parametrize("pickled", [b"", b"\x80\x02}", b"\x80\x02h\x05.", b"\x80\x02R.", b"\x80\x02\x82\x01."])
+@pytest.mark.parametrize(
+    "pickled", [b"", b"\x80\x02}", b"\x80\x02h\x05.", b"\x80\x02R.", b"\x80\x02\x82\x01."]
+)
 def test_a_damaged_pickle_is_refused(tmp_path, pickled):
     assert refusal(pth(tmp_path / "a.pth", saved(), pickled=pickled)).startswith("damaged checkpoint (")
 
