@@ -22,7 +22,7 @@ from magtwin.learn.models.linear import Linear
 from magtwin.learn.models.network import load_net
 from magtwin.learn.models.predictor import PREDICTORS, load_predictor
 from magtwin.learn.models.weights import write_weights
-from magtwin.twin import open_twin, simulate, simulate_many
+from magtwin.twin import open_twin, simulate, sweep
 
 NAMES = SETS["gradient"]
 KINDS = ("mlp", "linear", "hybrid", "base alone")
@@ -109,13 +109,13 @@ def test_a_released_checkpoint_is_a_predictor(real_data):
 
 def test_a_simulation_is_read_by_any_kind_and_many_as_one(lab_scene, tmp_path):
     a_predictor("hybrid").save(tmp_path / "n.safetensors")
-    twin = open_twin(lab_scene, net=tmp_path / "n.safetensors")
+    twin = open_twin(lab_scene, network=tmp_path / "n.safetensors")
     one = simulate(twin, seed=3, duration_s=1.0)
     assert one.metadata["network_kind"] == "hybrid"
     x = features(one, NAMES)
     noise = twin.scene.robot.magnetometer.noise_density_nt * math.sqrt(135 / 2)
     assert_allclose(one["b_sd_nt"], np.hypot(twin.magnetometer.net.predict(x)[1], noise))
-    both = simulate_many(twin, ["figure8", "figure8"], [8, 3], duration_s=1.0)
+    both = sweep(twin, ["figure8", "figure8"], [8, 3], duration_s=1.0)
     for name in ("b_disturbance_nt", "b_sd_nt", "b_measured_nt", "flag_out_of_distribution"):
         assert_array_equal(both[1][name], one[name])
 
@@ -128,9 +128,9 @@ def test_robots_that_step_together_read_every_set_of_inputs_but_the_vector_axes(
     a_predictor("hybrid", SETS[inputs]).save(tmp_path / "h.safetensors")
     if inputs == "vector":
         with pytest.raises(InputError, match="reads b_vector_measured_nt, which MagNav does not simulate"):
-            MagNavEnv(scene=lab_scene, net=tmp_path / "h.safetensors")
+            MagNavEnv(scene=lab_scene, network=tmp_path / "h.safetensors")
         return
-    env = MagNavEnv(scene=lab_scene, net=tmp_path / "h.safetensors")
+    env = MagNavEnv(scene=lab_scene, network=tmp_path / "h.safetensors")
     env.reset(seed=0)
     assert np.isfinite(env.step(np.array([0.2, 0.1], np.float32))[0]).all()
 
