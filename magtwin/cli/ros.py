@@ -29,7 +29,7 @@ from magtwin.errors import InputError
 
 if TYPE_CHECKING:
     from magtwin.ros.bus import Bus
-    from magtwin.spec.scene import DriveSpec
+    from magtwin.spec.drive import DriveSpec
 
 ros_app = App(name="ros", help="Run the twin and its sensors as ROS 2 nodes.")
 app.command(ros_app)
@@ -169,8 +169,9 @@ def magnetometer(
 
     It reads pose (/robot/enu/pose), odometry, IMU, battery and scans, as far as the network needs them. It
     publishes qtfm/magnitude and qtfm/total_field_nt while its inputs are fresh, and its state in
-    /diagnostics. Inputs may come and go. Settings have the form of ROS, name:=value: rate_hz (135),
-    units (T or nT), use_sim_time, max_age_s (0.5), battery_max_age_s (30), lidar (scan, on, off), outside (silent, clamp).
+    /diagnostics. Inputs may come and go. Settings have the form of ROS, name:=value: rate_hz (135), units
+    (T or nT), use_sim_time, max_age_s (0.5), battery_max_age_s (30), lidar (scan, on, off), outside
+    (silent, clamp).
 
     Parameters
     ----------

@@ -82,7 +82,7 @@ def _info_of_usd(file: Path) -> Report:
 
 def _info_of_network(file: Path) -> Report:
     if file.suffix == ".onnx":
-        from magtwin.learn.models.onnx import report_onnx
+        from magtwin.learn.inference.onnx import report_onnx
 
         return report_onnx(file)
     from magtwin.learn.models.predictor import load_predictor

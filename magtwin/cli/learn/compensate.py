@@ -1,13 +1,12 @@
 """`magtwin compensate`: the platform's field taken out of a run's readings, by Tolles and Lawson's model."""
 
 from pathlib import Path
-from typing import Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import App
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Json
-from magtwin.cli.terminal import check_suffix, print_report, say, step
+from magtwin.cli.options import Flag, Force
+from magtwin.cli.terminal import Done, check_output, step
 
 compensate_app = App(name="compensate", help="Take the platform's field out of a run (Tolles-Lawson).")
 app.command(compensate_app)
@@ -20,12 +19,11 @@ def fit(
     out: Path,
     terms: str = "permanent,induced6,eddy9",
     band_hz: tuple[float, float] = (0.1, 0.9),
-    no_band: Annotated[bool, Parameter(negative="")] = False,
-    ridge: float | None = None,
-    exact: Annotated[bool, Parameter(negative="")] = False,
+    no_band: Flag = False,
+    penalty: float | None = None,
+    truth: Flag = False,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Done:
     """Fit the model to a calibration run: one that turns about in a field that is uniform or well mapped.
 
     A map that the same robot surveyed in several headings holds the platform's field already, so what is
@@ -44,40 +42,33 @@ def fit(
         Pass band of the manoeuvres [Hz].
     no_band
         Fit all frequencies, slow ones too.
-    ridge
+    penalty
         Penalty of the regression; by cross-validation unless given.
-    exact
+    truth
         Take the directions from the exact field of a simulated run, b_vector_nt, in place of what the vector
         axes read, b_vector_measured_nt: shows what their errors cost.
-    force
-        Replace the file if it exists.
-    json
-        Print the summary as JSON.
     """
-    from magtwin.files import check_free, output
+    from magtwin.files import output
     from magtwin.io.tables import read_parquet
-    from magtwin.learn.tolles_lawson import fit_run
+    from magtwin.learn.compensation.tolles_lawson import fit_run
 
-    check_suffix(out, (".json",), "a Tolles-Lawson model")
-    check_free(out, force=force)
+    check_output(out, (".json",), "a Tolles-Lawson model", force=force)
     names = tuple(name.strip() for name in terms.split(",") if name.strip())
     step("Fitting the model")
     model = fit_run(
         read_parquet(run),
-        vector="exact" if exact else "measured",
+        vector="exact" if truth else "measured",
         terms=names,
         band_hz=None if no_band else band_hz,
-        ridge=ridge,
+        ridge=penalty,
     )
     with output(out, force=force) as aside:
         model.save(aside)
-    print_report(model.report(f"Tolles-Lawson model of {run}"), json)
-    if not json:
-        say(f"Wrote {out}")
+    return Done(model.report(f"Tolles-Lawson model of {run}"), out)
 
 
 @compensate_app.command
-def apply(run: Path, model: Path, *, out: Path, force: Force = False, json: Json = False) -> None:
+def apply(run: Path, model: Path, *, out: Path, force: Force = False) -> Done:
     """Take what a fitted model explains out of a run's b_measured_nt.
 
     Parameters
@@ -88,19 +79,11 @@ def apply(run: Path, model: Path, *, out: Path, force: Force = False, json: Json
         Model that `magtwin compensate fit` wrote (.json).
     out
         Compensated run to write, a .parquet file.
-    force
-        Replace the file if it exists.
-    json
-        Print the summary as JSON.
     """
-    from magtwin.files import check_free
     from magtwin.io.tables import read_parquet, write_parquet
-    from magtwin.learn.tolles_lawson import TollesLawson, compensate_run
+    from magtwin.learn.compensation.tolles_lawson import TollesLawson, compensate_run
 
-    check_suffix(out, (".parquet",), "a run")
-    check_free(out, force=force)
+    check_output(out, (".parquet",), "a run", force=force)
     compensated, report = compensate_run(read_parquet(run), TollesLawson.load(model))
     write_parquet(compensated, out, force=force)
-    print_report(report, json)
-    if not json:
-        say(f"Wrote {out}")
+    return Done(report, out)

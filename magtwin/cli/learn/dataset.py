@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Json
-from magtwin.cli.terminal import print_report, progress, say, step
+from magtwin.cli.options import Force, Remap, Unit
+from magtwin.cli.terminal import Done, progress, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 dataset_app = App(name="dataset", help="Data sets: recordings with labels on a map, to learn from.")
 app.command(dataset_app)
 
-By = Literal["fact", "file", "folder"]
+By = Literal["metadata", "file", "folder"]
 
 
 @dataset_app.command
@@ -27,18 +27,17 @@ def build(
     *,
     map: Path,  # noqa: A002
     out: Path,
-    align: Literal["fit", "none"] = "none",
-    lever_arm: tuple[float, float] | None = None,
-    latency: float | None = None,
-    session_by: By = "fact",
-    path_by: By = "fact",
+    alignment: Literal["fit", "none"] = "none",
+    lever_arm_m: tuple[float, float] | None = None,
+    latency_s: float | None = None,
+    session_by: By = "metadata",
+    path_by: By = "metadata",
     rate_hz: float | None = None,
-    topic: Annotated[list[str] | None, Parameter(negative="")] = None,
-    field_unit: Literal["nT", "uT", "T", "mG", "G"] | None = None,
+    remap: Remap = None,
+    unit: Unit = None,
     column: Annotated[list[str] | None, Parameter(negative="")] = None,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Done:
     """Label recordings on a map and write them as a data set: measured total field less the map.
 
     Parameters
@@ -50,32 +49,24 @@ def build(
         Map that the labels are made on: a layer or stage, or a folder of survey CSVs.
     out
         Folder to make.
-    align
+    alignment
         fit: find the sensor's lever arm and latency from all recordings together; none: take pose and
         reading as they stand.
-    lever_arm
+    lever_arm_m
         Where the sensor is, forward and left of where the map has it [m], if known.
-    latency
+    latency_s
         How much older a reading is than its stamp [s], if known.
     session_by
-        What tells sessions apart, a day or a switching on: the recording's own fact "session" (its name where
+        What tells sessions apart, a day or a switching on: the recording's metadata "session" (its name where
         it has none), its file, or its folder.
     path_by
-        What tells which path was driven: the recording's own fact "path" (its name where it has none), its
+        What tells which path was driven: the recording's metadata "path" (its name where it has none), its
         file, or its folder.
     rate_hz
         Keep at most so many readings a second [Hz]; all unless given.
-    topic
-        What a topic is called in a robot's own bag, as NAME=THEIRS. Repeatable.
-    field_unit
-        Unit of the field in a robot's own bag; told by its size unless given.
     column
         What a CSV or Parquet of another program calls a column of a run, as NAME=THEIRS, a vector's by its
         parts: b_measured_nt=field, p_world_base_x=east. Repeatable. A p_world_base without z is on the floor.
-    force
-        Replace the folder if it exists.
-    json
-        Print the summary as JSON.
     """
     from magtwin.cli.runs.file import pairs
     from magtwin.files import check_free, sha256
@@ -84,42 +75,38 @@ def build(
     from magtwin.learn.data.labels import Alignment
 
     check_free(out, force=force)
-    given = lever_arm is not None or latency is not None
-    if given and align == "fit":
-        raise InputError("--align fit finds lever arm and latency; drop it, or --lever-arm and --latency")
-    options: dict[str, Any] = {"topics": pairs("topic", topic) if topic else None, "unit": field_unit}
+    given = lever_arm_m is not None or latency_s is not None
+    if given and alignment == "fit":
+        raise InputError("--alignment fit finds lever arm and latency; drop it, or both others")
+    options: dict[str, Any] = {"topics": pairs("remap", remap) if remap else None, "unit": unit}
     options["columns"] = _columns(column) if column else None
     options = {name: value for name, value in options.items() if value is not None}
     sources = _sources(_files(run), session_by, path_by, options)
-    alignment: Any = "fit" if align == "fit" else None
+    aligned: Any = "fit" if alignment == "fit" else None
     if given:
-        alignment = Alignment(lever_arm or (0.0, 0.0), latency or 0.0)
+        aligned = Alignment(lever_arm_m or (0.0, 0.0), latency_s or 0.0)
     with progress("Labelling", "recordings") as advance:
         made = build_dataset(
             sources,
             open_map(map),
             out,
-            alignment=alignment,
+            alignment=aligned,
             map_sha256=sha256(map) if map.is_file() else "",
             rate_hz=rate_hz,
             force=force,
             progress=advance,
         )
-    print_report(made.report(), json)
-    if not json:
-        say(f"Wrote {out}")
+    return Done(made.report(), out)
 
 
 @dataset_app.command
-def info(dataset: Path, *, json: Json = False) -> None:
+def info(dataset: Path) -> Done:
     """What a data set holds, each shard read against its checksum.
 
     Parameters
     ----------
     dataset
         Folder that `magtwin dataset build` made.
-    json
-        Print as JSON.
     """
     from dataclasses import replace
 
@@ -134,7 +121,7 @@ def info(dataset: Path, *, json: Json = False) -> None:
         f"{one.label_mean_nt:.0f} ± {one.label_sd_nt:.0f} nT"
         for one in found.recordings
     }
-    print_report(replace(report, metadata={**report.metadata, "recordings": each}), json)
+    return Done(replace(report, metadata={**report.metadata, "recordings": each}))
 
 
 @dataset_app.command
@@ -144,8 +131,7 @@ def correlate(
     features: str = "full",
     out: Path | None = None,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Done:
     """Correlate each input with the disturbance: Spearman's rank correlation, as in the paper's Figure 2.
 
     Parameters
@@ -156,10 +142,6 @@ def correlate(
         Set of inputs, or names with commas between.
     out
         Picture to write, .png or .svg.
-    force
-        Replace the picture if it exists.
-    json
-        Print as JSON.
     """
     import numpy as np
 
@@ -182,9 +164,7 @@ def correlate(
         from magtwin.figures.correlations import plot_correlations
 
         plot_correlations(result, out, title=f"{dataset}", force=force)
-    print_report(result.report(f"Correlation with the disturbance in {dataset}"), json)
-    if out is not None and not json:
-        say(f"Wrote {out}")
+    return Done(result.report(f"Correlation with the disturbance in {dataset}"), out or ())
 
 
 def _columns(given: Sequence[str]) -> dict[str, str]:
@@ -226,7 +206,7 @@ def _sources(files: Sequence[Path], session_by: By, path_by: By, options: dict[s
     short = [named(existing(path, "recording").resolve().stem) for path in files]
     long = [named(f"{path.resolve().parent.name}_{path.resolve().stem}") for path in files]
     names = [one if short.count(one) == 1 else other for one, other in zip(short, long, strict=True)]
-    by = {"fact": lambda path, name: "", "file": lambda path, name: name}
+    by = {"metadata": lambda path, name: "", "file": lambda path, name: name}
     by["folder"] = lambda path, name: path.resolve().parent.name or name
     return [
         Source(name, partial(read_run, path, **options), by[session_by](path, name), by[path_by](path, name))

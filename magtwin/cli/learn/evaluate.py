@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Json, Seed
-from magtwin.cli.terminal import progress, say, stdout_console, step
+from magtwin.cli.options import Force, Seed
+from magtwin.cli.terminal import Done, progress, stdout_console, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -37,14 +37,13 @@ def evaluate(
     train: Path | None = None,
     case: Names = None,
     scene: Path | None = None,
-    against: Path | None = None,
+    overlay: Path | None = None,
     engine: Literal["kinematic", "newton"] | None = None,
     any_map: Flag = False,
     truth: Flag = False,
     seed: Seed = 0,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Done:
     """Measure the error of models on recordings, beside the naive model and Tolles and Lawson's.
 
     Errors are of the total field at the sensor. The report, DIR/evaluation.html, .md and .json, has Table
@@ -71,7 +70,7 @@ def evaluate(
     scene
         Stage of the twin that made the recordings, training's too: adds an error budget, how much of the
         error is map, lever arm, latency, sessions, platform and sensor. Needs train.
-    against
+    overlay
         Another recording of a path that is judged by, laid over that one: the paper's Figure 8.
     engine
         Drive the first recording's path once more in the scene, moved by this engine and with another seed,
@@ -82,14 +81,13 @@ def evaluate(
         Judge by the exact field, which simulated runs know, in place of the reading.
     seed
         Seed of the intervals' draws.
-    force
-        Replace the folder if it exists.
-    json
-        Print the figures as JSON.
     """
+    from json import loads
+
     import numpy as np
 
     from magtwin.figures.evaluations import page_of_evaluation, read_curve, write_evaluation
+    from magtwin.figures.pages import to_json
     from magtwin.files import check_free
     from magtwin.learn.evaluation import evaluate as room
 
@@ -126,21 +124,16 @@ def evaluate(
             section, told = _budget(found, scene, *learned[0], advance)
         sections.append(section)
         data["budget"] = told
-    if against is not None or engine is not None:
-        section, told = _traversals(found, scene, against, engine)
+    if overlay is not None or engine is not None:
+        section, told = _traversals(found, scene, overlay, engine)
         sections.append(section)
         data["traversals"] = told
     step("Writing the report")
     curves = {name: read_curve(path) for path, name in zip(weights, names, strict=True)}
     page = page_of_evaluation(found, curves=curves, more=sections, data=data)
     write_evaluation(page, out, force=force)
-    if json:
-        from magtwin.figures.pages import to_json
-
-        say(to_json(page).rstrip())
-        return
-    _print(found)
-    say(f"Wrote {out}: evaluation.html, evaluation.md, evaluation.json")
+    written = f"Wrote {out}: evaluation.html, evaluation.md, evaluation.json"
+    return Done(table=lambda: _print(found), text=written, data=loads(to_json(page)))
 
 
 def _charts(maps: Sequence[Path] | None, scene: Path | None) -> "list[Chart]":
@@ -188,7 +181,7 @@ def _trials(
     learning = None if train is None else open_dataset(train)
     learned = [] if learning is None else [(learning, learning.names)]
     if dataset is None:
-        sources = _sources(_files(runs or []), "fact", "fact", {})
+        sources = _sources(_files(runs or []), "metadata", "metadata", {})
         trials = [Trial(one.name, one.read) for one in sources]
         return (trials if learning is None else unlearned(trials, learning)), learned
     judged = open_dataset(dataset)
@@ -253,7 +246,7 @@ def _budget(
 
 
 def _traversals(
-    found: "Evaluation", scene: Path | None, against: Path | None, engine: str | None
+    found: "Evaluation", scene: Path | None, overlay: Path | None, engine: str | None
 ) -> "tuple[Section, dict[str, Any]]":
     """One path driven twice, as a section and in figures."""
     from magtwin.figures.traversals import section_of_traversals
@@ -261,11 +254,11 @@ def _traversals(
     from magtwin.io.provenance import made_again
     from magtwin.run.compare import traversals
 
-    if against is not None and engine is not None:
-        raise InputError("--against and --engine both say what to lay over a recording; give one of them")
+    if overlay is not None and engine is not None:
+        raise InputError("--overlay and --engine both say what to lay over a recording; give one of them")
     first = found.judged[0]
-    if against is not None:
-        other, name = read_run(against), against.stem
+    if overlay is not None:
+        other, name = read_run(overlay), overlay.stem
         path = str(other.metadata.get("path", ""))
         able = [one for one in found.judged if one.path == path and one.name != name]
         first = able[0] if able else first

@@ -5,15 +5,15 @@ from pathlib import Path
 from cyclopts import App
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Json
-from magtwin.cli.terminal import check_suffix, print_report, say, step
+from magtwin.cli.options import Force, Licence
+from magtwin.cli.terminal import Done, check_output, step
 
 net_app = App(name="network", help="Convert and export networks.")
 app.command(net_app)
 
 
 @net_app.command(name="convert")
-def net_convert(pth: Path, *, out: Path, licence: str = "", force: Force = False) -> None:
+def net_convert(pth: Path, *, out: Path, licence: Licence = "", force: Force = False) -> Done:
     """Convert a released checkpoint (.pth) to safetensors, executing nothing of what it holds.
 
     Parameters
@@ -22,22 +22,17 @@ def net_convert(pth: Path, *, out: Path, licence: str = "", force: Force = False
         Checkpoint with the weights and the two scalers.
     out
         File to write, .safetensors.
-    licence
-        Licence of the weights, an SPDX identifier such as MIT; an export says it.
-    force
-        Replace the file if it exists.
     """
     from magtwin.learn.models.network import convert
 
-    check_suffix(out, (".safetensors",), "a network")
+    check_output(out, (".safetensors",), "a network", force=force)
     step("Reading the checkpoint")
     net = convert(pth, out, licence=licence, force=force)
-    print_report(net.report(str(out)), as_json=False)
-    say(f"Wrote {out}")
+    return Done(net.report(str(out)), out)
 
 
 @net_app.command(name="export")
-def net_export(weights: Path, *, onnx: Path, force: Force = False, json: Json = False) -> None:
+def net_export(weights: Path, *, out: Path, force: Force = False) -> Done:
     """Export a network as ONNX, which runs in onnxruntime without torch and without magtwin.
 
     Its input is float64 features in their units, as magtwin info lists them; its outputs are the disturbance
@@ -48,18 +43,12 @@ def net_export(weights: Path, *, onnx: Path, force: Force = False, json: Json = 
     ----------
     weights
         Weights, .safetensors or .pth.
-    onnx
+    out
         File to write, .onnx.
-    force
-        Replace the file if it exists.
-    json
-        Print what it holds as JSON.
     """
-    from magtwin.learn.models.onnx import export_onnx
+    from magtwin.learn.inference.onnx import export_onnx
 
-    check_suffix(onnx, (".onnx",), "an ONNX file")
+    check_output(out, (".onnx",), "an ONNX file", force=force)
     step("Exporting the network")
-    report = export_onnx(weights, onnx, force=force)
-    print_report(report, json)
-    if not json:
-        say(f"Wrote {onnx}")
+    report = export_onnx(weights, out, force=force)
+    return Done(report, out)

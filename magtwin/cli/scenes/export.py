@@ -80,7 +80,7 @@ def _stage(scene: Path) -> Path:
 
 
 def _write_onnx(weights: Path, out: Path) -> None:
-    from magtwin.learn.models.onnx import export_onnx
+    from magtwin.learn.inference.onnx import export_onnx
 
     export_onnx(weights, out)
 

@@ -1,13 +1,11 @@
 """`magtwin robot`: a description in, a USD articulation out, and back."""
 
 from pathlib import Path
-from typing import Annotated, Literal
-
-from cyclopts import Parameter
+from typing import Literal
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Json
-from magtwin.cli.terminal import check_suffix, print_report, say, step
+from magtwin.cli.options import Flag, Force
+from magtwin.cli.terminal import Done, check_output, step
 from magtwin.errors import InputError
 
 
@@ -15,93 +13,87 @@ from magtwin.errors import InputError
 def robot(
     urdf: Path,
     *,
-    out: Path | None = None,
-    to_urdf: Path | None = None,
+    out: Path,
     settings: Path | None = None,
-    package: Annotated[list[str] | None, Parameter(negative="")] = None,
-    arg: Annotated[list[str] | None, Parameter(negative="")] = None,
+    package: list[str] | None = None,
+    arg: list[str] | None = None,
     missing_meshes: Literal["refuse", "note"] | None = None,
     collision: Literal["hull", "decomposition", "mesh"] | None = None,
     profile: Literal["general", "diff-drive"] | None = None,
-    drive: Annotated[list[str] | None, Parameter(negative="")] = None,
+    drive: list[str] | None = None,
     fix_base: bool | None = None,
     merge_fixed: bool | None = None,
-    density: float | None = None,
-    mass: float | None = None,
+    density_kg_m3: float | None = None,
+    mass_kg: float | None = None,
     single_file: bool | None = None,
     strict: bool | None = None,
-    thumbnail: Annotated[bool, Parameter(negative="")] = False,
+    thumbnail: Flag = False,
     report: Path | None = None,
     force: Force = False,
-    json: Json = False,
-) -> None:
-    """Convert a URDF or a xacro to a USD articulation that drives, or such a stage to a URDF.
+) -> Done:
+    """Convert a URDF or xacro to a USD articulation that drives, or such a stage to a URDF.
 
     Parameters
     ----------
     urdf
-        The robot's description, .urdf or .xacro; with --to-urdf a stage of one robot.
+        Robot description (.urdf, .xacro); or a stage with one robot, to write as a URDF.
     out
-        Folder to make; it will hold NAME.usda and the layers it refers to.
-    to_urdf
-        URDF to write from a stage, in place of --out, with equal kinematics and inertia.
-        It takes --force and --json alone.
+        Folder to make, with NAME.usda and its layers; or a .urdf to write from a stage, with the same
+        kinematics and inertia.
     settings
         TOML with drive, battery, platform field, sensor mounts and conversion, such as
-        robots/turtlebot4/robot.toml; options given here come before its [conversion].
+        robots/turtlebot4/robot.toml. Options given here override its [conversion].
     package
-        NAME=DIR: where a package lies that package:// or $(find) names; may be given again.
+        NAME=DIR: folder of a package that package:// or $(find) names. May be repeated.
     arg
-        NAME=VALUE: an argument of the xacro; may be given again.
+        NAME=VALUE: argument of the xacro. May be repeated.
     missing_meshes
-        What to do about a mesh that is not there: refuse, or leave it out and note it.
+        What to do about a missing mesh: refuse, or leave it out and note it. Default: refuse.
     collision
-        What a mesh collides as: its convex hull, a convex decomposition (extra "decomposition"), or itself.
+        Collision shape of a mesh: convex hull, convex decomposition (extra "decomposition"), or the mesh.
     profile
-        diff-drive: velocity drives on wheels, slippery casters, dead suspensions welded.
+        general; or diff-drive: velocity drives on wheels, casters without friction, dead suspensions welded.
     drive
-        PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X], TYPE velocity, position or none: how joints
-        whose name fits are driven; may be given again, the first that fits wins.
+        PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X], TYPE velocity, position or none: drive of the
+        joints whose name fits. May be repeated; the first that fits wins.
     fix_base
-        Bolt the base to the world.
+        Fix the base to the world.
     merge_fixed
-        Merge links on fixed joints into the body that they ride on; their frames stay.
-    density
+        Merge links on fixed joints into the body that carries them; their frames stay.
+    density_kg_m3
         Density of links without inertia [kg/m3].
-    mass
-        Mass of a data sheet to hold the robot's against [kg].
+    mass_kg
+        Mass of the data sheet to compare the robot's with [kg].
     single_file
-        One root layer and its meshes, in place of Isaac Sim's layers.
+        Write one root layer and its meshes, in place of Isaac Sim's layers.
     strict
         Refuse a conversion that loses anything.
     thumbnail
-        Draw a picture of the robot beside it, which NVIDIA's SimReady profiles ask for.
+        Draw a picture of the robot beside it, which NVIDIA's SimReady profiles require.
     report
-        Where to write the whole report, a .json file.
-    force
-        Replace what exists.
-    json
-        Print the summary as JSON.
+        Full report to write (.json).
     """
     from magtwin.author.from_urdf import DriveRule, from_urdf
-    from magtwin.files import check_free, output
+    from magtwin.files import output
 
-    if (out is None) == (to_urdf is None):
-        raise InputError(
-            "robot makes a stage with --out DIR, or a URDF with --to-urdf FILE; give one of them"
+    if out.suffix == ".urdf":
+        given: tuple[object, ...] = (
+            settings,
+            package,
+            arg,
+            missing_meshes,
+            collision,
+            profile,
+            drive,
+            fix_base,
+            merge_fixed,
         )
-    given = (settings, package, arg, missing_meshes, collision, profile, drive, fix_base, merge_fixed)
-    if to_urdf is not None:
-        if any(option is not None for option in (*given, density, mass, single_file, strict, report)):
-            raise InputError(
-                "--to-urdf takes a stage as it is, with --force and --json; leave the others out"
-            )
-        _to_urdf(urdf, to_urdf, force=force, json=json)
-        return
-    assert out is not None
-    if report is not None:
-        check_suffix(report, (".json",), "a report")
-        check_free(report, force=force)
+        if any(
+            option is not None for option in (*given, density_kg_m3, mass_kg, single_file, strict, report)
+        ):
+            raise InputError("a stage is written as a URDF without other options than --force; drop them")
+        return _to_urdf(urdf, out, force=force)
+    check_output(report, (".json",), "a report", force=force)
     choices = {
         "packages": {k: Path(v) for k, v in _pairs("package", package).items()} if package else None,
         "arguments": _pairs("arg", arg) if arg else None,
@@ -111,8 +103,8 @@ def robot(
         "drives": tuple(DriveRule.parse(text) for text in drive) if drive else None,
         "fix_base": fix_base,
         "merge_fixed": merge_fixed,
-        "density": density,
-        "mass": mass,
+        "density": density_kg_m3,
+        "mass": mass_kg,
         "single_file": single_file,
         "strict": strict,
     }
@@ -128,19 +120,15 @@ def robot(
     if report is not None:
         with output(report, force=force) as aside:
             aside.write_text(made.report.to_json(), encoding="utf-8")
-    print_report(made.report.summary(), json)
-    if not json:
-        say(f"Wrote {made.asset}")
+    return Done(made.report.summary(), made.asset)
 
 
-def _to_urdf(stage: Path, out: Path, *, force: bool, json: bool) -> None:
+def _to_urdf(stage: Path, out: Path, *, force: bool) -> Done:
     from magtwin.author.from_urdf import write_urdf
 
     if stage.suffix in (".urdf", ".xacro"):
-        raise InputError(f"{stage}: --to-urdf takes a stage, .usd, .usda, .usdc or .usdz")
-    print_report(write_urdf(stage, out, force=force), json)
-    if not json:
-        say(f"Wrote {out}")
+        raise InputError(f"{stage}: is no stage; a URDF is written from .usd, .usda, .usdc or .usdz")
+    return Done(write_urdf(stage, out, force=force), out)
 
 
 def _thumbnail(asset: Path, out: Path) -> None:

@@ -15,7 +15,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files import shipped
 from magtwin.io.tables import write_parquet
-from magtwin.learn.tolles_lawson import (
+from magtwin.learn.compensation.tolles_lawson import (
     TollesLawson,
     compensate_run,
     design_matrix,
@@ -391,7 +391,7 @@ def test_what_cannot_be_fitted_is_refused(change, says):
 def test_compensate_says_which_vectors_it_took(calibration, tmp_path, capsys):
     write_parquet(calibration("figure8", 1), tmp_path / "run.parquet")
     told = {}
-    for name, options in (("measured", []), ("exact", ["--exact"])):
+    for name, options in (("measured", []), ("exact", ["--truth"])):
         model = str(tmp_path / f"{name}.json")
         main(
             [

@@ -1,14 +1,13 @@
 """What a training takes from a data set, and the ridge that stands beside every model."""
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 from test_train_command import FIELD, a_run
 
 from magtwin.learn.data.dataset import build_dataset
 from magtwin.learn.data.recording import Source
 from magtwin.learn.data.split import split
-from magtwin.learn.training.training_data import material
+from magtwin.learn.training.training_data import read_training_data
 from magtwin.run.run import Run
 
 INPUTS = ("yaw_sin", "odom_v_x")
@@ -29,7 +28,7 @@ def parts_of(data, by="session"):
 
 def test_rows_know_their_session_where_days_are_kept_together(tmp_path):
     data = a_set(tmp_path, days=6)
-    of = material(data, parts_of(data), INPUTS)
+    of = read_training_data(data, parts_of(data), INPUTS)
     session = {one.name: one.session for one in data.recordings}
     numbers = sorted(session.values())
     for part, rows in of.rows.items():
@@ -39,7 +38,7 @@ def test_rows_know_their_session_where_days_are_kept_together(tmp_path):
 
 def test_where_one_day_is_all_there_is_to_learn_from_its_recordings_are_left_out_in_turn(tmp_path):
     data = a_set(tmp_path)
-    of = material(data, parts_of(data), INPUTS)
+    of = read_training_data(data, parts_of(data), INPUTS)
     assert len({one.session for one in data.recordings if one.name in of.rows["train"].names}) == 1
     assert len(np.unique(of.groups["train"])) == len(of.rows["train"].names) == 2
 
@@ -47,7 +46,7 @@ def test_where_one_day_is_all_there_is_to_learn_from_its_recordings_are_left_out
 def test_the_ridge_takes_what_terms_the_recordings_have(tmp_path):
     kept = ("t", "p_world_base", "yaw", "odom_v", "b_measured_nt")
     data = a_set(tmp_path, lambda run: Run({name: run[name] for name in kept}, run.metadata))
-    of = material(data, parts_of(data), INPUTS)
+    of = read_training_data(data, parts_of(data), INPUTS)
     terms = ("yaw_sin", "yaw_cos", "yaw_sin_2", "yaw_cos_2", "odom_v_x")
     assert of.ridge.model.features == terms
     mean, _ = of.ridge_of("test")
@@ -61,7 +60,7 @@ def test_a_hole_in_what_only_the_ridge_reads_costs_no_row_and_counts_as_the_mean
         return run.with_columns(battery_a=current)
 
     data = a_set(tmp_path, holed)
-    of = material(data, parts_of(data), INPUTS)
+    of = read_training_data(data, parts_of(data), INPUTS)
     assert len(of.rows["test"].y) == 400
     j = of.ridge.model.features.index("battery_a")
     with_mean = of.rows["test"].beside.copy()
@@ -69,15 +68,3 @@ def test_a_hole_in_what_only_the_ridge_reads_costs_no_row_and_counts_as_the_mean
     assert hole.sum() == 20
     with_mean[hole, j] = np.nanmean(of.rows["train"].beside[:, j])
     assert_allclose(of.ridge_of("test")[0], of.ridge.model.predict(with_mean)[0])
-
-
-def test_recordings_are_whole_and_labelled_in_the_rows_of_their_part_alone(tmp_path):
-    data = a_set(tmp_path, days=6)
-    of = material(data, parts_of(data, "row"), INPUTS)
-    tracks = {part: of.tracks(part) for part in of.rows}
-    for part, rows in of.rows.items():
-        assert sum(int(np.isfinite(track.y).sum()) for track in tracks[part]) == len(rows.y)
-    for one in zip(*tracks.values(), strict=True):
-        assert (np.isfinite([track.y for track in one]).sum(axis=0) == 1).all()
-        assert all(len(track.x) == 200 for track in one)
-    assert of.step_s == pytest.approx(0.1)

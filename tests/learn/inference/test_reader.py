@@ -12,8 +12,9 @@ from test_predictor import KINDS, a_predictor
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.features import FEATURES, FULL, SETS, features
+from magtwin.learn.inference import reader
+from magtwin.learn.inference.reader import POSE, Reader
 from magtwin.learn.models.network import load_net
-from magtwin.learn.reading import POSE, Reader
 from magtwin.run.run import COLUMNS
 
 
@@ -87,19 +88,7 @@ def test_every_kind_is_read_as_in_a_run(kind, run, field):
     assert [one.outside_training for one in read] == predictor.outside(x).tolist()
 
 
-def test_a_hole_is_nan_and_as_the_row_before_to_a_predictor_that_looks_back(run, field):
-    predictor = a_predictor("tcn")
-    run = run.with_columns(
-        battery_a=np.where(np.isin(np.arange(run.rows), [0, 4, 5]), np.nan, run["battery_a"])
-    )
-    reader = Reader(predictor, field)
-    read = [reader.read(p, yaw, signals_of(reader, run, row)) for row, (p, yaw) in enumerate(poses(run))]
-    wanted = predictor.predict(features(run, predictor.features))[0]
-    assert_allclose([one.b_disturbance_nt for one in read], wanted, rtol=1e-5)
-    assert np.flatnonzero(np.isnan(wanted)).tolist() == [0, 4, 5]
-
-
-@pytest.mark.parametrize("kind", ["linear", "hybrid", "ensemble"])
+@pytest.mark.parametrize("kind", ["linear", "hybrid"])
 def test_nan_in_gives_nan_out_of_every_kind(kind, run, field):
     reader = Reader(a_predictor(kind), field)
     reading = reader.read((0.0, 0.0), 0.0, signals_of(reader, run, 0) | {"battery_a": math.nan})
@@ -173,8 +162,8 @@ def test_signals_that_are_missing_or_of_another_width_are_refused(field, run, wr
 def test_without_numba_a_reading_is_the_same_and_takes_longer(field, run, monkeypatch):
     net = a_net(FULL, (16, 8))
     quick = Reader(net, field)
-    monkeypatch.setitem(sys.modules, "magtwin.learn.models.compiled", None)
-    monkeypatch.delattr("magtwin.learn.models.compiled", raising=False)
+    monkeypatch.setattr(reader.LOOPS, "code", None)
+    monkeypatch.setitem(sys.modules, reader.LOOPS.module, None)
     slow = Reader(net, field)
     signals = signals_of(quick, run, 5)
     assert_allclose(slow.read((0.5, 0.5), 1.0, signals), quick.read((0.5, 0.5), 1.0, signals), atol=1e-3)

@@ -14,8 +14,8 @@ from test_predictor import KINDS, a_predictor
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.files import sha256
-from magtwin.learn.data.features import FEATURES, FULL, SETS
-from magtwin.learn.models.onnx import export_onnx, model_of, report_onnx
+from magtwin.learn.data.features import FEATURES, FULL
+from magtwin.learn.inference.onnx import export_onnx, model_of, report_onnx
 from magtwin.learn.models.predictor import load_predictor
 
 
@@ -152,40 +152,17 @@ def test_every_kind_gives_in_onnxruntime_what_it_gives_here(kind, tmp_path):
     export_onnx(tmp_path / "p.safetensors", tmp_path / "p.onnx")
     x = 40 * np.random.default_rng(1).normal(size=(50, len(predictor.features)))  # beyond the training too
     x[7, 3] = np.nan
-    given = np.concatenate([np.repeat(x[:1], predictor.context, axis=0), x])
-    given[predictor.context + 7] = given[predictor.context + 6] if predictor.context else x[7]
-    for found, wanted in zip(run(tmp_path / "p.onnx", given), predictor.predict(x), strict=True):
-        if predictor.context:
-            found[7] = np.nan
-        assert_allclose(found, wanted, atol=1e-3)
+    for exported, expected in zip(run(tmp_path / "p.onnx", x), predictor.predict(x), strict=True):
+        assert_allclose(exported, expected, atol=1e-3)
     model = onnx.load(tmp_path / "p.onnx")
     onnx.checker.check_model(model, full_check=True)
     told = report_onnx(tmp_path / "p.onnx")
     assert {f.name: f.value for f in told.figures}["kind"] == predictor.kind
 
 
-def test_a_temporal_network_is_given_the_rows_before_and_says_how_many(tmp_path):
-    predictor = a_predictor("tcn")
-    predictor.save(tmp_path / "p.safetensors")
-    told = {f.name: f for f in export_onnx(tmp_path / "p.safetensors", tmp_path / "p.onnx").figures}
-    assert told["rows back"].value == predictor.context == 6
-    assert told["input"].value == f"features (rows + 6, {len(predictor.features)}), float64"
-    x = np.random.default_rng(1).normal(size=(20, len(predictor.features)))
-    assert len(run(tmp_path / "p.onnx", x)[0]) == 14
-    assert_allclose(run(tmp_path / "p.onnx", x)[0], predictor.predict(x)[0][6:], atol=1e-3)
-
-
-def test_a_nan_stays_nan_in_the_row_of_a_temporal_network(tmp_path):
-    a_predictor("tcn").save(tmp_path / "p.safetensors")
-    export_onnx(tmp_path / "p.safetensors", tmp_path / "p.onnx")
-    x = np.ones((12, len(SETS["gradient"])))
-    x[9, 2] = np.nan
-    assert np.isnan([values[3] for values in run(tmp_path / "p.onnx", x)]).all()
-
-
 def test_what_has_no_graph_is_refused_by_its_kind():
     class Foreign:
-        kind, context = "forest", 0
+        kind = "forest"
 
     with pytest.raises(InputError, match="'forest' has no ONNX graph"):
         model_of(Foreign())
