@@ -1,18 +1,27 @@
-"""Views: show, picture or film a file of any kind."""
+"""Views of files: show, draw or film a run or a stage; a page about runs; two runs compared."""
 
 import shutil
 import subprocess
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 from magtwin.errors import InputError, MismatchWarning
+from magtwin.figures.page import write_page
+from magtwin.figures.reports import NamedRun, page_of_comparison, page_of_runs
 from magtwin.files import check_free, existing
 from magtwin.io.convert import twin_to_show
 from magtwin.io.formats import read_run
+from magtwin.io.provenance import map_of, planned_of
+from magtwin.run.compare import Comparison, compare
 from magtwin.run.run import Run
 from magtwin.usd.layers import stage_sha256
+
+MOST_PICTURED = 60
+"""Largest number of runs with pictures on a page; each takes 0.4 MB and a second."""
 
 STAGES = (".usd", ".usda", ".usdc", ".usdz")
 
@@ -96,41 +105,115 @@ def film(
     file: Source,
     out: Source,
     *,
-    camera: str = "orbit",
-    fps: float = 25.0,
-    pace: float | None = None,
-    size: tuple[int, int] | None = None,
     scene: Source | None = None,
+    pace: float | None = None,
     force: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    **options: Any,
 ) -> None:
-    """Film a run in its lab, or a stage on a turntable.
+    """Film a run in its lab.
 
     Args:
-        file: Run in any format; a stage if the camera is "turntable".
+        file: Run in any format.
         out: MP4 or GIF to write.
-        camera: "orbit", "top", "chase", "x,y,z:x,y,z" [m], or "turntable".
-        fps: Frames per second [Hz].
-        pace: Simulated seconds per second of film. None: 1, or more for a film of at most 30 s.
-        size: Width and height [pixels]. None: 1280 x 720, or 640 x 360 for a GIF.
         scene: Scene of the run. None: the one of the metadata.
+        pace: Simulated seconds per second of film. None: 1, or more for a film of at most 30 s.
         force: Whether an existing output is replaced.
-        progress: Called with frames done and frames in all.
+        options: Of `magtwin.figures.films.film_of_run`: camera, fps, size, advance.
 
     Raises:
         InputError: The file cannot be read or drawn, or the output exists.
     """
-    from magtwin.figures.films import film_of_run, film_of_stage
+    from magtwin.figures.films import film_of_run
 
-    turns = camera == "turntable"
-    file, out = existing(file, "stage" if turns else "run"), check_free(out, force=force)
-    if turns and (pace is not None or scene is not None):
-        raise InputError("a turntable shows a stage as it is: drop `pace` and `scene`")
-    if turns:
-        film_of_stage(file, out, fps=fps, size=size, force=force, advance=progress)
-        return
+    file, out = existing(file, "run"), check_free(out, force=force)
     run, stage = _run_and_scene(file, scene)
-    film_of_run(run, stage, out, fps=fps, speed=pace, camera=camera, size=size, force=force, advance=progress)
+    film_of_run(run, stage, out, speed=pace, force=force, **options)
+
+
+def report_runs(
+    runs: Sequence[Source],
+    out: Source,
+    *,
+    scene: Source | None = None,
+    force: bool = False,
+    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+) -> None:
+    """Write a page about runs: what was run, map and path, time series, errors, events, provenance.
+
+    Args:
+        runs: Runs in any format; a folder that `magtwin sweep` made stands for its runs.
+        out: Page to write (.html, .md or .json).
+        scene: Scene of the map below the paths. None: the one of each run's metadata.
+        force: Whether an existing page is replaced.
+        progress: Called with the number of runs done, the number in all and the current step.
+
+    Raises:
+        InputError: A run cannot be read, or the page cannot be written.
+    """
+    out = check_free(out, force=force)
+    files = [file for source in runs for file in runs_in(Path(source))]
+    names = [file.name for file in files]
+    named = []
+    for k, file in enumerate(files):
+        progress(k, len(files), f"reading {file.name}")
+        run, note, field = read_run(file), "", None
+        try:
+            field = map_of(run, scene, near=file)
+        except InputError as error:
+            note = f"Its map is not shown: {error}."
+        name = file.name if names.count(file.name) == 1 else str(file)
+        named.append(NamedRun(name, run, field, planned_of(run, near=file), note))
+    pictured = out.suffix == ".html" and len(named) <= MOST_PICTURED
+    page = page_of_runs(named, pictures=pictured, advance=lambda done: progress(done, len(named), "drawing"))
+    if out.suffix == ".html" and not pictured:
+        page = replace(page, lead=f"{page.lead} Pages of more than {MOST_PICTURED} runs have no pictures.")
+    write_page(page, out, force=force)
+
+
+def compare_files(
+    a: Source,
+    b: Source,
+    *,
+    align: Literal["time", "path", "none"] = "time",
+    out: Source | None = None,
+    force: bool = False,
+) -> Comparison:
+    """Compare two runs, and write a page or a picture of the comparison.
+
+    Args:
+        a: First run, in any format.
+        b: Second run.
+        align: As for `magtwin.run.compare.compare`.
+        out: Page (.html, .md, .json) or picture (.png, .svg) to write.
+        force: Whether an existing output is replaced.
+
+    Raises:
+        InputError: A run cannot be read, they do not overlap, or the output cannot be written.
+    """
+    a, b = Path(a), Path(b)
+    runs = read_run(a), read_run(b)
+    comparison = compare(*runs, align=align)
+    names = names_of(a, b)
+    if out is not None and Path(out).suffix in (".png", ".svg"):
+        from magtwin.figures.comparisons import plot_comparison
+
+        plot_comparison(*runs, comparison, out, names=names, force=force)
+    elif out is not None:
+        page = page_of_comparison(NamedRun(names[0], runs[0]), NamedRun(names[1], runs[1]), comparison)
+        write_page(page, out, force=force)
+    return comparison
+
+
+def names_of(a: Path, b: Path) -> tuple[str, str]:
+    """Names of two files that tell them apart."""
+    return (a.name, b.name) if a.name != b.name else (str(a), str(b))
+
+
+def runs_in(path: Path) -> list[Path]:
+    """The runs in a folder that `magtwin sweep` made, or the one run that a path names."""
+    if not (path / "runs.csv").is_file():
+        return [path]
+    return sorted(path.glob("run_*.parquet"))
 
 
 def _run_and_scene(file: Path, scene: Source | None) -> tuple[Run, Path]:
@@ -147,23 +230,15 @@ def _run_and_scene(file: Path, scene: Source | None) -> tuple[Run, Path]:
 
 
 def _view_run(file: Path, scene: Source | None) -> None:
-    from magtwin.io.rerun.file import view as view_recording
-    from magtwin.io.rerun.file import write_rrd
+    from magtwin.io.rerun.file import show_run
     from magtwin.io.rerun.viewer import show
 
     existing(file, "run")
     if file.suffix == ".rrd" and scene is None:
-        view_recording(file)
-        return
-    run = read_run(file)
-    twin = twin_to_show(run, file, scene)
-    if twin is None:
-        view_recording(file)
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        rrd = Path(folder) / f"{file.stem}.rrd"
-        write_rrd(run, rrd, twin)
-        show(rrd, shown=file)
+        show(file)
+    else:
+        run = read_run(file)
+        show_run(run, twin_to_show(run, file, scene), file=file)
 
 
 def _view_together(files: Sequence[Path], scene: Source | None, offsets_s: Sequence[float]) -> None:
@@ -178,7 +253,7 @@ def _view_together(files: Sequence[Path], scene: Source | None, offsets_s: Seque
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder) / "runs.rrd"
         write_comparison(runs, rrd, twin, offsets_s=dict(zip(runs, offsets_s, strict=True)))
-        show(rrd, shown=files[0])
+        show(rrd, source=files[0])
 
 
 def _view_stage(file: Path) -> None:

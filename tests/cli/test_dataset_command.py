@@ -152,7 +152,7 @@ def test_correlate_tells_and_draws(made, tmp_path, capsys):
         (["build", "DAYS/monday/a.json", "DAYS/monday/a.json"], "two recordings are called 'monday_a'"),
         (
             ["build", "DAYS/c.parquet", "--alignment", "fit", "--latency-s", "0.1"],
-            "drop it, or both others",
+            "drop it, or --lever-arm-m and --latency-s",
         ),
         (
             ["build", "DAYS/c.parquet", "--alignment", "fit"],

@@ -270,7 +270,7 @@ def test_plot_shows_the_headings_and_the_day_that_are_asked_for(tmp_path, series
 
 
 def test_a_map_in_many_headings_is_drawn_in_four_unless_asked(tmp_path):
-    from magtwin.figures.plots import plot_map
+    from magtwin.figures.maps import plot_map
 
     headings = np.radians(np.arange(0, 360, 15.0))
     values = np.repeat(a_map().values_nt[:1], 24, axis=0)

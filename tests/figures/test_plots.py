@@ -10,8 +10,8 @@ import pytest
 from magtwin.errors import InputError
 from magtwin.field.maps.difference import difference
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.figures.plots import plot_difference, plot_map
-from magtwin.figures.plotting import plot_run
+from magtwin.figures.maps import plot_difference, plot_map
+from magtwin.figures.runs import plot_run
 from magtwin.run.run import Run
 
 FOUR = np.radians([0.0, 90.0, 180.0, 270.0])
@@ -239,7 +239,7 @@ def test_a_map_of_millions_of_nodes_gives_a_small_drawing(tmp_path):
 @pytest.mark.parametrize(
     ("what", "said"),
     [
-        ("variance", "nothing is known of the variance of map ''"),
+        ("variance", "map '' has no variance"),
         ("headings", "map '' has one heading only"),
         ("feild", "no quantity 'feild'; did you mean 'field'"),
     ],
@@ -358,9 +358,9 @@ def test_a_picture_that_exists_is_kept_unless_force_is_given(tmp_path):
 
 def test_plotting_leaves_pyplot_alone(tmp_path):
     code = (
-        "import sys; from magtwin.figures import plots; assert 'matplotlib' not in sys.modules;"
+        "import sys; from magtwin.figures import maps;"
         "from magtwin.field.maps.map import AnomalyMap; import numpy as np;"
         "m = AnomalyMap(values_nt=np.full((1, 2, 2), 4e4), origin_m=(0, 0), cell_m=(1, 1), headings_rad=[0]);"
-        f"plots.plot_map(m, {str(tmp_path / 'a.png')!r}); sys.exit('matplotlib.pyplot' in sys.modules)"
+        f"maps.plot_map(m, {str(tmp_path / 'a.png')!r}); sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -261,7 +261,7 @@ def shown(monkeypatch):
     """What the viewer is given, in place of a window."""
     seen = []
 
-    def show(rrd, *, shown=None):
+    def show(rrd, *, source=None):
         from magtwin.io.rerun.file import read_runs
 
         seen.append(read_runs(rrd))

@@ -21,10 +21,10 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_from_rpy, quat_from_yaw, rotate
 from magtwin.io.rerun import recording
-from magtwin.io.rerun.file import read_run, read_runs, view, write_comparison, write_rrd
+from magtwin.io.rerun.file import read_run, read_runs, show_run, write_comparison, write_rrd
 from magtwin.io.rerun.live import RrdWriter
 from magtwin.io.rerun.series import DERIVED, STATES
-from magtwin.io.rerun.viewer import headless_viewer, screenshot
+from magtwin.io.rerun.viewer import headless_viewer, screenshot, show
 from magtwin.io.tables import write_parquet
 from magtwin.path import figure8
 from magtwin.run.run import COLUMNS, Run
@@ -653,7 +653,7 @@ except InputError as error:
 def test_the_room_asked_of_a_disk_is_enough_and_no_multiple_of_it(rows, shown, parts, tmp_path, monkeypatch):
     run, rest = parts
     asked = []
-    monkeypatch.setattr(recording, "check_room", lambda file, size, said: asked.append(size))
+    monkeypatch.setattr(recording, "check_room", lambda file, size, final: asked.append(size))
     run = run.take(slice(rows))
     scans = scan(rest["twin"], run.with_columns(lidar_on=np.ones(run.rows, bool)))
     write_rrd(run, tmp_path / "run.rrd", **({**rest, "scans": scans} if shown else {}))
@@ -691,14 +691,6 @@ def test_rerun_switched_off_by_the_environment_is_said_rather_than_nothing_writt
     assert not list(tmp_path.iterdir())
 
 
-def test_view_refuses_what_is_missing_or_of_another_kind(tmp_path):
-    with pytest.raises(InputError, match=r"none\.rrd: no such recording"):
-        view(tmp_path / "none.rrd")
-    (tmp_path / "run.xyz").touch()
-    with pytest.raises(InputError, match=r"run\.xyz: no known kind of run file"):
-        view(tmp_path / "run.xyz")
-
-
 @pytest.fixture
 def no_display(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
@@ -708,36 +700,28 @@ def no_display(monkeypatch):
 
 
 @pytest.mark.usefixtures("no_display")
-def test_view_of_a_parquet_file_without_a_display_names_no_file_that_is_gone(parts, tmp_path):
-    write_parquet(parts[0], tmp_path / "run.parquet")
-    with pytest.raises(InputError) as refused:
-        view(tmp_path / "run.parquet")
+def test_without_a_display_the_error_names_the_run_or_the_browser(parts, written, tmp_path):
+    source = tmp_path / "run.parquet"
+    with pytest.raises(InputError, match="the Rerun viewer opened no window: ") as refused:
+        show_run(parts[0], file=source)
     text = str(refused.value)
-    assert text.startswith(f"{tmp_path / 'run.parquet'}: the Rerun viewer opened no window: ")
+    assert text.startswith(f"{source}: ")
     assert text.endswith("; without a display view the .rrd of this run, which a browser shows too")
-
-
-@pytest.mark.usefixtures("no_display")
-def test_view_without_a_display_is_refused_and_names_the_browser(written):
     with pytest.raises(InputError, match=r"opened no window: .*DISPLAY.*; .*rerun --web-viewer --bind 127"):
-        view(written)
+        show(written)
 
 
-def test_view_of_a_parquet_file_shows_its_series(parts, tmp_path, monkeypatch):
+def test_a_run_from_any_file_is_shown_as_series_and_one_without_plotted_columns_is_refused(
+    parts, tmp_path, monkeypatch
+):
     run, _ = parts
-    write_parquet(run, tmp_path / "run.parquet")
     seen = tmp_path / "seen.rrd"
     monkeypatch.setattr("magtwin.io.rerun.file.show", lambda rrd, **_: shutil.copy(rrd, seen))
-    view(tmp_path / "run.parquet")
+    show_run(run, file="run.parquet")
     assert np.array_equal(read_run(seen)["b_disturbance_nt"], run["b_disturbance_nt"])
-
-
-def test_view_of_a_parquet_file_with_nothing_to_plot_is_refused(tmp_path):
-    write_parquet(Run({"t": np.arange(3.0), "est_bias_nt": np.zeros(3)}), tmp_path / "run.parquet")
-    with pytest.raises(
-        InputError, match=r"run\.parquet: holds none of the columns that are plotted, such as b_total"
-    ):
-        view(tmp_path / "run.parquet")
+    bare = Run({"t": np.arange(3.0), "est_bias_nt": np.zeros(3)})
+    with pytest.raises(InputError, match=r"run\.parquet: holds none of the columns that are plotted, such"):
+        show_run(bare, file="run.parquet")
 
 
 @pytest.fixture

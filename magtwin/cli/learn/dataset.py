@@ -77,7 +77,7 @@ def build(
     check_free(out, force=force)
     given = lever_arm_m is not None or latency_s is not None
     if given and alignment == "fit":
-        raise InputError("--alignment fit finds lever arm and latency; drop it, or both others")
+        raise InputError("--alignment fit finds both; drop it, or --lever-arm-m and --latency-s")
     options: dict[str, Any] = {"topics": pairs("remap", remap) if remap else None, "unit": unit}
     options["columns"] = _columns(column) if column else None
     options = {name: value for name, value in options.items() if value is not None}
@@ -161,7 +161,7 @@ def correlate(
     step("Ranking the inputs")
     result = correlations(rows.x, rows.y, rows.features, groups)
     if out is not None:
-        from magtwin.figures.correlations import plot_correlations
+        from magtwin.figures.training import plot_correlations
 
         plot_correlations(result, out, title=f"{dataset}", force=force)
     return Done(result.report(f"Correlation with the disturbance in {dataset}"), out or ())

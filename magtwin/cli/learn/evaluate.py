@@ -13,7 +13,7 @@ from magtwin.cli.terminal import Done, progress, stdout_console, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
-    from magtwin.figures.pages import Section
+    from magtwin.figures.page import Section
     from magtwin.learn.data.dataset import Dataset
     from magtwin.learn.evaluation.evaluate import Chart, Contender, Evaluation, Trial
     from magtwin.run.run import Run
@@ -87,7 +87,7 @@ def evaluate(
     import numpy as np
 
     from magtwin.figures.evaluations import page_of_evaluation, read_curve, write_evaluation
-    from magtwin.figures.pages import to_json
+    from magtwin.figures.page import to_json
     from magtwin.files import check_free
     from magtwin.learn.evaluation import evaluate as room
 
@@ -249,7 +249,7 @@ def _traversals(
     found: "Evaluation", scene: Path | None, overlay: Path | None, engine: str | None
 ) -> "tuple[Section, dict[str, Any]]":
     """One path driven twice, as a section and in figures."""
-    from magtwin.figures.traversals import section_of_traversals
+    from magtwin.figures.comparisons import section_of_traversals
     from magtwin.io.formats import read_run
     from magtwin.io.provenance import made_again
     from magtwin.run.compare import traversals

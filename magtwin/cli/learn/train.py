@@ -100,12 +100,9 @@ def train(
     rrd
         Rerun recording of the learning curve to write, .rrd.
     """
-    from magtwin.figures.learning_curves import (
-        plot_learning_curve,
-        record_learning_curve,
-        write_learning_curve,
-    )
+    from magtwin.figures.training import plot_learning_curve, write_learning_curve
     from magtwin.files import check_free
+    from magtwin.io.rerun.learning import record_learning_curve
     from magtwin.learn.training.config import TrainConfig, read_config
     from magtwin.learn.training.train import train as train_model
 

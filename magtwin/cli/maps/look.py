@@ -34,7 +34,7 @@ def map_plot(
         Headings to draw [deg], such as 0,90,180,270. Default: the map's, or four of them if it has more than
         eight.
     """
-    from magtwin.figures.plots import plot_map
+    from magtwin.figures.maps import plot_map
     from magtwin.io.surveys.maps import open_map
 
     check_output(out, PICTURES, "a picture", force=force)
@@ -78,7 +78,7 @@ def map_diff(before: Path, after: Path, *, out: Path | None = None, force: Force
     step("Comparing the maps")
     change = difference(open_map(before), open_map(after))
     if out is not None:
-        from magtwin.figures.plots import plot_difference
+        from magtwin.figures.maps import plot_difference
 
         plot_difference(change, out, force=force)
     report = change.report()

@@ -60,19 +60,19 @@ def film(
     scene: RunScene = None,
     force: Force = False,
 ) -> Done:
-    """Film a run in its lab, or a stage on a turntable.
+    """Film a run in its lab.
 
     Things between the camera and the map or the robot are drawn as a veil.
 
     Parameters
     ----------
     file
-        A run in any format that magtwin reads; a stage for a turntable.
+        A run in any format that magtwin reads.
     out
         MP4 or GIF to write.
     camera
-        orbit, slowly around the lab; top, straight from above; chase, from behind the robot; x,y,z:x,y,z, the
-        camera's position and target [m]; or turntable, once around a stage, in 10 s.
+        orbit, slowly around the lab; top, straight from above; chase, from behind the robot; or x,y,z:x,y,z,
+        the camera's position and target [m].
     fps
         Frames per second [Hz].
     pace
@@ -93,7 +93,7 @@ def film(
             size=pixels,
             scene=scene,
             force=force,
-            progress=lambda done, total: advance(done, total),
+            advance=advance,
         )
     return Done(wrote=out)
 

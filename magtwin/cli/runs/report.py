@@ -32,7 +32,7 @@ def report(
     out
         Page to write: .html, which needs no other file, .md or .json.
     """
-    from magtwin.figures.reports import report_runs
+    from magtwin.figures.views import report_runs
 
     check_output(out, (".html", ".md", ".json"), "a report", force=force)
     with progress("Reporting", "runs") as advance:
@@ -64,7 +64,7 @@ def compare(
         Page (.html, .md, .json) or picture (.png, .svg) to write: readings as recorded and aligned, the
         distance between the runs, and both paths.
     """
-    from magtwin.figures.reports import compare_files, names_of
+    from magtwin.figures.views import compare_files, names_of
 
     check_output(out, (".html", ".md", ".json", ".png", ".svg"), "a comparison", force=force)
     step("Comparing the runs")

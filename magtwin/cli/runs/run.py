@@ -245,7 +245,7 @@ def run(
 
 def draw_run(driven: "Driven", out: Path, force: bool) -> None:
     """Draw run.png: the path over the map."""
-    from magtwin.figures.plotting import plot_run
+    from magtwin.figures.runs import plot_run
 
     planned = driven.planned.p_xy if driven.planned else None
     plot_run(driven.run, driven.twin.field, out, planned=planned, force=force)
