@@ -63,7 +63,9 @@ def test_parameters_of_a_file_are_read_where_they_are_the_nodes(arguments, tmp_p
     file = tmp_path / "settings.yaml"
     file.write_text(yaml.safe_dump(sections))
     given = f"lab.usda --ros-args -r __ns:=/tb4 -r __node:=m --params-file {file} -p lidar:=on".split()
-    wanted = "ros magnetometer lab.usda lidar:=on rate_hz:=50.0 use_sim_time:=true --namespace=tb4 --node-name=m"
+    wanted = (
+        "ros magnetometer lab.usda lidar:=on rate_hz:=50.0 use_sim_time:=true --namespace=tb4 --node-name=m"
+    )
     assert arguments("magnetometer", given) == wanted.split()
 
 

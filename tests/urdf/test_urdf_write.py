@@ -252,11 +252,8 @@ def test_the_command_goes_both_ways_and_says_what_stays_behind(tmp_path, capfd):
     assert said["figures"]["links"]["value"] == len(read_description(out).links)
     assert "MagtwinMagnetometerAPI" in said["metadata"]["notes"][0]
     for words, message in (
-        ([], "give one of them"),
-        (["--out", "x", "--out", "y.urdf"], "give one of them"),
-        (["--out", str(out), "--mass-kg", "3"], "leave the others out"),
+        (["--out", str(out), "--mass-kg", "3"], "without other options than --force"),
         (["--out", str(out)], "exists already"),
-        (["--out", "a.xml"], "a URDF ends in .urdf"),
     ):
         with pytest.raises(SystemExit):
             main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), *words])
