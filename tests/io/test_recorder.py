@@ -264,7 +264,7 @@ def test_a_viewer_that_is_not_there_is_refused_before_anything_is_written(lab_sc
             main([*arguments, "--viewer", address])
         assert said in capsys.readouterr().err.splitlines()[-1]
     for options, said in (
-        (["--pace", "2"], "--pace is for a run that is shown live"),
+        (["--pace", "2"], "--pace is for a run that is shown"),
         (["--live", "--pace", "0"], "--pace must be above 0"),
         (["--live", "--viewer", "rerun+http://127.0.0.1:9/proxy"], "give one of them"),
         (["--out-unit", "nT"], "--out-unit is for a bag"),

@@ -44,7 +44,7 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
         ),
         (
             "magnetometer",
-            "--ros-args --log-level warn -p scene:=lab.usda -p duration:=5 --disable-stdout-logs odom:=o",
+            "--ros-args --log-level warn -p scene:=lab.usda -p duration_s:=5 --disable-stdout-logs odom:=o",
             "ros magnetometer lab.usda --duration-s=5 --remap odom:=o",
         ),
         ("replay", "a.mcap --ros-args -p use_sim_time:=true -r x:__ns:=/", "ros replay a.mcap --namespace="),

@@ -289,7 +289,7 @@ def test_meet_flag_lets_robots_drive_through_each_other(two, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--path", "sine"], "which of ann, bob is to drive sine? say it with --robot NAME"),
+        (["--path", "sine"], "which of ann, bob is to drive sine? name it with --robot NAME"),
         (["--robot", "bo"], "no robot 'bo'; did you mean 'bob'"),
         (["--engine", "newton"], "--engine newton drives one robot by itself"),
         (["--live"], "--live and --viewer show one robot"),
