@@ -19,10 +19,10 @@ from magtwin.learn.data.dataset import build_dataset
 from magtwin.learn.data.labels import Alignment
 from magtwin.learn.data.split import split
 from magtwin.learn.evaluation.evaluate import Contender, Mean, Trial, chart_of, evaluate
-from magtwin.learn.magnetometer import NeuralMagnetometer
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.learn.training.config import TrainConfig
-from magtwin.learn.training.result import fit as train
+from magtwin.learn.training.train import fit as train
 from magtwin.path import path_named
 from magtwin.report import Figure, Report
 from magtwin.run.compare import compare
@@ -62,7 +62,7 @@ def learnt(twin, run, tmp_path_factory):
     chart = chart_of("lab", twin.field)
     models = [
         Contender("naive", Mean(0.0, 1.0), chart),
-        Contender("net", NeuralMagnetometer(trained.net), chart),
+        Contender("net", NeuralMagnetometer(trained.predictor), chart),
     ]
     trials = [Trial(name, lambda run=run: run) for name, run in runs.items()]
     return data, parts, trained, evaluate(models, trials, rng=np.random.default_rng(0), truth=True)
@@ -104,8 +104,8 @@ def nouns(twin, run, learnt):
         "data set": data,
         "split": parts,
         "trained": trained,
-        "net": trained.net,
-        "inputs": trained.net.inputs,
+        "net": trained.predictor,
+        "inputs": trained.predictor.inputs,
         "evaluation": evaluation,
         "judged": evaluation.judged[0],
         "case": evaluation.cases[0],

@@ -375,7 +375,7 @@ def test_the_licence_of_a_network_is_read_from_its_weights(metadata, said, tmp_p
 
 def test_a_released_network_is_handed_on_under_the_licence_that_it_was_converted_with(real_data, tmp_path):
     pth = real_data / "aprilab" / "models" / "nn_magnetometer_model_v0.0.1.pth"
-    main(["net", "convert", str(pth), "--out", str(tmp_path / "n.safetensors"), "--licence", "MIT"])
+    main(["network", "convert", str(pth), "--out", str(tmp_path / "n.safetensors"), "--licence", "MIT"])
     assert licence_of(tmp_path / "n.safetensors") == "MIT"
 
 

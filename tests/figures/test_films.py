@@ -191,7 +191,7 @@ def test_a_long_run_is_shown_in_half_a_minute_and_a_short_one_as_it_happened(run
 def test_the_commands_draw_a_moment_a_film_and_a_stage(run, lab_scene, tmp_path, capsys):
     file = tmp_path / "run.parquet"
     write_parquet(run, file)
-    main(["picture", str(file), "--out", str(tmp_path / "run.png"), "--size", "160x90", "--time", "2"])
+    main(["picture", str(file), "--out", str(tmp_path / "run.png"), "--size", "160x90", "--time-s", "2"])
     view = ["--size", "160x90", "--camera", "top"]
     main(["picture", str(lab_scene), "--out", str(tmp_path / "stage.png"), *view])
     for name in ("run", "stage"):

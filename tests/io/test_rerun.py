@@ -533,12 +533,12 @@ def test_view_shows_several_runs_with_the_offsets_that_are_given(parts, tmp_path
     seen = tmp_path / "seen.rrd"
     monkeypatch.setattr("magtwin.io.rerun.viewer.show", lambda rrd, **_: shutil.copy(rrd, seen))
     files = [str(tmp_path / "a.parquet"), str(tmp_path / "b.parquet")]
-    main(["view", *files, "--offset", "0", "--offset", "1.5"])
+    main(["view", *files, "--offset-s", "0", "--offset-s", "1.5"])
     assert [columns_of(seen, f"run/{name}")[0][0] for name in "ab"] == [0, 1.5e9]
-    for arguments in ([*files, "--offset", "1"], [files[0], "--offset", "1"]):
+    for arguments in ([*files, "--offset-s", "1"], [files[0], "--offset-s", "1"]):
         with pytest.raises(SystemExit):
             main(["view", *arguments])
-        assert "--offset is given once for each of several runs" in capsys.readouterr().err
+        assert "--offset-s is given once for each of several runs" in capsys.readouterr().err
 
 
 def test_runs_that_cannot_be_told_apart_and_offsets_of_none_are_refused(parts, tmp_path):
@@ -731,10 +731,10 @@ def test_what_is_no_recording_is_refused_before_a_viewer_starts(written, tmp_pat
 def test_the_picture_command_draws_a_recording_and_refuses_a_time_beyond_it(written, tmp_path, capsys):
     out = tmp_path / "run.png"
     with pytest.raises(SystemExit):
-        main(["picture", str(written), "--out", str(out), "--time", "9999"])
+        main(["picture", str(written), "--out", str(out), "--time-s", "9999"])
     assert re.search(r"the recording goes from 0 to [\d.]+ s; there is no 9999 s", capsys.readouterr().err)
     assert not out.exists()
-    main(["picture", str(written), "--out", str(out), "--time", "5", "--size", "640x400"])
+    main(["picture", str(written), "--out", str(out), "--time-s", "5", "--size", "640x400"])
     with Image.open(out) as image:
         assert image.size == (640, 400)
         assert np.std(np.asarray(image.convert("L"))) > 20

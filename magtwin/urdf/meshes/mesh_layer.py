@@ -267,7 +267,9 @@ def _primvar(
     values: NDArray,
     interpolation: str = UsdGeom.Tokens.faceVarying,
 ) -> None:
-    """Author a primvar, by default of values at corners, shape (F, 3, K), with an index of distinct values."""
+    """Author a primvar, by default of values at corners, shape (F, 3, K), with an index of distinct
+    values.
+    """
     rows = values.reshape(-1, values.shape[-1]).astype(np.float32) + np.float32(0)
     first, index = distinct(rows)
     arrays = {2: Vt.Vec2fArray, 3: Vt.Vec3fArray}

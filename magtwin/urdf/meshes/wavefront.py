@@ -40,7 +40,9 @@ class _Group:
 
 
 def read_wavefront(reading: Reading) -> list[Piece]:
-    """The triangles of a Wavefront OBJ, for `read_mesh`; vertices may have colours, as MeshLab writes them."""
+    """The triangles of a Wavefront OBJ, for `read_mesh`; vertices may have colours, as MeshLab writes
+    them.
+    """
     path = reading.path
     rows: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}
     paints: dict[str, Paint] = {}
