@@ -1,4 +1,4 @@
-"""ClosedLoop: a robot's closed loop, ready to be run, alone or with many others, in plain Python or compiled."""
+"""ClosedLoop: a robot and its controller, ready to run, alone or with many others, plain or compiled."""
 
 import math
 from array import array

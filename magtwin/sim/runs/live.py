@@ -16,7 +16,7 @@ from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.drive import Moment, advance, draw_wheel_errors, wheel_rates
 from magtwin.sim.motion.follow import CONTROL_RATE_HZ
 from magtwin.sim.motion.manual import at_start
-from magtwin.sim.runs.sensing import LidarMode, Sensing, streams
+from magtwin.sim.runs.sensing import Conditions, LidarMode, Sensing, streams
 from magtwin.sim.runs.simulate import check_run, run_metadata
 from magtwin.sim.sensors.clock import Samples
 from magtwin.sim.sensors.lidar import Scanner, Scans
@@ -115,15 +115,14 @@ class LiveRobot:
             InputError: It would begin in an obstacle, or an option is out of range.
         """
         robot, obstacles = scene.robot, obstacles or Obstacles()
-        self.rate_hz = check_run(
-            scene,
-            Commands("live", np.zeros((1, 3))),
+        conditions = Conditions(
             anomaly_map=anomaly_map,
-            rate_hz=rate_hz,
-            duration_s=None,
-            lidar=lidar,
             network=network is not None,
+            rate_hz=rate_hz,
+            lidar=lidar,
+            outside=outside,
         )
+        check_run(scene, Commands("live", np.zeros((1, 3))), conditions)
         self.step_s = 1.0 / CONTROL_RATE_HZ
         draws = streams(rng)
         errors = draw_wheel_errors(robot.drive, draws["drive"])
@@ -131,20 +130,13 @@ class LiveRobot:
         self._chassis: Chassis = at_start(robot.drive, scene.start, obstacles, radius, errors, self.step_s)
         self._track = Track(robot.drive, self.step_s, scene.start)
         self._network, self._model_error, self._height_m = network, model_error, robot.base_height_m
-        self._sensing = Sensing(
-            scene,
-            draws,
-            anomaly_map=anomaly_map,
-            rate_hz=self.rate_hz,
-            outside=outside,
-            lidar=lidar,
-            network=network is not None,
-        )
+        self._sensing = Sensing(scene, draws, conditions)
+        self.rate_hz = self._sensing.rate_hz
         self._scanner = Scanner(robot, obstacles, draws["lidar"])
         self._noise_sd_nt = robot.magnetometer.noise_density_nt * np.sqrt(self.rate_hz / 2)
         self._readings = 0
         self._rows: list[tuple[float, float, float]] = []
-        self._metadata = {**run_metadata(self._sensing), "controller": "commands", "lidar": lidar}
+        self._metadata = {**run_metadata(self._sensing), "controller": "commands"}
 
     @property
     def t(self) -> float:

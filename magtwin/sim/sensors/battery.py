@@ -55,7 +55,8 @@ def wheels_energy_j(spec: BatterySpec, drive: DriveSpec, moments: Moment) -> Arr
     rolled = np.abs(np.diff(moments.wheel_angle, axis=0)) * drive.wheel_radius_m
     gain = np.maximum(np.diff(speed * speed, axis=0), 0.0)
     work = spec.drag_n / 2 * rolled + spec.mass_kg / 4 * gain
-    return np.asarray((work[..., 0] + work[..., 1]) / spec.motor_efficiency)
+    joules: Array = (work[..., 0] + work[..., 1]) / spec.motor_efficiency
+    return joules
 
 
 @dataclass(frozen=True, eq=False)
