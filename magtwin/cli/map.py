@@ -334,8 +334,7 @@ def map_survey(
 
     from magtwin.author.scene import read_scene
     from magtwin.files import check_free, sha256
-    from magtwin.sim.room_survey import blocked_by
-    from magtwin.sim.survey import survey, survey_readings
+    from magtwin.sim.survey import blocked_by, survey, survey_readings
     from magtwin.usd.layers import layer_files
     from magtwin.usd.obstacles import read_obstacles
 

@@ -65,7 +65,7 @@ class Learner(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClosedLoop:
+class Course:
     """How far and how fast a descent goes."""
 
     epochs: int
@@ -99,7 +99,7 @@ def check_device(device: str) -> None:
 
 def descend(
     learner: Learner,
-    course: ClosedLoop,
+    course: Course,
     settings: Mapping[str, Any],
     *,
     started: bool = False,
@@ -138,7 +138,7 @@ def descend(
 class _Descent:
     """A module on its way, and all that its next step depends on."""
 
-    def __init__(self, learner: Learner, course: ClosedLoop, settings: Mapping[str, Any], started: bool) -> None:
+    def __init__(self, learner: Learner, course: Course, settings: Mapping[str, Any], started: bool) -> None:
         self.learner, self.course, self.settings, self.started = learner, course, settings, started
         self.module = learner.module
         self.trained = {name: p for name, p in self.module.named_parameters() if p.requires_grad}

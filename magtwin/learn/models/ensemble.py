@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError, find
 from magtwin.learn.data.inputs import Array, inputs_from, inputs_of, scaler_tensors
 from magtwin.learn.models import heads
-from magtwin.learn.models.descent import ClosedLoop, Epoch, check_device, descend
+from magtwin.learn.models.descent import Course, Epoch, check_device, descend
 from magtwin.learn.models.perceptron import outputs
 from magtwin.learn.models.state import digest
 from magtwin.learn.models.weights import Weights
@@ -142,7 +142,7 @@ def fit_ensemble(
         features: Names of the features, in order, or of a set of them.
         members: How many networks.
         layers: Widths of their hidden layers.
-        epochs: As `ClosedLoop` has it, and so the next three.
+        epochs: As `Course` has it, and so the next three.
         batch: Rows a step.
         lr: Largest step size of Adam.
         patience: Epochs without a better one after which it stops.
@@ -176,7 +176,7 @@ def fit_ensemble(
     model = Ensemble(inputs=of, net=net, y_mean_nt=y_mean, y_scale_nt=y_scale)
     check_device(device)
     net.to(device)
-    course = ClosedLoop(epochs=epochs, batch=batch, lr=lr, patience=patience, seed=seed)
+    course = Course(epochs=epochs, batch=batch, lr=lr, patience=patience, seed=seed)
     settings = {
         "kind": "ensemble",
         "features": list(of.features),

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.learn.data.features import feature_names
-from magtwin.learn.models.descent import ClosedLoop, Epoch, check_device, descend
+from magtwin.learn.models.descent import Course, Epoch, check_device, descend
 from magtwin.learn.models.network import Fact, FieldNet
 from magtwin.learn.models.state import digest
 
@@ -122,7 +122,7 @@ def train(
         _Rows(
             net, x, y, counts, x_val, y_val, Dropout(dropout, torch.Generator(device).manual_seed(seed + 1))
         ),
-        ClosedLoop(epochs=epochs, batch=batch, lr=lr, patience=patience, seed=seed),
+        Course(epochs=epochs, batch=batch, lr=lr, patience=patience, seed=seed),
         settings,
         started=init is not None,
         checkpoint=checkpoint,

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array, inputs_from, inputs_of, scaler_tensors
 from magtwin.learn.models import heads
-from magtwin.learn.models.descent import ClosedLoop, Epoch, check_device, descend
+from magtwin.learn.models.descent import Course, Epoch, check_device, descend
 from magtwin.learn.models.perceptron import CHUNK, in_threads
 from magtwin.learn.models.state import digest
 from magtwin.learn.models.weights import Weights
@@ -191,7 +191,7 @@ def fit_temporal(
         step_s: Time between rows [s].
         layers: Widths of the convolutions.
         kernel: How many rows each of them looks at.
-        epochs: As `ClosedLoop` has it, and so the next three.
+        epochs: As `Course` has it, and so the next three.
         batch: Rows a step, in stretches of `STRETCH`.
         lr: Largest step size of Adam.
         patience: Epochs without a better one after which it stops.
@@ -225,7 +225,7 @@ def fit_temporal(
     model = Temporal(inputs=of, net=net, y_mean_nt=y_mean, y_scale_nt=y_scale, step_s=step_s)
     check_device(device)
     net.to(device)
-    course = ClosedLoop(epochs=epochs, batch=max(1, batch // STRETCH), lr=lr, patience=patience, seed=seed)
+    course = Course(epochs=epochs, batch=max(1, batch // STRETCH), lr=lr, patience=patience, seed=seed)
     settings = {
         "kind": "tcn",
         "features": list(of.features),

@@ -169,7 +169,7 @@ class Battery(SampledSensor):
         else:
             self._history, self._first = self._history[-1:], self._done
         last = max(int(np.ceil((until_s - 1e-9) / STEP_S)) - 1, self._done)
-        times = np.arange(self._done, last + 1) * STEP_S
+        times: Array = np.arange(self._done, last + 1, dtype=float) * STEP_S
         self._done = last
         if len(times) > 1:
             energy = wheels_energy_j(self.spec, self._drive, motion.at(times))
