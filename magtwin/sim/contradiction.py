@@ -132,8 +132,9 @@ def check_agrees(scene: Scene, anomaly_map: AnomalyMap, where: str) -> Contradic
     difference = contradiction_nt(scene, anomaly_map)
     if not difference.agrees:
         raise InputError(
-            f"{where}: the map differs from the field of the scene's Earth, sources and furniture by {difference} "
-            f"({difference.allowed_nt:,.0f} nT rms is allowed); if the map is right, remove the sources and the "
-            "furniture (or their magnetization); if they are, survey them: magtwin map survey"
+            f"{where}: the map differs from the field of the scene's Earth, sources and furniture by "
+            f"{difference} ({difference.allowed_nt:,.0f} nT rms is allowed); if the map is right, remove the "
+            "sources and the furniture (or their magnetization); if they are right, survey them: "
+            "magtwin map survey"
         )
     return difference

@@ -152,7 +152,7 @@ class ExactField:
     def _mapped(
         self, scene: Scene, true: Moment, at_rest_nt: Array | None, *, eddy: bool
     ) -> tuple[Array, Array | float]:
-        """The map as a vector (N, 3) [nT], and its rate of change for eddy currents [nT/s], in base_link axes."""
+        """The map as a vector [nT], and its rate of change for eddy currents [nT/s], in base_link axes."""
         field, robot, yaw = self.anomaly_map, scene.robot, true.pose[:, 2]
         cos, sin = np.cos(yaw), np.sin(yaw)
         place = true.pose[:, :2] if self.holds_robot else sensor_places(robot, true.pose)[:, :2]

@@ -9,8 +9,8 @@ Each kind has a protocol, a registry, and a decorator that registers an entry un
 | controller | `motion.controllers.Controller` | `@controller("mine")` | `simulate(..., controller="mine")` |
 | engine | `motion.engine.Engine` | `@engine("mine")` | `simulate(..., engine="mine")` |
 
-Functions and objects can be given in place of names. Installed packages register entries by entry points of the
-groups `magtwin.sensors`, `magtwin.interference`, `magtwin.controllers` and `magtwin.engines`.
+Functions and objects can be given in place of names. Installed packages register entries by entry points of
+the groups `magtwin.sensors`, `magtwin.interference`, `magtwin.controllers` and `magtwin.engines`.
 
     @sensor("speedometer")
     class Speedometer:

@@ -107,7 +107,7 @@ def survey_readings(
         licence: SPDX name of the survey's licence.
         created: Day of the survey, YYYY-MM-DD.
         progress: Called with headings done, headings in all, and what is being done.
-        blocked: From nodes of shape (Y, X, 2) to whether the robot cannot stand there. Default: it always can.
+        blocked: From nodes of shape (Y, X, 2) to whether the robot cannot stand there. Default: none.
 
     Returns:
         A row for each node, in the order of `Grid.poses`, with magnitudes; `good` where the robot can stand.
@@ -437,7 +437,7 @@ def survey_room(
     )
 
 
-def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], Array]:
+def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], NDArray[np.bool_]]:
     """Which nodes the robot cannot stand at, because of obstacles or magnetised things.
 
     Walls at the border of the floor do not count, because the map is needed up to them.
@@ -458,7 +458,7 @@ def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], Array]:
     )
     radius = scene.robot.footprint_radius_m
 
-    def blocked(nodes: Array) -> Array:
+    def blocked(nodes: Array) -> NDArray[np.bool_]:
         p = nodes.reshape(-1, 2)
         distance, _ = standing.clearance(p, reach_m=radius)
         inside = in_steel(scene, p, sensor_height_m(scene))
@@ -467,7 +467,7 @@ def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], Array]:
     return blocked
 
 
-def in_steel(scene: Scene, p: Array, height_m: float) -> Array:
+def in_steel(scene: Scene, p: Array, height_m: float) -> NDArray[np.bool_]:
     """Whether a robot at points (N, 2) of the floor would stand in something magnetised, shape (N,).
 
     Args:

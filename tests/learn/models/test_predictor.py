@@ -147,7 +147,7 @@ def test_robots_that_step_together_have_no_network_that_looks_back(lab_scene, tm
     from magtwin.gym import MagNavEnv
 
     a_predictor("tcn").save(tmp_path / "n.safetensors")
-    with pytest.raises(InputError, match=r"n\.safetensors: a tcn looks at 6 earlier readings"):
+    with pytest.raises(InputError, match=r"n\.safetensors: a tcn reads 6 earlier readings"):
         MagNavEnv(scene=lab_scene, network=tmp_path / "n.safetensors")
 
 

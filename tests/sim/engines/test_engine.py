@@ -98,7 +98,7 @@ def test_a_replay_between_its_samples_is_the_drive_itself():
 
 @pytest.mark.parametrize(
     ("t", "x", "what"),
-    [([0, 1, 1], [0, 1, 2], "row 3"), ([0, 1, 2], [0, np.nan, 2], "row 2"), ([0], [0], "two or more")],
+    [([0, 1, 1], [0, 1, 2], "row 3"), ([0, 1, 2], [0, np.nan, 2], "row 2"), ([0], [0], "at least two rows")],
 )
 def test_a_run_that_cannot_be_replayed_is_refused(t, x, what):
     zero = np.zeros(len(t))
