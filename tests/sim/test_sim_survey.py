@@ -220,10 +220,10 @@ def test_a_survey_tells_frame_datum_and_figures():
     ("options", "message"),
     [
         ({"heading_error_rad": -1.0}, "heading_error_rad must not be below 0, got -1"),
-        ({"position_error_m": 1e9}, "position_error_m 1000000000.0 is beyond the spacing of 0.25 m"),
+        ({"position_error_m": 1e9}, "position_error_m 1000000000.0 is above the spacing of 0.25 m"),
         ({"heading_error_rad": 2.0}, "heading_error_rad must not be above pi/2, got 2.0"),
         ({"position_error_m": np.nan}, "position_error_m must not be below 0, got nan"),
-        ({"height_m": np.inf}, "height_m is a height above the floor, 0 m or more, got inf"),
+        ({"height_m": np.inf}, "height_m must be a height above the floor, 0 m or more, got inf"),
     ],
 )
 def test_errors_and_heights_that_are_none_are_refused(options, message):

@@ -122,11 +122,11 @@ def test_commands_are_read_as_they_were_written(tmp_path):
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        ("t,v,w\n0,0.1,0\n0.5,0.1,0\n0.4,0.1,0\n", ":4: time must go on"),
+        ("t,v,w\n0,0.1,0\n0.5,0.1,0\n0.4,0.1,0\n", ":4: times must ascend"),
         ("0,nan,0\n", ":1: a command must be finite"),
         ("0,0.1\n", ":1: a command is three numbers"),
         ("t,v,w\nx,y,z\n", ":2: not a number"),
-        ("-1,0.1,0\n", ":1: time must go on"),
+        ("-1,0.1,0\n", ":1: times must ascend"),
         ("t,v,w\n", "no commands"),
     ],
 )
