@@ -32,8 +32,8 @@ class InputError(ValueError):
         """The text with parameters spelled as flags: `` `force=True` `` becomes `--force`.
 
         Args:
-            flags: Flag of each parameter that the command has ({"force": "--force"}). Other words in
-                backticks stay as they are.
+            flags: Flag of each parameter that the command has ({"force": "--force"}). Other words
+                in backticks stay as they are.
         """
 
         def flag(match: re.Match[str]) -> str:

@@ -28,7 +28,10 @@ from magtwin.report import Figure, Report
 from magtwin.run.compare import compare
 from magtwin.run.run import Column, Run
 from magtwin.sim.motion.commands import Commands
-from magtwin.spec.scene import PlacedRobot, Scene, SourceSpec, spelled
+from magtwin.spec.base import spelled
+from magtwin.spec.magnetics import SourceSpec
+from magtwin.spec.robot import PlacedRobot
+from magtwin.spec.scene import Scene
 from magtwin.summary import LINES, WIDTH, Summarized
 from magtwin.twin import open_twin, scan, simulate, sweep
 

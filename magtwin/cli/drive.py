@@ -109,7 +109,7 @@ def drive(
             commands=folder / "commands.csv",
             metadata={"commands_file": "commands.csv"},
             steps=announcer(quiet=json),
-            net=net,
+            network=net,
             model_error=model_error,
             seed=seed,
             session=session,

@@ -40,7 +40,8 @@ from magtwin.run.run import COLUMNS, Column
 from magtwin.sim.motion.controllers import CUSTOM_CONTROLLERS
 from magtwin.sim.motion.engine import ENGINES
 from magtwin.sim.motion.sampling import Moving
-from magtwin.spec.scene import RobotSpec, Scene
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 

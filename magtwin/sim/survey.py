@@ -12,12 +12,14 @@ from magtwin.errors import InputError
 from magtwin.field.grid import Grid
 from magtwin.field.maps.holes import filled
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.sources.magnets import body_of
 from magtwin.field.survey.readings import Readings
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.sim.interference import ambient_field_nt, ambient_gradient_nt_m, platform_field_nt
 from magtwin.sim.sensors.magnetometer import lost_in, rounded, stuck_nt
+from magtwin.spec.lab import SurveySpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import Scene, SurveySpec
+from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -480,7 +482,7 @@ def in_steel(scene: Scene, p: Array, height_m: float) -> NDArray[np.bool_]:
     for source in scene.magnets:
         if source.shape == "point":
             continue
-        body = replace(source, susceptibility=0.0).body()
+        body = body_of(replace(source, susceptibility=0.0))
         middle = body.p_world + body.rotation @ body.middle
         half = np.abs(body.rotation) @ (body.size_m / 2)
         near = np.flatnonzero(np.all(np.abs(p - middle[:2]) < half[:2] + radius, axis=1))

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import find
 from magtwin.files import check_free, output, sha256, shipped
+from magtwin.spec.lab import SurveySpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import Scene, SurveySpec
+from magtwin.spec.scene import Scene
 
 if TYPE_CHECKING:
     from tempfile import TemporaryDirectory

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.files import existing, git_revision, sha256
 from magtwin.run.run import Run
-from magtwin.spec.scene import RobotSpec, Scene
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
 from magtwin.twin.twin import Kind, Metadata, Twin, scene_sha256, without_model_error
 
 if TYPE_CHECKING:

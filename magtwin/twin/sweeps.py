@@ -12,7 +12,8 @@ from magtwin.errors import InputError
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive_input import drive_inputs
-from magtwin.spec.scene import RobotSpec, Scene
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
 from magtwin.twin.opening import opened
 from magtwin.twin.simulation import check_commands, finished
 from magtwin.twin.twin import (

@@ -12,8 +12,11 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.placement import Room
+from magtwin.spec.base import spelled
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import MagnetometerSpec, RobotSpec, Scene, spelled
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.summary import Summarized, Summary
 
 if TYPE_CHECKING:

@@ -22,18 +22,11 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.earth import earth_field_nt
 from magtwin.files import sha256, shipped
 from magtwin.frames import IDENTITY_XYZW, quat_from_rpy, quat_multiply
-from magtwin.spec.scene import (
-    BatterySpec,
-    DriveSpec,
-    EarthFieldSpec,
-    ImuSpec,
-    LabSpec,
-    LidarSpec,
-    MagnetometerSpec,
-    PlatformFieldSpec,
-    Scene,
-    SourceSpec,
-)
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.lab import LabSpec
+from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec
 from magtwin.twin import open_twin, simulate
 from magtwin.usd import sensors
 from magtwin.usd.attributes import write_pose

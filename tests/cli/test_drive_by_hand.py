@@ -20,8 +20,8 @@ from magtwin.io.tables import read_parquet
 from magtwin.sim.motion.commands import read_commands
 from magtwin.sim.motion.follow import play
 from magtwin.sim.motion.manual import Gamepad, Keyboard, Recorder, at_start
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec
 from magtwin.twin import open_twin
 
 DRIVE = DriveSpec()

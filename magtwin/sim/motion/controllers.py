@@ -19,7 +19,7 @@ from magtwin.path import Path
 from magtwin.registry import Registry
 from magtwin.sim.motion import loop
 from magtwin.sim.motion.plan import LIMIT_SHARE, drivable, plan
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from magtwin.sim.motion.controllers import (
 from magtwin.sim.motion.drive import Pose
 from magtwin.sim.motion.engine import KINEMATIC, Engine, Travel
 from magtwin.sim.motion.plan import SLOWEST, drivable
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec
 
 CONTROL_RATE_HZ = 50.0
 """Control steps a second [Hz]."""

@@ -27,7 +27,8 @@ from magtwin.sim.motion.engine import Travel
 from magtwin.sim.motion.follow import check_arrived, loop_along, loop_by_commands
 from magtwin.sim.runs.sensing import Conditions, Sensing, streams
 from magtwin.sim.runs.simulate import Metadata, Sensed, check_run, sense_all, travel
-from magtwin.spec.scene import DriveSpec, Scene
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.scene import Scene
 from magtwin.summary import Summarized, Summary, listed
 
 BLOCK = 16

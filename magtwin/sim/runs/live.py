@@ -21,8 +21,9 @@ from magtwin.sim.runs.simulate import check_run, run_metadata
 from magtwin.sim.sensors.clock import Samples
 from magtwin.sim.sensors.lidar import Scanner, Scans
 from magtwin.sim.sensors.model_error import ModelError
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec, Scene
+from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 Network = Callable[[Run], tuple[NDArray[Any], NDArray[Any], "NDArray[np.bool_] | None"]]

@@ -25,7 +25,8 @@ from magtwin.sim.runs.sensing import Conditions, LidarMode, Outside, Predicted, 
 from magtwin.sim.sensors.lidar import lidar_on
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import RobotSpec, Scene
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
 
 Metadata = dict[str, str | int | float | bool]
 

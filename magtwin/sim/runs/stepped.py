@@ -36,7 +36,8 @@ from magtwin.sim.sensors.noise import GaussMarkov
 from magtwin.sim.sensors.odometry import Odometry
 from magtwin.sim.sensors.stateful import Stateful
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import RobotSpec, Scene
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 Columns = dict[str, NDArray[Any]]

@@ -10,7 +10,8 @@ from magtwin.sim.motion.drive import Moment
 from magtwin.sim.motion.sampling import Moving
 from magtwin.sim.sensors.clock import Array, Columns, SampleClock, SampledSensor
 from magtwin.sim.sensors.noise import accumulate
-from magtwin.spec.scene import BatterySpec, DriveSpec
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.sensors import BatterySpec
 
 SECONDS_PER_HOUR = 3600.0
 

@@ -7,7 +7,8 @@ from magtwin.sim.motion.drive import Moment
 from magtwin.sim.motion.sampling import axes_in_base, into_sensor
 from magtwin.sim.sensors.clock import Array, Columns, SampleClock, SampledSensor
 from magtwin.sim.sensors.noise import accumulate, gauss_markov, random_walk
-from magtwin.spec.scene import ImuSpec, Quat
+from magtwin.spec.base import Quat
+from magtwin.spec.sensors import ImuSpec
 
 
 class Imu(SampledSensor):

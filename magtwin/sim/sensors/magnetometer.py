@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 from magtwin.sim.sensors.noise import gauss_markov
 from magtwin.sim.sensors.stateful import Stateful
-from magtwin.spec.scene import MagnetometerSpec
+from magtwin.spec.sensors import MagnetometerSpec
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -254,7 +254,7 @@ def stuck_nt(
         Readings [nT], shape (N,); meaningful if lock is lost.
     """
     begins = lost & ~np.concatenate([[was_lost], lost[:-1]])
-    drawn = spec.latched_nt + spec.latched_std_nt * rng.standard_normal(np.count_nonzero(begins))
+    drawn = spec.stuck_nt + spec.stuck_std_nt * rng.standard_normal(np.count_nonzero(begins))
     return np.concatenate([[before], drawn])[np.cumsum(begins)]
 
 

@@ -7,7 +7,7 @@ from magtwin.frames import canonical, quat_from_rpy, quat_from_yaw, quat_multipl
 from magtwin.sim.motion.drive import Moment
 from magtwin.sim.motion.sampling import check_count
 from magtwin.sim.sensors.clock import Array, Columns, SampleClock, SampledSensor
-from magtwin.spec.scene import MocapSpec
+from magtwin.spec.sensors import MocapSpec
 
 _ROUND = 64
 """Dropouts drawn at a time."""

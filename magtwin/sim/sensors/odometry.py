@@ -6,7 +6,7 @@ from magtwin.frames import quat_from_yaw, wrap_angle
 from magtwin.sim.motion.drive import Moment
 from magtwin.sim.sensors.clock import Array, Columns, SampleClock, SampledSensor
 from magtwin.sim.sensors.noise import accumulate
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 
 
 class Odometry(SampledSensor):

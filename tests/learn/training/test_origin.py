@@ -16,9 +16,9 @@ from magtwin.learn.data.origin import label_frame, map_metadata, mismatches, sha
 from magtwin.learn.models.network import FieldNet
 from magtwin.sim.runs.simulate import robot_metadata
 from magtwin.sim.session import draw_session
-from magtwin.spec.scene import MocapSpec
-from magtwin.twin.opening import _platform_sha256
+from magtwin.spec.sensors import MocapSpec
 from magtwin.twin import in_session, open_twin, sweep
+from magtwin.twin.opening import _platform_sha256
 from magtwin.usd.maps import save_map
 
 ROBOT = read_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))

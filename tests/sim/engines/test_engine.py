@@ -20,8 +20,8 @@ from magtwin.sim.motion.controllers import guide_by_commands
 from magtwin.sim.motion.driver import Driver
 from magtwin.sim.motion.engine import Kinematic
 from magtwin.sim.motion.follow import follow, loop_along, play
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec
 from magtwin.twin import open_twin, simulate
 
 DRIVE = DriveSpec()

@@ -16,8 +16,8 @@ from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop, run_loops
 from magtwin.sim.motion.controllers import CONTROLLERS, guide_by_commands
 from magtwin.sim.motion.drive import Motion, draw_wheel_errors
 from magtwin.sim.motion.follow import follow, loop_along, play
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec
 
 REAL = DriveSpec()
 IDEAL = dataclasses.replace(REAL, motor_lag_s=0.0, slip_s2_m=0.0, yaw_slip=0.0)

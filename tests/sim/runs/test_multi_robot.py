@@ -22,15 +22,11 @@ from magtwin.sim.motion.drive import Motion
 from magtwin.sim.runs.multi_robot import simulate_robots as run_robots
 from magtwin.sim.runs.neighbours import Neighbour, approaches, iron_moments, neighbours_field_nt
 from magtwin.sim.runs.simulate import simulate
-from magtwin.spec.scene import (
-    DriveSpec,
-    EarthFieldSpec,
-    MagnetometerSpec,
-    PlacedRobot,
-    PlatformFieldSpec,
-    RobotSpec,
-    Scene,
-)
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec
+from magtwin.spec.robot import PlacedRobot, RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.twin import Twin, scene_from_toml, simulate_robots
 from magtwin.twin import simulate as simulate_one
 

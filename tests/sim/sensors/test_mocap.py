@@ -9,7 +9,8 @@ from magtwin.errors import InputError
 from magtwin.frames import canonical, quat_conjugate, quat_from_yaw, quat_multiply, rotate
 from magtwin.sim.motion.drive import Motion
 from magtwin.sim.sensors.mocap import Dropouts, Mocap
-from magtwin.spec.scene import DriveSpec, MocapSpec
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.sensors import MocapSpec
 
 T = np.arange(135 * 60) / 135.0
 CIRCLE = Motion(DriveSpec(), 0.02, np.full(3000, 0.2), np.full(3000, 0.5), (1.0, -1.0, 2.0))

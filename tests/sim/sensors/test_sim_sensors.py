@@ -19,16 +19,10 @@ from magtwin.sim.sensors.magnetometer import Magnetometer
 from magtwin.sim.sensors.mocap import Mocap
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.sim.sensors.odometry import Odometry
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import (
-    BatterySpec,
-    DriveSpec,
-    ImuSpec,
-    LidarSpec,
-    MagnetometerSpec,
-    MocapSpec,
-    RobotSpec,
-)
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec
 
 T = np.arange(135 * 60) / 135.0
 
