@@ -1,7 +1,7 @@
 """The differential drive: exact integration of twists, wheels, limits."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -230,14 +230,28 @@ class Motion:
             t: Times since the start, from 0 [s], shape (N,).
         """
         t = np.asarray(t, float)
-        starts = np.arange(len(self.v)) * self.dt
-        k = np.searchsorted(starts, t, side="right") - 1
-        into = np.clip(t - starts[k], 0.0, self.dt)
-        then = self._steps.take(k, axis=0)
-        v, w, a, v_cmd, w_cmd, bump = then[:, 7:].T
-        pose = advance(then[:, :3], v, w, into)
-        turned = then[:, 3:5] + then[:, 5:7] * into[:, None]
+        moment = moment_in_steps(self._steps, self.dt, t)
         moving = t < self.duration_s
-        if not moving.all():
-            v, w, a, v_cmd, w_cmd = (column * moving for column in (v, w, a, v_cmd, w_cmd))
-        return Moment(pose=pose, v=v, w=w, a=a, wheel_angle=turned, v_cmd=v_cmd, w_cmd=w_cmd, bump=bump > 0)
+        if moving.all():
+            return moment
+        stopped = {name: getattr(moment, name) * moving for name in ("v", "w", "a", "v_cmd", "w_cmd")}
+        return replace(moment, **stopped)
+
+
+def moment_in_steps(steps: Array, dt: float, t: Array, *, first: int = 0) -> Moment:
+    """A motion within its control steps, exact.
+
+    Args:
+        steps: Columns of each step, as `Motion` keeps them, shape (K, 13).
+        dt: Length of a control step [s].
+        t: Times within the steps [s], shape (N,).
+        first: Number of the first of these steps since the start.
+    """
+    starts = np.arange(first, first + len(steps)) * dt
+    k = np.maximum(np.searchsorted(starts, t, side="right") - 1, 0)
+    into = np.clip(t - starts[k], 0.0, dt)
+    then = steps.take(k, axis=0)
+    v, w, a, v_cmd, w_cmd, bump = then[:, 7:].T
+    pose = advance(then[:, :3], v, w, into)
+    turned = then[:, 3:5] + then[:, 5:7] * into[:, None]
+    return Moment(pose=pose, v=v, w=w, a=a, wheel_angle=turned, v_cmd=v_cmd, w_cmd=w_cmd, bump=bump > 0)

@@ -454,13 +454,8 @@ def drive_on(
     """
     dt = figures[0]
     limits = (figures[1], figures[2], figures[3], figures[4], figures[5], figures[6])
-    left_at_end, left_in_mean, slip, scale_v, scale_w = (
-        figures[7],
-        figures[8],
-        figures[9],
-        figures[10],
-        figures[11],
-    )
+    left_at_end, left_in_mean, slip = figures[7], figures[8], figures[9]
+    scale_v, scale_w = figures[10], figures[11]
     timeout, radius, rest_w = figures[12], figures[13], REST_M_S / figures[6]
     gains = (
         figures[14],

@@ -13,7 +13,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.run.run import Run
 from magtwin.sim.motion.closed_loop import Chassis
 from magtwin.sim.motion.commands import Commands
-from magtwin.sim.motion.drive import Moment, advance, draw_wheel_errors, wheel_rates
+from magtwin.sim.motion.drive import Moment, draw_wheel_errors, moment_in_steps, wheel_rates
 from magtwin.sim.motion.follow import CONTROL_RATE_HZ
 from magtwin.sim.motion.manual import at_start
 from magtwin.sim.runs.sensing import Conditions, LidarMode, Sensing, streams
@@ -27,15 +27,15 @@ from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 Network = Callable[[Run], tuple[NDArray[Any], NDArray[Any], "NDArray[np.bool_] | None"]]
-"""From rows of a run to the disturbance of each, the standard deviation of its error [nT], and whether it is
-out of the training's range. Rows come in the order of time, each once."""
+"""From rows of a run to the disturbance of each, the standard deviation of its error [nT], and whether the row is
+outside of the training range. Rows come in the order of time, each once."""
 
 KEPT = 256
-"""Control steps that are kept: 5 s, more than any sensor looks back."""
+"""Control steps that are kept: 5 s, more than any sensor needs."""
 
 
 class Track:
-    """The last steps of a chassis, as `magtwin.sim.motion.drive.Motion` tells all of them."""
+    """The last steps of a chassis, as a motion."""
 
     def __init__(self, drive: DriveSpec, dt: float, pose0: tuple[float, float, float]) -> None:
         """Begin at rest."""
@@ -43,12 +43,12 @@ class Track:
         self._first, self._count = 0, 0
         self._steps = np.zeros((2 * KEPT, 13))
         self._pose = np.array(pose0, float)
-        self._turned = np.zeros(2)  # the sum of rates, which a Motion multiplies by dt once
+        self._turned = np.zeros(2)  # sum of rates, as in a Motion
         self._v = 0.0
 
     @property
     def steps(self) -> int:
-        """How many steps have been made."""
+        """Number of steps so far."""
         return self._first + self._count
 
     @property
@@ -57,7 +57,7 @@ class Track:
         return self.steps * self._dt
 
     def add(self, record: Array) -> None:
-        """A step, as `magtwin.sim.motion.loop.RECORD` tells it."""
+        """Add a step; see `magtwin.sim.motion.loop.RECORD`."""
         if self._count == len(self._steps):
             self._steps[:KEPT] = self._steps[KEPT:]
             self._first, self._count = self._first + KEPT, KEPT
@@ -71,16 +71,9 @@ class Track:
         self._count += 1
 
     def at(self, t: Any) -> Moment:
-        """As `magtwin.sim.motion.drive.Motion.at`, of times within the steps that are kept."""
-        t = np.asarray(t, float)
-        starts = np.arange(self._first, self.steps) * self._dt
-        k = np.maximum(np.searchsorted(starts, t, side="right") - 1, 0)
-        into = np.clip(t - starts[k], 0.0, self._dt)
-        then = self._steps[: self._count].take(k, axis=0)
-        v, w, a, v_cmd, w_cmd, bump = then[:, 7:].T
-        pose = advance(then[:, :3], v, w, into)
-        turned = then[:, 3:5] + then[:, 5:7] * into[:, None]
-        return Moment(pose=pose, v=v, w=w, a=a, wheel_angle=turned, v_cmd=v_cmd, w_cmd=w_cmd, bump=bump > 0)
+        """As `magtwin.sim.motion.drive.Motion.at`, for times within the kept steps."""
+        steps = self._steps[: self._count]
+        return moment_in_steps(steps, self._dt, np.asarray(t, float), first=self._first)
 
 
 class LiveRobot:
