@@ -27,7 +27,7 @@ from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 Network = Callable[[Run], tuple[NDArray[Any], NDArray[Any], "NDArray[np.bool_] | None"]]
-"""From rows of a run to the disturbance of each, the standard deviation of its error [nT], and whether the row is
+"""From rows of a run to the disturbance of each, the standard deviation of its error [nT], and whether it is
 outside of the training range. Rows come in the order of time, each once."""
 
 KEPT = 256
