@@ -258,7 +258,7 @@ class LidarSpec(MountSpec):
 
 @dataclass(frozen=True, kw_only=True)
 class BatterySpec(Spec):
-    """A battery and what it feeds; `magtwin.sim.sensors.battery.discharge` says what becomes of it."""
+    """A battery and what it feeds; see `magtwin.sim.sensors.battery.Battery`."""
 
     model: Literal["power", "linear"] = "power"
     """"power": it gives what electronics, LiDAR and motors draw, and sags; "linear": it falls evenly."""
