@@ -272,8 +272,8 @@ def no_map(path: str | os.PathLike[str], *, furnished: bool) -> InputError:
     """The refusal of a scene without a map that cannot be surveyed either."""
     more = "" if furnished else " and furniture or sources ([[furniture]], [[source]])"
     return InputError(
-        f'{path}: names no map; add map = "FILE.usdc" to it, or give --map FILE.usdc, or add an [earth] '
-        f"table (latitude_deg, longitude_deg, height_m, date){more}, from which it is surveyed"
+        f'{path}: names no map; add map = "FILE.usdc" to it, or give `map_layer=FILE.usdc`, or add an '
+        f"[earth] table (latitude_deg, longitude_deg, height_m, date){more}, from which it is surveyed"
     )
 
 

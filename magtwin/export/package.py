@@ -128,7 +128,10 @@ def export_scene(
     name: str = profile or ("omniverse" if kind in ("folder", "package") else "viewer")
     find("profile", name, PROFILES)
     if kind in ("layer", "web") and name != "viewer":
-        raise InputError(f"{out}: {out.suffix} is for viewers; give a folder or a .usdz for --profile {name}")
+        raise InputError(
+            f"{out}: {out.suffix} is for viewers; give a folder or a .usdz for `profile='{name}'`",
+            parameter="profile",
+        )
     beside = out.with_name(f"{out.stem}_magtwin") if kind == "package" and name != "viewer" else None
     for target in filter(None, (out, beside)):
         check_free(target, force=force)
@@ -287,8 +290,8 @@ class _Work:
         """Give robots Isaac Sim's asset structure, and the scene its Action Graphs."""
         if self.scene is None:
             raise InputError(
-                f"{self.source}: is no scene of magtwin's, with lab, robot and magnetometer, which --profile "
-                "isaac is for; take --profile omniverse"
+                f"{self.source}: has no lab, robot and magnetometer, which profile isaac needs; use "
+                "`profile='omniverse'`"
             )
         self.progress("Authoring what Isaac Sim needs")
         for asset in {placed.robot.asset for placed in self.scene.robots}:

@@ -260,7 +260,7 @@ def test_what_exists_is_replaced_only_when_asked(lab, tmp_path):
     for name in ("a", "a.usdz", "a.glb", "a.usd"):
         export_scene(stage, tmp_path / name, trusted=True)
         before = (tmp_path / name).stat().st_mtime_ns
-        with pytest.raises(InputError, match="exists already; give --force"):
+        with pytest.raises(InputError, match="exists already; give `force=True`"):
             export_scene(stage, tmp_path / name, trusted=True)
         assert (tmp_path / name).stat().st_mtime_ns == before
         export_scene(stage, tmp_path / name, trusted=True, force=True)

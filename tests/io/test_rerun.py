@@ -388,7 +388,7 @@ def test_a_recording_that_exists_is_kept_unless_forced(parts, tmp_path):
     run, rest = parts
     path = tmp_path / "run.rrd"
     path.write_text("kept")
-    with pytest.raises(InputError, match=r"run\.rrd: exists already; give --force"):
+    with pytest.raises(InputError, match=r"run\.rrd: exists already; give `force=True`"):
         write_rrd(run, path, **rest)
     assert path.read_text() == "kept"
     write_rrd(run, path, **rest, force=True)

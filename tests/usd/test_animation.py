@@ -218,7 +218,7 @@ def test_a_part_of_the_scene_is_never_replaced_by_what_plays_in_it(run, lab_scen
 
 def test_what_exists_is_kept_unless_forced_and_other_names_are_refused(run, played):
     before = played.read_bytes()
-    with pytest.raises(InputError, match="exists already; give --force"):
+    with pytest.raises(InputError, match="exists already; give `force=True`"):
         write_animation(run, played)
     with pytest.raises(InputError, match="a USD file ends in"):
         write_animation(run, played.with_suffix(".usdz"))

@@ -426,7 +426,7 @@ def test_a_map_comes_along_with_a_stage_that_sublayers_it(tmp_path):
 def test_an_output_that_exists_is_refused_and_kept(tmp_path):
     save_map(a_map(), tmp_path / "m.usdc")
     before = (tmp_path / "m.usdc").read_bytes()
-    with pytest.raises(InputError, match=r"m\.usdc: exists already; give --force"):
+    with pytest.raises(InputError, match=r"m\.usdc: exists already; give `force=True`"):
         save_map(a_map(name="other"), tmp_path / "m.usdc")
     assert (tmp_path / "m.usdc").read_bytes() == before
 
