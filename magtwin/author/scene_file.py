@@ -6,18 +6,9 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from magtwin.author.furniture import FurnitureTable, check_names, placed_furniture
 from magtwin.author.robot import RobotSettings, build_robot
-from magtwin.author.room import (
-    FurnitureTable,
-    asset_named,
-    check_name,
-    check_names,
-    check_start,
-    lab_of,
-    no_map,
-    obstacles_in,
-    placed_furniture,
-)
+from magtwin.author.room import asset_named, check_name, check_start, lab_of, no_map, obstacles_in
 from magtwin.author.scene import check_things
 from magtwin.errors import InputError
 from magtwin.files import existing, from_table, read_toml, refused_at, sha256

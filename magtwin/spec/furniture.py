@@ -1,7 +1,6 @@
 """Furniture and parts of a building: the parts of each kind, and their steel."""
 
-import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
@@ -38,7 +37,8 @@ class Part:
     """"cuboid", "cylinder" or "mesh"."""
 
     fill: float = 1.0
-    """Fraction of the volume that is steel; it scales a magnetization that is drawn."""
+    """Fraction of the volume that is steel; it scales a magnetization that is drawn. Computed for a generic
+    part."""
 
     vertices_m: tuple[Vec3, ...] = ()
     """Vertices of a mesh about its centre [m], in single precision."""
@@ -78,13 +78,6 @@ GENERIC = ("box", "cylinder", "mesh")
 
 BODY = "body"
 """Name of that part."""
-
-WALL_M = 0.002
-"""Thickness of the steel of a generic piece, for the magnetization that is drawn [m]: most are hollow."""
-
-DRAWN_A_M = (500.0, 5000.0)
-"""Least and greatest magnetization that is drawn for a steel part [A/m], of either sign: what desks, chairs
-and cabinets usually have."""
 
 
 def _desk() -> Iterator[Part]:
@@ -225,10 +218,8 @@ def parts_of(
         raise InputError(f"size_m of a {kind} must be its three sides, above 0 m, got {size_m}")
     if kind == "cylinder" and size_m[0] != size_m[1]:
         raise InputError(f"size_m of a cylinder must be as wide in y as in x, got {size_m}")
-    inner = [max(side - 2 * WALL_M, 0.0) / side for side in size_m]
     shape = "cuboid" if kind == "box" else "cylinder"
-    steel = 1 - inner[0] * inner[1] * inner[2]
-    return (Part(BODY, (0.0, 0.0, size_m[2] / 2), size_m, look, shape, fill=steel),)
+    return (Part(BODY, (0.0, 0.0, size_m[2] / 2), size_m, look, shape),)
 
 
 def _mesh_part(look: str, size_m: Vec3, vertices_m: tuple[Vec3, ...], faces: tuple[Face, ...]) -> Part:
@@ -242,10 +233,6 @@ def _mesh_part(look: str, size_m: Vec3, vertices_m: tuple[Vec3, ...], faces: tup
     middle = (low + high) / 2
     if np.abs(middle).max() > 1e-6 * (high - low).max():  # rounding; a mesh that was centred stays as it is
         points = (points - middle).astype(np.float32).astype(float)
-    corner = points[np.array(faces)]
-    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    volume = abs(float(np.einsum("fi,fi->", corner[:, 0], across)) / 6)
-    shell = WALL_M * float(np.linalg.norm(across, axis=1).sum()) / 2
     x, y, z = (float(side) for side in high - low)
     return Part(
         BODY,
@@ -253,34 +240,9 @@ def _mesh_part(look: str, size_m: Vec3, vertices_m: tuple[Vec3, ...], faces: tup
         (x, y, z),
         look,
         "mesh",
-        fill=min(1.0, shell / volume) if volume else 1.0,
         vertices_m=tuple(map(tuple, points.tolist())),
         faces=faces,
     )
-
-
-def drawn_magnetization(name: str, parts: Iterable[Part], *, seed: int = 0) -> tuple[float, ...]:
-    """Magnetization of a piece's steel parts where none is given, each along its longest side.
-
-    Uniform in `DRAWN_A_M`, of random sign, times the part's `fill`, to 1 A/m. Each piece draws from a
-    stream of its own, from the seed and its name: adding, removing or moving a piece changes no other.
-
-    Args:
-        name: Name of the piece.
-        parts: Its parts.
-        seed: Seed of the scene.
-
-    Returns:
-        One number for each steel part, in order [A/m].
-    """
-    words = np.frombuffer(hashlib.sha256(name.encode()).digest(), "<u4").tolist()
-    rng = np.random.default_rng([seed, *words])
-    drawn = []
-    for part in parts:
-        if part.steel:
-            size = rng.uniform(*DRAWN_A_M) * rng.choice((-1.0, 1.0)) * part.fill
-            drawn.append(float(np.copysign(max(round(abs(size)), 1), size)))
-    return tuple(drawn)
 
 
 @dataclass(frozen=True, kw_only=True)

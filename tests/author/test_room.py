@@ -11,6 +11,7 @@ from pxr import Usd
 from validators import assert_valid
 
 import magtwin
+from magtwin.author.furniture import DRAWN_A_M, drawn_magnetization
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.holes import filled
@@ -21,12 +22,10 @@ from magtwin.files import shipped
 from magtwin.sim.contradiction import contradiction_nt
 from magtwin.sim.survey import field_at_rest_nt
 from magtwin.spec.furniture import (
-    DRAWN_A_M,
     KINDS,
     MATERIALS,
     STEEL,
     FurnitureSpec,
-    drawn_magnetization,
     parts_of,
 )
 from magtwin.twin import author_scene, new_scene, open_twin, scene_from_toml, simulate
