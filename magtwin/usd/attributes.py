@@ -19,7 +19,7 @@ from magtwin.usd.schema import attribute_name, place, require_api
 S = TypeVar("S")
 
 
-def write_figures(prim: Usd.Prim, noun: str, spec: Any, *, skip: Any = ()) -> Usd.Prim:
+def write_spec(prim: Usd.Prim, noun: str, spec: Any, *, skip: Any = ()) -> Usd.Prim:
     """Write each field of a spec, but those in `skip`, to the attribute that stands for it.
 
     None, "" and () are left to the fallback, unless a weaker layer gives another value.
@@ -35,7 +35,7 @@ def write_figures(prim: Usd.Prim, noun: str, spec: Any, *, skip: Any = ()) -> Us
     return prim
 
 
-def read_figures(cls: type[S], prim: Usd.Prim, noun: str, **known: Any) -> S:
+def read_spec(cls: type[S], prim: Usd.Prim, noun: str, **known: Any) -> S:
     """A spec from the attributes of `prim`, for those fields that are not in `known`.
 
     Raises:

@@ -8,7 +8,7 @@ from magtwin.errors import InputError
 from magtwin.field.sources.earth import earth_field_nt
 from magtwin.spec.base import ZERO3
 from magtwin.spec.magnetics import EarthFieldSpec
-from magtwin.usd.attributes import read_figures, write_figures
+from magtwin.usd.attributes import read_spec, write_spec
 from magtwin.usd.schema import apply_api, attribute_name, place
 
 DERIVED_FROM = attribute_name("earth", "derived_from")
@@ -21,7 +21,7 @@ AGREES_NT = 1.0
 
 def define_earth(stage: Usd.Stage, path: str | Sdf.Path, spec: EarthFieldSpec) -> Usd.Prim:
     """Author the Earth's field as an Xform of its own; returns its prim."""
-    prim = write_figures(apply_api(UsdGeom.Xform.Define(stage, path).GetPrim(), "earth"), "earth", spec)
+    prim = write_spec(apply_api(UsdGeom.Xform.Define(stage, path).GetPrim(), "earth"), "earth", spec)
     prim.GetAttribute(DERIVED_FROM).Set("" if spec.measured else _inputs(spec))
     return prim
 
@@ -32,7 +32,7 @@ def read_earth(prim: Usd.Prim) -> EarthFieldSpec:
     Raises:
         InputError: It is none, or a figure is out of range.
     """
-    spec = read_figures(EarthFieldSpec, prim, "earth")
+    spec = read_spec(EarthFieldSpec, prim, "earth")
     if spec.measured or prim.GetAttribute(DERIVED_FROM).Get() == _inputs(spec):
         return spec
     try:

@@ -19,8 +19,8 @@ from magtwin.usd.sources import (
     SOURCES,
     define_source,
     define_triangles,
-    placement,
     read_source,
+    read_transform,
     source_prims,
 )
 
@@ -116,7 +116,7 @@ def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[Furnit
 def _whole(root: Usd.Prim, prims: list[Usd.Prim]) -> FurnitureSpec | None:
     """The piece of furniture at a prim; none where its steel is not as that kind's."""
     own = [prim for prim in prims if prim.GetPath().HasPrefix(root.GetPath())]
-    p, q, scale = placement(root)
+    p, q, scale = read_transform(root)
     if max(abs(s - 1) for s in scale) > 1e-9 or any(prim.GetParent() != root for prim in own):
         return None
     kind = plain_value(root.GetAttribute(KIND))

@@ -5,7 +5,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, Vt
 
 from magtwin.frames import quat_from_rpy
 from magtwin.spec.lab import LabSpec
-from magtwin.usd.attributes import read_figures, write_figures, write_pose
+from magtwin.usd.attributes import read_spec, write_pose, write_spec
 from magtwin.usd.layers import WORLD
 from magtwin.usd.looks import define_box, define_looks, wear
 from magtwin.usd.schema import apply_api
@@ -37,7 +37,7 @@ def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
     Returns:
         The prim of the lab.
     """
-    lab = write_figures(apply_api(UsdGeom.Xform.Define(stage, LAB).GetPrim(), "lab"), "lab", spec)
+    lab = write_spec(apply_api(UsdGeom.Xform.Define(stage, LAB).GetPrim(), "lab"), "lab", spec)
     _define_physics_scene(stage)
     define_looks(stage, LOOKS, [look.name for look in (FLOOR, WALL, POST, CAMERA, LENS)])
     _define_floor(stage, spec)
@@ -53,7 +53,7 @@ def read_lab(prim: Usd.Prim) -> LabSpec:
     Raises:
         InputError: It is none, or a figure is out of range.
     """
-    return read_figures(LabSpec, prim, "lab")
+    return read_spec(LabSpec, prim, "lab")
 
 
 def _define_physics_scene(stage: Usd.Stage) -> None:

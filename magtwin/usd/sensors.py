@@ -16,7 +16,7 @@ from magtwin.errors import InputError, hint
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import PlatformFieldSpec
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
-from magtwin.usd.attributes import read_figures, read_pose, target, write_figures, write_pose
+from magtwin.usd.attributes import read_pose, read_spec, target, write_pose, write_spec
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
 
 S = TypeVar("S")
@@ -69,7 +69,7 @@ def define_magnetometer(stage: Usd.Stage, path: str | Sdf.Path, spec: Magnetomet
         InputError: The parent prim is not the link, or a prim of another type is there.
     """
     prim = _define_mounted(stage, path, spec)
-    write_figures(apply_api(prim, "magnetometer"), "magnetometer", spec, skip=POSE_FIELDS)
+    write_spec(apply_api(prim, "magnetometer"), "magnetometer", spec, skip=POSE_FIELDS)
     return prim
 
 
@@ -88,7 +88,7 @@ def define_imu(stage: Usd.Stage, path: str | Sdf.Path, spec: ImuSpec) -> Usd.Pri
     Args and refusals as for `define_magnetometer`.
     """
     prim = _define_mounted(stage, path, spec)
-    write_figures(apply_api(prim, "imu"), "imu", spec, skip=POSE_FIELDS)
+    write_spec(apply_api(prim, "imu"), "imu", spec, skip=POSE_FIELDS)
     define_isaac_imu(prim, spec.rate_hz)
     return prim
 
@@ -112,7 +112,7 @@ def define_lidar(stage: Usd.Stage, path: str | Sdf.Path, spec: LidarSpec) -> Usd
     Args and refusals as for `define_magnetometer`.
     """
     prim = _define_mounted(stage, path, spec)
-    write_figures(apply_api(prim, "lidar"), "lidar", spec, skip=POSE_FIELDS)
+    write_spec(apply_api(prim, "lidar"), "lidar", spec, skip=POSE_FIELDS)
     sensor = define_omni_lidar(prim, spec.scan_rate_hz, (spec.range_min_m, spec.range_max_m))
     _define_beam(sensor, spec.rays)
     return prim
@@ -171,12 +171,12 @@ def read_lidar(prim: Usd.Prim) -> LidarSpec:
 
 def define_battery(stage: Usd.Stage, path: str | Sdf.Path, spec: BatterySpec) -> Usd.Prim:
     """Author a battery as an Xform of its own; returns its prim."""
-    return write_figures(apply_api(_define_xform(stage, path), "battery"), "battery", spec)
+    return write_spec(apply_api(_define_xform(stage, path), "battery"), "battery", spec)
 
 
 def read_battery(prim: Usd.Prim) -> BatterySpec:
     """The spec of an authored battery; refusals as for `read_magnetometer`."""
-    return read_figures(BatterySpec, prim, "battery")
+    return read_spec(BatterySpec, prim, "battery")
 
 
 def define_footprint(prim: Usd.Prim, footprint_radius_m: float) -> Usd.Prim:
@@ -195,12 +195,12 @@ def read_footprint(prim: Usd.Prim) -> float:
 def define_path(prim: Usd.Prim, path: str | Path) -> Usd.Prim:
     """Say what the robot rooted at `prim` drives unless told otherwise: a name, a CSV file, or ""."""
     way = _Way(path_file=path) if isinstance(path, Path) else _Way(path=path)
-    return write_figures(apply_api(prim, "robot"), "robot", way)
+    return write_spec(apply_api(prim, "robot"), "robot", way)
 
 
 def read_path(prim: Usd.Prim) -> str | Path:
     """What the robot rooted at `prim` drives unless told otherwise; a file is named before a name is."""
-    way = read_figures(_Way, prim, "robot")
+    way = read_spec(_Way, prim, "robot")
     return way.path_file or way.path
 
 
@@ -210,7 +210,7 @@ def define_drive(prim: Usd.Prim, spec: DriveSpec) -> Usd.Prim:
     Raises:
         InputError: No joint has the name that the spec gives.
     """
-    write_figures(apply_api(prim, "drive"), "drive", spec, skip=JOINT_FIELDS)
+    write_spec(apply_api(prim, "drive"), "drive", spec, skip=JOINT_FIELDS)
     found = [p for p in Usd.PrimRange(prim) if p.IsA(UsdPhysics.Joint)]
     joints = {p.GetDisplayName() or p.GetName(): p for p in found} | {p.GetName(): p for p in found}
     for field in JOINT_FIELDS:
@@ -231,29 +231,29 @@ def read_drive(prim: Usd.Prim) -> DriveSpec:
     """
     require_api(prim, "drive")
     joints = {f: target(prim, attribute_name("drive", f)).GetName() for f in JOINT_FIELDS}
-    return read_figures(DriveSpec, prim, "drive", **joints)
+    return read_spec(DriveSpec, prim, "drive", **joints)
 
 
 def define_platform(prim: Usd.Prim, spec: PlatformFieldSpec) -> Usd.Prim:
     """Apply the robot's own magnetic field to its root prim."""
-    return write_figures(apply_api(prim, "platform"), "platform", spec)
+    return write_spec(apply_api(prim, "platform"), "platform", spec)
 
 
 def read_platform(prim: Usd.Prim) -> PlatformFieldSpec:
     """The spec of an authored platform field; refusals as for `read_magnetometer`."""
-    return read_figures(PlatformFieldSpec, prim, "platform")
+    return read_spec(PlatformFieldSpec, prim, "platform")
 
 
 def define_mocap(prim: Usd.Prim, spec: MocapSpec) -> Usd.Prim:
     """Apply to a robot's root prim how motion capture sees it."""
-    return write_figures(apply_api(prim, "mocap"), "mocap", spec)
+    return write_spec(apply_api(prim, "mocap"), "mocap", spec)
 
 
 def read_mocap(prim: Usd.Prim) -> MocapSpec:
     """How motion capture sees the robot rooted at `prim`: the default where no layer says it."""
     if not prim.HasAPI(NOUNS["mocap"]):
         return MocapSpec()
-    return read_figures(MocapSpec, prim, "mocap")
+    return read_spec(MocapSpec, prim, "mocap")
 
 
 def _define_xform(stage: Usd.Stage, path: str | Sdf.Path) -> Usd.Prim:
@@ -277,7 +277,7 @@ def _read_mounted(cls: type[S], prim: Usd.Prim, noun: str) -> S:
     require_api(prim, noun)
     p, q = read_pose(prim)
     link = prim.GetParent().GetName()
-    return read_figures(cls, prim, noun, link=link, p_link_sensor=p, q_link_sensor_xyzw=q)
+    return read_spec(cls, prim, noun, link=link, p_link_sensor=p, q_link_sensor_xyzw=q)
 
 
 def _write_foreign(prim: Usd.Prim, name: str, kind: Sdf.ValueTypeName, value: Any) -> None:

@@ -36,7 +36,7 @@ TURNS: dict[str, Quat] = {"X": (0.5, 0.5, 0.5, 0.5), "Y": (-0.5, -0.5, -0.5, 0.5
 POSED = (["translate"], ["translate", "orient"], ["translate", "scale"], ["translate", "orient", "scale"])
 """Transforms that come back to the bit."""
 
-Placement = tuple[Vec3, Quat, Vec3]
+Transform = tuple[Vec3, Quat, Vec3]
 """Position [m], turn and scale."""
 
 
@@ -144,7 +144,7 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
         key: plain_value(prim.GetAttribute(attribute_name("source", key)))
         for key in ("moment", "magnetization", "susceptibility")
     }
-    p, q, scale = placement(prim, local=local)
+    p, q, scale = read_transform(prim, local=local)
     try:
         spec: dict[str, Any] = {"name": name or prim.GetName(), "p_world": p, "shape": shape}
         if shape == "point":
@@ -236,7 +236,7 @@ def _check_round(scales: Any, what: str) -> None:
         raise InputError(f"{what} must be the same each way, got {seen}; use a Mesh for an ellipsoid or oval")
 
 
-def placement(prim: Usd.Prim, *, local: bool = False) -> Placement:
+def read_transform(prim: Usd.Prim, *, local: bool = False) -> Transform:
     """Position [m], turn and scale of a prim in world, or in its parent.
 
     What magtwin wrote at the origin comes back to the bit, any other transform as it composes.

@@ -89,7 +89,7 @@ def test_keys_of_a_urdf_are_refused_beside_an_asset(tmp_path):
 
     asset = shipped("robots", "turtlebot4", "turtlebot4.usda")
     file = scene(tmp_path, SCENE.replace(f'urdf = "{CART}"', f'asset = "{asset}"'))
-    with pytest.raises(InputError, match=r"\[robot\] drive goes with urdf; the asset says it already"):
+    with pytest.raises(InputError, match=r"\[robot\] drive goes with urdf; an asset has it already"):
         scene_from_toml(file)
 
 

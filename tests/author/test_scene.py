@@ -571,7 +571,7 @@ def test_a_scene_of_several_robots_passes_the_gates(own_parts, tmp_path):
     [
         ('name = "bob"', 'name = "ann"', "different names, got \"'ann' twice"),
         ('name = "bob"\n', "", r"scene\.toml: \[\[robot\]\] '' needs name = "),
-        ('name = "bob"', 'name = "Lab"', "'Lab' has the name of a part of the scene"),
+        ('name = "bob"', 'name = "Lab"', "'Lab' has a name that scenes reserve"),
         ('"figure8"', '"figure9"', r"\[\[robot\]\] 'ann' path: no path 'figure9'; did you mean"),
         ('"there.csv"', '"their.csv"', r"'bob' path: .*their\.csv: no such path file; did you"),
         ("start = [0, -1, 0]", "start = [0, -1]", r"start must be a list of 3"),
@@ -667,7 +667,7 @@ def test_a_folder_that_exists_is_refused_and_kept(parts, tmp_path):
             lambda s: {"robot": replace(s.robot, asset=s.map_layer)},
             r"needs one prim with MagtwinMagnetometerAPI",
         ),
-        (lambda s: {"robot": replace(s.robot, name="Lab")}, "'Lab' has the name of a part of the scene"),
+        (lambda s: {"robot": replace(s.robot, name="Lab")}, "'Lab' has a name that scenes reserve"),
         (lambda s: {"robot": replace(s.robot, name="my bot")}, "'my bot' cannot name a prim"),
         (lambda s: {"sources": (SOURCES[0], SOURCES[0])}, "two sources are called 'beam'"),
         (
@@ -812,7 +812,7 @@ def test_a_toml_names_the_kind_of_magnetometer_and_a_network_makes_it_neural(own
     assert kind('kind = "map-only"') == "map-only"
     assert kind('network = "net.pth"\nkind = "physical"') == "physical"
     assert kind('kind = "map-only"', network=own_parts / "net.pth") == "neural"  # weights asked for are used
-    with pytest.raises(InputError, match=r'\[robot\] kind = "neural" needs network = "FILE" beside it'):
+    with pytest.raises(InputError, match=r'\[robot\] kind = "neural" needs network = "FILE"'):
         kind('kind = "neural"')
     with pytest.raises(InputError, match=r"scene\.toml"):
         kind('kind = "magnetic"')
