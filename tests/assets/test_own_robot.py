@@ -70,7 +70,7 @@ def test_a_scene_that_names_a_urdf_is_driven_in_two_commands(tmp_path, capsys):
         ('joint = "left"', 'joint = "lft"', r"no joint 'lft' for left_wheel_joint; did you mean 'left'"),
         ("cart.urdf", "cat.urdf", r"cat.urdf: no such .*did you mean 'cart.urdf'"),
         ("urdf =", "udrf =", r"mine.toml:6: \[robot\] unknown key 'udrf'; did you mean 'urdf'"),
-        ("urdf =", 'asset = "a.usda"\nurdf =', "needs asset .* or urdf .* one of the two"),
+        ("urdf =", 'asset = "a.usda"\nurdf =', "needs asset .* or urdf .* and not both"),
         ('[robot.magnetometer]\nlink = "mast"', "[robot.magnetometer]", "no link 'magnetometer_link'"),
     ],
 )

@@ -107,7 +107,7 @@ def test_a_map_that_is_not_the_one_of_its_checksum_is_refused(lab, tmp_path):
     values = layer.GetAttributeAtPath("/World/AnomalyMap.magtwin:anomalyMap:values")
     values.default = type(values.default)([v + 1 for v in values.default])
     layer.Save()
-    refuse("<.*AnomalyMap>: the map's values are not those that its checksum", own / "lab.usda", tmp_path)
+    refuse("<.*AnomalyMap>: the map's values do not match its checksum", own / "lab.usda", tmp_path)
 
 
 def test_a_texture_that_is_not_there_is_refused_with_the_property_that_names_it(tmp_path):

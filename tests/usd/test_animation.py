@@ -190,7 +190,7 @@ def test_only_what_plays_a_run_is_an_animation(played, lab_scene):
 @pytest.mark.parametrize(
     ("columns", "options", "message"),
     [
-        ({"b_total_nt": np.zeros(2)}, {}, "says nowhere where the robot is; it needs p_world_base and"),
+        ({"b_total_nt": np.zeros(2)}, {}, "has no pose of the robot; it needs p_world_base and"),
         ({"t": [1.0, 1.0]}, {}, "row 1 has 1 s after 1 s"),
         ({"t": []}, {}, "no rows, there is nothing to play"),
         (

@@ -307,9 +307,9 @@ def put(prim: Usd.Prim, attribute: str, value) -> None:
         (lambda p: p.SetTypeName("Xform"), "an Xform has no volume to be magnetised; give it a moment"),
         (
             lambda p: p.GetParent().SetTypeName("PointInstancer"),
-            "below a PointInstancer stands in no one place",
+            "below a PointInstancer has no single place",
         ),
-        (lambda p: apply_api(p.GetParent(), "robot"), "on the robot /World/Sources, which carries it about"),
+        (lambda p: apply_api(p.GetParent(), "robot"), "on the robot /World/Sources, which moves"),
     ],
 )
 def test_what_cannot_be_a_source_is_refused_by_prim(change, said):
