@@ -355,8 +355,8 @@ def mesh_solid(mesh: UsdGeom.Mesh) -> Solid:
         len(corners) and not 0 <= corners.min() <= corners.max() < len(points)
     ):
         raise InputError(
-            f"its {counts.sum()} corners, {len(corners)} indices and {len(points)} points do not fit together; "
-            "export the mesh again"
+            f"its {counts.sum()} corners, {len(corners)} indices and {len(points)} points do not fit together"
+            "; export the mesh again"
         )
     cuts = np.maximum(counts - 2, 0)
     origin = np.repeat(np.arange(len(counts)), cuts)

@@ -232,7 +232,7 @@ def test_a_broken_stage_is_refused_with_usds_own_words(tmp_path):
 
 def test_a_mesh_that_contradicts_itself_is_refused_by_prim(stage):
     quad(stage).GetFaceVertexIndicesAttr().Set([0, 1, 2, 3, 1, 4, 5, 9])
-    with pytest.raises(InputError, match=r"/mesh: its 8 corners, 8 indices and 6 points contradict"):
+    with pytest.raises(InputError, match=r"/mesh: its 8 corners, 8 indices and 6 points do not fit together"):
         read_shapes(stage)
 
 
