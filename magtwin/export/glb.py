@@ -45,7 +45,7 @@ def write_glb(stage_file: Path, out: Path) -> None:
     """Write the visible shapes of a stage.
 
     Surfaces have the colour and roughness of their material, or their own colours, but no textures. Metals
-    are not metallic, since a page without an environment would show them black. Selected variants are written.
+    are not metallic, since a page without an environment would show them black. Variants stay as selected.
 
     Args:
         stage_file: Root layer, in metres with Z up.

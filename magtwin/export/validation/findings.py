@@ -50,7 +50,7 @@ class Check:
 
     @property
     def result(self) -> str:
-        """ "not run", "failed" if there is an error, else "passed"."""
+        """Verdict: 'not run', 'failed' if there is an error, else 'passed'."""
         if self.not_run:
             return "not run"
         return "failed" if self.count("error") else "passed"
