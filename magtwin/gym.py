@@ -337,11 +337,6 @@ def _predictions(network: "NeuralMagnetometer") -> Predict:
 
 def _check_network(network: "NeuralMagnetometer") -> None:
     """Refuse a network whose inputs are not simulated here."""
-    if network.net.context:
-        raise InputError(
-            f"{network.name}: a {network.net.kind} reads {network.net.context} earlier readings, which "
-            "MagNav does not keep; give a network that reads one row at a time"
-        )
     if missing := sorted(network.columns - SENSED):
         raise InputError(
             f"{network.name}: reads {', '.join(missing)}, which MagNav does not simulate; give a network of "

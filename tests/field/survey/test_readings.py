@@ -302,7 +302,7 @@ def test_the_same_readings_give_the_same_bytes_with_units_on_every_column(tmp_pa
     assert schema.field("b_nt").metadata[b"unit"] == b"nT"
     assert schema.field("p_xy_x").metadata[b"unit"] == b"m"
     assert json.loads(schema.metadata[b"magtwin_readings"])["source"] == readings.source
-    with pytest.raises(InputError, match=r"a\.parquet: exists already; give --force"):
+    with pytest.raises(InputError, match=r"a\.parquet: exists already; give `force=True`"):
         save_readings(readings, tmp_path / "a.parquet")
 
 
