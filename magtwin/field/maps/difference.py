@@ -1,6 +1,6 @@
 """MapDifference: compare two surveys of one floor, and find what changed and where."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -225,7 +225,7 @@ def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
     floor = float(np.spacing(np.float32(np.abs(b.values_nt[b.valid]).max())))
     from_variance = a.variance_nt2 is not None and b.variance_nt2 is not None
     if from_variance:
-        sd = np.sqrt(_variance(a, p, yaw) + _variance(b, p, yaw))
+        sd = np.hypot(a.lookup_with_sd(p, yaw)[1], b.lookup_with_sd(p, yaw)[1])
     else:
         sd = np.where(known, _robust_sd(local[known]), np.nan)
     sd = np.maximum(sd, floor)
@@ -284,12 +284,6 @@ def _common(a: AnomalyMap, b: AnomalyMap) -> Grid:
         rows=rows,
         columns=columns,
     )
-
-
-def _variance(field: AnomalyMap, p_xy: Array, yaw: Array) -> Array:
-    """Variance of a map's values at poses, interpolated [nT^2]."""
-    assert field.variance_nt2 is not None
-    return replace(field, values_nt=field.variance_nt2, variance_nt2=None, harmonic=None).lookup(p_xy, yaw)
 
 
 def _robust_sd(values: Array) -> float:

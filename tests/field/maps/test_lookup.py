@@ -5,6 +5,7 @@ import math
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -266,3 +267,16 @@ def test_a_map_that_was_looked_up_is_copied_and_pickled_without_what_lookup_keep
         assert same == field
         assert_array_equal(same.lookup(p, yaw), want)
     assert len(pickle.dumps(field)) == before
+
+
+def test_the_sd_is_the_root_of_the_interpolated_variance():
+    field = field_map(masked=0.05)
+    variance = np.random.default_rng(3).uniform(1, 9, field.values_nt.shape)
+    known = replace(field, variance_nt2=variance)
+    p, yaw = poses(field, 200)
+    mean, sd = known.lookup_with_sd(p.reshape(20, 10, 2), yaw.reshape(20, 10))
+    assert mean.shape == sd.shape == (20, 10)
+    assert_array_equal(mean.ravel(), field.lookup(p, yaw))
+    assert_allclose(sd.ravel() ** 2, replace(field, values_nt=variance).lookup(p, yaw), rtol=1e-12)
+    with pytest.raises(InputError, match=r"map 'lab' has no variance; fit one"):
+        field.lookup_with_sd(p, yaw)
