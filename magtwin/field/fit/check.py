@@ -20,15 +20,11 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 Progress = Callable[[int, int, str], Any]
 
+# Options of methods in a check: held-out nodes are filled, or every cell would be unknown
 FILLED: Mapping[str, Mapping[str, Any]] = {"trilinear": {"fill": True}, "cubic": {"fill": True}}
-"""Options of methods in a check: held-out nodes are filled, or every cell would be unknown."""
-
-BLOCK_SPACINGS = 3
-"""Side of a held-out block, in spacings of the readings."""
-
+BLOCK_SPACINGS = 3  # Side of a held-out block, in spacings of the readings
+# Number of parts of a floor in blocks: block (i, j) is in part (i + 2 j) mod 5, unlike all eight around it
 BLOCKS = 5
-"""Number of parts of a floor in blocks: block (i, j) is in part (i + 2 j) mod 5, unlike all eight around
-it."""
 
 
 def check(
@@ -179,13 +175,13 @@ def _block(readings: Readings) -> tuple[Rows, str]:
     return (i + 2 * j) % BLOCKS, f"every fifth block of {side:.3g} x {side:.3g} m, in turn"
 
 
+# Functions that assign each reading to a part, by name
 SPLITS: dict[str, Callable[[Readings], tuple[Rows, str]]] = {
     "checkerboard": _checkerboard,
     "heading": _heading,
     "run": _run,
     "block": _block,
 }
-"""Functions that assign each reading to a part, by name."""
 
 
 def _near(readings: Readings, train: Rows, test: Rows, within_m: float | None) -> Rows:

@@ -11,20 +11,11 @@ Kernel = Literal["matern", "poisson"]
 
 ROOT5 = np.sqrt(5.0)
 
-ARM_M = 1 / 30
-"""Unit of the sensor's position in the hyperparameters [m], chosen for the optimiser's scale."""
-
-UNLIKELY = 1e25
-"""Loss if the covariance is not positive definite: finite, so that a line search steps back."""
-
-DOUBT = 3.0
-"""Prior standard deviation of every logarithm about its first guess: a factor of 20 either way."""
-
-UNEVEN = 0.25
-"""Prior standard deviation of the logarithm of the field's local strength, about 0."""
-
-OVERLAP = 0.7
-"""Width of a patch (one standard deviation), as a share of the distance between patches."""
+ARM_M = 1 / 30  # Unit of the sensor's position in the hyperparameters [m], chosen for the optimiser's scale
+UNLIKELY = 1e25  # Loss if the covariance is not positive definite: finite, so that a line search steps back
+DOUBT = 3.0  # Prior standard deviation of every logarithm about its first guess: a factor of 20 either way
+UNEVEN = 0.25  # Prior standard deviation of the logarithm of the field's local strength, about 0
+OVERLAP = 0.7  # Width of a patch (one standard deviation), as a share of the distance between patches
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,20 +35,12 @@ class Covariance:
     upward continuation of white noise; Blakely 1995, eq. 12.6).
     """
 
-    kernel: Kernel
-    """Function of distance."""
-
-    harmonics: int
-    """Number of terms in h: 3, or 1 if all headings are equal."""
-
-    runs: bool
-    """Whether runs may disagree."""
-
+    kernel: Kernel  # Function of distance
+    harmonics: int  # Number of terms in h: 3, or 1 if all headings are equal
+    runs: bool  # Whether runs may disagree
+    # Centres of patches of the floor [m], shape (B, 2); empty for uniform strength
     patches: Array = field(default_factory=lambda: np.empty((0, 2)))
-    """Centres of patches of the floor [m], shape (B, 2); empty for uniform strength."""
-
-    apart_m: float = 1.0
-    """Distance between patches [m]."""
+    apart_m: float = 1.0  # Distance between patches [m]
 
     @property
     def size(self) -> int:

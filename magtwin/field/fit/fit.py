@@ -26,24 +26,15 @@ from magtwin.report import Figure, Report
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
 
-NARROW = 5.0
-"""Readings lie on a line if their extent is below their spacing over this."""
-
-REACH = 2.0
-"""Largest distance from a known node to a good reading, in spacings of the readings."""
-
-MOST_DOUBT = 0.5
-"""Largest standard deviation of a known node, as a share of the readings' own."""
-
+NARROW = 5.0  # Readings lie on a line if their extent is below their spacing over this
+REACH = 2.0  # Largest distance from a known node to a good reading, in spacings of the readings
+MOST_DOUBT = 0.5  # Largest standard deviation of a known node, as a share of the readings' own
+# Parameters of a map: RMS errors of linear interpolation
 ERRORS = ("error between nodes [nT]", "error between headings [nT]")
-"""Parameters of a map: RMS errors of linear interpolation."""
-
-MOST_THREADS = 4
-"""Headings of a raster that are computed in parallel: each holds blocks of 100 MB."""
+MOST_THREADS = 4  # Headings of a raster that are computed in parallel: each holds blocks of 100 MB
 
 
-ON_NODES = ("trilinear",)
-"""Methods whose map of a gridded survey has the survey's own nodes."""
+ON_NODES = ("trilinear",)  # Methods whose map of a gridded survey has the survey's own nodes
 
 
 def fit(

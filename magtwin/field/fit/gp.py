@@ -18,75 +18,37 @@ from magtwin.field.survey.readings import Readings
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]
 
-MOST = 4000
-"""Most readings, or means of adjacent ones, in the conditioning: 128 MB of covariance."""
-
-MOST_LEARNT = 800
-"""Most of these from which the hyperparameters are learnt."""
-
-MOST_TRIED = 240
-"""Most of these on which the starts are tried."""
-
-STARTS = (1.0, 0.4, 2.5)
-"""Initial reaches of the optimisation, as factors of the first guess."""
-
-STEPS = 60
-"""Steps of L-BFGS from the best start."""
-
-PATCHES = 8
-"""Most patches along the longer side of the floor, each with its own field strength."""
-
+MOST = 4000  # Most readings, or means of adjacent ones, in the conditioning: 128 MB of covariance
+MOST_LEARNT = 800  # Most of these from which the hyperparameters are learnt
+MOST_TRIED = 240  # Most of these on which the starts are tried
+STARTS = (1.0, 0.4, 2.5)  # Initial reaches of the optimisation, as factors of the first guess
+STEPS = 60  # Steps of L-BFGS from the best start
+PATCHES = 8  # Most patches along the longer side of the floor, each with its own field strength
+# Least distance between patches, in spacings of the readings: smaller ones cannot tell strength from noise
 PATCH_SPACINGS = 3.0
-"""Least distance between patches, in spacings of the readings: smaller ones cannot tell strength from
-noise."""
-
+# Largest change of a hyperparameter from its first guess: a factor of 400 for logarithms, 0.2 m for the arm
 WIDEST = 6.0
-"""Largest change of a hyperparameter from its first guess: a factor of 400 for logarithms, 0.2 m for the
-arm."""
-
-SECTORS = 24
-"""Heading sectors in which adjacent readings are averaged separately."""
-
-FINEST = 8
-"""Averaging cells per spacing for readings of a drive, at least."""
-
-BLOCK = 1024
-"""Poses predicted at a time."""
+SECTORS = 24  # Heading sectors in which adjacent readings are averaged separately
+FINEST = 8  # Averaging cells per spacing for readings of a drive, at least
+BLOCK = 1024  # Poses predicted at a time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class GpModel(FittedModel):
     """A Gaussian process conditioned on readings."""
 
-    parameters: Mapping[str, Any]
-    """Hyperparameters and data, by name with unit."""
-
-    noise_nt2: float
-    """Variance of a reading about the field [nT^2]: sensor, headings, positions, and runs."""
-
-    covariance: Covariance
-    """Form of the covariance."""
-
-    figures: Array
-    """Its hyperparameters, shape (covariance.size,)."""
-
-    mean_nt: float
-    """Mean of the readings [nT]."""
-
+    parameters: Mapping[str, Any]  # Hyperparameters and data, by name with unit
+    noise_nt2: float  # Variance of a reading about the field [nT^2]: sensor, headings, positions, and runs
+    covariance: Covariance  # Form of the covariance
+    figures: Array  # Its hyperparameters, shape (covariance.size,)
+    mean_nt: float  # Mean of the readings [nT]
+    # Positions [m], shape (N, 2), and headings [rad], shape (N,), of the conditioning
     poses: tuple[Array, Array]
-    """Positions [m], shape (N, 2), and headings [rad], shape (N,), of the conditioning."""
-
-    lower: Array
-    """Cholesky factor of the readings' covariance, shape (N, N)."""
-
-    alpha: Array
-    """Inverse of that covariance times the readings minus their mean, shape (N,)."""
-
+    lower: Array  # Cholesky factor of the readings' covariance, shape (N, N)
+    alpha: Array  # Inverse of that covariance times the readings minus their mean, shape (N,)
+    # Positions left out in turn, a cKDTree, and the mean squared residual over the variance at each
     missed: tuple[Any, Array]
-    """Positions left out in turn, a cKDTree, and the mean squared residual over the variance at each."""
-
-    method: str = "gp"
-    """Name of the method."""
+    method: str = "gp"  # Name of the method
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field [nT] and its variance [nT^2] at poses; nan if a pose is nan. See `FieldModel`.

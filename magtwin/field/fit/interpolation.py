@@ -24,17 +24,10 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Order = Literal["linear", "cubic"]
 
-EDGE = 1e-9
-"""Rounding forgiven at a node, in cells; also the weight from which an unknown node counts."""
-
-BINS_A_SPACING = 4
-"""Averaging cells per spacing of a scattered survey."""
-
-FLATTEST = 0.05
-"""Least relative spread of a heading wave within cells; waves with less are not fitted."""
-
-LEAST = 4
-"""Fewest readings of a map."""
+EDGE = 1e-9  # Rounding forgiven at a node, in cells; also the weight from which an unknown node counts
+BINS_A_SPACING = 4  # Averaging cells per spacing of a scattered survey
+FLATTEST = 0.05  # Least relative spread of a heading wave within cells; waves with less are not fitted
+LEAST = 4  # Fewest readings of a map
 
 
 def fit_trilinear(readings: Readings, *, fill: bool = False) -> "GridInterpolation | ScatterInterpolation":
@@ -96,32 +89,15 @@ def check_readings(readings: Readings) -> None:
 class GridInterpolation(FittedModel):
     """Values on the nodes of a survey, interpolated."""
 
-    method: str
-    """"trilinear" or "cubic"."""
-
-    parameters: Mapping[str, Any]
-    """Parameters of the fit."""
-
-    noise_nt2: float
-    """Variance of a reading about the field of its node, mean over the survey [nT^2]."""
-
-    grid: Grid
-    """The nodes."""
-
-    values_nt: Array
-    """Field at the nodes [nT], shape (H, Y, X); 0 where not `known`."""
-
-    known: Flags
-    """Nodes that were read or filled, shape (H, Y, X)."""
-
-    node_nt2: Array
-    """Variance of the value of each node [nT^2], shape (H, Y, X)."""
-
-    roughness: Roughness
-    """Error of interpolation between nodes."""
-
-    turned_nt2: float
-    """Mean squared error of interpolating a heading that is left out [nT^2]."""
+    method: str  # "trilinear" or "cubic"
+    parameters: Mapping[str, Any]  # Parameters of the fit
+    noise_nt2: float  # Variance of a reading about the field of its node, mean over the survey [nT^2]
+    grid: Grid  # The nodes
+    values_nt: Array  # Field at the nodes [nT], shape (H, Y, X); 0 where not `known`
+    known: Flags  # Nodes that were read or filled, shape (H, Y, X)
+    node_nt2: Array  # Variance of the value of each node [nT^2], shape (H, Y, X)
+    roughness: Roughness  # Error of interpolation between nodes
+    turned_nt2: float  # Mean squared error of interpolating a heading that is left out [nT^2]
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field [nT] and its variance [nT^2] at poses; nan off the grid and in unknown cells. See
@@ -167,29 +143,14 @@ class GridInterpolation(FittedModel):
 class ScatterInterpolation(FittedModel):
     """A surface over triangles of scattered readings, and a wave over heading."""
 
-    method: str
-    """"trilinear" or "cubic"."""
-
-    parameters: Mapping[str, Any]
-    """Parameters of the fit."""
-
-    noise_nt2: float
-    """Variance of readings at one place, within and between runs [nT^2]."""
-
-    p_xy: Array
-    """Positions of the surface's vertices [m], shape (M, 2)."""
-
-    b_nt: Array
-    """Values at the vertices [nT], shape (M,)."""
-
-    place_nt2: Array
-    """Variance of these values [nT^2], shape (M,)."""
-
-    wave_nt: Array
-    """Coefficients of cos yaw, sin yaw, cos 2 yaw, sin 2 yaw [nT], shape (4,)."""
-
-    roughness: Roughness
-    """Error of interpolation between the vertices."""
+    method: str  # "trilinear" or "cubic"
+    parameters: Mapping[str, Any]  # Parameters of the fit
+    noise_nt2: float  # Variance of readings at one place, within and between runs [nT^2]
+    p_xy: Array  # Positions of the surface's vertices [m], shape (M, 2)
+    b_nt: Array  # Values at the vertices [nT], shape (M,)
+    place_nt2: Array  # Variance of these values [nT^2], shape (M,)
+    wave_nt: Array  # Coefficients of cos yaw, sin yaw, cos 2 yaw, sin 2 yaw [nT], shape (4,)
+    roughness: Roughness  # Error of interpolation between the vertices
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field [nT] and its variance [nT^2] at poses; nan outside the convex hull. See `FieldModel`."""

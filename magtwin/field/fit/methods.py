@@ -65,6 +65,7 @@ class MapMethod(Protocol):
         """Fit the good readings of a survey; raise `InputError` if they make no map."""
 
 
+# Map methods by name
 METHODS: Registry[MapMethod] = Registry(
     "method",
     "map_methods",
@@ -75,10 +76,7 @@ METHODS: Registry[MapMethod] = Registry(
         "harmonic": "magtwin.field.fit.harmonic.inversion:fit_harmonic",
     },
 )
-"""Map methods by name."""
-
-map_method = METHODS.register
-"""Decorator that names a map method."""
+map_method = METHODS.register  # Decorator that names a map method
 
 
 class FittedModel(Summarized):

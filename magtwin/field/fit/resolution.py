@@ -15,44 +15,27 @@ from magtwin.field.survey.readings import Readings
 Array = NDArray[np.float64]
 Choice = TypeVar("Choice")
 
-LEAST_HEIGHT_M = 0.3
-"""Assumed least height of a sensor above magnetic sources [m]."""
-
+LEAST_HEIGHT_M = 0.3  # Assumed least height of a sensor above magnetic sources [m]
+# Nodes tried per scale of the field: the larger of the sensor's height and the readings' spacing. A field has
+# almost no waves shorter than its height above the sources.
 PARTS = (2.0, 2.5, 3.0, 4.0, 5.0, 6.0)
-"""Nodes tried per scale of the field: the larger of the sensor's height and the readings' spacing. A field
-has almost no waves shorter than its height above the sources."""
-
-HEADINGS = (4, 6, 8, 12, 24)
-"""Numbers of headings that are tried."""
-
+HEADINGS = (4, 6, 8, 12, 24)  # Numbers of headings that are tried
+# Allowed error of linear interpolation, as a share of the fit's standard deviation: adds 2 % to it
 SHARE = 0.2
-"""Allowed error of linear interpolation, as a share of the fit's standard deviation: adds 2 % to it."""
-
-PROBES = 400
-"""Poses at which the error is measured."""
-
+PROBES = 400  # Poses at which the error is measured
+# Steps of a sequence that fills a cube evenly (Roberts 2018, R3)
 GOLDEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
-"""Steps of a sequence that fills a cube evenly (Roberts 2018, R3)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Resolution:
     """Spacing and headings of a map, and the errors of linear interpolation between them."""
 
-    spacing_m: float
-    """Distance between nodes [m]."""
-
-    headings_rad: tuple[float, ...]
-    """Headings [rad], ascending in [0, 2 pi)."""
-
-    nodes_nt: float
-    """RMS error of interpolation between nodes [nT]; nan if not measured."""
-
-    turn_nt: float
-    """The same between headings [nT]."""
-
-    sd_nt: float
-    """Standard deviation of the fit, median over poses of the readings [nT]."""
+    spacing_m: float  # Distance between nodes [m]
+    headings_rad: tuple[float, ...]  # Headings [rad], ascending in [0, 2 pi)
+    nodes_nt: float  # RMS error of interpolation between nodes [nT]; nan if not measured
+    turn_nt: float  # The same between headings [nT]
+    sd_nt: float  # Standard deviation of the fit, median over poses of the readings [nT]
 
 
 def resolution(

@@ -11,14 +11,9 @@ from magtwin.verdict import Z_90
 
 Array = NDArray[np.float64]
 
-FOLDS = 5
-"""Parts left out in turn: cell (i, j) is in part (i + 2 j) mod 5, unlike the eight cells around it."""
-
-NEIGHBOURS = 16
-"""Residuals per local mean square."""
-
-PRIOR = 4
-"""Weight of the survey's mean square in a local one, as a number of residuals."""
+FOLDS = 5  # Parts left out in turn: cell (i, j) is in part (i + 2 j) mod 5, unlike the eight cells around it
+NEIGHBOURS = 16  # Residuals per local mean square
+PRIOR = 4  # Weight of the survey's mean square in a local one, as a number of residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,17 +27,10 @@ class Roughness:
     in their 90 % intervals, including the readings' errors.
     """
 
-    tree: Any
-    """Positions of the readings, a scipy cKDTree."""
-
-    left_out: Any
-    """Positions of the residuals, a scipy cKDTree."""
-
-    scaled: Array
-    """Squared residual minus the readings' variance, over (d g)^2 [nT^2 / m^4], shape (R,)."""
-
-    cell_m: float
-    """Typical distance between readings [m]."""
+    tree: Any  # Positions of the readings, a scipy cKDTree
+    left_out: Any  # Positions of the residuals, a scipy cKDTree
+    scaled: Array  # Squared residual minus the readings' variance, over (d g)^2 [nT^2 / m^4], shape (R,)
+    cell_m: float  # Typical distance between readings [m]
 
     @classmethod
     def of(

@@ -12,11 +12,8 @@ from magtwin.field.sources.harmonic import HarmonicField
 
 Array = NDArray[np.float64]
 
-LARGEST_STEP_DOWN = 0.25
-"""Largest step down of a grid, in cells: its shortest waves then grow threefold."""
-
-GRAIN_M = 1e-6
-"""Heights closer than this are equal."""
+LARGEST_STEP_DOWN = 0.25  # Largest step down of a grid, in cells: its shortest waves then grow threefold
+GRAIN_M = 1e-6  # Heights closer than this are equal
 
 
 def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:

@@ -15,46 +15,24 @@ from magtwin.summary import Summarized, Summary
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-FALSE_SHARE = 0.05
-"""False-discovery rate: expected share of the nodes called changed that did not change."""
-
-SD_PER_MAD = 1.4826
-"""Standard deviation of a normal distribution per median absolute deviation."""
-
-GRAIN_M = 1e-3
-"""Heights that differ by less are equal: 5 nT in a steep field."""
-
-TOLD = 20
-"""Most regions in a report, those of the greatest z first."""
+FALSE_SHARE = 0.05  # False-discovery rate: expected share of the nodes called changed that did not change
+SD_PER_MAD = 1.4826  # Standard deviation of a normal distribution per median absolute deviation
+GRAIN_M = 1e-3  # Heights that differ by less are equal: 5 nT in a steep field
+TOLD = 20  # Most regions in a report, those of the greatest z first
 
 
 @dataclass(frozen=True, kw_only=True)
 class Region:
     """Adjacent nodes, also diagonally, whose field changed at some heading."""
 
-    centre_m: tuple[float, float]
-    """World x and y of its centre, weighted by change [m]."""
-
-    extent_m: tuple[float, float, float, float]
-    """Least x, greatest x, least y, greatest y of its nodes [m]."""
-
-    nodes: int
-    """Number of nodes."""
-
-    peak_nt: float
-    """Local change at the greatest |z| [nT]."""
-
-    peak_sd_nt: float
-    """Standard deviation of that change if the field did not change [nT]."""
-
-    peak_z: float
-    """z at that node."""
-
-    peak_m: tuple[float, float]
-    """World x and y of that node [m]."""
-
-    peak_heading_rad: float
-    """Heading of that node [rad]."""
+    centre_m: tuple[float, float]  # World x and y of its centre, weighted by change [m]
+    extent_m: tuple[float, float, float, float]  # Least x, greatest x, least y, greatest y of its nodes [m]
+    nodes: int  # Number of nodes
+    peak_nt: float  # Local change at the greatest |z| [nT]
+    peak_sd_nt: float  # Standard deviation of that change if the field did not change [nT]
+    peak_z: float  # z at that node
+    peak_m: tuple[float, float]  # World x and y of that node [m]
+    peak_heading_rad: float  # Heading of that node [rad]
 
     def said(self) -> str:
         """Place and significance, as text."""

@@ -13,11 +13,9 @@ from magtwin.field.days import day_number, parse_day
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.report import Figure, Report
 
+# What all epochs of a map share, besides the number of nodes
 COMMON = ("headings_rad", "origin_m", "cell_m", "frame", "datum", "height_m")
-"""What all epochs of a map share, besides the number of nodes."""
-
-GRAIN = 1e-9
-"""Lengths [m] and angles [rad] closer than this are equal."""
+GRAIN = 1e-9  # Lengths [m] and angles [rad] closer than this are equal
 
 
 def day_of(field: AnomalyMap) -> datetime.date:

@@ -24,11 +24,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 TURN = 2 * np.pi
-TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")
-"""Metadata that are texts."""
-
-CONSTANT_NT = 1e-3
-"""Range of values up to which a map is constant [nT]."""
+TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")  # Metadata that are texts
+CONSTANT_NT = 1e-3  # Range of values up to which a map is constant [nT]
 
 Outside = Literal["nan", "clamp", "raise"]
 

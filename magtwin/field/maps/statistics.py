@@ -19,35 +19,16 @@ from magtwin.summary import span
 class HeadingStatistics:
     """Statistics of one heading over its valid nodes; nan if there is none."""
 
-    heading_deg: float
-    """Heading [deg]."""
-
-    nodes: int
-    """Number of nodes."""
-
-    masked: int
-    """Nodes that are not valid."""
-
-    mean_nt: float
-    """Mean [nT]."""
-
-    sd_nt: float
-    """Standard deviation over the nodes [nT]."""
-
-    least_nt: float
-    """Smallest value [nT]."""
-
-    greatest_nt: float
-    """Largest value [nT]."""
-
-    median_gradient_nt_m: float
-    """Median horizontal gradient of the magnitude, by central differences [nT/m]."""
-
-    greatest_gradient_nt_m: float
-    """Largest gradient [nT/m]."""
-
-    median_error_nt: float
-    """Median standard deviation of a value [nT]; nan if unknown."""
+    heading_deg: float  # Heading [deg]
+    nodes: int  # Number of nodes
+    masked: int  # Nodes that are not valid
+    mean_nt: float  # Mean [nT]
+    sd_nt: float  # Standard deviation over the nodes [nT]
+    least_nt: float  # Smallest value [nT]
+    greatest_nt: float  # Largest value [nT]
+    median_gradient_nt_m: float  # Median horizontal gradient of the magnitude, by central differences [nT/m]
+    greatest_gradient_nt_m: float  # Largest gradient [nT/m]
+    median_error_nt: float  # Median standard deviation of a value [nT]; nan if unknown
 
 
 def statistics(field: AnomalyMap) -> tuple[HeadingStatistics, ...]:
@@ -198,12 +179,9 @@ def _said(vector: np.ndarray) -> str:
     return "(" + ", ".join(f"{c:.5g}" for c in vector) + ")"
 
 
-COLOUR_MAP = "viridis"
-"""Name of the colour map for fields."""
-
+COLOUR_MAP = "viridis"  # Name of the colour map for fields
+# Share of nodes left out at either end of a colour scale: a few nodes beside a source would flatten the rest
 OUTER_PERCENT = 0.5
-"""Share of nodes left out at either end of a colour scale: a few nodes beside a source would flatten the
-rest."""
 
 
 def colour_limits(values: ArrayLike, outer_percent: float = OUTER_PERCENT) -> tuple[float, float]:

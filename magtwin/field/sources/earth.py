@@ -10,8 +10,7 @@ from magtwin.frames import quat_from_yaw, rotate
 
 MODEL = "the IGRF-14"
 
-SPAN = (datetime.date(1900, 1, 1), datetime.date(2030, 1, 1))
-"""First and last day of the model."""
+SPAN = (datetime.date(1900, 1, 1), datetime.date(2030, 1, 1))  # First and last day of the model
 
 
 def earth_field_nt(

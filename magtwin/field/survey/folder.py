@@ -25,17 +25,12 @@ Array = NDArray[np.float64]
 COLUMNS = ("x", "y", "theta", "scalar_mag")
 SUFFIX = "_map.csv"
 
+# Widest angle between headings of a complete survey, if the caller does not give the headings
 WIDEST_DEG = 90.0
-"""Widest angle between headings of a complete survey, if the caller does not give the headings."""
-
-GRAIN_M = 1e-6
-"""Coordinates closer than this are equal."""
-
+GRAIN_M = 1e-6  # Coordinates closer than this are equal
+# Method of a map whose values are readings
 METHOD = "survey, one reading a node and heading, the robot at rest"
-"""Method of a map whose values are readings."""
-
-QUOTED = 60
-"""Characters of a file that an error quotes."""
+QUOTED = 60  # Characters of a file that an error quotes
 
 
 def read_grid(folder: str | os.PathLike[str], **options: Any) -> Readings:
@@ -262,8 +257,7 @@ class _Layer:
     theta: Array
     field: Array
     sha256: str
-    metadata: dict[str, Any]
-    """Metadata of its comment lines; see `magtwin.field.survey.header`."""
+    metadata: dict[str, Any]  # Metadata of its comment lines; see `magtwin.field.survey.header`
 
 
 def _read(

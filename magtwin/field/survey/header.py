@@ -18,11 +18,10 @@ from magtwin.field.days import check_day
 from magtwin.field.maps.map import TEXTS, AnomalyMap
 from magtwin.field.maps.statistics import statistics
 
+# Fields of a map that an import restores. Its source becomes the imported files.
 KEPT = (*(name for name in TEXTS if name != "source"), "height_m", "parameters")
-"""Fields of a map that an import restores. Its source becomes the imported files."""
-
+# Keys: rows of a file that are not field, counted from 0; median standard deviation of its values [nT]
 MASKED, ERROR = "masked_rows", "median_error_nt"
-"""Keys: rows of a file that are not field, counted from 0; median standard deviation of its values [nT]."""
 
 _LINE = re.compile(r"#\s*(\w+):\s*(.*?)\s*$")
 _SAID = 60

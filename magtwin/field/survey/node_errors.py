@@ -11,41 +11,24 @@ from magtwin.field.survey.readings import Readings
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+# Standard deviation of the robot's position about its node, in x and in y, if it cannot be estimated [m]
 PLACE_M = 0.01
-"""Standard deviation of the robot's position about its node, in x and in y, if it cannot be estimated [m]."""
-
-FEWEST = 24
-"""Fewest differences from which errors are estimated."""
-
-GROSS = 4.0
-"""Standard deviations at which a difference is clipped."""
-
-MEDIAN = 0.4549
-"""Median of the square of a standard normal."""
-
-ROUNDS = 8
-"""Rounds of the weighted fit of the two variances."""
+FEWEST = 24  # Fewest differences from which errors are estimated
+GROSS = 4.0  # Standard deviations at which a difference is clipped
+MEDIAN = 0.4549  # Median of the square of a standard normal
+ROUNDS = 8  # Rounds of the weighted fit of the two variances
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NodeErrors:
     """Variance of the reading of a node about the field there, at the node's nominal heading."""
 
+    # Variance of each node's reading [nT^2], shape (H, Y, X); the mean of the others at nodes without one
     variance_nt2: Array
-    """Variance of each node's reading [nT^2], shape (H, Y, X); the mean of the others at nodes without one.
-    """
-
-    mean_nt2: float
-    """Mean variance over the readings [nT^2]."""
-
-    place_m: float
-    """Standard deviation of the robot's position about its nodes, in x and in y [m]."""
-
-    noise_nt: float
-    """Standard deviation of the errors that do not depend on the gradient [nT]."""
-
-    told: bool
-    """Whether place_m and noise_nt were estimated; otherwise they are `PLACE_M` and 0."""
+    mean_nt2: float  # Mean variance over the readings [nT^2]
+    place_m: float  # Standard deviation of the robot's position about its nodes, in x and in y [m]
+    noise_nt: float  # Standard deviation of the errors that do not depend on the gradient [nT]
+    told: bool  # Whether place_m and noise_nt were estimated; otherwise they are `PLACE_M` and 0
 
 
 def node_errors(readings: Readings, grid: Grid, values_nt: Array, read: Flags) -> NodeErrors:

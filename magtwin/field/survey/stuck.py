@@ -39,44 +39,21 @@ from magtwin.report import Figure, Report
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
-FALSE_FROZEN = 0.01
-"""Share of frozen stretches that are false, and of sound surveys that show any."""
-
-FALSE_FLAT = 0.01
-"""Expected number of sound flat stretches per survey that are masked."""
-
-SURE = 0.95
-"""Probability from which a reading counts as stuck."""
-
-REACH_M = 0.1
-"""Distance over which the field's slope is assumed constant."""
-
+FALSE_FROZEN = 0.01  # Share of frozen stretches that are false, and of sound surveys that show any
+FALSE_FLAT = 0.01  # Expected number of sound flat stretches per survey that are masked
+SURE = 0.95  # Probability from which a reading counts as stuck
+REACH_M = 0.1  # Distance over which the field's slope is assumed constant
+# Slopes nearest to a stretch from which the field's roughness is estimated; slopes of 0 do not count
 BESIDE = 48
-"""Slopes nearest to a stretch from which the field's roughness is estimated; slopes of 0 do not count."""
-
+# Range about the level in which stuck readings are searched, in standard deviations of the level
 WIDTH = 12.0
-"""Range about the level in which stuck readings are searched, in standard deviations of the level."""
-
-CELL_M = 0.05
-"""Length of a drive whose readings are averaged for the fit."""
-
-LEAST_SLOPES = 8
-"""With fewer slopes the roughness is unknown, and no stretch is called frozen."""
-
-FLAT_M = 0.25
-"""Least length of a flat stretch of a drive."""
-
-MOST_TOGETHER = 12
-"""Most readings of one place that are tested jointly; more are thinned evenly."""
-
-ROUNDS = 4
-"""Rounds in which level, spread and share of stuck readings converge."""
-
-SPREAD_ROWS = 51
-"""Readings of a drive from which the usual size of a jump is estimated."""
-
-NAMED = 20
-"""Most outliers listed in the report, the largest first."""
+CELL_M = 0.05  # Length of a drive whose readings are averaged for the fit
+LEAST_SLOPES = 8  # With fewer slopes the roughness is unknown, and no stretch is called frozen
+FLAT_M = 0.25  # Least length of a flat stretch of a drive
+MOST_TOGETHER = 12  # Most readings of one place that are tested jointly; more are thinned evenly
+ROUNDS = 4  # Rounds in which level, spread and share of stuck readings converge
+SPREAD_ROWS = 51  # Readings of a drive from which the usual size of a jump is estimated
+NAMED = 20  # Most outliers listed in the report, the largest first
 
 
 def mask_stuck(readings: Readings) -> tuple[Readings, Report]:
@@ -98,26 +75,13 @@ def mask_stuck(readings: Readings) -> tuple[Readings, Report]:
 class Findings:
     """What is wrong with which readings."""
 
-    frozen: NDArray[np.bool_]
-    """Repeats to the last digit, shape (N,)."""
-
-    stuck: NDArray[np.bool_]
-    """At the level of a sensor that lost lock, shape (N,); may also be frozen."""
-
-    doubt: Array
-    """Probability that a stuck reading is field, shape (N,); 0 if it is not stuck."""
-
-    outlier: Array
-    """Difference from the neighbours' prediction [nT], shape (N,); 0 if it is not unusual."""
-
-    level_nt: float | None
-    """Level of the stuck sensor; None if no stretches agree on one."""
-
-    spread_nt: float
-    """Standard deviation of stuck readings about the level [nT]."""
-
-    judged: bool
-    """Whether there were enough readings to compare with neighbours."""
+    frozen: NDArray[np.bool_]  # Repeats to the last digit, shape (N,)
+    stuck: NDArray[np.bool_]  # At the level of a sensor that lost lock, shape (N,); may also be frozen
+    doubt: Array  # Probability that a stuck reading is field, shape (N,); 0 if it is not stuck
+    outlier: Array  # Difference from the neighbours' prediction [nT], shape (N,); 0 if it is not unusual
+    level_nt: float | None  # Level of the stuck sensor; None if no stretches agree on one
+    spread_nt: float  # Standard deviation of stuck readings about the level [nT]
+    judged: bool  # Whether there were enough readings to compare with neighbours
 
     def report(self, readings: Readings) -> Report:
         """Counts, level, doubt and outliers of the findings."""

@@ -10,36 +10,27 @@ from magtwin.field.sources.harmonic import HarmonicField
 
 Array = NDArray[np.float64]
 
+# Orthonormal components of soft iron: six off the diagonal, two on it. The trace is left out: it cannot be
+# told from the strength of the field, and the prior of the moments would make it grow.
 SOFT = np.zeros((8, 3, 3))
-"""Orthonormal components of soft iron: six off the diagonal, two on it. The trace is left out: it cannot
-be told from the strength of the field, and the prior of the moments would make it grow."""
 SOFT[np.arange(6), [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = 1.0
 SOFT[6] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2)
 SOFT[7] = np.diag([1.0, 1.0, -2.0]) / np.sqrt(6)
 SOFT.flags.writeable = False
 
-PLATFORM = 13
-"""Unknowns of the platform: hard iron (3), soft iron (8, see `SOFT`), lever arm (2)."""
-
+PLATFORM = 13  # Unknowns of the platform: hard iron (3), soft iron (8, see `SOFT`), lever arm (2)
+# dR/dyaw = R SPIN for rotations about z
 SPIN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-"""dR/dyaw = R SPIN for rotations about z."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
     """Predicted readings with C components each: 1 for magnitudes, 3 for vectors."""
 
-    values_nt: Array
-    """Predicted values [nT], shape (N, C)."""
-
-    jacobian: Array
-    """Derivatives by the unknowns, shape (N, C, P)."""
-
-    by_place: Array
-    """Derivatives by x and y of the robot [nT/m], shape (N, C, 2)."""
-
-    by_yaw: Array
-    """Derivative by the heading [nT/rad], shape (N, C)."""
+    values_nt: Array  # Predicted values [nT], shape (N, C)
+    jacobian: Array  # Derivatives by the unknowns, shape (N, C, P)
+    by_place: Array  # Derivatives by x and y of the robot [nT/m], shape (N, C, 2)
+    by_yaw: Array  # Derivative by the heading [nT/rad], shape (N, C)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +41,8 @@ class Forward:
     platform's h, S and l (`PLATFORM`).
     """
 
-    p_world_dipole: Array
-    """Dipole positions [m], shape (D, 3)."""
-
-    height_m: float
-    """Height of the sensor [m]."""
+    p_world_dipole: Array  # Dipole positions [m], shape (D, 3)
+    height_m: float  # Height of the sensor [m]
 
     @property
     def size(self) -> int:

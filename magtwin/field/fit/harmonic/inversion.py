@@ -37,18 +37,11 @@ Progress = Callable[[int, int, str], Any]
 
 LEAST_READINGS = 8
 
-EARTH_SD_NT = 1000.0
-"""Prior standard deviation of the uniform field about `earth_nt`, per component [nT]."""
-
-ROUNDS = 30
-"""Most rounds of learning."""
-
-LAYERWISE = 4
-"""First rounds, in which a layer has one strength."""
-
+EARTH_SD_NT = 1000.0  # Prior standard deviation of the uniform field about `earth_nt`, per component [nT]
+ROUNDS = 30  # Most rounds of learning
+LAYERWISE = 4  # First rounds, in which a layer has one strength
+# Change of the logarithms of hyperparameters in a round (of strengths, in the mean) at which learning ends
 STILL = 0.03
-"""Change of the logarithms of hyperparameters in a round (of strengths, in the mean) at which learning
-ends."""
 
 
 def fit_harmonic(

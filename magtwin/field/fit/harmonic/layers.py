@@ -13,58 +13,33 @@ from magtwin.field.survey.readings import Readings
 
 Array = NDArray[np.float64]
 
+# Depths of the layers below the sensor, in that of the first; each represents sources twice as large. The
+# second set has a layer above the sensor, for iron beside it. The set with the greater evidence is used.
 LADDERS = ((1.0, 2.0, 4.0), (1.0, 2.0, 4.0, -2.0))
-"""Depths of the layers below the sensor, in that of the first; each represents sources twice as large. The
-second set has a layer above the sensor, for iron beside it. The set with the greater evidence is used."""
-
+# Depth of the first layer in spacings of the survey: a layer nearer than about one represents waves that the
+# readings do not resolve (Dampney 1969)
 DEPTH_SPACINGS = 1.8
-"""Depth of the first layer in spacings of the survey: a layer nearer than about one represents waves that
-the readings do not resolve (Dampney 1969)."""
-
-DRIVE_SPACINGS = 0.9
-"""The same for a drive, whose readings are dense along it."""
-
-LEAST_DEPTH_M = 0.3
-"""Least depth of the first layer below the sensor [m]."""
-
+DRIVE_SPACINGS = 0.9  # The same for a drive, whose readings are dense along it
+LEAST_DEPTH_M = 0.3  # Least depth of the first layer below the sensor [m]
+# Distance between the dipoles of a layer, in its depth: the ripple is e^(-2 pi / 0.6) = 3e-5 of their field
 SHEET = 0.6
-"""Distance between the dipoles of a layer, in its depth: the ripple is e^(-2 pi / 0.6) = 3e-5 of their
-field."""
-
-MARGIN = 1.2
-"""Width by which a layer extends beyond the readings, in its depth."""
-
-REACH = 0.6
-"""Distance over which dipoles share one strength, in their layer's depth."""
-
-MOST_DIPOLES = 1500
-"""Most dipoles; larger layers are thinned."""
-
-FEW_ROWS = 2700
-"""Most reading components whose matrix is factored; beyond, that of the unknowns is."""
-
-DIPOLES_OF_MANY = 800
-"""Most dipoles if there are more rows than `FEW_ROWS`."""
-
+MARGIN = 1.2  # Width by which a layer extends beyond the readings, in its depth
+REACH = 0.6  # Distance over which dipoles share one strength, in their layer's depth
+MOST_DIPOLES = 1500  # Most dipoles; larger layers are thinned
+FEW_ROWS = 2700  # Most reading components whose matrix is factored; beyond, that of the unknowns is
+DIPOLES_OF_MANY = 800  # Most dipoles if there are more rows than `FEW_ROWS`
+# Most dipoles for the magnitudes of a drive: more took 15 times as long and predicted no better
 DIPOLES_OF_DRIVE = 500
-"""Most dipoles for the magnitudes of a drive: more took 15 times as long and predicted no better."""
 
 
 @dataclass(frozen=True, eq=False)
 class Layers:
     """Positions of the dipoles."""
 
-    p_world_dipole: Array
-    """Positions [m], shape (D, 3)."""
-
-    area_m2: Array
-    """Area per dipole [m^2], shape (D,)."""
-
-    layer: NDArray[np.intp]
-    """Layer of each dipole, shape (D,)."""
-
-    depths: tuple[float, ...]
-    """Depth of each layer below the sensor, negative above it [m]."""
+    p_world_dipole: Array  # Positions [m], shape (D, 3)
+    area_m2: Array  # Area per dipole [m^2], shape (D,)
+    layer: NDArray[np.intp]  # Layer of each dipole, shape (D,)
+    depths: tuple[float, ...]  # Depth of each layer below the sensor, negative above it [m]
 
     def shares(self) -> list[Array]:
         """Weights with which dipoles of a layer share their strengths, one matrix per layer."""

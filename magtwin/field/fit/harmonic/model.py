@@ -15,58 +15,37 @@ from magtwin.field.sources.harmonic import HarmonicField
 
 Array = NDArray[np.float64]
 
-BLOCK = 512
-"""Poses predicted at a time."""
-
+BLOCK = 512  # Poses predicted at a time
+# Largest distance between nodes at which the variance is computed, in the depth of the nearest layer
 COARSE = 1 / 3
-"""Largest distance between nodes at which the variance is computed, in the depth of the nearest layer."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class HarmonicModel(FittedModel):
     """A harmonic field fitted to readings, with its uncertainty."""
 
-    field: HarmonicField
-    """The field and the platform."""
-
-    parameters: Mapping[str, Any]
-    """Hyperparameters and unknowns, by name with unit."""
-
-    noise_nt2: float
-    """Variance of one reading of the magnitude about the field, mean over the survey [nT^2]."""
-
-    figures: Figures
-    """Hyperparameters."""
-
-    forward: Forward
-    """How readings follow from the unknowns."""
-
-    unknowns: Array
-    """Most likely unknowns, shape (P,)."""
-
-    prior_sd: Array
-    """Prior standard deviations of the unknowns, shape (P,)."""
-
+    field: HarmonicField  # The field and the platform
+    parameters: Mapping[str, Any]  # Hyperparameters and unknowns, by name with unit
+    noise_nt2: float  # Variance of one reading of the magnitude about the field, mean over the survey [nT^2]
+    figures: Figures  # Hyperparameters
+    forward: Forward  # How readings follow from the unknowns
+    unknowns: Array  # Most likely unknowns, shape (P,)
+    prior_sd: Array  # Prior standard deviations of the unknowns, shape (P,)
+    # Information of the readings: in units of `prior_sd` the posterior covariance is 1 - learnt learnt^T,
+    # shape (P, K)
     learnt: Array
-    """Information of the readings: in units of `prior_sd` the posterior covariance is 1 - learnt learnt^T,
-    shape (P, K)."""
 
     @property
     def method(self) -> str:
         """Name of the method."""
         return "harmonic"
 
-    width: float
-    """Factor of the posterior variance where it is large against the noise, see `widened`."""
-
-    headings_rad: Array
-    """Surveyed headings, ascending, if they are few and far apart; else empty, shape (H,)."""
-
+    width: float  # Factor of the posterior variance where it is large against the noise, see `widened`
+    headings_rad: Array  # Surveyed headings, ascending, if they are few and far apart; else empty, shape (H,)
+    # Added variance between these headings, over (d g)^2 with the angles d and g to the two beside, estimated
+    # from headings left out in turn [nT^2/rad^4]. Few headings determine it loosely: of the APRILab survey's
+    # four, each left out, 73 % of the readings lie in the 90 % intervals from the other three.
     turned: float
-    """Added variance between these headings, over (d g)^2 with the angles d and g to the two beside,
-    estimated from headings left out in turn [nT^2/rad^4]. Few headings determine it loosely: of the
-    APRILab survey's four, each left out, 73 % of the readings lie in the 90 % intervals from the other
-    three."""
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field magnitude as the survey's robot reads it [nT], and its variance without noise [nT^2]. See
@@ -152,14 +131,9 @@ def widened(variance_nt2: Array, noise_nt2: Array | float, width: Array | float)
     return np.asarray(variance_nt2 * (noise_nt2 + width * variance_nt2) / (noise_nt2 + variance_nt2))
 
 
-FAR_TURN = np.radians(60.0)
-"""Gap between headings that counts as not surveyed."""
-
-TURN_SECTORS = 24
-"""Heading sectors in which gaps of a scattered survey are found."""
-
-STRAY = 0.05
-"""Largest share of readings at a heading that is ignored."""
+FAR_TURN = np.radians(60.0)  # Gap between headings that counts as not surveyed
+TURN_SECTORS = 24  # Heading sectors in which gaps of a scattered survey are found
+STRAY = 0.05  # Largest share of readings at a heading that is ignored
 
 
 def surveyed(yaw: Array) -> tuple[Array, NDArray[np.intp]]:

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-TOLD = 0.01
-"""Directions with less information than this, relative to the prior, are left out."""
+TOLD = 0.01  # Directions with less information than this, relative to the prior, are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,14 +19,12 @@ class Posterior:
     rows^T rows + 1 (Rasmussen & Williams 2006, section 2.1.2, eqs. 2.8 and 2.12).
     """
 
-    rows: Array
-    """Shape (R, P)."""
-
-    lower: Array
-    """Cholesky factor of that matrix."""
+    rows: Array  # Shape (R, P)
+    lower: Array  # Cholesky factor of that matrix
 
     @classmethod
     def of(cls, rows: Array) -> "Posterior":
+        """The posterior of a problem; factors the matrix."""
         whole = rows @ rows.T if len(rows) <= rows.shape[1] else rows.T @ rows
         whole[np.diag_indices(len(whole))] += 1
         return cls(rows, np.asarray(np.linalg.cholesky(whole)))

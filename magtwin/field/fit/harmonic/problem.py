@@ -13,41 +13,27 @@ from magtwin.field.survey.readings import Readings
 
 Array = NDArray[np.float64]
 
-WEAK = 0.1
-"""Initial strength of layers above relative to layers below: what both can explain is put below."""
-
+WEAK = 0.1  # Initial strength of layers above relative to layers below: what both can explain is put below
+# Compass directions and dip of the starts beside straight down, if the Earth's field is unknown: several
+# fields explain magnitudes, and the steps find the nearest one
 BEGINNINGS, BEGUN_DIP = 4, np.radians(60.0)
-"""Compass directions and dip of the starts beside straight down, if the Earth's field is unknown: several
-fields explain magnitudes, and the steps find the nearest one."""
-
+# Prior standard deviations of the platform's unknowns, about 0
 HARD_IRON_SD_NT, SOFT_IRON_SD, LEVER_SD_M = 3000.0, 0.03, 0.05
-"""Prior standard deviations of the platform's unknowns, about 0."""
-
+# Length of a drive that is left out together, in the first layer's depth: over half a minute at 0.2 m/s
 STRETCH = 24.0
-"""Length of a drive that is left out together, in the first layer's depth: over half a minute at 0.2 m/s."""
-
+# Length of the headings' mean vector from which they count as one: a spread of at most 8 deg
 ONE_HEADING = 0.99
-"""Length of the headings' mean vector from which they count as one: a spread of at most 8 deg."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Figures:
     """Hyperparameters of a fit."""
 
-    noise_nt: float
-    """Noise of a reading, or of a mean of several [nT]."""
-
-    position_m: float
-    """Error of a recorded position, per axis [m]."""
-
-    heading_rad: float
-    """Error of a recorded heading [rad]."""
-
-    freedom: float
-    """Degrees of freedom of Student's t."""
-
-    strength: Array
-    """Prior standard deviation of each component of each dipole's moment [A m^2], shape (D,)."""
+    noise_nt: float  # Noise of a reading, or of a mean of several [nT]
+    position_m: float  # Error of a recorded position, per axis [m]
+    heading_rad: float  # Error of a recorded heading [rad]
+    freedom: float  # Degrees of freedom of Student's t
+    strength: Array  # Prior standard deviation of each component of each dipole's moment [A m^2], shape (D,)
 
     def change(self, before: "Figures") -> float:
         """Logarithmic difference to other hyperparameters: of the noise, or RMS of the strengths."""

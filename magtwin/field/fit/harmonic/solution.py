@@ -15,28 +15,17 @@ from magtwin.verdict import Z_90
 
 Array = NDArray[np.float64]
 
-DRAWN = 0.005
-"""Weight of the layer's strength relative to that of the dipoles around."""
-
-TAILS = np.geomspace(4.0, 48.0, 13)
-"""Degrees of freedom of Student's t that are tried."""
-
-SETTLED = 0.2
-"""Gain of the log posterior below which Gauss-Newton has converged."""
+DRAWN = 0.005  # Weight of the layer's strength relative to that of the dipoles around
+TAILS = np.geomspace(4.0, 48.0, 13)  # Degrees of freedom of Student's t that are tried
+SETTLED = 0.2  # Gain of the log posterior below which Gauss-Newton has converged
 
 STEPS = 30
 
-FIRST_STEPS = 4
-"""Gauss-Newton steps before learning begins."""
-
+FIRST_STEPS = 4  # Gauss-Newton steps before learning begins
+# Logarithms of the widths that are tried, as factors of the posterior's variances
 WIDTHS = np.linspace(-np.log(16), np.log(16), 161)
-"""Logarithms of the widths that are tried, as factors of the posterior's variances."""
-
-NOISES = np.geomspace(1.0, 16.0, 25)
-"""Factors of the noise's variance that are tried for a drive."""
-
-WIDTH_SD = np.log(2)
-"""Prior standard deviation of the logarithm of the width about 0."""
+NOISES = np.geomspace(1.0, 16.0, 25)  # Factors of the noise's variance that are tried for a drive
+WIDTH_SD = np.log(2)  # Prior standard deviation of the logarithm of the width about 0
 
 
 @dataclass(frozen=True, eq=False)
