@@ -16,8 +16,8 @@ from magtwin.field.maps import lookup
 from magtwin.sim.motion import loop
 from magtwin.sim.motion.controllers import Guide
 from magtwin.sim.motion.drive import Motion, Pose, limits
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec
 
 Array = NDArray[np.float64]
 
