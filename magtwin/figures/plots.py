@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError, find
-from magtwin.field.maps.difference import TOLD, MapDifference
+from magtwin.field.maps.difference import LISTED, MapDifference
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.files import output
@@ -463,7 +463,7 @@ def _draw_regions(ax: "Axes", found: MapDifference) -> None:
     from matplotlib.patches import Rectangle
 
     dx, dy = found.grid.cell_m
-    for number, region in enumerate(found.regions[:TOLD], 1):
+    for number, region in enumerate(found.regions[:LISTED], 1):
         x0, x1, y0, y1 = region.extent_m
         box = Rectangle((x0 - dx / 2, y0 - dy / 2), x1 - x0 + dx, y1 - y0 + dy, fill=False, ec=INK, lw=1.2)
         ax.add_patch(box)

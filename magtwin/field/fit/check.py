@@ -136,13 +136,13 @@ def _turns(
     if split is None:
         runs = len(np.unique(readings.run[good])) > 1
         split = "checkerboard" if readings.grid is not None else "run" if runs else "block"
-    part, said = find("split", split, SPLITS)(readings)
+    part, description = find("split", split, SPLITS)(readings)
     parts = np.unique(part[good])
     if len(parts) < 2:
         raise InputError(
             f"split {split!r} leaves nothing out of {readings.name!r}: all readings are in one part"
         )
-    return said, [(good[part[good] != k], good[part[good] == k]) for k in parts]
+    return description, [(good[part[good] != k], good[part[good] == k]) for k in parts]
 
 
 def _checkerboard(readings: Readings) -> tuple[Rows, str]:

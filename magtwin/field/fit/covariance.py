@@ -125,11 +125,11 @@ class Covariance:
         """cos(h (yaw - yaw')) of every pair, for each h, from one product: cosines of every pair would be
         slowest.
         """
-        one = np.ones((len(a), len(b)))
+        ones = np.ones((len(a), len(b)))
         if self.harmonics == 1:
-            return [one]
+            return [ones]
         turned = np.column_stack([np.cos(a), np.sin(a)]) @ np.vstack([np.cos(b), np.sin(b)])
-        return [one, turned, 2 * turned * turned - 1]
+        return [ones, turned, 2 * turned * turned - 1]
 
     def loss(
         self,

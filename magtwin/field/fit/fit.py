@@ -113,10 +113,10 @@ def raster(
     predict = getattr(model, "predict_nodes", model.predict)
     threads = min(MOST_THREADS, os.cpu_count() or 1, len(headings))
     with _one_thread(), ThreadPoolExecutor(threads) as pool:
-        for h, told in enumerate(pool.map(predict, p, headings)):
+        for h, predicted in enumerate(pool.map(predict, p, headings)):
             if progress is not None:
                 progress(h, len(headings), "headings")
-            values[h], variance[h] = told
+            values[h], variance[h] = predicted
     if progress is not None:
         progress(len(headings), len(headings), "headings")
     valid = np.isfinite(values) & np.isfinite(variance) & _known(model, readings, p[0], variance)

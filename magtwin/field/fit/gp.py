@@ -177,7 +177,7 @@ def _learn(
 
     def descend(start: Array, rows: NDArray[np.intp], steps: int, bounds: Any) -> tuple[float, Array]:
         data = (bins.p_xy[rows], bins.yaw[rows], bins.run[rows], b[rows])
-        found = minimize(
+        result = minimize(
             covariance.loss,
             np.maximum(start, least),
             (guess, *data),
@@ -186,7 +186,7 @@ def _learn(
             bounds=bounds,
             options={"maxiter": steps},
         )
-        return float(found.fun), np.asarray(found.x)
+        return float(result.fun), np.asarray(result.x)
 
     tried = np.sort(order[:MOST_TRIED])
     starts = []
@@ -195,7 +195,7 @@ def _learn(
         start = guess.copy()
         start[h : 2 * h] += np.log(factor)
         starts.append(descend(start, tried, STEPS // 2, even))
-    best = min(starts, key=lambda found: found[0])[1]
+    best = min(starts, key=lambda start: start[0])[1]
     say(len(STARTS), "figures")
     return descend(best, np.sort(order[:MOST_LEARNT]), STEPS, bounds)[1]
 
@@ -276,7 +276,7 @@ def _parameters(
 ) -> dict[str, Any]:
     h = covariance.harmonics
     size, uneven = np.exp(figures[: 3 * h]), np.exp(figures[covariance.of_patches])
-    told: dict[str, Any] = {
+    parameters: dict[str, Any] = {
         "kernel": covariance.kernel,
         "readings": int(readings.good.sum()),
         "conditioned_on": count,
@@ -287,8 +287,8 @@ def _parameters(
         "noise_nt": round(float(np.sqrt(noise)), 3),
     }
     if covariance.runs:
-        told["run_sd_nt"] = round(float(np.sqrt(covariance.run_nt2(figures))), 3)
-        told["run_reach_m"] = round(float(np.exp(figures[3 * h + 2])), 5)
+        parameters["run_sd_nt"] = round(float(np.sqrt(covariance.run_nt2(figures))), 3)
+        parameters["run_reach_m"] = round(float(np.exp(figures[3 * h + 2])), 5)
     if h > 1:
-        told["p_base_sensor_m"] = [round(float(v), 5) for v in covariance.arm_m(figures)]
-    return told
+        parameters["p_base_sensor_m"] = [round(float(v), 5) for v in covariance.arm_m(figures)]
+    return parameters

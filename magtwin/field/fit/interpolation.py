@@ -208,7 +208,7 @@ def _fit_gridded(readings: Readings, grid: Grid, order: Order, fill: bool) -> Gr
             "nodes_read": int(read.sum()),
             "nodes_filled": int((known & ~read).sum()),
             "noise_nt": round(float(np.sqrt(errors.mean_nt2)), 3),
-            f"place_error_m_{'told' if errors.told else 'assumed'}": round(errors.place_m, 5),
+            f"place_error_m_{'estimated' if errors.estimated else 'assumed'}": round(errors.place_m, 5),
         },
         noise_nt2=errors.mean_nt2,
         grid=grid,
@@ -266,8 +266,8 @@ def _periodic_cubic(headings_rad: tuple[float, ...], yaw: Array) -> Array:
     if count == 1:
         return np.ones((len(yaw), 1))
     knots = np.append(headings_rad, headings_rad[0] + TURN)
-    one = np.eye(count)
-    spline = CubicSpline(knots, np.vstack([one, one[:1]]), bc_type="periodic")
+    layers = np.eye(count)
+    spline = CubicSpline(knots, np.vstack([layers, layers[:1]]), bc_type="periodic")
     weights = np.asarray(spline(np.mod(yaw - knots[0], TURN) + knots[0]))
     return np.where(np.abs(weights) < EDGE, 0.0, weights)
 
@@ -339,8 +339,8 @@ def _binned(readings: Readings, still: Array, cell_m: float) -> tuple[Bins, floa
     if not freedom:
         return replace(bins, b_nt=mean), within, np.full(len(runs), within)
     middle, several = np.bincount(place, means) / runs, runs[place] > 1
-    found = float(np.sum((means - middle[place]) ** 2) / freedom)
-    between = max(found - within * float(np.mean(1 / apart.count[several])), 0.0)
+    variance = float(np.sum((means - middle[place]) ** 2) / freedom)
+    between = max(variance - within * float(np.mean(1 / apart.count[several])), 0.0)
     return replace(bins, b_nt=mean), within + between, between / runs + within / bins.count
 
 
@@ -356,8 +356,8 @@ def _wave(readings: Readings, cell_m: float) -> Array:
     means = np.stack([np.bincount(index, c) / bins.count for c in every.T], axis=-1)
     away = every - means[index]
     left, size, right = np.linalg.svd(away[:, :4], full_matrices=False)
-    told = size > FLATTEST * np.sqrt(len(rows))
-    return np.asarray(right[told].T @ ((left[:, told].T @ away[:, 4]) / size[told]))
+    determined = size > FLATTEST * np.sqrt(len(rows))
+    return np.asarray(right[determined].T @ ((left[:, determined].T @ away[:, 4]) / size[determined]))
 
 
 def _waves(yaw: Array) -> Array:

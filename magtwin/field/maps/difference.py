@@ -18,7 +18,7 @@ Flags = NDArray[np.bool_]
 FALSE_SHARE = 0.05  # False-discovery rate: expected share of the nodes called changed that did not change
 SD_PER_MAD = 1.4826  # Standard deviation of a normal distribution per median absolute deviation
 GRAIN_M = 1e-3  # Heights that differ by less are equal: 5 nT in a steep field
-TOLD = 20  # Most regions in a report, those of the greatest z first
+LISTED = 20  # Most regions in a report, those of the greatest z first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,7 @@ class Region:
     peak_m: tuple[float, float]  # World x and y of that node [m]
     peak_heading_rad: float  # Heading of that node [rad]
 
-    def said(self) -> str:
+    def text(self) -> str:
         """Place and significance, as text."""
         (x, y), (x0, x1, y0, y1) = self.centre_m, self.extent_m
         return (
@@ -131,8 +131,8 @@ class MapDifference(Summarized):
             Figure("changed nodes", changed, note=f"{changed / count:.1%} of those compared"),
             Figure("regions", len(self.regions)),
         ]
-        for number, region in enumerate(self.regions[:TOLD], 1):
-            figures.append(Figure(f"region {number}", region.peak_nt, "nT", region.peak_sd_nt, region.said()))
+        for number, region in enumerate(self.regions[:LISTED], 1):
+            figures.append(Figure(f"region {number}", region.peak_nt, "nT", region.peak_sd_nt, region.text()))
         metadata: dict[str, Any] = {}
         for label, name, day in zip(("from", "to"), self.names, self.days, strict=True):
             metadata[label] = " ".join(text for text in (name, day) if text)
@@ -246,7 +246,7 @@ def _compared(a: AnomalyMap, b: AnomalyMap) -> tuple[str, ...]:
     }
     for count, which in ((1, "one map"), (2, "both maps")):
         if names := [name for name, maps in unknown.items() if maps == count]:
-            cautions.append(f"{', '.join(names)} unknown in {which}, taken for one")
+            cautions.append(f"{', '.join(names)} unknown in {which}; assumed equal")
     return tuple(cautions)
 
 

@@ -57,8 +57,8 @@ def in_order(maps: Sequence[AnomalyMap]) -> tuple[AnomalyMap, ...]:
             mine, theirs = getattr(first, name), getattr(other, name)
             if not _same(mine, theirs):
                 raise InputError(
-                    f"epochs lie on one grid, but {name} is {_said(mine)} on {first.created} and "
-                    f"{_said(theirs)} on {other.created}; fit or survey both on one grid"
+                    f"epochs lie on one grid, but {name} is {_text(mine)} on {first.created} and "
+                    f"{_text(theirs)} on {other.created}; fit or survey both on one grid"
                 )
         if first.values_nt.shape != other.values_nt.shape:
             raise InputError(
@@ -162,5 +162,5 @@ def _joined(first: str, second: str) -> str:
     return first if first == second else "; ".join(text for text in (first, second) if text)
 
 
-def _said(value: object) -> str:
+def _text(value: object) -> str:
     return str(value.tolist()) if isinstance(value, np.ndarray) else repr(value)

@@ -118,8 +118,8 @@ class LocalFit:
         from scipy.spatial import cKDTree
 
         count = min(self.count, len(pool) - 1)
-        _, found = cKDTree(self.p_xy[pool]).query(self.p_xy[rows], k=count + 1)
-        near = pool[found]
+        _, nearest = cKDTree(self.p_xy[pool]).query(self.p_xy[rows], k=count + 1)
+        near = pool[nearest]
         own = near == rows[:, None]
         dropped = np.where(own.any(axis=1), own.argmax(axis=1), count)  # itself, else the farthest
         kept = np.arange(count + 1) != dropped[:, None]

@@ -66,9 +66,9 @@ def mask_stuck(readings: Readings) -> tuple[Readings, Report]:
         The readings with frozen and stuck ones no longer good; and the report: counts, the level, nodes stuck
         at every heading, the expected number masked falsely, outliers with place and size.
     """
-    found = find_stuck(readings)
-    good = readings.good & ~found.frozen & ~found.stuck
-    return readings.with_(good=good), found.report(readings)
+    findings = find_stuck(readings)
+    good = readings.good & ~findings.frozen & ~findings.stuck
+    return readings.with_(good=good), findings.report(readings)
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,9 @@ class Findings:
             metadata["note"] = f"fewer than {LEAST} good readings: only repeats were looked for"
         if len(outliers):
             first = outliers[np.argsort(-np.abs(self.outlier[outliers]), kind="stable")][:NAMED]
-            metadata["outliers"] = [_say(readings, int(row), float(self.outlier[row])) for row in first]
+            metadata["outliers"] = [
+                _place_and_size(readings, int(row), float(self.outlier[row])) for row in first
+            ]
         return Report(f"stuck and outlying readings of {readings.name}", tuple(figures), metadata)
 
 
@@ -196,7 +198,7 @@ def _frozen(readings: Readings) -> list[Rows]:
         return [] if still or readings.good.sum() <= LEAST_SLOPES else [np.flatnonzero(readings.good)]
     resolution = float(gaps.min())
     place, slope = _slopes(readings, sequences)
-    found = []
+    candidates = []
     for rows in sequences:
         same = np.diff(b[rows]) == 0
         if readings.b_body_nt is not None:
@@ -213,12 +215,12 @@ def _frozen(readings: Readings) -> list[Rows]:
             if usual * way / trials < 3 * resolution:
                 continue  # the sensor is too coarse for this place to tell
             chance = resolution * 0.25 / (2 * usual) * trials / way  # a quarter of slopes lie within +-usual
-            found.append((trials * np.log(min(1.0, chance)), held))
-    found.sort(key=lambda one: one[0])
+            candidates.append((trials * np.log(min(1.0, chance)), held))
+    candidates.sort(key=lambda candidate: candidate[0])
     tests = sum(len(rows) - 1 for rows in sequences)
-    allowed = np.log(FALSE_FROZEN / max(tests, 1) * np.arange(1, len(found) + 1))
-    passed = [k for k, (chance, _) in enumerate(found) if chance <= allowed[k]]
-    return [held for _, held in found[: passed[-1] + 1]] if passed else []
+    allowed = np.log(FALSE_FROZEN / max(tests, 1) * np.arange(1, len(candidates) + 1))
+    passed = [k for k, (chance, _) in enumerate(candidates) if chance <= allowed[k]]
+    return [held for _, held in candidates[: passed[-1] + 1]] if passed else []
 
 
 def _slopes(readings: Readings, sequences: list[Rows]) -> tuple[Array, Array]:
@@ -428,7 +430,7 @@ def _spikes(b: Array) -> Array:
     return np.where(spike, off, 0.0)
 
 
-def _say(readings: Readings, row: int, off_nt: float) -> str:
+def _place_and_size(readings: Readings, row: int, off_nt: float) -> str:
     """Place and size of an outlier, as text."""
     x, y = readings.p_xy[row]
     run = readings.runs[readings.run[row]]

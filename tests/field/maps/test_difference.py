@@ -187,8 +187,8 @@ def test_the_report_tells_where_when_and_what_is_doubtful_and_is_json():
     assert "about (1.0" in told.note
     assert told.note.endswith(" nodes")
     assert report.metadata["caution"] == [
-        "height unknown in one map, taken for one",
-        "datum unknown in both maps, taken for one",
+        "height unknown in one map; assumed equal",
+        "datum unknown in both maps; assumed equal",
     ]
     told = json.loads(report.to_json())["figures"]["surest local change"]
     assert "at (1, -0.5) m, heading" in told["note"]

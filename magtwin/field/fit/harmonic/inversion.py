@@ -152,26 +152,26 @@ def _solve(
     tried = len(begins) if len(begins) > 1 else 0
     total = tried * (1 + LAYERWISE) + ROUNDS
 
-    def told(done: int) -> None:
+    def report(done: int) -> None:
         if progress is not None:
             progress(done, total, "learning")
 
-    told(0)
+    report(0)
     begun = []
     for k, uniform in enumerate(begins):
         solution = Solution.start(problem, problem.first(), uniform)
         for step in range(LAYERWISE if tried else 0):
-            told(k * (1 + LAYERWISE) + step + 1)
+            report(k * (1 + LAYERWISE) + step + 1)
             solution = solution.learnt(None).step()
         begun.append(solution)
     solution = max(begun, key=Solution.evidence) if tried else begun[0]
     shares = problem.layers.shares()
     for done in range(ROUNDS):
-        told(total - ROUNDS + done)
+        report(total - ROUNDS + done)
         before = solution.figures
         solution = solution.learnt(shares if done >= LAYERWISE else None).step()
         if done > LAYERWISE and solution.figures.change(before) < STILL:
             break
     solution = solution.settle()
-    told(total)
+    report(total)
     return solution

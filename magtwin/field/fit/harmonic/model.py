@@ -117,8 +117,8 @@ class HarmonicModel(FittedModel):
     def _variance(self, jacobian: Array) -> Array:
         """Posterior variances of linear functions `jacobian` (N, P) of the unknowns, shape (N,)."""
         scaled = jacobian * self.prior_sd
-        told = scaled @ self.learnt
-        left = np.einsum("np,np->n", scaled, scaled) - np.einsum("nk,nk->n", told, told)
+        known = scaled @ self.learnt
+        left = np.einsum("np,np->n", scaled, scaled) - np.einsum("nk,nk->n", known, known)
         return np.asarray(np.maximum(left, 0))
 
 

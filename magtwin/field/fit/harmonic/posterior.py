@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-TOLD = 0.01  # Directions with less information than this, relative to the prior, are left out
+LEAST = 0.01  # Directions with less information than this, relative to the prior, are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class Posterior:
 
         rows = self.rows
         size, ways = eigh(rows @ rows.T if self.dual else rows.T @ rows, overwrite_a=True, check_finite=False)
-        kept = size > TOLD
+        kept = size > LEAST
         size, ways = size[kept], ways[:, kept]
         if self.dual:
             return np.asarray(rows.T @ (ways / np.sqrt(1 + size)))
