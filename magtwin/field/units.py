@@ -76,8 +76,7 @@ def check_unit(
     could = {other: number * factor for other, factor in NT_PER.items()}
     could = {other: value for other, value in could.items() if LEAST_MEAN_NT <= value <= GREATEST_MEAN_NT}
     advice = " or ".join(
-        f"were it {other}, it would be {value:,.0f} nT, so say --unit {other}"
-        for other, value in could.items()
+        f"in {other} it would be {value:,.0f} nT: give --unit {other}" for other, value in could.items()
     )
     if not any(INDOORS_NT[0] <= value <= INDOORS_NT[1] for value in could.values()):
         no_unit = "no usual unit makes it the Earth's field"

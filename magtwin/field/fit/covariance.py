@@ -132,13 +132,7 @@ class Covariance:
         return [ones, turned, 2 * turned * turned - 1]
 
     def loss(
-        self,
-        figures: Array,
-        guess: Array,
-        p_xy: Array,
-        yaw: Array,
-        run: NDArray[np.intp],
-        b_nt: Array,
+        self, figures: Array, guess: Array, p_xy: Array, yaw: Array, run: NDArray[np.intp], b_nt: Array
     ) -> tuple[float, Array]:
         """Negative logarithm of marginal likelihood and prior, and its gradient.
 

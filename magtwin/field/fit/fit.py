@@ -123,9 +123,9 @@ def raster(
     if not valid.any():
         x0, x1, y0, y1 = grid.extent
         raise InputError(
-            f"no node of x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m is known to the {model.method} fit of "
+            f"the {model.method} fit has no valid node in x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m, for survey "
             f"{readings.name!r}: each is too far from a good reading, or its sd is above {MOST_DOUBT:g} of "
-            "theirs; keep the extent within the readings, and leave out what contradicts itself"
+            "theirs; keep the extent within the readings, and mask readings that contradict each other"
         )
     return AnomalyMap(
         values_nt=values,

@@ -95,11 +95,7 @@ def resolution(
         headings = np.asarray(headings_rad, float).ravel()
         turn = between_headings(headings)
     return Resolution(
-        spacing_m=step,
-        headings_rad=tuple(headings.tolist()),
-        nodes_nt=nodes,
-        turn_nt=turn,
-        sd_nt=sd,
+        spacing_m=step, headings_rad=tuple(headings.tolist()), nodes_nt=nodes, turn_nt=turn, sd_nt=sd
     )
 
 

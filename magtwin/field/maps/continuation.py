@@ -58,7 +58,7 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
     height_m = float(height_m)
     if field.height_m is None:
         raise InputError(
-            f"the height of map {field.name!r} is unknown, so it cannot be taken to another; say it when the "
+            f"the height of map {field.name!r} is unknown, so it cannot be continued; give it when the "
             "survey is read (--height)"
         )
     start = field.harmonic.height_m if field.harmonic is not None else field.height_m

@@ -150,10 +150,7 @@ class MapDifference(Summarized):
         return Summary(
             f"MapDifference: {before} to {after}",
             (
-                (
-                    "nodes",
-                    f"{changed:,} of {known:,} changed (|z| >= {self.threshold_z:.2f})",
-                ),
+                ("nodes", f"{changed:,} of {known:,} changed (|z| >= {self.threshold_z:.2f})"),
                 ("bias", f"{self.bias_nt.mean():+.3g} nT, mean over {len(self.bias_nt)} headings"),
                 ("regions", f"{len(self.regions)}" + (f"; first: {self.regions[0]}" if self.regions else "")),
                 ("caution", "; ".join(self.cautions)),

@@ -26,7 +26,7 @@ def day_of(field: AnomalyMap) -> datetime.date:
     """
     if field.created == "":
         raise InputError(
-            f"map {field.name!r} does not say its day; say it when the map is made (--created YYYY-MM-DD)"
+            f"map {field.name!r} has no day; give it when the map is made (--created YYYY-MM-DD)"
         )
     return parse_day(field.created, f"created of map {field.name!r}")
 

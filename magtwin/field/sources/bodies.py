@@ -11,13 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.sources.dipoles import (
-    MU_0_OVER_4_PI,
-    NT_PER_T,
-    dipole_block,
-    in_blocks,
-    in_two_threads,
-)
+from magtwin.field.sources.dipoles import MU_0_OVER_4_PI, NT_PER_T, dipole_block, in_blocks, in_two_threads
 from magtwin.frames import matrix_from_quat
 
 Array = NDArray[np.float64]
@@ -350,10 +344,7 @@ class Bodies:
     """
 
     def __init__(
-        self,
-        bodies: Sequence[Body] = (),
-        p_world_dipole: ArrayLike = (),
-        m_world: ArrayLike = (),
+        self, bodies: Sequence[Body] = (), p_world_dipole: ArrayLike = (), m_world: ArrayLike = ()
     ) -> None:
         """Take bodies, and dipoles as positions [m] and moments [A m2] in world, each of shape (D, 3)."""
         self.bodies = tuple(bodies)

@@ -261,10 +261,7 @@ class _Layer:
 
 
 def _read(
-    folder: str | os.PathLike[str],
-    headings_deg: tuple[float, ...] | None,
-    unit: str,
-    scale: float | None,
+    folder: str | os.PathLike[str], headings_deg: tuple[float, ...] | None, unit: str, scale: float | None
 ) -> list[_Layer]:
     folder = existing(folder, "survey folder")
     if not folder.is_dir():
