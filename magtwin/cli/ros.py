@@ -331,7 +331,7 @@ def teleop(
     from magtwin.author.robot import read_robot
     from magtwin.cli.drive import device
     from magtwin.files import existing, shipped
-    from magtwin.io.bags.raw import RawBagWriter
+    from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder
     from magtwin.ros.teleop import Teleop
     from magtwin.sim.motion.manual import HELP, Gamepad, Hand, Keyboard
@@ -385,7 +385,7 @@ def record(
     force
         Replace what exists.
     """
-    from magtwin.io.bags.raw import RawBagWriter
+    from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder
 
     writer = RawBagWriter(out, force=force)

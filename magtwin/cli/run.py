@@ -547,7 +547,7 @@ class _Outputs:
 
     def sinks(self, driven: _Driven) -> list["Sink"]:
         """What takes the run as it comes."""
-        from magtwin.io.bags.rosbag import BagWriter
+        from magtwin.io.bags import BagWriter
         from magtwin.io.rerun.live import RrdWriter
         from magtwin.io.tables import ParquetParts
 

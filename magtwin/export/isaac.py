@@ -1,7 +1,7 @@
 """Isaac Sim: what a scene needs there beside what every USD has, ROS 2 topics above all.
 
 An Action Graph a robot publishes clock, odometry, inertial unit, pose, battery, joints and scan, and drives
-the robot by the commands that come in, on the topics and in the frames of `magtwin.io.bags.messages`. Isaac
+the robot by the commands that come in, on the topics and in the frames of `magtwin.io.bags.topics`. Isaac
 Sim
 has no magnetometer: whoever reads these topics has what the network reads, and computes the field. None of
 this has been run in Isaac Sim; the graph is held against its nodes' definitions, see `magtwin.export.ogn`.
@@ -106,7 +106,7 @@ def _author(graph: Graph, robot: RobotSpec, parts: _Parts, namespace: str, *, cl
 
 
 def _qos(graph: Graph) -> None:
-    """As `magtwin.io.bags.messages` offers its topics."""
+    """As `magtwin.io.bags.topics` offers its topics."""
     kind = f"{BRIDGE}ROS2QoSProfile"
     reliable, best = {"reliability": "reliable"}, {"reliability": "bestEffort"}
     graph.node(DEFAULT_QOS, kind, createProfile="Default for publishers/subscribers", depth=10, **reliable)

@@ -55,7 +55,7 @@ _NAMED = frozenset(("columns",))
 _PARQUET = Format("Parquet", _TABLES, "read_parquet", "write_parquet", reads=_NAMED)
 _BAG = Format(
     "rosbag2",
-    "magtwin.io.bags.rosbag",
+    "magtwin.io.bags",
     "read_bag",
     "write_bag",
     reads=frozenset(("topics", "unit")),

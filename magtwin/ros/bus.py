@@ -2,7 +2,7 @@
 
 Two carry it: rclpy, where it can be imported, and cyclonedds, which meets any ROS 2 on the network over DDS
 from any Python. Both are handed messages as bytes, which `magtwin.io.bags.cdr` makes of fields by the one
-table of types, `magtwin.io.bags.messages.TYPES`; so a node says and hears the same with either.
+table of types, `magtwin.io.bags.types.layout`; so a node says and hears the same with either.
 """
 
 import importlib
@@ -15,8 +15,9 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from magtwin.errors import InputError, find
-from magtwin.io.bags.cdr import Messages, decode, encode, leaves
-from magtwin.io.bags.messages import TYPES, Qos
+from magtwin.io.bags.cdr import Messages, decode, encode
+from magtwin.io.bags.topics import Qos
+from magtwin.io.bags.types import layout
 from magtwin.ros.parameters import Parameter
 
 Backend = Literal["auto", "rclpy", "cyclonedds"]
@@ -32,27 +33,15 @@ MISSING = (
     "cyclonedds, which meets ROS 2 over the network (pip install 'magtwin[ros]')"
 )
 
-NS = 10**9
-"""Nanoseconds in a second."""
-
-
-def form_of(kind: str, fields: Mapping[str, Any] | None = None) -> str:
-    """Leaves of a type of messages; those with parts of their own (`transforms`) come along in `fields`."""
-    if fields is not None and "form" in fields:
-        return str(fields["form"])
-    return find("type of messages", kind, TYPES)
-
 
 def to_bytes(kind: str, fields: Mapping[str, Any]) -> bytes:
     """One message in CDR.
 
     Args:
         kind: Its type, such as `sensor_msgs/msg/Imu`.
-        fields: By the leaves' names, as `magtwin.io.bags.cdr.encode` takes them; `form` in place of the
-        table's
-            leaves, where parts are counted.
+        fields: Values by leaf name, as for `magtwin.io.bags.cdr.encode`.
     """
-    return encode(leaves(form_of(kind, fields)), fields, 1).tobytes()
+    return encode(layout(kind, fields), fields, 1).tobytes()
 
 
 @dataclass(frozen=True)
@@ -69,21 +58,19 @@ class Message:
     received_ns: int
     """When it was taken in, by ours [ns]."""
 
-    def read(self, wanted: Iterable[str], form: str | None = None) -> dict[str, Any]:
-        """What stands in some leaves: numbers, arrays, strings; stamps as whole nanoseconds.
+    def read(self, wanted: Iterable[str], counts: Mapping[str, int] | None = None) -> dict[str, Any]:
+        """Values of some leaves: numbers, arrays, strings; stamps in whole nanoseconds.
 
         Args:
             wanted: Names of the leaves.
-            form: Leaves in place of the table's, where parts are counted.
+            counts: Lengths of sequences of structures, as for `magtwin.io.bags.types.layout`.
 
         Raises:
             InputError: It is too short for its type, or not plain CDR.
         """
         buffer = np.frombuffer(self.data, np.uint8)
-        one = Messages(np.zeros(1, np.int64), buffer, np.zeros(1, np.int64), np.array([len(buffer)]))
-        return {
-            name: value[0] for name, value in decode(leaves(form or TYPES[self.kind]), one, wanted).items()
-        }
+        message = Messages(np.zeros(1, np.int64), buffer, np.zeros(1, np.int64), np.array([len(buffer)]))
+        return {name: value[0] for name, value in decode(layout(self.kind, counts), message, wanted).items()}
 
 
 Heard = Callable[[Message], None]
@@ -192,7 +179,7 @@ class Names:
         """The name of a topic on the network, from the root.
 
         A relative name (`odom`) is in the namespace, `/clock` is global. `/robot/...` of
-        `magtwin.io.bags.messages.TOPICS` counts as relative.
+        `magtwin.io.bags.topics.TOPICS` counts as relative.
         """
         relative = name.removeprefix("/robot/")
         whole = relative if relative.startswith("/") else f"{self._space}/{relative}"

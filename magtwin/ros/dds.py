@@ -29,13 +29,13 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic as DdsTopic
 
 from magtwin.errors import InputError
-from magtwin.io.bags.messages import CLOCK, TYPES, Qos
+from magtwin.io.bags.cdr import NS
+from magtwin.io.bags.topics import CLOCK, Qos
+from magtwin.io.bags.types import typestore
 from magtwin.ros.bus import Heard, Message, Names, localhost_only
 from magtwin.ros.clock import Alarm, Clock
 from magtwin.ros.parameters import Parameter
-from magtwin.ros.types import PARTED, raw, ros_name, struct_of
-
-NS = 10**9
+from magtwin.ros.types import raw, ros_name, struct_of
 
 MOST_TAKEN = 256
 """Messages of a topic that are taken at a time."""
@@ -155,8 +155,8 @@ class DdsBus:
         return False
 
     def knows(self, kind: str) -> bool:
-        """As for `Bus`: all of the table, and those with parts of their own."""
-        return kind in TYPES or kind in PARTED
+        """As for `Bus`: the types of ROS 2 Humble."""
+        return kind in typestore().fielddefs
 
     def resolve(self, topic: str) -> str:
         """As for `Bus`."""

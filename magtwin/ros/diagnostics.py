@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from magtwin.io.bags.messages import Qos, diagnostics
+from magtwin.io.bags.topics import Qos
 from magtwin.ros.bus import Bus, Message, to_bytes
 
 Level = Literal["ok", "warn", "error", "stale"]
@@ -36,44 +36,34 @@ class Status:
 
 def to_fields(statuses: Sequence[Status], stamp_ns: int, hardware: str = "") -> dict[str, Any]:
     """Fields of a DiagnosticArray."""
-    fields: dict[str, Any] = {
-        "form": diagnostics([len(status.values) for status in statuses]),
-        "header.stamp": np.int64(stamp_ns),
-        "count": len(statuses),
-    }
+    fields: dict[str, Any] = {"header.stamp": np.int64(stamp_ns), "status": len(statuses)}
     for k, status in enumerate(statuses):
-        fields |= {
-            f"{k}.level": LEVELS[status.level],
-            f"{k}.name": status.name,
-            f"{k}.message": status.message,
-            f"{k}.hardware_id": hardware,
-            f"{k}.values": len(status.values),
-        }
+        parts = {"level": LEVELS[status.level], "name": status.name, "message": status.message}
+        parts |= {"hardware_id": hardware, "values": len(status.values)}
         for n, (key, value) in enumerate(status.values.items()):
-            fields |= {f"{k}.{n}.key": key, f"{k}.{n}.value": value}
+            parts |= {f"values.{n}.key": key, f"values.{n}.value": value}
+        fields |= {f"status.{k}.{name}": value for name, value in parts.items()}
     return fields
 
 
 def from_message(message: Message) -> list[Status]:
-    """What a DiagnosticArray says."""
-    names, counts = list(LEVELS), list[int]()
-    total = int(message.read(["count"], diagnostics([]))["count"])
+    """The statuses of a DiagnosticArray."""
+    counts = {"status": 0}
+    total = int(message.read(["status"], counts)["status"])
     for k in range(total):
-        form = diagnostics([*counts, 0])
-        counts.append(int(message.read([f"{k}.values"], form)[f"{k}.values"]))
-    form = diagnostics(counts)
-    wanted = [f"{k}.{part}" for k in range(total) for part in ("level", "name", "message")]
-    wanted += [f"{k}.{n}.{part}" for k in range(total) for n in range(counts[k]) for part in ("key", "value")]
-    read = message.read(wanted, form) if wanted else {}
-    return [
-        Status(
-            read[f"{k}.name"],
-            names[int(read[f"{k}.level"])],  # type: ignore[arg-type]
-            read[f"{k}.message"],
-            {read[f"{k}.{n}.key"]: read[f"{k}.{n}.value"] for n in range(counts[k])},
-        )
-        for k in range(total)
-    ]
+        name = f"status.{k}.values"
+        counts |= {"status": k + 1, name: 0}
+        counts[name] = int(message.read([name], counts)[name])
+    names = list(LEVELS)
+    statuses = []
+    for k in range(total):
+        keys = [f"status.{k}.values.{n}" for n in range(counts[f"status.{k}.values"])]
+        parts = [f"status.{k}.{part}" for part in ("level", "name", "message")]
+        read = message.read([*parts, *(f"{key}.{part}" for key in keys for part in ("key", "value"))], counts)
+        level: Any = names[int(read[parts[0]])]
+        values = {read[f"{key}.key"]: read[f"{key}.value"] for key in keys}
+        statuses.append(Status(read[parts[1]], level, read[parts[2]], values))
+    return statuses
 
 
 class Reporter:

@@ -10,9 +10,10 @@ import numpy as np
 
 from magtwin.errors import InputError, find
 from magtwin.frames import yaw_from_quat
-from magtwin.io.bags.messages import COMMAND, ODOMETRY, POSE, Topic
+from magtwin.io.bags.cdr import NS
+from magtwin.io.bags.topics import COMMAND, ODOMETRY, POSE, Topic
 from magtwin.path import Path
-from magtwin.ros.bus import NS, Bus, to_bytes
+from magtwin.ros.bus import Bus, to_bytes
 from magtwin.ros.diagnostics import Reporter, Status
 from magtwin.ros.inputs import Input
 from magtwin.sim.motion.controllers import Guide, guide_along
@@ -263,7 +264,7 @@ class Follower:
 
 def command_bytes(kind: str, v: float, w: float, now_ns: int) -> bytes:
     """A command of forward speed [m/s] and yaw rate [rad/s], as a Twist or a TwistStamped."""
-    linear, angular = COMMAND.leaves[kind]
+    linear, angular = COMMAND.leaves(kind)
     fields: dict[str, Any] = {linear: [v, 0.0, 0.0], angular: [0.0, 0.0, w]}
     if kind.endswith("Stamped"):
         fields |= {"header.stamp": np.int64(now_ns), "header.frame_id": "base_link"}

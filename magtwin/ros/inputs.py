@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.frames import quat_conjugate, rotate
-from magtwin.io.bags.messages import SENSOR_DATA, TYPES, Topic
-from magtwin.ros.bus import NS, Bus, Message, Subscription
+from magtwin.io.bags.cdr import NS
+from magtwin.io.bags.topics import SENSOR_DATA, Topic
+from magtwin.io.bags.types import layout
+from magtwin.ros.bus import Bus, Message, Subscription
 from magtwin.ros.diagnostics import Status
 
 Columns = dict[str, NDArray[Any]]
@@ -60,12 +62,12 @@ class Input:
         self._trouble = ""
         self.silence = ""
         """What it means that nothing fresh is heard, where that is an answer too."""
-        self._gravity: Gravity | None = Gravity() if "imu_a" in topic.carries else None
+        self._gravity: Gravity | None = Gravity() if "imu_a" in topic.needs else None
 
     def look(self) -> None:
         """Listen, if it is offered and was not heard yet."""
         kinds = self._bus.types(self.topic.name)
-        known = [kind for kind in (self.topic.kind, *self.topic.read) if kind in kinds]
+        known = [kind for kind in (self.topic.kind, *self.topic.reads) if kind in kinds]
         if self._subscription is not None:
             other = kinds and self._kind not in kinds
             self._trouble = f"offered as {', '.join(kinds)} now: start this node anew" if other else ""
@@ -74,7 +76,7 @@ class Input:
             self._kind = known[0]
             self._subscription = self._bus.subscribe(self.topic.name, self._kind, self._hear, SENSOR_DATA)
         elif kinds:
-            self._trouble = f"offered as {', '.join(kinds)}; {' or '.join(self.topic.read)} can be read"
+            self._trouble = f"offered as {', '.join(kinds)}; {' or '.join(self.topic.reads)} can be read"
 
     def at(self, now_ns: int) -> tuple[Columns, float] | None:
         """Columns of the newest message that was taken by a time, one row, and its age [s]; none without."""
@@ -168,11 +170,11 @@ class Input:
         self._kept.append((stamp, columns))
 
     def _read(self, message: Message) -> tuple[int, Columns]:
-        stamped = "header.stamp" in TYPES[message.kind]
-        wanted = (*self.topic.leaves[message.kind], *(("header.stamp",) if stamped else ()))
+        stamped = layout(message.kind)[0].name == "header.stamp"
+        wanted = (*self.topic.leaves(message.kind), *(("header.stamp",) if stamped else ()))
         fields = message.read(wanted)
         stamp = int(fields.pop("header.stamp")) if stamped else self._bus.now_ns()
-        columns = self.topic.read[message.kind]({name: np.asarray(v)[None] for name, v in fields.items()})
+        columns = self.topic.read(message.kind, {name: np.asarray(v)[None] for name, v in fields.items()})
         if self._gravity is not None:
             columns = self._gravity.without(columns)
         return stamp, columns

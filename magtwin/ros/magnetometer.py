@@ -16,7 +16,9 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.frames import canonical, into_base, yaw_from_quat
-from magtwin.io.bags.messages import (
+from magtwin.io.bags.cdr import NS
+from magtwin.io.bags.sender import sender_of
+from magtwin.io.bags.topics import (
     BATTERY,
     COMMAND,
     IMU,
@@ -26,9 +28,8 @@ from magtwin.io.bags.messages import (
     SCAN,
     TOTAL_FIELD,
     Topic,
-    sender_of,
 )
-from magtwin.ros.bus import NS, Bus, Timer, to_bytes
+from magtwin.ros.bus import Bus, Timer, to_bytes
 from magtwin.ros.diagnostics import Reporter, Status
 from magtwin.ros.inputs import Input, Scanning, newest_sent_ns
 from magtwin.ros.network import Following
@@ -321,4 +322,4 @@ class Magnetometer:
 
 def _columns_of(topic: Topic) -> frozenset[str]:
     """Columns that a topic's messages give."""
-    return frozenset(topic.carries or topic.needs)
+    return frozenset(topic.needs)

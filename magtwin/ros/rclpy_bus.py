@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from magtwin.errors import InputError
-from magtwin.io.bags.messages import Qos
+from magtwin.io.bags.topics import Qos
 from magtwin.ros.bus import Heard, Message, Names
 from magtwin.ros.parameters import Parameter, checked
 

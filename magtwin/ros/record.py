@@ -8,11 +8,13 @@ from functools import partial
 import numpy as np
 
 from magtwin.errors import InputError
-from magtwin.io.bags.cdr import encode, leaves
-from magtwin.io.bags.messages import Qos, Unit
-from magtwin.io.bags.raw import RawBagWriter
-from magtwin.io.bags.writer import Stream, sender_for
-from magtwin.ros.bus import NS, Bus, Message, Publisher
+from magtwin.io.bags import RawBagWriter
+from magtwin.io.bags.cdr import NS, encode
+from magtwin.io.bags.sender import Unit, sender_for
+from magtwin.io.bags.stream import Stream
+from magtwin.io.bags.topics import Qos
+from magtwin.io.bags.types import layout
+from magtwin.ros.bus import Bus, Message, Publisher
 from magtwin.ros.topics import READ, RECORDED, SAMPLED
 from magtwin.run.run import Run
 from magtwin.twin import Twin
@@ -157,9 +159,9 @@ class Player:
 
     def _messages(self, rows: Run) -> list[tuple[int, Publisher, bytes]]:
         events: list[tuple[int, int, Publisher, bytes]] = []
-        for topic, times, form, fields in self._stream.messages(rows):
+        for topic, times, fields in self._stream.messages(rows):
             if topic.name in self._publishers and len(times):
-                encoded = encode(leaves(form), fields, len(times))
+                encoded = encode(layout(topic.kind, fields), fields, len(times))
                 for t, data in zip(np.asarray(times).tolist(), encoded, strict=True):
                     heapq.heappush(events, (t, len(events), self._publishers[topic.name], data.tobytes()))
         return [(t, publisher, data) for t, _, publisher, data in sorted(events, key=lambda e: e[:2])]

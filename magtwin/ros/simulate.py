@@ -11,21 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.io.bags.cdr import encode, leaves
-from magtwin.io.bags.messages import (
+from magtwin.io.bags.cdr import NS, encode
+from magtwin.io.bags.sender import Unit, sender_for
+from magtwin.io.bags.stream import Sent, Stream
+from magtwin.io.bags.topics import (
     COMMAND,
     IMU,
     MAGNITUDE,
     SCAN,
     TOTAL_FIELD,
-    TYPES,
     VECTOR,
     Qos,
     Topic,
-    Unit,
 )
-from magtwin.io.bags.writer import Said, Stream, sender_for
-from magtwin.ros.bus import NS, Bus, Message, Publisher
+from magtwin.io.bags.types import layout
+from magtwin.ros.bus import Bus, Message, Publisher
 from magtwin.ros.diagnostics import Reporter, Status
 from magtwin.ros.network import Following
 from magtwin.ros.topics import READ, SAMPLED, TICKS
@@ -219,7 +219,7 @@ class Simulator:
         if len(scans.t):
             moments, came = (np.rint(t * NS).astype(np.int64) for t in (scans.t, scans.arrival))
             fields = SCAN.write({"ranges_m": scans.ranges_m}, moments, self._who)
-            self._queue((SCAN, came, TYPES[SCAN.kind], fields))
+            self._queue((SCAN, came, fields))
 
     def _streamed(self, rows: Run) -> Stream:
         silent = () if self._reads else (MAGNITUDE, VECTOR, TOTAL_FIELD)
@@ -235,10 +235,10 @@ class Simulator:
         if topic is IMU and self._moved is not None:  # it shakes with the speed, and tells how much
             columns["odom_v"] = np.repeat(self._moved, taken.sum(), axis=0)
         stamps, arrivals = (np.rint(t[taken] * NS).astype(np.int64) for t in (samples.t, samples.arrival))
-        self._queue((topic, arrivals, TYPES[topic.kind], topic.write(columns, stamps, self._who)))
+        self._queue((topic, arrivals, topic.write(columns, stamps, self._who)))
 
-    def _queue(self, said: Said) -> None:
-        topic, times, form, fields = said
+    def _queue(self, sent: Sent) -> None:
+        topic, times, fields = sent
         publisher = self._publishers.get(topic.name)
         if publisher is None or not len(times):
             return
@@ -247,7 +247,9 @@ class Simulator:
                 name: value + self._begin_ns if name.endswith("stamp") or name == "clock" else value
                 for name, value in fields.items()
             }
-        for t, data in zip(times.tolist(), encode(leaves(form), fields, len(times)), strict=True):
+        for t, data in zip(
+            times.tolist(), encode(layout(topic.kind, fields), fields, len(times)), strict=True
+        ):
             self._count += 1
             heapq.heappush(self._events, (t, self._count, publisher, data.tobytes()))
 
@@ -266,7 +268,7 @@ class Simulator:
                 return
 
     def _commanded(self, message: Message) -> None:
-        linear, angular = COMMAND.leaves[self._kind]
+        linear, angular = COMMAND.leaves(self._kind)
         try:
             read = message.read([linear, angular])
             v, w = float(read[linear][0]), float(read[angular][2])

@@ -4,7 +4,7 @@ import os
 import select
 from collections.abc import Callable
 
-from magtwin.io.bags.messages import COMMAND
+from magtwin.io.bags.topics import COMMAND
 from magtwin.ros.bus import Bus
 from magtwin.ros.follow import command_bytes
 from magtwin.sim.motion.manual import Hand

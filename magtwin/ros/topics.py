@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from magtwin.io.bags.messages import (
+from magtwin.io.bags.topics import (
     BATTERY,
     CLOCK,
     COMMAND,

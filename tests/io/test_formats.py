@@ -10,7 +10,7 @@ from test_tables import few_bytes
 
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.io.bags.rosbag import BagWriter
+from magtwin.io.bags import BagWriter
 from magtwin.io.formats import FORMATS, read_run, write_run
 from magtwin.io.tables import ParquetParts
 from magtwin.run.run import Column, Run

@@ -103,7 +103,7 @@ def read_readings(
         if path.is_dir() or path.suffix in BAGS:
             _only_unit(path, columns)
         if path.suffix in BAGS or (path.is_dir() and (path / "metadata.yaml").is_file()):
-            from magtwin.io.bags.rosbag import read_bag_readings
+            from magtwin.io.bags import read_bag_readings
 
             parts.append(
                 read_bag_readings(
