@@ -10,7 +10,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 
 from magtwin.errors import InputError
 from magtwin.files import check_free, output, sha256
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 from magtwin.urdf.description.control import define_differential, define_safety, read_commands, read_drive
 from magtwin.urdf.description.description import Description, origin_of, read_description
 from magtwin.urdf.description.gazebo import (

@@ -17,7 +17,7 @@ from magtwin.io.bags.sender import sender_of
 from magtwin.io.bags.topics import SCAN, TOPICS
 from magtwin.io.bags.types import layout
 from magtwin.ros.magnetometer import INPUTS
-from magtwin.spec.scene import PlacedRobot
+from magtwin.spec.robot import PlacedRobot
 from magtwin.usd.layers import open_stage
 from magtwin.usd.schema import only_prim_with
 

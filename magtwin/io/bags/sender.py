@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from magtwin.errors import InputError
-from magtwin.spec.scene import IDENTITY_XYZW, ZERO3, Quat, RobotSpec, Vec3
+from magtwin.frames import IDENTITY_XYZW
+from magtwin.spec.base import ZERO3, Quat, Vec3
+from magtwin.spec.robot import RobotSpec
 
 if TYPE_CHECKING:
     from magtwin.twin import Twin
