@@ -695,7 +695,7 @@ def test_view_refuses_what_is_missing_or_of_another_kind(tmp_path):
     with pytest.raises(InputError, match=r"none\.rrd: no such recording"):
         view(tmp_path / "none.rrd")
     (tmp_path / "run.xyz").touch()
-    with pytest.raises(InputError, match=r"run\.xyz: no known kind of run file"):
+    with pytest.raises(InputError, match=r"run\.xyz: unknown format of a run"):
         view(tmp_path / "run.xyz")
 
 
