@@ -1,4 +1,4 @@
-"""A network that reads rows as they come, a few at a time."""
+"""A network that reads rows as they come."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -12,18 +12,18 @@ if TYPE_CHECKING:
 
 
 class Following:
-    """A neural magnetometer that remembers the rows that its predictor looks back at."""
+    """A neural magnetometer that keeps the previous rows that its predictor needs as context."""
 
     def __init__(self, magnetometer: "NeuralMagnetometer") -> None:
-        """Begin without any."""
+        """Start without context."""
         self._magnetometer = magnetometer
         self._before: Run | None = None
 
     def __call__(self, run: Run) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_] | None]:
-        """Disturbances, their standard deviations [nT] and what is out of the training's range.
+        """Disturbances and their standard deviations [nT], and whether inputs left the training range.
 
         Args:
-            run: The next rows, later than those before.
+            run: The next rows.
         """
         context = self._magnetometer.net.context
         if not run.rows:
