@@ -351,14 +351,14 @@ def test_a_csv_of_a_spreadsheet_is_a_run_where_the_names_are(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (b"", "no line of column names; it is empty"),
+        (b"", "no line of column names; the file is empty"),
         (b"# facts {}\n", "no line of column names"),
         (b"t,yaw\n0,1\n1\n", "Expected 2 columns, got 1"),
         (b"t,yaw\n0,1\n1,2,3\n", "Expected 2 columns, got 3"),
         (b"t,yaw\n0,1\n1,north\n", "invalid value 'north'"),
         (b"t,yaw\n0,1\n1,\n", "column 'yaw', row 1: no value; write nan"),
         (b"t,yaw,yaw\n0,1,2\n", "two columns are called 'yaw'"),
-        (b"t;yaw\n0;1,5\n", "its columns are separated by ';'; save it with commas"),
+        (b"t;yaw\n0;1,5\n", "columns are separated by ';'; save it with commas"),
         (b"time,yaw\n0,1\n", "not a Run: column 't' is missing"),
         (b"t,yaw\n0,1\n0,2\n", "row 1 has 0 s after 0 s"),
         (b"t,yaw\n2,1\n1,2\n", "t must ascend from row to row, but row 1 has 1 s after 2 s"),

@@ -301,7 +301,7 @@ def test_a_spec_that_does_not_fit_its_column_is_refused():
     run = Run({"t": [0.0, 1.0], "head": np.zeros((2, 3))})
     with pytest.raises(InputError, match="'head' has rows of 3 parts, but its spec names 2"):
         run.with_specs(head=Column("K", "", "", 2, ("in", "out")))
-    with pytest.raises(InputError, match="'est_x' has rows of no parts, and its spec names 1"):
+    with pytest.raises(InputError, match="'est_x' has rows of no parts, but its spec names 1"):
         Run({"t": [0.0], "est_x": [1.0]}, {}, {"est_x": Column("", "", "", 1, ("a",))})
 
 
