@@ -15,7 +15,7 @@ over four headings and the first once more, a list of twenty numbers through Sta
 network in eager torch, StandardScaler.inverse_transform. magtwin's is
 `magtwin.learn.inference.reader.Reader`. They take turns in rounds of readings, as a robot's node has the
 processor's caches for itself, and then reading by reading, where each finds the caches full of the other's
-weights. """
+weights."""
 
 import argparse
 import itertools
