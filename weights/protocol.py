@@ -26,7 +26,7 @@ from rich.console import Console
 from magtwin.author.scene import author_scene
 from magtwin.cli import main as magtwin
 from magtwin.field.fit.fit import fit, raster
-from magtwin.field.survey.gridded import read_survey
+from magtwin.field.survey.folder import read_survey
 from magtwin.files import from_table, read_toml, shipped
 from magtwin.io.surveys.readings import read_readings
 from magtwin.spec.lab import LabSpec

@@ -96,7 +96,7 @@ def scene_from_toml(
 def _file_of(path: str | FilePath) -> FilePath:
     """The TOML that a path or the name of a shipped scene leads to."""
     file = FilePath(path)
-    if file.suffix or file.exists():
+    if file.suffix or file.is_file():
         return file
     return find("scene", str(path), {toml.stem: toml for toml in sorted(shipped("scenes").glob("*.toml"))})
 

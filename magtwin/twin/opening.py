@@ -18,7 +18,7 @@ from magtwin.spec.scene import Scene
 from magtwin.twin.twin import Kind, Metadata, Twin, scene_sha256, without_model_error
 
 if TYPE_CHECKING:
-    from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 
 _CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_sha256": "the scene"}
 
@@ -195,7 +195,7 @@ def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
             f"scene {scene.name!r} has a neural magnetometer without a network; name one with `network`, or "
             'take the kind "physical" or "map-only"'
         )
-    from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 
     magnetometer = NeuralMagnetometer.load(spec.network, sha256=spec.network_sha256)
     if spec.inputs and spec.inputs != magnetometer.features:

@@ -20,7 +20,7 @@ from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.summary import Summarized, Summary
 
 if TYPE_CHECKING:
-    from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
     from magtwin.sim.sensors.model_error import ModelError
 
 Kind = Literal["physical", "neural", "map-only"]

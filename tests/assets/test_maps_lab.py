@@ -179,7 +179,7 @@ def test_the_protocol_surveys_as_the_shipped_map_was_surveyed(script):
     spec.loader.exec_module(protocol)
     options = dict(zip(protocol.SURVEY[::2], map(float, protocol.SURVEY[1::2]), strict=True))
     assert options == {
-        "--heading-error": script.HEADING_ERROR_DEG,
-        "--position-error": script.POSITION_ERROR_M,
+        "--heading-error-deg": script.HEADING_ERROR_DEG,
+        "--position-error-m": script.POSITION_ERROR_M,
         "--readings": script.READINGS,
     }

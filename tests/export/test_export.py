@@ -25,7 +25,7 @@ from magtwin.export.attached import BYTES, SCOPE
 from magtwin.export.glb import corner_normals
 from magtwin.export.package import PLUGIN, README, export_scene, licence_of
 from magtwin.export.usdz import ALIGNMENT, ALLOWED
-from magtwin.field.survey.gridded import import_survey
+from magtwin.field.survey.folder import read_survey
 from magtwin.files import sha256, shipped
 from magtwin.run.run import Run
 from magtwin.usd.animation import read_animation
@@ -375,7 +375,7 @@ def test_the_licence_of_a_network_is_read_from_its_weights(metadata, said, tmp_p
 
 def test_a_released_network_is_handed_on_under_the_licence_that_it_was_converted_with(real_data, tmp_path):
     pth = real_data / "aprilab" / "models" / "nn_magnetometer_model_v0.0.1.pth"
-    main(["net", "convert", str(pth), "--out", str(tmp_path / "n.safetensors"), "--licence", "MIT"])
+    main(["network", "convert", str(pth), "--out", str(tmp_path / "n.safetensors"), "--licence", "MIT"])
     assert licence_of(tmp_path / "n.safetensors") == "MIT"
 
 
@@ -531,7 +531,7 @@ def test_a_smooth_edge_shares_its_normal_and_a_sharp_one_does_not():
 def aprilab(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The APRILab lab with its own map and network."""
     home = tmp_path_factory.mktemp("aprilab")
-    save_map(import_survey(real_data / "aprilab" / "maps", name="aprilab", licence="MIT"), home / "map.usdc")
+    save_map(read_survey(real_data / "aprilab" / "maps", name="aprilab", licence="MIT")[0], home / "map.usdc")
     scene = scene_from_toml(
         shipped("scenes", "aprilab.toml"),
         map_layer=home / "map.usdc",

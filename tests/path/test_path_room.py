@@ -125,12 +125,12 @@ def test_a_placing_that_is_none_is_refused(placing):
 
 def test_a_fitted_run_is_repeated_to_the_bit(lab_scene, tmp_path, capsys):
     (tmp_path / "far.csv").write_text("0,0\n4,0\n4,1\n")
-    run = ["run", str(lab_scene), "--path", str(tmp_path / "far.csv"), "--rate-hz", "5", "--net", "none"]
+    run = ["run", str(lab_scene), "--path", str(tmp_path / "far.csv"), "--rate-hz", "5", "--network", "none"]
     with pytest.raises(InputError, match=r"far\.csv leaves the floor .*give `fit=True`"):
-        main([*run, "--parquet", str(tmp_path / "run.parquet"), "--debug"])
-    main([*run, "--parquet", str(tmp_path / "run.parquet"), "--fit"])
+        main([*run, "--out", str(tmp_path / "run.parquet"), "--debug"])
+    main([*run, "--out", str(tmp_path / "run.parquet"), "--fit"])
     assert "Path far.csv is moved by (" in capsys.readouterr().err
-    main(["rerun-of", str(tmp_path / "run.parquet")])
+    main(["reproduce", str(tmp_path / "run.parquet")])
     assert "yes, to the bit" in capsys.readouterr().out
     with pytest.raises(InputError, match="--fit is for a path"):
         main([*run[:2], "--path", "random", "--fit", "--debug"])

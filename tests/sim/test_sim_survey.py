@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.field.maps.difference import difference
+from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.field.sources.magnets import body_of
-from magtwin.field.sources.point_dipoles import dipole_field_nt
 from magtwin.frames import quat_from_yaw, rotate
 from magtwin.sim.interference import ambient_gradient_nt_m
 from magtwin.sim.survey import field_at_rest_nt, pose_error_nt2, survey, survey_readings

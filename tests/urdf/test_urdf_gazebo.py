@@ -98,7 +98,7 @@ def test_tags_about_nothing_that_is_there_are_a_loss_that_names_it(tmp_path):
 
 def test_friction_that_differs_across_is_a_loss(tmp_path):
     _, _, report = cart(tmp_path, on("left_wheel", "<mu1>1</mu1><mu2>0.2</mu2>"))
-    assert report.losses == ("link 'left_wheel': friction 1 is taken for that across it too, mu2 0.2",)
+    assert report.losses == ("link 'left_wheel': friction 1 is used across too, in place of mu2 0.2",)
 
 
 def test_one_link_that_collides_with_its_robot_switches_all_on(tmp_path):
@@ -110,7 +110,7 @@ def test_one_link_that_collides_with_its_robot_switches_all_on(tmp_path):
 def test_a_link_without_gravity_floats_in_physx(tmp_path):
     _stage, robot, report = cart(tmp_path, on("left_wheel", "<gravity>false</gravity>"))
     assert robot.GetPrimAtPath("left_wheel").GetAttribute("physxRigidBody:disableGravity").Get() is True
-    assert any("knows no gravity in PhysX" in note for note in report.notes)
+    assert any("has no gravity in PhysX" in note for note in report.notes)
 
 
 # --- sensors --------------------------------------------------------------------------------------
@@ -298,7 +298,7 @@ def test_older_plugins_give_a_diameter_and_limits_come_from_the_wheels(tmp_path,
     spec = read_drive(robot)
     assert_allclose([spec.wheel_separation_m, spec.wheel_radius_m], [0.31, 0.041])
     assert_allclose([spec.v_max, spec.w_max], [10 * 0.041, 2 * 10 * 0.041 / 0.31])
-    assert any("not told, so as TurtleBot4's: a_max" in note for note in report.notes)
+    assert any("TurtleBot 4's values are used for a_max" in note for note in report.notes)
 
 
 def test_a_size_that_no_plugin_tells_is_measured_on_the_robot(tmp_path):
@@ -307,7 +307,7 @@ def test_a_size_that_no_plugin_tells_is_measured_on_the_robot(tmp_path):
     _stage, robot, report = cart(tmp_path, plugin)
     spec = read_drive(robot)
     assert_allclose([spec.wheel_separation_m, spec.wheel_radius_m], [0.3, 0.04])
-    assert sum("is not told" in note for note in report.notes) == 2
+    assert sum("given: " in note for note in report.notes) == 2
 
 
 YAML = """/**:
@@ -336,7 +336,7 @@ def test_a_controllers_settings_become_the_drive_of_the_robot(tmp_path):
         [spec.wheel_separation_m, spec.wheel_radius_m, spec.v_max, spec.w_max], [0.33, 0.04, 0.6, 2.5]
     )
     assert (spec.command_timeout_s, spec.odometry_rate_hz) == (0.25, 40)
-    assert spec.alpha_max == 7.725  # its limit is switched off, so it is not told
+    assert spec.alpha_max == 7.725  # its limit is switched off, so it is not used
 
 
 def test_settings_that_are_missing_are_a_loss_that_names_them(tmp_path):
