@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from pxr import Usd
 
+from magtwin.author.furniture import LARGEST_M
 from magtwin.errors import InputError
 from magtwin.files import refused_at, shipped
 from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import PlacedRobot
-from magtwin.usd.furniture import FURNITURE, LARGEST_M, define_furniture
+from magtwin.usd.furniture import FURNITURE, define_furniture
 from magtwin.usd.lab import define_lab
 from magtwin.usd.maps import load_map
 from magtwin.usd.obstacles import read_obstacles
