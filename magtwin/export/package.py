@@ -320,7 +320,7 @@ class _Work:
         if self.scene is None:
             raise InputError(
                 f"{self.source}: is no scene of magtwin's, with lab, robot and magnetometer, which --profile "
-                "isaac is for; take --profile omniverse"
+                "isaac is for; take --target omniverse"
             )
         self.progress("Authoring what Isaac Sim needs")
         for asset in {placed.robot.asset for placed in self.scene.robots}:

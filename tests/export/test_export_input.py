@@ -251,7 +251,7 @@ def test_what_cannot_be_made_is_refused(out, options, text, tmp_path):
 
 def test_a_stage_without_a_robot_has_no_action_graph_to_be_exported_with(tmp_path):
     refuse(
-        "is no scene of magtwin's, .* take --profile omniverse",
+        "is no scene of magtwin's, .* take --target omniverse",
         write(tmp_path, HEAD + CUBE),
         tmp_path,
         profile="isaac",

@@ -240,7 +240,7 @@ def read_survey(
     if not (keep_latched or masked.good.any()):
         raise InputError(
             f"{folder}: all {len(readings)} readings are those of a sensor that was stuck; "
-            "survey it again, or import them as they are with keep_latched (--keep-latched)"
+            "survey it again, or import them as they are with keep_latched (--keep-stuck)"
         )
     field = node_map(readings if keep_latched else masked)
     field = replace(field, parameters=_said(layers, "parameters") or {})

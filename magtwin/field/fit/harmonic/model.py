@@ -67,7 +67,7 @@ class HarmonicModel(FittedModel):
     """Variance that headings between them add, over (d g)^2 with d and g the angles to the two beside,
     as headings left out in turn show it [nT^2/rad^4]: a platform is more than iron. Few headings tell it
     loosely: of the APRILab survey's four, each left out, 73 % lie in the 90 % intervals that the other three
-    give; `magtwin map check --split heading` says so of any survey."""
+    give; `magtwin map validate --split heading` says so of any survey."""
 
     def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
         """Field magnitude as the survey's robot reads it, and its variance.
