@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from magtwin.field.fit.fit import fit
-from magtwin.field.survey.stuck import mask_latched
+from magtwin.field.survey.stuck import mask_stuck
 from magtwin.io.surveys.readings import read_readings
 
 SCENE = Path(__file__).resolve().parents[1] / "scenes" / "lab" / "lab.usda"
@@ -101,7 +101,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(options.drives):
             file = drive(Path(folder), options.minutes, seed)
-            readings, _ = mask_latched(read_readings(file))
+            readings, _ = mask_stuck(read_readings(file))
             first = None
             for method in options.method:
                 seconds, memory = whole(file, method)

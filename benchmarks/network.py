@@ -31,10 +31,10 @@ from sklearn.preprocessing import StandardScaler
 
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.features import FULL
+from magtwin.learn.inference.reader import Reader
 from magtwin.learn.models.network import FieldNet, load_net
 from magtwin.learn.models.perceptron import in_threads
 from magtwin.learn.models.sparse import Skipping, warm_up
-from magtwin.learn.inference.reader import Reader
 
 WANTED_MANY, GOAL_MANY = 0.90, 1.45
 WANTED_ONE, GOAL_ONE = 25, 50

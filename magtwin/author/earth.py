@@ -37,7 +37,7 @@ def earth_of(text: str) -> tuple[float, float, float]:
                 parameter="earth",
             )
         return x, y, z
-    from magtwin.author.scene import read_scene
+    from magtwin.usd.scene import read_scene
 
     if not Path(text).is_file():
         raise InputError(f"`earth` is {FORMS}; there is no file {text!r}", parameter="earth")

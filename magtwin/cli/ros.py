@@ -403,10 +403,10 @@ def spin(bus: "Bus", duration_s: float | None) -> None:
 
 def _drive_of(asset: Path | None) -> "DriveSpec":
     """Limits of a robot's drive."""
-    from magtwin.author.robot import read_robot
     from magtwin.files import shipped
+    from magtwin.usd.robot import load_robot
 
-    return read_robot(asset or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
+    return load_robot(asset or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
 
 
 def _warn(text: str) -> None:

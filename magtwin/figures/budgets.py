@@ -4,9 +4,7 @@ from collections.abc import Sequence
 from textwrap import fill
 from typing import Any
 
-import numpy as np
-
-from magtwin.figures.canvas import INK, WIDTH_IN, Picture, label, new_figure, open_frame, picture
+from magtwin.figures.canvas import WIDTH_IN, Picture, label, new_figure, open_frame, picture
 from magtwin.figures.evaluation_pictures import MOST_PANELS, ink, trained_models
 from magtwin.figures.page import Section, Table
 from magtwin.learn.evaluation.budget import CLOSED, TERMS, Budget, TrueError
@@ -43,9 +41,8 @@ def section_of_budget(
     rows = tuple((e.chart, e.mae_nt, e.rms_nt, e.bias_nt) for e in map_errors)
     note = "Map minus the exact field of the surveying robot at rest, along the recorded paths."
     maps = Table("Errors of the maps", ("map", "MAE [nT]", "RMS [nT]", "mean [nT]"), rows, note)
-    pictures = (_waterfall(evaluation, budgets), _steps_picture(evaluation, order))
     tables = (_steps_table(evaluation, order), _budget_table(budgets), sizes, maps)
-    return Section("Error budget", lead, pictures, tables)
+    return Section("Error budget", lead, (_waterfall(evaluation, budgets),), tables)
 
 
 def _steps_table(evaluation: Evaluation, order: Sequence[int]) -> Table:
@@ -100,35 +97,6 @@ def _waterfall(evaluation: Evaluation, budgets: Sequence[Budget]) -> Picture:
     axes[-1].set_xticks(range(len(TERMS) + 1), ["as it is", *(fill(term, 8) for term in TERMS)], fontsize=9)
     title = "Error budget: how much closing each term in turn reduces the mean absolute error"
     return picture(figure, title, file="budget")
-
-
-def _steps_picture(evaluation: Evaluation, order: Sequence[int]) -> Picture:
-    """Errors of all models, step by step from the paper's configuration on."""
-    scores = evaluation.every.scores
-    figure = new_figure(WIDTH_IN, 1.0 + 0.4 * len(order))
-    ax = figure.subplots()
-    for k, m in enumerate(order):
-        (low, high), mae = scores[m].mae_interval_nt, scores[m].mae_nt
-        ax.barh(k, mae, 0.66, color=ink(m))
-        if np.isfinite(low + high):
-            spread = [[max(mae - low, 0.0)], [max(high - mae, 0.0)]]
-            ax.errorbar(mae, k, xerr=spread, fmt="none", ecolor=INK, elinewidth=0.8, capsize=2)
-        step = f", {_signed(mae - scores[order[k - 1]].mae_nt)}" if k else ""
-        end = max(high, mae) if np.isfinite(high) else mae
-        style: dict[str, Any] = {
-            "xytext": (6, 0),
-            "textcoords": "offset points",
-            "va": "center",
-            "fontsize": 9,
-        }
-        ax.annotate(f"{mae:.0f} nT ({scores[m].ratio:.3f}{step})", (end, k), **style)
-    ax.set_yticks(range(len(order)), [fill(evaluation.names[m], 20) for m in order], fontsize=9)
-    ax.invert_yaxis()
-    ax.set_xlim(0, 2.0 * max(max(scores[m].mae_interval_nt[1], scores[m].mae_nt) for m in order))
-    label(ax, "mean absolute error [nT]")
-    open_frame(ax)
-    title = "Steps: each model's error (ratio to naive, change from the line above)"
-    return picture(figure, title, file="steps")
 
 
 def _signed(change: float) -> str:

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import PolyCollection
 from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
@@ -18,9 +17,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
-from magtwin.field.maps.colours import COLOUR_MAP, colour_limits
 from magtwin.field.maps.difference import TOLD, MapDifference
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.figures.canvas import INK, Array, colour_bar, label, new_figure, save
 
 MOST_NODES_A_SIDE = 600
@@ -109,7 +108,7 @@ def draw_map(field: AnomalyMap, *, what: str = "field", headings: Sequence[float
     legend = []
     if what == "mask":
         for ax, layer in zip(axes, layers, strict=False):
-            draw_cells(ax, x, y, layer, (0.0, 1.0), ListedColormap([VALID]))
+            draw_cells(ax, x, y, layer, ListedColormap([VALID]))
         legend.append(Patch(label="holds field", facecolor=VALID))
     else:
         scale = _Scale.of(layers, quantity)
@@ -148,7 +147,8 @@ def plot_difference(difference: MapDifference, out: str | os.PathLike[str], *, f
         (axes[1], z, "z, of the heading where it is greatest" if several else "z"),
     ):
         reach = max(map(abs, colour_limits(layer, 0))) or 1.0  # all values: the peaks matter here
-        colour_bar(figure, draw_cells(ax, grid.x_m, grid.y_m, layer, (-reach, reach), "RdBu_r"), ax, title)
+        cells = draw_cells(ax, grid.x_m, grid.y_m, layer, "RdBu_r", vmin=-reach, vmax=reach)
+        colour_bar(figure, cells, ax, title)
         _draw_regions(ax, difference)
     names = [" ".join(t for t in pair if t) for pair in zip(difference.names, difference.days, strict=True)]
     changed, regions = int(difference.changed.any(axis=0).sum()), len(difference.regions)
@@ -167,7 +167,7 @@ def plot_difference(difference: MapDifference, out: str | os.PathLike[str], *, f
 
 
 def draw_cells(
-    ax: Axes, x_m: Array, y_m: Array, layer: Array, limits: tuple[float, float], colours: str | Colormap
+    ax: Axes, x_m: Array, y_m: Array, layer: Array, colours: str | Colormap, **look: Any
 ) -> ScalarMappable:
     """Draw one layer of a map, one cell per node, over hatched grey that shows where it is unknown.
 
@@ -176,25 +176,20 @@ def draw_cells(
         x_m: Nodes along x [m], shape (X,).
         y_m: Nodes along y [m], shape (Y,).
         layer: Values, nan where unknown, shape (Y, X).
-        limits: Values at the ends of the colour scale.
         colours: The colour scale, or its name.
+        look: Further options of `pcolormesh`, such as `vmin` and `vmax`.
     """
-    _hatch_ground(ax)
-    known = np.ma.masked_invalid(layer)
-    ends: dict[str, Any] = {"vmin": limits[0], "vmax": limits[1], "rasterized": known.size > MOST_SHAPES}
-    return ax.pcolormesh(x_m, y_m, known, shading="nearest", cmap=colours, **ends)
+    ax.set_facecolor(MASKED)
+    ax.patch.set(hatch=HATCH, edgecolor=MASKED_INK)
+    ax.set_aspect("equal")
+    ax.tick_params(labelsize=8)
+    look = {"rasterized": layer.size > MOST_SHAPES, **look}
+    return ax.pcolormesh(x_m, y_m, np.ma.masked_invalid(layer), shading="nearest", cmap=colours, **look)
 
 
 def mean_field_ut(field: AnomalyMap) -> Array:
     """Mean of a map over its headings [µT], nan where a heading is masked, shape (Y, X)."""
     return np.where(field.valid.all(axis=0), field.values_nt.mean(axis=0), np.nan) / 1000
-
-
-def _hatch_ground(ax: Axes) -> None:
-    ax.set_facecolor(MASKED)
-    ax.patch.set(hatch=HATCH, edgecolor=MASKED_INK)
-    ax.set_aspect("equal")
-    ax.tick_params(labelsize=8)
 
 
 def _hatched(name: str) -> Patch:
@@ -313,37 +308,17 @@ class _Scale:
         return cls(levels, (low, high), colormaps[quantity.colours], extend)
 
     def draw(self, ax: Axes, x: Array, y: Array, layer: Array) -> ScalarMappable:
-        """Filled contours of one layer; a known node beside an unknown one fills its cell."""
-        _hatch_ground(ax)
-        known = np.isfinite(layer)
+        """Filled contours of one layer over its cells, which show beside unknown nodes."""
         middle = np.convolve(self.levels, (0.5, 0.5), "valid")
         low, high = self.limits
         bands = self.colours(np.clip((middle - low) / (high - low), 0, 1))
         colours = ListedColormap(bands).with_extremes(under=bands[0], over=bands[-1])
-        look: dict[str, Any] = {"cmap": colours, "norm": BoundaryNorm(self.levels, len(bands))}
-        j, i = np.nonzero(known & _beside(~known))
-        across, up = _edges(x), _edges(y)
-        left, right, below, above = across[i], across[i + 1], up[j], up[j + 1]
-        corners = np.stack([left, below, right, below, right, above, left, above], axis=-1).reshape(-1, 4, 2)
-        cells = PolyCollection(list(corners), array=layer[j, i], ec="face", lw=0.3, zorder=0.5, **look)
-        ax.add_collection(cells)
-        masked = np.ma.masked_invalid(layer)
-        drawn = ax.contourf(x, y, masked, self.levels, extend=self.extend, zorder=0.6, **look)
+        norm = BoundaryNorm(self.levels, len(bands))
+        draw_cells(ax, x, y, layer, colours, norm=norm, zorder=0.5, rasterized=True)
+        look: dict[str, Any] = {"cmap": colours, "norm": norm, "extend": self.extend, "zorder": 0.6}
+        drawn = ax.contourf(x, y, np.ma.masked_invalid(layer), self.levels, **look)
         ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
         return drawn
-
-
-def _edges(nodes: Array) -> Array:
-    """Borders of the cells around ascending nodes, shape (N,) -> (N + 1,)."""
-    middle = (nodes[:-1] + nodes[1:]) / 2
-    return np.concatenate([[2 * nodes[0] - middle[0]], middle, [2 * nodes[-1] - middle[-1]]])
-
-
-def _beside(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Flags with their neighbours at sides and corners."""
-    wide = np.pad(flags, 1)
-    rows, columns = flags.shape
-    return np.logical_or.reduce([wide[j : j + rows, i : i + columns] for j in range(3) for i in range(3)])
 
 
 def _between_headings(field: AnomalyMap, layers: Array, headings: Array) -> Array:

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
-from magtwin.field.maps.colours import colour_limits
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.statistics import colour_limits
 from magtwin.figures.canvas import (
     INK,
     MAP_INK,
@@ -240,7 +240,8 @@ def draw_path(
     if field is not None:
         known = mean_field_ut(field)
         paper = LinearSegmentedColormap.from_list("paper", ["white", "0.4"])  # lighter than the path
-        mesh = draw_cells(ax, field.x_m, field.y_m, known, colour_limits(known), paper)
+        low, high = colour_limits(known)
+        mesh = draw_cells(ax, field.x_m, field.y_m, known, paper, vmin=low, vmax=high)
         colour_bar(ax.figure, mesh, ax, "map, mean over headings [µT]", **flat)
     for ink, width in ((INK, 5.4), ("white", 4.5)):  # one of the two edges differs from the map
         ax.plot(*p_xy[evenly(len(p_xy), 3000)].T, color=ink, lw=width, solid_capstyle="round")

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.author.scene import read_scene
 from magtwin.errors import InputError
-from magtwin.field.maps.colours import COLOUR_MAP, colour_limits
+from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.figures.cutaway import Cutaway
 from magtwin.figures.pictures import (
     BACKGROUND,
@@ -41,6 +40,7 @@ from magtwin.run.run import Run
 from magtwin.spec.base import Vec3
 from magtwin.usd.geometry import ColourScale, Link, Shape, read_colour_scale, read_links, read_shapes
 from magtwin.usd.layers import open_stage
+from magtwin.usd.scene import read_scene
 
 Array = NDArray[np.float64]
 

@@ -54,14 +54,14 @@ def info_of_run(file: Path) -> Report:
 def _info_of_folder(folder: Path) -> Report:
     if not any(folder.glob("*_map.csv")):
         return info_of_run(folder)
-    from magtwin.field.maps.card import map_card
-    from magtwin.field.survey.gridded import import_survey
+    from magtwin.field.maps.statistics import map_metadata
+    from magtwin.field.survey.folder import read_survey
 
-    return map_card(import_survey(folder))
+    return map_metadata(read_survey(folder)[0])
 
 
 def _info_of_usd(file: Path) -> Report:
-    from magtwin.field.maps.card import map_card
+    from magtwin.field.maps.statistics import map_metadata
     from magtwin.usd.animation import is_animation
     from magtwin.usd.info import info_of_stage
     from magtwin.usd.maps import is_map_layer, load_epochs
@@ -75,7 +75,7 @@ def _info_of_usd(file: Path) -> Report:
     if file.suffix == ".usdz" or not is_map_layer(file):
         return info_of_stage(file)
     epochs = load_epochs(file)
-    card = map_card(epochs[-1], epochs)
+    card = map_metadata(epochs[-1], epochs)
     stage = [figure for figure in info_of_stage(file).figures if figure.value != 0]
     return replace(_with_figures(card, stage), title=f"{card.title} ({file})")
 

@@ -15,7 +15,7 @@ from magtwin.io.formats import format_of, read_run, write_run
 from magtwin.path import Path as Planned
 from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands, read_commands
-from magtwin.sim.motion.way import way_of
+from magtwin.sim.motion.drive_input import drive_input
 from magtwin.twin import Session, Twin, in_session, open_twin, room_of, scan, simulate
 
 if TYPE_CHECKING:
@@ -86,12 +86,12 @@ def drive(
         what = read_run(replay)
         metadata = {"replay_file": Path(replay).as_posix(), **metadata}
     elif path != "random":
-        way_of(path)  # refuses a wrong name before the scene is opened
+        drive_input(path)  # refuses a wrong name before the scene is opened
     twin = open_twin(scene_file, network=network, magnetometer=magnetometer, model_error=model_error)
     twin = in_session(twin, session, seed=seed)
     planned = None
     if what is path and path != "random":
-        what = planned = way_of(path, room_of(twin), fit=fit)
+        what = planned = drive_input(path, room_of(twin), fit=fit)
         if isinstance(planned, Planned) and planned.placing:
             report(
                 f"Path {planned.name} is {_placing(planned.placing)} to fit this floor and what stands on it"

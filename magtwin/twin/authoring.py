@@ -52,7 +52,7 @@ def scene_from_toml(
         InputError: A key is misspelt or missing, a file is missing or invalid, there is neither a map nor an
             Earth field, or the map contradicts the sources; the text gives the difference.
     """
-    from magtwin.author.scene import scene_from_toml as read_toml_scene
+    from magtwin.author.scene_file import scene_from_toml as read_toml_scene
     from magtwin.sim.contradiction import check_agrees
     from magtwin.usd.maps import is_map_layer, load_map
 

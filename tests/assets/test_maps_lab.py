@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from magtwin.author.scene import read_sources
+from magtwin.author.scene_file import read_sources
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.magnets import body_of
 from magtwin.files import from_table, read_toml, shipped

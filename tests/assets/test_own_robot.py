@@ -53,7 +53,7 @@ def test_a_scene_that_names_a_urdf_is_driven_in_two_commands(tmp_path, capsys):
     out = capsys.readouterr().out
     metadata = json.loads(out[out.rindex('{\n  "title"') :])["metadata"]
     assert metadata["scene"] == "mine"
-    from magtwin.author.scene import read_scene
+    from magtwin.usd.scene import read_scene
 
     robot = read_scene(tmp_path / "mine" / "mine.usda").robot
     assert robot.name == "cart"
@@ -85,7 +85,7 @@ def test_a_scene_that_does_not_fit_its_urdf_is_refused_and_nothing_is_written(
 
 
 def test_keys_of_a_urdf_are_refused_beside_an_asset(tmp_path):
-    from magtwin.author.scene import scene_from_toml
+    from magtwin.author.scene_file import scene_from_toml
 
     asset = shipped("robots", "turtlebot4", "turtlebot4.usda")
     file = scene(tmp_path, SCENE.replace(f'urdf = "{CART}"', f'asset = "{asset}"'))

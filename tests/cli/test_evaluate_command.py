@@ -213,7 +213,7 @@ def test_a_budget_is_made_where_the_scene_is_at_hand(room, lab_scene, tmp_path, 
     for one in told["budget"]["models"]:
         assert sum(term["bought_nt"] for term in one["terms"]) == pytest.approx(one["mae_nt"])
     pictures = {path.stem for path in (tmp_path / "out" / "figures").iterdir()}
-    assert {"budget", "steps", "figure_8"} <= pictures
+    assert {"budget", "figure_8"} <= pictures
 
 
 def test_the_example_of_the_docs_runs(room, tmp_path, monkeypatch, capsys):

@@ -9,9 +9,9 @@ import pytest
 
 from magtwin.cli import main
 from magtwin.field.grid import Grid
-from magtwin.field.maps.card import map_card, source_files
 from magtwin.field.maps.epochs import drift
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.statistics import map_metadata, source_files
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
 
@@ -122,13 +122,13 @@ def test_info_says_what_is_unknown():
         headings_rad=[0.0],
         source="by hand",
     )
-    card = map_card(bare)
+    card = map_metadata(bare)
     figures = {f.name: f.value for f in card.figures}
     assert figures["standard deviation"] == figures["height"] == "unknown"
     assert [card.metadata[n] for n in ("method", "frame", "datum", "created", "licence")] == ["unknown"] * 5
     assert card.metadata["source"] == "by hand"
     assert "dipoles" not in figures
-    assert map_card(replace(bare, source="")).metadata["source"] == "unknown"
+    assert map_metadata(replace(bare, source="")).metadata["source"] == "unknown"
 
 
 def test_info_works_on_a_stage_that_holds_a_map(lab_scene, capsys):

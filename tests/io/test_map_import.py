@@ -11,12 +11,12 @@ from test_latch import gridded
 from test_rosbag import at_middle, drive, write_bag
 
 from magtwin.author.earth import earth_of
-from magtwin.author.scene import read_scene
 from magtwin.cli import main
 from magtwin.field.sources.earth import earth_field_nt
-from magtwin.field.survey.gridded import import_survey
+from magtwin.field.survey.folder import import_survey
 from magtwin.io.surveys.readings import load_readings, save_readings
 from magtwin.usd.maps import load_map
+from magtwin.usd.scene import read_scene
 
 
 def run(*arguments):

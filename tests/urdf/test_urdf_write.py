@@ -233,9 +233,9 @@ def _no_robot(stage):
     [
         (_ball, "URDF has no PhysicsSphericalJoint"),
         (_second, "'arm' is held by two joints, in a circle"),
-        (_scaled, "is scaled, which no link of a URDF is"),
+        (_scaled, "is scaled, which a URDF cannot do to links"),
         (_off, "turns about a point of 'arm' that is not its origin"),
-        (_no_robot, "a URDF is of one articulation, found none"),
+        (_no_robot, "a URDF has one articulation, found none"),
     ],
 )
 def test_what_no_urdf_holds_is_refused_with_nothing_written(tmp_path, change, said):

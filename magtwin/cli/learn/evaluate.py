@@ -144,7 +144,7 @@ def _charts(maps: Sequence[Path] | None, scene: Path | None) -> "list[Chart]":
 
     files = list(maps or ())
     if not files and scene is not None:
-        from magtwin.author.scene import read_scene
+        from magtwin.usd.scene import read_scene
 
         files = [read_scene(existing(scene, "scene"), check_network=False).map_layer]
     if not files:

@@ -47,15 +47,15 @@ def map_plot(
 @map_app.command(name="info")
 def map_info(file: MapFile, *, date: Date = None) -> Done:
     """Print a map's metadata: field, uncertainty, method, sources, licence, frame, height and dates."""
-    from magtwin.field.maps.card import map_card
     from magtwin.field.maps.epochs import at_date
+    from magtwin.field.maps.statistics import map_metadata
     from magtwin.io.surveys.maps import open_map
     from magtwin.usd.maps import load_epochs
 
     if file.is_dir():
-        return Done(map_card(open_map(file, date)))
+        return Done(map_metadata(open_map(file, date)))
     epochs = load_epochs(file)
-    return Done(map_card(epochs[-1] if date is None else at_date(epochs, date), epochs))
+    return Done(map_metadata(epochs[-1] if date is None else at_date(epochs, date), epochs))
 
 
 @map_app.command(name="diff")
@@ -103,8 +103,8 @@ def map_upward(
     out
         Map layer to write (.usdc).
     """
-    from magtwin.field.maps.card import map_card
     from magtwin.field.maps.continuation import at_height
+    from magtwin.field.maps.statistics import map_metadata
     from magtwin.io.surveys.maps import open_map
     from magtwin.usd.maps import save_map
 
@@ -112,7 +112,7 @@ def map_upward(
     step(f"Continuing the field to {height_m:g} m")
     field = at_height(open_map(file, date), height_m)
     save_map(field, out, force=force)
-    return Done(map_card(field), out)
+    return Done(map_metadata(field), out)
 
 
 @map_app.command(name="export")
@@ -127,7 +127,7 @@ def map_export(file: MapFile, *, out: Path, date: Date = None, force: Force = Fa
     out
         Folder to make: 0_map.csv, 90_map.csv, ..., rows of x [m], y [m], heading [rad], field [nT].
     """
-    from magtwin.field.survey.gridded import write_survey
+    from magtwin.field.survey.folder import write_survey
     from magtwin.io.surveys.maps import open_map
 
     return Done(wrote=tuple(write_survey(open_map(file, date), out, force=force)))

@@ -59,7 +59,7 @@ def drive(
     from magtwin.sim.motion.drive import draw_wheel_errors
     from magtwin.sim.motion.follow import CONTROL_RATE_HZ
     from magtwin.sim.motion.manual import HELP, Gamepad, Keyboard, Recorder, at_start
-    from magtwin.sim.runs.simulate import streams
+    from magtwin.sim.runs.sensing import streams
     from magtwin.twin import in_session, open_twin
 
     existing(scene, "scene")

@@ -153,9 +153,9 @@ def run(
     pace
         Simulated seconds per second while it is shown. Default: 1.
     """
-    from magtwin.author.scene import robots_in
     from magtwin.files import existing
     from magtwin.io.outputs import Outputs, drive
+    from magtwin.usd.scene import robots_in
 
     existing(scene, "scene")
     if scene.suffix == ".toml":
@@ -268,7 +268,7 @@ def _run_robots(
     from magtwin.path import Path as Planned
     from magtwin.report import Report
     from magtwin.sim.motion.commands import read_commands
-    from magtwin.sim.motion.way import way_of
+    from magtwin.sim.motion.drive_input import drive_input
     from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots
 
     commands, replay = options.pop("commands"), options.pop("replay")
@@ -278,7 +278,7 @@ def _run_robots(
     if robot is not None and (commands or replay or path):
         ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path
     ways = {
-        name: way_of(way, room_of(led_by(twin, name)), fit=fit and name == robot)
+        name: drive_input(way, room_of(led_by(twin, name)), fit=fit and name == robot)
         for name, way in ways.items()
     }
     names = list(ways) if robot is None else [robot]

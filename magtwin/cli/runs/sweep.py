@@ -79,7 +79,7 @@ def sweep(
         Columns to write beside t. Default: all.
     """
     from magtwin.files import check_free, existing
-    from magtwin.sim.motion.way import way_of
+    from magtwin.sim.motion.drive_input import drive_input
     from magtwin.twin import MIXTURE, open_twin, room_of
     from magtwin.twin import sweep as drive_many
 
@@ -91,13 +91,13 @@ def sweep(
         raise InputError("--session survey is one session; drop --sessions")
     check_free(out, force=force)
     for name in path or MIXTURE:
-        way_of(name)  # refuses a wrong name before the scene is opened
+        drive_input(name)  # refuses a wrong name before the scene is opened
     announce("Opening the scene")
     twin = open_twin(scene, network=network, magnetometer=magnetometer, model_error=model_error)
     announce(f"Driving {count} runs")
     runs = drive_many(
         twin,
-        [way_of(name, room_of(twin), fit=fit) for name in path or MIXTURE],
+        [drive_input(name, room_of(twin), fit=fit) for name in path or MIXTURE],
         count,
         seed=seed,
         sessions=session or sessions or max(1, round(count / RUNS_A_SESSION)),

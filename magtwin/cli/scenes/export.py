@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Literal
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Flag, Force
+from magtwin.cli.options import Force
 from magtwin.cli.terminal import Done, announce
 from magtwin.errors import InputError, find
 
@@ -16,7 +16,6 @@ def export(
     out: Path,
     target: Literal["omniverse", "isaac", "newton", "viewer"] | None = None,
     run: Path | None = None,
-    convert_units: Flag = False,
     onnx: bool = True,
     thumbnail: bool = True,
     force: Force = False,
@@ -34,8 +33,6 @@ def export(
         for simple viewers. Default: omniverse for folders and packages, else viewer.
     run
         Run in any format that magtwin reads, to play over the stage.
-    convert_units
-        Convert a stage that is not in metres with Z up; without it such a stage is refused.
     onnx
         Write networks as ONNX beside their weights, if the extra onnx is installed.
     thumbnail
@@ -58,7 +55,6 @@ def export(
         animation=animation,
         to_onnx=_write_onnx if onnx and _has_onnx() else None,
         thumbnail=_draw if thumbnail and target != "viewer" else None,
-        convert_units=convert_units,
         force=force,
         progress=announce,
     )

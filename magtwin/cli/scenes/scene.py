@@ -55,11 +55,11 @@ def scene(
         Map layer that replaces the one of the TOML. Earth, sources and furniture stay. A map that contradicts
         them is refused, and the difference is given in nT.
     """
-    from magtwin.author.robot import notes_of
     from magtwin.author.scene import author_scene
     from magtwin.files import check_free
     from magtwin.twin import scene_from_toml
     from magtwin.usd.info import info_of_stage
+    from magtwin.usd.robot import conversion_notes
 
     check_free(out, force=force)
     lines: list[str] = []
@@ -72,7 +72,7 @@ def scene(
         announce("Authoring the stage")
         root = author_scene(read, out, force=force)
         made = [s.robot for s in read.robots if s.robot.asset.is_relative_to(Path(workshop).resolve())]
-        notes = {f"notes on {robot.name}": notes_of(robot.asset) for robot in made}
+        notes = {f"notes on {robot.name}": conversion_notes(robot.asset) for robot in made}
     report = info_of_stage(root)
     report = replace(report, metadata={**report.metadata, **notes})
     return Done(report, root, text="\n".join([*lines, f"Wrote {root}"]))

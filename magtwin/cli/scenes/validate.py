@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from magtwin.export.validation.findings import Check, Findings, Severity
 
 Validator = Literal["core", "nvidia", "simready", "isaac", "newton", "magtwin"]
-Fix = Literal["map-checksum", "map-file", "network-file"]
 
 MOST = 12
 """Findings of one validator that are printed; the JSON has all."""
@@ -26,7 +25,6 @@ def validate(
     *files: Annotated[Path, Parameter(required=True)],
     against: Annotated[list[Validator] | None, Parameter(consume_multiple=True)] = None,
     fix: Flag = False,
-    fix_also: Annotated[list[Fix] | None, Parameter(consume_multiple=True)] = None,
     out: Path | None = None,
     force: Force = False,
 ) -> Done:
@@ -43,9 +41,6 @@ def validate(
         Validators to use, one or several: core nvidia simready isaac newton magtwin. Default: all.
     fix
         Repair first what is safe: default prim, missing units, absolute paths, extents, bindings.
-    fix_also
-        Also repair by name: map-checksum, map-file, network-file. The checksums then accept the files as they
-        are.
     out
         Report to write (.json), with all findings.
     """
@@ -57,7 +52,7 @@ def validate(
     from magtwin.learn.data.features import FEATURES
 
     check_output(out, (".json",), "a report", force=force)
-    fixes = [*(SAFE if fix else ()), *(fix_also or ())]
+    fixes = SAFE if fix else ()
 
     def validated(file: Path) -> "Findings":
         def report(validator: str) -> None:

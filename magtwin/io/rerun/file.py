@@ -19,7 +19,7 @@ from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plott
 from magtwin.io.rerun.recording import ROOM, Recording, content_id, recording_of, size_of, stream, title_of
 from magtwin.io.rerun.series import COLUMNS_ENTITY, entity_of, table_of
 from magtwin.io.rerun.viewer import check_decodes, show
-from magtwin.io.rerun.world import Interior, Room, heading_of
+from magtwin.io.rerun.world import Interior, Robot, heading_of, send_room
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
@@ -111,19 +111,22 @@ def write_comparison(
     ]
     first = next(iter(runs.values()))
     lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, first))
-    interior = None if twin is None else Interior.of(twin)
-    size = ROOM + sum(map(size_of, runs.values())) + (interior.size if interior else 0)
+    size = ROOM + sum(map(size_of, runs.values()))
+    if twin is not None:
+        interior = Interior.of(twin.scene, twin.scene_file)
+        size += interior.size(twin.field)
     title = " and ".join(runs) if len(runs) < 4 else f"{len(runs)} runs"
     views = comparison_layout(compared, lab, heading=heading)
     with (
         output(path, force=force) as aside,
         stream(content_id(*runs.values()), title, views, file=aside, final=FilePath(path), room=size) as rec,
     ):
-        room = None if interior is None else Room.enter(rec, interior, first, planned=planned)
+        if twin is not None:
+            send_room(rec, interior, twin.field, first, planned)
         for shown in compared:
-            look = (shown.name, shown.colour, shown.offset_s)
-            robot = None if room is None else room.one_of_several(*look)
-            recording = Recording(rec, shown.name, shown.offset_s, robot)
+            look: dict[str, Any] = {"name": shown.name, "offset_s": shown.offset_s}
+            robot = None if twin is None else Robot(rec, interior, colour=shown.colour, **look)
+            recording = Recording(rec, robot=robot, **look)
             recording.append(runs[shown.name])
             recording.close()
 

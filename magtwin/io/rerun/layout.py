@@ -184,12 +184,6 @@ class Shown:
             column = column[:, COLUMNS[series.column].parts.index(series.part)]
         return column if np.isfinite(column).any() else None
 
-    @property
-    def ends(self) -> tuple[float, float]:
-        """First and last time on the timeline [s]."""
-        t = self.run["t"]
-        return float(t[0]) + self.offset_s, float(t[-1]) + self.offset_s
-
 
 def plotted(run: Run) -> bool:
     """Whether a run has a column that is plotted."""
@@ -216,9 +210,8 @@ def layout(
     """
     shown = Shown.of(run)
     axis = _whole([shown]) if whole else None
-    series = _stacked(
-        [(shown, FIELD_PANEL)], [(shown, DISTURBANCE_PANEL)], [(shown, ERROR_PANEL)], whole=axis, tall=0
-    )
+    panels = (FIELD_PANEL, DISTURBANCE_PANEL, ERROR_PANEL)
+    series = _stacked(*([(shown, panel)] for panel in panels), whole=axis, tall=0)
     tabs = [
         rrb.Vertical(*views, name=name)
         for name, panels in (
@@ -228,10 +221,8 @@ def layout(
         )
         if (views := _stacked(*([(shown, panel)] for panel in panels), whole=axis))
     ]
-    shares = [2.2, 1.2, 1.2][: len(series)]
-    side = rrb.Vertical(
-        *series, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=[*shares, *([2.6] if tabs else [])]
-    )
+    shares = [2.2, 1.2, 1.2][: len(series)] + [2.6] * bool(tabs)
+    side = rrb.Vertical(*series, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=shares)
     if events is None:
         events = [key for key in STATES if key in run and run[key].any()]
     lanes = [STATES[key].name for key in STATES if key == "lidar_on" or key in events]
@@ -240,13 +231,8 @@ def layout(
     )
     pages = rrb.Tabs(_event_view(), rrb.TextDocumentView(origin="metadata", name="Run"))
     about = rrb.Vertical(states, pages, row_shares=[1.2, 1.4])
-    if lab is None:
-        root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
-    else:
-        below = rrb.Horizontal(_robot_view(), _floor_view(lab, [""]), about, column_shares=[0.9, 1.1, 1.6])
-        left = rrb.Vertical(_lab_view(lab, heading, [""]), below, row_shares=[2.0, 1.0])
-        root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
-    return _blueprint(root)
+    below = [_robot_view(), _floor_view(lab, [""])] if lab else []
+    return _blueprint(lab, heading, [""], side, [*below, about], [0.9, 1.1, 1.6])
 
 
 def comparison_layout(
@@ -269,14 +255,9 @@ def comparison_layout(
         rrb.TextDocumentView(origin=entity_of("metadata", shown.name), name=shown.name) for shown in runs
     ]
     about = rrb.Tabs(_event_view(), *metadata)
-    if lab is None:
-        root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
-    else:
-        names = [shown.name for shown in runs]
-        below = rrb.Horizontal(_floor_view(lab, names), about)
-        left = rrb.Vertical(_lab_view(lab, heading, names), below, row_shares=[1.6, 1.0])
-        root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
-    return _blueprint(root)
+    names = [shown.name for shown in runs]
+    below = [_floor_view(lab, names)] if lab else []
+    return _blueprint(lab, heading, names, side, [*below, about], [1.0, 1.0])
 
 
 def drive_layout(lab: LabSpec) -> rrb.Blueprint:
@@ -286,7 +267,21 @@ def drive_layout(lab: LabSpec) -> rrb.Blueprint:
     return rrb.Blueprint(_view_3d("world", "Lab, driven by hand", [""], **eye), collapse_panels=True)
 
 
-def _blueprint(root: Any) -> rrb.Blueprint:
+def _blueprint(
+    lab: LabSpec | None,
+    heading: float,
+    names: Sequence[str],
+    side: Any,
+    below: list[Any],
+    shares: list[float],
+) -> rrb.Blueprint:
+    """The plots in `side`, beside the lab with the views `below` it; without a lab, beside these views."""
+    if lab is None:
+        root = rrb.Horizontal(side, *below, column_shares=[3.0, 1.0])
+    else:
+        lower = rrb.Horizontal(*below, column_shares=shares)
+        left = rrb.Vertical(_lab_view(lab, heading, names), lower, row_shares=[2.0, 1.0])
+        root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
@@ -297,13 +292,9 @@ def _blueprint(root: Any) -> rrb.Blueprint:
 
 def _whole(runs: Sequence[Shown]) -> rrb.TimeAxis:
     """The axis that covers all of the runs."""
-    ends = np.array([shown.ends for shown in runs])
-    return rrb.TimeAxis(
-        view_range=rr.TimeRange(
-            start=rrb.TimeRangeBoundary.absolute(seconds=float(ends.min())),
-            end=rrb.TimeRangeBoundary.absolute(seconds=float(ends.max())),
-        )
-    )
+    ends = [shown.run["t"][[0, -1]] + shown.offset_s for shown in runs]
+    first, last = (rrb.TimeRangeBoundary.absolute(seconds=float(k(ends))) for k in (np.min, np.max))
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
 
 
 def _stacked(
@@ -331,9 +322,8 @@ def _plot(
     corner = rrb.Corner2D.LeftTop
     ends = value_range(np.array([(np.nanmin(values), np.nanmax(values)) for _, _, values in lines]))
     if legend and ends:
-        height = min(
-            _LEGEND_MOST, len({series.name for _, series, _ in lines}) * _LEGEND_ROW * (1.0 if tall else 2.0)
-        )
+        count = len({series.name for _, series, _ in lines})
+        height = min(_LEGEND_MOST, count * _LEGEND_ROW * (1.0 if tall else 2.0))
         width = _LEGEND_WIDTH + _LEGEND_LETTER * max(len(series.name) for _, series, _ in lines)
         t, values = [], []
         for shown, _, line in lines:
@@ -344,23 +334,19 @@ def _plot(
         corner, ends = legend_corner(
             np.concatenate(values)[order, None], np.concatenate(t)[order], ends, (width, height)
         )
-    overrides: dict[str, list[rrb.Visualizer]] = {}
+    overrides: dict[Any, list[rrb.Visualizer]] = {}
     for shown, series, _ in lines:
-        overrides.setdefault(_entity_of(shown, series), []).append(_line(series))
+        entity = entity_of(DERIVED_ENTITY if series.column in DERIVED else COLUMNS_ENTITY, shown.name)
+        overrides.setdefault(f"/{entity}", []).append(_line(series))
     return rrb.TimeSeriesView(
         origin="/",
-        contents=[f"/{entity}" for entity in overrides],
+        contents=list(overrides),
         name=title,
         axis_x=whole,
         axis_y=rrb.ScalarAxis(range=ends) if ends and whole else None,
         plot_legend=rrb.PlotLegend(corner, visible=legend),
-        overrides={f"/{entity}": lines for entity, lines in overrides.items()},
+        overrides=overrides,
     )
-
-
-def _entity_of(shown: Shown, series: Series) -> str:
-    """Entity of the values of a series."""
-    return entity_of(DERIVED_ENTITY if series.column in DERIVED else COLUMNS_ENTITY, shown.name)
 
 
 def _line(series: Series) -> rrb.Visualizer:
@@ -412,27 +398,22 @@ def legend_corner(
         The corner for which the axis grows least, and the ends of that axis. One hundredth of the readings
         beside the legend may be under it, such as the ramp at the start of a run.
     """
-    low, high = ends
     width, height = size
     span = (t[-1] - t[0]) * width
-    corners = []
-    left, right = t <= t[0] + span, t >= t[-1] - span
-    for corner, beside, top in (
-        (rrb.Corner2D.LeftTop, left, True),
-        (rrb.Corner2D.RightTop, right, True),
-        (rrb.Corner2D.LeftBottom, left, False),
-        (rrb.Corner2D.RightBottom, right, False),
+    choices = []
+    for corner, beside, sign in (
+        (rrb.Corner2D.LeftTop, t <= t[0] + span, 1),
+        (rrb.Corner2D.RightTop, t >= t[-1] - span, 1),
+        (rrb.Corner2D.LeftBottom, t <= t[0] + span, -1),
+        (rrb.Corner2D.RightBottom, t >= t[-1] - span, -1),
     ):
-        part = values[beside]
+        low, high = sorted(sign * end for end in ends)  # a lower corner is an upper one turned over
+        part = sign * values[beside]
         part = part[np.isfinite(part)]
-        if top:
-            most = float(np.quantile(part, 0.99)) if part.size else low
-            grown = (low, max(high, (most - height * low) / (1 - height)))
-        else:
-            least = float(np.quantile(part, 0.01)) if part.size else high
-            grown = (min(low, (least - height * high) / (1 - height)), high)
-        corners.append((grown[1] - grown[0], corner, grown))
-    _, corner, grown = min(corners, key=lambda c: c[0])
+        most = float(np.quantile(part, 0.99)) if part.size else low
+        high = max(high, (most - height * low) / (1 - height))
+        choices.append((high - low, corner, (low, high) if sign > 0 else (-high, -low)))
+    _, corner, grown = min(choices, key=lambda choice: choice[0])
     return corner, grown
 
 

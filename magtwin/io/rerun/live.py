@@ -11,7 +11,6 @@ from urllib.parse import urlsplit
 import numpy as np
 import rerun as rr
 
-from magtwin.author.scene import open_alone
 from magtwin.errors import InputError
 from magtwin.files import check_free
 from magtwin.frames import quat_from_yaw
@@ -29,13 +28,12 @@ from magtwin.io.rerun.recording import (
 )
 from magtwin.io.rerun.series import STATES
 from magtwin.io.rerun.viewer import live_viewer
-from magtwin.io.rerun.world import POSE_HZ, Robot, send_still
+from magtwin.io.rerun.world import POSE_HZ, Interior, Robot, send_still
 from magtwin.path import Path as Planned
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
 from magtwin.spec.scene import Scene
 from magtwin.twin import Twin
-from magtwin.usd.geometry import read_links, read_shapes
 
 Show = Callable[[float, tuple[float, float, float]], None]
 """Takes the time [s] and x [m], y [m], yaw [rad] of base_link."""
@@ -250,10 +248,9 @@ def streamed(scene: Scene, scene_file: Path, address: str) -> Iterator[Show]:
     rec = rr.RecordingStream(APPLICATION, send_properties=False)
     rec.connect_grpc(address, default_blueprint=drive_layout(scene.lab))
     rec.send_recording_name("manual drive")
-    stage = open_alone(scene_file, scene.robot.name)
-    shapes, links = list(read_shapes(stage)), read_links(stage)
-    send_still(rec, shapes)
-    robot = Robot(rec, scene.robot, shapes, links, None, rate_hz=POSE_HZ)
+    interior = Interior.of(scene, scene_file)
+    send_still(rec, interior.shapes)
+    robot = Robot(rec, interior, rate_hz=POSE_HZ)
 
     def show(t: float, pose: tuple[float, float, float]) -> None:
         x, y, yaw = pose

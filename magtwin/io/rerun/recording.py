@@ -20,7 +20,7 @@ import rerun.blueprint as rrb
 from magtwin.errors import InputError
 from magtwin.io.rerun.layout import layout
 from magtwin.io.rerun.series import Flags, entity_of, send_columns, send_metadata, send_rows
-from magtwin.io.rerun.world import Feed, Interior, Robot, Room, heading_of
+from magtwin.io.rerun.world import Feed, Interior, Robot, heading_of, send_room
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
@@ -211,7 +211,7 @@ def recording_of(
     rate_hz: float = 0.0,
     **sinks: Any,
 ) -> Iterator[Recording]:
-    """A recording of one run with its layout, metadata and room; it holds no rows yet.
+    """A recording of one run with its layout, metadata and lab; it holds no rows yet.
 
     Args:
         run: The run, or its first rows.
@@ -219,11 +219,11 @@ def recording_of(
         name: Name in the viewer.
         twin: Where the run took place. None: only series.
         known: The run that sets axes and colours. Default: `run`.
-        planned: The planned path, drawn on the floor.
-        scans: LiDAR scans, drawn as points.
-        events: Flags that get a lane of states, as for `layout`.
+        planned: The planned path, or None.
+        scans: LiDAR scans, or None.
+        events: As for `layout`, like `whole`.
         room: Upper bound of the size of the rows [bytes].
-        whole: Whether `known` is the whole run, as for `layout`.
+        whole: Whether `known` is the whole run.
         rate_hz: Rows per second. Default: the rate of the first rows.
         sinks: `file`, `address` and `final` of `stream`.
 
@@ -233,8 +233,10 @@ def recording_of(
     known = run if known is None else known
     lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, known))
     views = layout(known, lab, heading=heading, events=events, whole=whole)
-    interior = None if twin is None else Interior.of(twin)
-    room += ROOM + (interior.size if interior else 0)
+    room += ROOM
+    if twin is not None:
+        interior = Interior.of(twin.scene, twin.scene_file)
+        room += interior.size(twin.field)
     with stream(recording_id, name, views, room=room, **sinks) as rec:
         properties: dict[str, Any] = {
             key: [value] for key, value in run.metadata.items() if not _too_large(value)
@@ -243,8 +245,9 @@ def recording_of(
             rec.send_property("run", rr.AnyValues(**properties))
         rec.log("metadata", metadata_page(run.metadata), static=True)
         robot = None
-        if interior is not None:
-            robot = Room.enter(rec, interior, known, planned=planned).robot(rate_hz)
+        if twin is not None:
+            scale = send_room(rec, interior, twin.field, known, planned)
+            robot = Robot(rec, interior, scale, rate_hz=rate_hz)
         yield Recording(rec, robot=robot, scans=scans)
 
 

@@ -293,11 +293,6 @@ class Flags:
         flag, t = run[column], run["t"]
         edges = np.diff(flag.astype(np.int8), prepend=0, append=0)
         begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-        apart = t[begins[1:]] - t[ends[:-1]] > GAP_S
-        begins, ends = (
-            begins[np.append(True, apart)[: len(begins)]],
-            ends[np.append(apart, True)[: len(ends)]],
-        )
         for first, last in zip(begins, ends, strict=True):
             since = float(t[first])
             if column in self._open and since - self._open[column][1] > GAP_S:
@@ -325,7 +320,7 @@ class Flags:
         send(self.rec, "events", at, rr.TextLog, text=named, level=list(levels))
 
 
-def _place(run: Run, row: int) -> str:
+def _place(run: Run, row: np.intp) -> str:
     """Position of the robot at a row, as text."""
     if "p_world_base" not in run.columns:
         return ""

@@ -1,6 +1,7 @@
 """World: the lab, the robots and their paths in a Rerun recording, in 3D and from above."""
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,7 +11,6 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from magtwin.author.scene import open_alone
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_multiply, rotate, wrap_angle
 from magtwin.io.rerun.layout import Colour
@@ -19,9 +19,10 @@ from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
 from magtwin.spec.robot import RobotSpec
-from magtwin.twin import Twin
+from magtwin.spec.scene import Scene
 from magtwin.usd.geometry import BASE_LINK, Link, Shape, read_links, read_shapes, srgb_from_linear
 from magtwin.usd.maps import HEAT_MAP, HEAT_MAP_HEIGHT_M
+from magtwin.usd.scene import open_alone
 
 Array = NDArray[np.float64]
 
@@ -87,83 +88,55 @@ def heading_of(field: AnomalyMap, run: Run) -> float:
 
 @dataclass(frozen=True)
 class Interior:
-    """Shapes and links of a twin's stage."""
+    """A lab and its robot, read from a stage."""
 
-    twin: Twin
+    robot: RobotSpec
     shapes: Sequence[Shape]
     links: dict[str, Link]
 
     @classmethod
-    def of(cls, twin: Twin) -> "Interior":
-        """Read the stage of a twin.
+    def of(cls, scene: Scene, scene_file: str | os.PathLike[str]) -> "Interior":
+        """Read the stage of a scene.
 
         Raises:
             InputError: The stage cannot be read.
         """
-        stage = open_alone(twin.scene_file, twin.scene.robot.name)
-        return cls(twin, list(read_shapes(stage)), read_links(stage))
+        stage = open_alone(scene_file, scene.robot.name)
+        return cls(scene.robot, list(read_shapes(stage)), read_links(stage))
 
-    @property
-    def size(self) -> int:
+    def size(self, field: AnomalyMap) -> int:
         """Upper bound of its bytes in a recording: corners, normals and colours; the map twice."""
         corners = 3 * sum(len(shape.faces) for shape in self.shapes)
-        _, width, height = _pixels(self.twin.field)
+        _, width, height = _pixels(field)
         return 28 * corners + 8 * width * height
 
 
-@dataclass(frozen=True)
-class Room:
-    """A twin's lab in a recording, to which robots can be added."""
+def send_room(
+    rec: rr.RecordingStream, interior: Interior, field: AnomalyMap, known: Run, planned: Path | None
+) -> Scale:
+    """Send the map on the floor, its legend, walls, furniture and the planned path.
 
-    rec: rr.RecordingStream
-    spec: RobotSpec
-    shapes: Sequence[Shape]
-    links: dict[str, Link]
-    scale: Scale
+    Args:
+        rec: The recording.
+        interior: The lab.
+        field: The map.
+        known: The run, for the range of its readings and its first heading.
+        planned: The planned path, or None.
 
-    @classmethod
-    def enter(
-        cls,
-        rec: rr.RecordingStream,
-        interior: Interior,
-        known: Run,
-        *,
-        planned: Path | None = None,
-    ) -> "Room":
-        """Send the map on the floor, its legend, walls and furniture.
-
-        Args:
-            rec: The recording.
-            interior: The lab.
-            known: The run, for the range of its readings and its first heading.
-            planned: The planned path, or None.
-        """
-        twin = interior.twin
-        scale = Scale.over(twin.field, known.get("b_total_nt", np.empty(0)))
-        _send_map(rec, twin.field, scale, heading_of(twin.field, known))
-        _send_scale(rec, twin.field, scale)
-        send_still(rec, interior.shapes)
-        if planned is not None:
-            _send_planned(rec, planned)
-        return cls(rec, twin.scene.robot, interior.shapes, interior.links, scale)
-
-    def robot(self, rate_hz: float = 0.0) -> "Robot":
-        """The robot of a single run, its readings in the colours of the map."""
-        return Robot(self.rec, self.spec, self.shapes, self.links, self.scale, rate_hz=rate_hz)
-
-    def one_of_several(self, name: str, colour: Colour, offset_s: float) -> "Robot":
-        """The robot of one of several runs, its path in a single colour."""
-        return Robot(
-            self.rec, self.spec, self.shapes, self.links, None, name=name, colour=colour, offset_s=offset_s
-        )
-
-
-def _send_planned(rec: rr.RecordingStream, planned: Path) -> None:
-    """The planned path on the floor."""
-    strip = np.column_stack([planned.p_xy, np.full(len(planned.p_xy), 0.012)])
-    rec.log("world/planned", rr.LineStrips3D([strip], colors=(255, 255, 255), radii=0.008), static=True)
-    flat = rr.LineStrips2D([planned.p_xy], colors=(255, 255, 255), radii=0.01, draw_order=1.0)
-    rec.log("floor/paths/planned", flat, static=True)
+    Returns:
+        The colours of the map.
+    """
+    scale = Scale.over(field, known.get("b_total_nt", np.empty(0)))
+    _send_map(rec, field, scale, heading_of(field, known))
+    _send_scale(rec, field, scale)
+    send_still(rec, interior.shapes)
+    if planned is not None:
+        strip = np.column_stack([planned.p_xy, np.full(len(planned.p_xy), 0.012)])
+        white: dict[str, Any] = {"colors": (255, 255, 255)}
+        rec.log("world/planned", rr.LineStrips3D([strip], radii=0.008, **white), static=True)
+        flat = rr.LineStrips2D([planned.p_xy], radii=0.01, draw_order=1.0, **white)
+        rec.log("floor/paths/planned", flat, static=True)
+    return scale
 
 
 def _send_map(rec: rr.RecordingStream, field: AnomalyMap, scale: Scale, heading: float) -> None:
@@ -267,10 +240,8 @@ class Robot:
     """A robot in a recording: its body, its sensors, its path and the readings along it."""
 
     rec: rr.RecordingStream
-    spec: RobotSpec
-    shapes: Sequence[Shape]
-    links: dict[str, Link]
-    scale: Scale | None
+    interior: Interior
+    scale: Scale | None = None
     """Colours of the readings along its path. None: only the path."""
     name: str = ""
     offset_s: float = 0.0
@@ -286,13 +257,12 @@ class Robot:
 
     def __post_init__(self) -> None:
         rec, root = self.rec, entity_of("world/robot", self.name)
-        drive = self.spec.drive
+        drive, links = self.interior.robot.drive, self.interior.links
         sides = {drive.left_wheel_joint: 0, drive.right_wheel_joint: 1}
-        links = self.links
         bases = [name for name, link in links.items() if not link.joint] or [""]
         base = BASE_LINK if BASE_LINK in links else bases[0]
         for name, link in links.items():
-            carried = [shape for shape in self.shapes if shape.link == name]
+            carried = [shape for shape in self.interior.shapes if shape.link == name]
             if not (carried or link.joint in sides):
                 continue
             if not link.joint and name != base:  # a separate body that stands still
@@ -313,7 +283,7 @@ class Robot:
 
     def _send_sensors(self, root: str) -> None:
         """The axes of each sensor, forward red, left green, up blue, with its name."""
-        spec = self.spec
+        spec = self.interior.robot
         for name, p, q in (
             ("magnetometer", spec.p_base_magnetometer, spec.q_base_magnetometer_xyzw),
             ("LiDAR", spec.p_base_lidar, spec.q_base_lidar_xyzw),
@@ -379,7 +349,9 @@ class Robot:
         dips. Its pose is relative to the robot, as the sensor's link may have no shape and so no entity.
         """
         entity = f"{entity_of('world/robot', self.name)}/magnetometer"
-        place = _transform(self.spec.p_base_magnetometer, self.spec.q_base_magnetometer_xyzw)
+        place = _transform(
+            self.interior.robot.p_base_magnetometer, self.interior.robot.q_base_magnetometer_xyzw
+        )
         self.rec.log(entity, place, static=True)
         style = rr.Arrows3D.from_fields(colors=[(255, 255, 255)], radii=[0.006])
         self.rec.log(f"{entity}/field", style, static=True)
@@ -408,10 +380,10 @@ class Robot:
         send(rec, entity_of("world/driven", self.name), end, rr.LineStrips3D, strips=line[None])
         send(rec, entity_of("floor/paths/driven", self.name), end, rr.LineStrips2D, strips=line[None, :, :2])
         if self.scale is not None and "b_total_nt" in run.columns:
-            sensor = (base + rotate(q, self.spec.p_base_magnetometer)).astype(np.float32)
+            sensor = (base + rotate(q, self.interior.robot.p_base_magnetometer)).astype(np.float32)
             start = sensor[:1]
             if before is not None:
-                lift = rotate(before["q_world_base_xyzw"], self.spec.p_base_magnetometer)
+                lift = rotate(before["q_world_base_xyzw"], self.interior.robot.p_base_magnetometer)
                 start = (before["p_world_base"] + lift).astype(np.float32)
             ribbon = np.stack([np.vstack([start, sensor[:-1]]), sensor], axis=1)
             colours = self.scale.colours(run["b_total_nt"][rows])

@@ -46,14 +46,14 @@ def open_map(file: Source, date: str | None = None) -> AnomalyMap:
     Raises:
         InputError: There is no map, it is damaged, or a folder is asked for a date.
     """
-    from magtwin.field.survey.gridded import import_survey
+    from magtwin.field.survey.folder import read_survey as read_folder
     from magtwin.usd.maps import load_map
 
     if not Path(file).is_dir():
         return load_map(file, date)
     if date is not None:
         raise InputError(f"{file}: a folder of CSVs has no dates; leave out `date`", parameter="date")
-    return import_survey(file)
+    return read_folder(file)[0]
 
 
 def read_survey(
@@ -78,13 +78,13 @@ def read_survey(
     Raises:
         InputError: A source cannot be read, or all of its readings are stuck.
     """
-    from magtwin.field.survey.stuck import mask_latched
+    from magtwin.field.survey.stuck import mask_stuck
 
     known = {} if about is None else {**asdict(about), "name": None}  # errors name the file
     readings = read_readings(
         *sources, columns=columns, pose_topic=pose_topic, field_topic=field_topic, **known
     )
-    masked, report = mask_latched(readings)
+    masked, report = mask_stuck(readings)
     if taken := [part.removeprefix(TAKEN) for part in readings.source.split("; ") if part.startswith(TAKEN)]:
         report = replace(report, metadata={**report.metadata, "taken": taken})
     if not (keep_stuck or masked.good.any()):
@@ -119,8 +119,8 @@ def import_survey(
     Raises:
         InputError: A source cannot be read, or the output cannot be written.
     """
-    from magtwin.field.survey.gridded import node_map
-    from magtwin.field.survey.gridded import read_survey as read_folder
+    from magtwin.field.survey.folder import node_map
+    from magtwin.field.survey.folder import read_survey as read_folder
     from magtwin.usd.maps import save_map
 
     out, columns, about = check_free(out, force=force), reading.get("columns") or Columns(), about or About()
@@ -131,7 +131,7 @@ def import_survey(
             **{**asdict(about), "name": name},
             unit=columns.unit or "nT",
             scale=columns.scale,
-            keep_latched=reading.get("keep_stuck", False),
+            keep_stuck=reading.get("keep_stuck", False),
         )
         save_map(field, out, force=force)
         return report
@@ -270,12 +270,12 @@ def survey_scene(
     Raises:
         InputError: The scene has no Earth field, a number is out of range, or the output cannot be written.
     """
-    from magtwin.author.scene import read_scene
     from magtwin.sim.room_survey import blocked_by
     from magtwin.sim.survey import survey, survey_readings
     from magtwin.usd.layers import layer_files
     from magtwin.usd.maps import save_map
     from magtwin.usd.obstacles import read_obstacles
+    from magtwin.usd.scene import read_scene
 
     out = check_free(out, force=force)
     if seed < 0:

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 from magtwin.errors import InputError
 from magtwin.field.maps.lookup import EDGE, TURN, Lookup, blend, sides
 from magtwin.field.maps.map import AnomalyMap, Outside
+from magtwin.field.sources.dipoles import MU_0_OVER_4_PI, NT_PER_T
 from magtwin.field.sources.harmonic import SHAPES, HarmonicField
-from magtwin.field.sources.point_dipoles import MU_0_OVER_4_PI, NT_PER_T
 
 
 class TorchMap(torch.nn.Module):

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.errors import InputError
 from magtwin.field.maps.difference import FALSE_SHARE, difference
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.field.sources.dipoles import dipole_field_nt
 
 FOUR = np.radians([0.0, 90.0, 180.0, 270.0])
 NOISE_NT = 20.0

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from magtwin import simulate
-from magtwin.author.robot import read_robot
 from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
@@ -20,8 +19,9 @@ from magtwin.spec.sensors import MocapSpec
 from magtwin.twin import in_session, open_twin, sweep
 from magtwin.twin.opening import _platform_sha256
 from magtwin.usd.maps import save_map
+from magtwin.usd.robot import load_robot
 
-ROBOT = read_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
+ROBOT = load_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
 SLOPE = 4000.0
 
 

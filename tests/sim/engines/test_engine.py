@@ -19,7 +19,7 @@ from magtwin.sim.motion.commands import Commands, read_commands, write_commands
 from magtwin.sim.motion.controllers import guide_by_commands
 from magtwin.sim.motion.driver import Driver
 from magtwin.sim.motion.engine import Kinematic
-from magtwin.sim.motion.follow import course_along, follow, play
+from magtwin.sim.motion.follow import follow, loop_along, play
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.twin import open_twin, simulate
@@ -53,7 +53,9 @@ def test_a_run_without_commands_is_not_replayed_for_a_network_that_reads_them(la
     t = np.arange(200) / 20.0
     p = np.column_stack([0.2 * t - 1, 0 * t, 0.05 + 0 * t])
     told = Run({"t": t, "p_world_base": p, "yaw": 0 * t})
-    with pytest.raises(InputError, match=r"has no 'v_cmd', and the network turtlebot4_hybrid\.safetensors"):
+    with pytest.raises(
+        InputError, match=r"has no column 'v_cmd', which the network turtlebot4_hybrid\.safetensors"
+    ):
         simulate(neural, told)
     paper = open_twin(lab_scene, network=shipped("weights", "turtlebot4_paper.safetensors"))
     assert np.isfinite(simulate(paper, told)["b_total_nt"]).all()
@@ -276,7 +278,7 @@ def physics(test):
 def by_equal_commands(twin, path, wheel_errors=(0.0, 0.0)):
     """What both engines make of the commands of a drive without slip, at the same times."""
     drive = replace(twin.scene.robot.drive, slip_s2_m=0.0, yaw_slip=0.0)
-    course = replace(course_along(path, drive, speed=0.2), wheel_errors=wheel_errors)
+    course = replace(loop_along(path, drive, speed=0.2), wheel_errors=wheel_errors)
     want = Kinematic().drive(course, None, None)
     rows = np.column_stack([np.arange(len(want.v)) * course.dt, want.v_cmd, want.w_cmd])
     scripted = replace(course, guide=guide_by_commands(rows, drive), steps=len(want.v))
