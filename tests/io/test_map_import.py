@@ -102,7 +102,6 @@ def test_scattered_readings_make_no_nodes_and_the_way_on_is_told(tmp_path, capsy
         (("m.usdc",), "m.usdc: a stage or a map, not readings"),
         (("b.csv",), "b.csv: no such source of readings; did you mean 'a.csv'"),
         (("a.csv+b.csv",), "b.csv: no such file of readings"),
-        ((), "no source of readings given"),
         (("a.csv", "--out", "a.txt"), "ends in .usdc or .usd or .parquet"),
     ],
 )
@@ -132,7 +131,7 @@ def test_a_survey_whose_sensor_was_stuck_throughout_is_refused_unless_it_is_to_b
     save_readings(readings.with_(b_nt=np.full(len(readings), 41_000.0)), tmp_path / "a.parquet")
     arguments = ("map", "import", tmp_path / "a.parquet", "--out", tmp_path / "a.usdc")
     line = refused(capsys, *arguments)
-    assert f"all {len(readings)} readings are those of a sensor that was stuck" in line
+    assert f"all {len(readings)} readings come from a sensor that was stuck" in line
     assert "--keep-stuck" in line
     run(*arguments, "--keep-stuck")
     assert load_map(tmp_path / "a.usdc").valid.all()
@@ -254,8 +253,8 @@ def test_a_check_takes_the_kernel_of_the_gaussian_process_and_leaves_headings_ou
 @pytest.mark.parametrize(
     ("arguments", "what"),
     [
-        (("--method", "cubic", "--kernel", "matern"), "--kernel is for --method gp alone"),
-        (("--method", "gp", "--earth", "1,2,3"), "--earth is for --method harmonic alone"),
+        (("--method", "cubic", "--kernel", "matern"), "--kernel is for --method gp; drop it"),
+        (("--method", "gp", "--earth", "1,2,3"), "--earth is for --method harmonic; drop it"),
         (("--earth", "1,2,south"), "--earth is a scene; latitude,longitude,height,date; or x,y,z in nT"),
         (("--earth", "0,0,0"), "earth_nt must be three numbers"),
         (
@@ -290,7 +289,7 @@ def test_a_fit_of_one_heading_and_of_few_readings_says_that_they_are_doubtful(tm
     )
     said = " ".join(capsys.readouterr().out.split())
     assert "only 16 good readings" in said
-    assert "one heading only, 29 deg: nothing tells the robot's own field from the room's" in said
+    assert "one heading only, 29 deg: the robot's own field cannot be separated" in said
     assert "field in uT, by its size (--unit)" in said
 
 

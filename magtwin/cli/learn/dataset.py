@@ -44,7 +44,7 @@ def build(
     ----------
     run
         Recordings of any kind: Parquet, CSV, npz, Rerun, rosbag2, USD, the released node's own .json; a
-        folder that `magtwin runs` made stands for all of its runs.
+        folder that `magtwin sweep` made stands for all of its runs.
     map
         Map that the labels are made on: a layer or stage, or a folder of survey CSVs.
     out
@@ -179,7 +179,7 @@ def _columns(given: Sequence[str]) -> dict[str, str]:
 
 
 def _files(given: Sequence[Path]) -> list[Path]:
-    """Recordings, a folder of `magtwin runs` by the files in it."""
+    """Recordings, a folder of `magtwin sweep` by the files in it."""
     found: list[Path] = []
     for path in given:
         if (path / "runs.csv").is_file():

@@ -56,7 +56,7 @@ def evaluate(
     out
         Folder of the report to make.
     runs
-        Recordings of any kind to judge by; a folder that `magtwin runs` made stands for all of its runs.
+        Recordings of any kind to judge by; a folder that `magtwin sweep` made stands for all of its runs.
     dataset
         In place of runs, a data set: the recordings of it that no weights learned from.
     map

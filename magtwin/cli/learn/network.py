@@ -1,4 +1,4 @@
-"""`magtwin net`: work with networks."""
+"""`magtwin network`."""
 
 from pathlib import Path
 

@@ -207,7 +207,8 @@ def _frame_mismatch(
         + (
             "Their fit of lever arm and latency is that far off: record more turns at several speeds"
             if metadata.get("alignment") == "fitted"
-            else "To avoid it, train on labels with fitted lever arm and latency (dataset build --align fit)"
+            else "To avoid it, train on labels with fitted lever arm and latency ("
+            "dataset build --alignment fit)"
         )
     )
 
