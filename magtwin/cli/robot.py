@@ -1,4 +1,4 @@
-"""`magtwin robot`: a description in, a USD articulation out, and back."""
+"""`magtwin robot`: convert a URDF to a USD articulation, and back."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -34,51 +34,51 @@ def robot(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Convert a URDF or a xacro to a USD articulation that drives, or such a stage to a URDF.
+    """Convert a URDF or a xacro to a USD articulation that can be driven, or back.
 
     Parameters
     ----------
     urdf
-        The robot's description, .urdf or .xacro; with --to-urdf a stage of one robot.
+        The robot's description, .urdf or .xacro; with --to-urdf, a stage with one robot.
     out
-        Folder to make; it will hold NAME.usda and the layers it refers to.
+        Folder to create, with NAME.usda and the layers it references.
     to_urdf
-        URDF to write from a stage, in place of --out, with equal kinematics and inertia.
-        It takes --force and --json alone.
+        URDF to write from a stage, instead of --out, with the same kinematics and inertia.
+        Only --force and --json may be given with it.
     settings
         TOML with drive, battery, platform field, sensor mounts and conversion, such as
-        robots/turtlebot4/robot.toml; options given here come before its [conversion].
+        robots/turtlebot4/robot.toml; options on the command line override its [conversion].
     package
-        NAME=DIR: where a package lies that package:// or $(find) names; may be given again.
+        NAME=DIR: folder of a package for package:// or $(find); may be repeated.
     arg
-        NAME=VALUE: an argument of the xacro; may be given again.
+        NAME=VALUE: an argument of the xacro; may be repeated.
     missing_meshes
-        What to do about a mesh that is not there: refuse, or leave it out and note it.
+        Treatment of missing meshes: refuse, or leave them out with a note.
     collision
-        What a mesh collides as: its convex hull, a convex decomposition (extra "decomposition"), or itself.
+        Mesh colliders: convex hull, convex decomposition (extra "decomposition"), or the mesh itself.
     profile
-        diff-drive: velocity drives on wheels, slippery casters, dead suspensions welded.
+        diff-drive: velocity drives on wheels, low friction on casters, suspensions without springs welded.
     drive
-        PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X], TYPE velocity, position or none: how joints
-        whose name fits are driven; may be given again, the first that fits wins.
+        PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X], TYPE velocity, position or none: drive of joints
+        whose name matches; may be repeated, the first match wins.
     fix_base
-        Bolt the base to the world.
+        Fix the base to the world.
     merge_fixed
-        Merge links on fixed joints into the body that they ride on; their frames stay.
+        Merge links on fixed joints into the body above; their frames stay.
     density
         Density of links without inertia [kg/m3].
     mass
-        Mass of a data sheet to hold the robot's against [kg].
+        Mass on the data sheet, to check the robot's [kg].
     single_file
-        One root layer and its meshes, in place of Isaac Sim's layers.
+        Write one root layer and the meshes, instead of Isaac Sim's layers.
     strict
         Refuse a conversion that loses anything.
     thumbnail
-        Draw a picture of the robot beside it, which NVIDIA's SimReady profiles ask for.
+        Draw a picture beside the asset, which NVIDIA's SimReady profiles require.
     report
-        Where to write the whole report, a .json file.
+        File for the whole report, .json.
     force
-        Replace what exists.
+        Replace existing files.
     json
         Print the summary as JSON.
     """
@@ -87,14 +87,12 @@ def robot(
 
     if (out is None) == (to_urdf is None):
         raise InputError(
-            "robot makes a stage with --out DIR, or a URDF with --to-urdf FILE; give one of them"
+            "robot writes a stage with --out DIR, or a URDF with --to-urdf FILE; give one of them"
         )
     given = (settings, package, arg, missing_meshes, collision, profile, drive, fix_base, merge_fixed)
     if to_urdf is not None:
         if any(option is not None for option in (*given, density, mass, single_file, strict, report)):
-            raise InputError(
-                "--to-urdf takes a stage as it is, with --force and --json; leave the others out"
-            )
+            raise InputError("--to-urdf takes only --force and --json; leave the other options out")
         _to_urdf(urdf, to_urdf, force=force, json=json)
         return
     assert out is not None
@@ -153,5 +151,5 @@ def _pairs(option: str, texts: list[str]) -> dict[str, str]:
     pairs = [text.partition("=") for text in texts]
     for text, (name, equals, _) in zip(texts, pairs, strict=True):
         if not (name and equals):
-            raise InputError(f"--{option} {text!r}: NAME=VALUE is wanted")
+            raise InputError(f"--{option} {text!r}: expected NAME=VALUE")
     return {name: value for name, _, value in pairs}

@@ -186,7 +186,7 @@ def test_only_the_first_scanner_is_magtwins(tmp_path):
     stage, robot, report = cart(tmp_path, on("eye", text) + on("base_link", text))
     assert len(prims_with(robot, "lidar")) == 1
     assert sum(p.GetTypeName() == "OmniLidar" for p in stage.Traverse()) == 2
-    assert any("is a LiDAR more than magtwin simulates" in note for note in report.notes)
+    assert any("is a second LiDAR, which magtwin does not simulate" in note for note in report.notes)
 
 
 CAMERA = """<sensor name="eye" type="{type}"><update_rate>30</update_rate><pose>0 0 0 0 0.2 0</pose><camera>
@@ -228,7 +228,7 @@ def test_a_magnetometer_is_magtwins_with_its_noise_in_nanotesla(tmp_path):
     spec = read_magnetometer(prim)
     assert spec.rate_hz == 50
     assert_allclose(spec.noise_std_nt, 20)
-    assert any("taken as tesla" in note for note in report.notes)
+    assert any("assumed to be tesla" in note for note in report.notes)
 
 
 def test_a_contact_sensor_is_nvidias_on_the_body(tmp_path):
@@ -429,7 +429,7 @@ REFUSED = {
     ),
     "pixels": (
         on("eye", CAMERA.format(type="camera").replace("<width>640", "<width>9e30")),
-        r"its image of 9.*e\+\d+ x \d+ is none; give sides from 1 to 65536",
+        r"its image of 9.*e\+\d+ x \d+ pixels is invalid; give sides from 1 to 65536",
     ),
     "flag": (
         on("base_link", "<selfCollide>maybe</selfCollide>"),

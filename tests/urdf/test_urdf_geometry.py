@@ -741,7 +741,7 @@ def test_a_material_that_one_visual_tells_of_holds_for_others_that_name_it_and_e
     assert_allclose(colours[:2], [[0, 1, 0, 1]] * 2, atol=1e-5)
     assert_allclose(colours[2][:3], np.full(3, colours[2][0]))
     notes = read_notes(stage.GetRootLayer().realPath)
-    assert "material 'geren' is named, but nothing says its colour: shown without it" in notes
+    assert "material 'geren' is named, but has no colour: shown without it" in notes
 
 
 SKIN = '<material name="skin"><texture filename="{}"/></material>'

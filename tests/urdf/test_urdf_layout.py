@@ -204,7 +204,7 @@ def test_the_layers_of_another_robot_are_never_overwritten(tmp_path):
     other = arm(tmp_path, name="leg")
     with pytest.raises(InputError, match="exists already"):
         convert_urdf(other, out / "leg.usda")
-    with pytest.raises(InputError, match=r"is of arm\.usda; give each robot a folder of its own"):
+    with pytest.raises(InputError, match=r"is of arm\.usda; give each robot its own folder"):
         convert_urdf(other, out / "leg.usda", force=True)
     assert before == {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
 
@@ -246,7 +246,7 @@ def test_what_the_asset_says_of_itself_is_from_its_package_unless_given(tmp_path
     [
         ({"autor": "me"}, "metadata 'autor' is unknown; did you mean 'author'"),
         ({"author": " "}, "metadata 'author' is empty"),
-        ({"qcode": "robot"}, "metadata 'qcode' must be Wikidata's, such as Q11012, got 'robot'"),
+        ({"qcode": "robot"}, "metadata 'qcode' must be an item of Wikidata, such as Q11012, got 'robot'"),
     ],
 )
 def test_metadata_that_is_none_is_refused(tmp_path, given, message):

@@ -477,8 +477,8 @@ def test_a_rule_that_fits_no_joint_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("rule", "message"),
     [
-        ({"type": "velocity"}, "without damping it holds no velocity; give damping="),
-        ({"type": "position", "damping": 1.0}, "without stiffness it holds no position"),
+        ({"type": "velocity"}, "without damping it cannot hold a velocity; give damping="),
+        ({"type": "position", "damping": 1.0}, "without stiffness it cannot hold a position"),
         ({"type": "velocity", "damping": 1.0, "stiffness": 2.0}, "type velocity has no stiffness, got 2"),
         ({"type": "none", "damping": 1.0}, "type none has no damping, got 1"),
         ({"damping": float("nan")}, "damping must be a number from 0 up, got nan"),

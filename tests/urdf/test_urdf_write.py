@@ -254,7 +254,7 @@ def test_the_command_goes_both_ways_and_says_what_stays_behind(tmp_path, capfd):
     for words, message in (
         ([], "give one of them"),
         (["--out", "x", "--to-urdf", "y.urdf"], "give one of them"),
-        (["--to-urdf", str(out), "--mass", "3"], "leave the others out"),
+        (["--to-urdf", str(out), "--mass", "3"], "leave the other options out"),
         (["--to-urdf", str(out)], "exists already"),
         (["--to-urdf", "a.xml"], "a URDF ends in .urdf"),
     ):
