@@ -30,7 +30,7 @@ from magtwin.urdf.physics.gazebo import (
     read_surfaces,
     self_collides,
 )
-from magtwin.urdf.physics.joint import define_joint, define_mimic, define_fixed_joint
+from magtwin.urdf.physics.joint import define_fixed_joint, define_joint, define_mimic
 from magtwin.urdf.physics.link import Rider, define_body, define_frame, is_marker
 from magtwin.urdf.physics.mechanism import Mechanism, read_mechanism
 from magtwin.urdf.physics.merge import WORLD, Place, carried, place_links, riders

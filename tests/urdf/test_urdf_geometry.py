@@ -5,7 +5,6 @@ import io
 import json
 import struct
 import sys
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.meshes.mesh import Piece, distinct, read_mesh
 from magtwin.urdf.meshes.polygon import cut_polygons
 from magtwin.urdf.options import Options
-from magtwin.usd.geometry import linear_from_srgb, read_links, read_shapes
+from magtwin.usd.geometry import linear_from_srgb, read_shapes
 
 GREEN = '<material name="green"><color rgba="0 1 0 1"/></material>'
 
@@ -330,6 +329,17 @@ def test_collada_nodes_may_refer_to_others_but_not_to_themselves(tmp_path):
     path.write_text(text.replace("<library_images>", library.format('<instance_node url="#part"/>')))
     with pytest.raises(InputError, match=r"n\.dae:\d+: node 'part' is within itself; export it again"):
         read_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("colour", "read"),
+    [("0.5 0.0 0.01.0", (0.5, 0, 0, 1)), ("0.2 0.4 0.6", (0.2, 0.4, 0.6, 1)), ("red", (0.5, 0.5, 0.5, 1))],
+)
+def test_a_malformed_collada_colour_is_repaired_with_a_note(tmp_path, colour, read):
+    mesh = read_mesh(dae(tmp_path / "n.dae", "<node>{mesh}</node>", diffuse=f"<color>{colour}</color>"))
+    assert_allclose(mesh.paints[0].rgba, read)
+    words = " ".join(f"{c:g}" for c in read)
+    assert [note.text for note in mesh.notes] == [f"n.dae: malformed colour {colour!r} read as {words!r}"]
 
 
 def test_a_collada_file_whose_author_has_an_accent_in_latin_1_is_read(tmp_path):
@@ -966,74 +976,3 @@ def test_bytes_are_the_same_each_time(tmp_path):
         files = {p.name: p.read_bytes() for p in sorted((tmp_path / "out").rglob("*")) if p.is_file()}
         assert files == (once or files)
         once = files
-
-
-# --- the real robot -------------------------------------------------------------------------------
-
-NAMESPACE = {"c": "http://www.collada.org/2005/11/COLLADASchema"}
-
-
-def collada_points(path):
-    """Points of a COLLADA file of plain nodes, read here by ElementTree alone, metres."""
-    root = ElementTree.fromstring(path.read_bytes())
-    unit = float(root.find("c:asset/c:unit", NAMESPACE).get("meter"))
-    arrays_ = {
-        geometry.get("id"): np.array(
-            geometry.find("c:mesh/c:source/c:float_array", NAMESPACE).text.split(), float
-        ).reshape(-1, 3)
-        for geometry in root.iterfind(".//c:geometry", NAMESPACE)
-    }
-    shown = []
-
-    def walk(node, T):
-        for child in node:
-            tag = child.tag.partition("}")[2]
-            if tag == "matrix":
-                T = T @ np.array(child.text.split(), float).reshape(4, 4)
-            elif tag in ("translate", "rotate", "scale"):
-                raise AssertionError(f"{path}: this reading knows matrices only")
-            elif tag == "instance_geometry":
-                shown.append(arrays_[child.get("url")[1:]] @ T[:3, :3].T + T[:3, 3])
-            elif tag == "node":
-                walk(child, T)
-
-    for scene in root.iterfind(".//c:visual_scene", NAMESPACE):
-        walk(scene, np.eye(4))
-    return np.vstack(shown) * unit
-
-
-@pytest.mark.parametrize("name", ["turtlebot4", "turtlebot4_gazebo_tags"])
-def test_every_mesh_of_the_real_robot_arrives_in_its_place_or_is_named_as_missing(real_data, tmp_path, name):
-    import yourdfpy
-
-    folder = real_data / "turtlebot4"
-    packages = {
-        "irobot_create_description": folder / "xacro/irobot_create_common/irobot_create_description",
-        "turtlebot4_description": folder / "xacro/turtlebot4_description",
-    }
-    urdf = folder / f"{name}.urdf"
-    options = Options(packages=packages, missing_meshes="note", single_file=True)
-    out = convert_urdf(urdf, tmp_path / "tb4.usda", options=options)
-    peer = yourdfpy.URDF.load(str(urdf), load_meshes=False, build_scene_graph=False)
-    shapes, links, notes = read_shapes(out), read_links(out), read_notes(out)
-    checked, missing = 0, []
-    for link in peer.robot.links:
-        for shown in link.visuals:
-            if shown.geometry.mesh is None:
-                continue
-            file = shown.geometry.mesh.filename
-            package, _, rest = file.removeprefix("package://").partition("/")
-            path = packages[package] / rest if file.startswith("package://") else folder / file
-            if not path.is_file():
-                missing.append(path.name)
-                assert f"link {link.name!r}: visual is left out: its mesh {file!r} is missing" in notes
-                continue
-            T = np.eye(4) if shown.origin is None else shown.origin
-            want = collada_points(path) @ T[:3, :3].T + T[:3, 3]
-            mine = [s.vertices for s in shapes if s.link == link.name and f"/{path.stem}" in s.prim]
-            assert_allclose(bounds(np.vstack(mine)), bounds(want), atol=2e-6, err_msg=link.name)
-            checked += 1
-    assert (checked, missing) == ((14, []) if name == "turtlebot4" else (13, ["shell.dae", "oakd_pro.dae"]))
-    lidar = [s for s in shapes if s.link == "rplidar_link"]
-    assert sum(len(s.faces) for s in lidar) > 5000
-    assert "rplidar_link" in links

@@ -332,23 +332,6 @@ def test_the_expanded_text_is_a_urdf_of_the_same_robot(tmp_path):
     assert list(read_description(again).links) == list(read_description(source).links)
 
 
-def test_capsules_arrive_beside_what_yourdfpy_knows():
-    link = read(URDF / "input_capsule.urdf").links["base_link"]
-    visual, collision = link.visuals[0].geometry, link.collisions[0].geometry
-    assert (visual.capsule.radius, visual.capsule.length, visual.cylinder) == (0.1, 0.4, None)
-    assert (collision.cylinder.radius, collision.cylinder.length, collision.capsule) == (0.1, 0.4, None)
-
-
-def test_every_kind_of_joint_arrives_with_its_figures():
-    joints = read(URDF / "input_joints.urdf").joints
-    kinds = ["planar", "floating", "continuous", "prismatic", "revolute", "fixed"]
-    assert [joint.type for joint in joints.values()] == kinds
-    slide, turn = joints["l2"], joints["l3"]
-    assert (slide.dynamics.damping, slide.dynamics.friction) == (1, 2)
-    assert (turn.limit.lower, turn.limit.effort) == (-np.inf, np.inf)
-    assert (turn.mimic.joint, turn.mimic.multiplier, turn.mimic.offset) == ("j1", 2, 0.5)
-
-
 def test_slips_are_repaired_and_noted():
     description = read(URDF / "input_repairs.urdf")
     link = description.links["base_link"]
