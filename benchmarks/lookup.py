@@ -19,8 +19,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from magtwin.field.maps import lookup
-from magtwin.field.maps.lookup import Lookup, warm_up
+from magtwin.field.maps.lookup import LOOPS, warm_up
 from magtwin.field.maps.map import AnomalyMap
 
 WANTED = {1: 80, 1_000: None, 1_000_000: 50}
@@ -48,11 +47,11 @@ def plain(look: Callable[[], object]) -> Callable[[], object]:
     """The same without compiled code."""
 
     def without() -> object:
-        opened, Lookup.compiled = Lookup.compiled, None
+        opened, LOOPS.code = LOOPS.code, None
         try:
             return look()
         finally:
-            Lookup.compiled = opened
+            LOOPS.code = opened
 
     return without
 
@@ -97,7 +96,7 @@ def measure(works: dict[str, Callable[[], object]], rounds: int, calls: int) -> 
 def main(rounds: int = 7) -> None:
     rng = np.random.default_rng(0)
     field = field_map(rng)
-    lookup.PAYS = sys.maxsize  # so that numpy stays numpy
+    LOOPS.pays = float("inf")  # so that numpy stays numpy
     start = time.perf_counter()
     warm_up()
     print(f"compiled code opened in {time.perf_counter() - start:.2f} s; {rounds} rounds")

@@ -32,7 +32,7 @@ from magtwin.sim.motion.course import run_courses, warm_up
 from magtwin.sim.motion.drive import draw_wheel_errors
 from magtwin.sim.motion.follow import course_along
 from magtwin.sim.session import draw_session
-from magtwin.twin import Twin, open_twin, scene_from_toml, simulate_many
+from magtwin.twin import Twin, open_twin, scene_from_toml, sweep
 
 DURATION_S, RATE_HZ = 60.0, 135.0
 HIDDEN = (512, 512, 512, 512)
@@ -67,7 +67,7 @@ def beside_the_network(twin: Twin, robots: int, repetitions: int, exact: bool) -
             network.predict(x[: rows * min(16, robots - first)])
 
     def whole() -> None:
-        runs = simulate_many(
+        runs = sweep(
             twin, "figure8", range(robots), robots=specs, columns=kept, duration_s=DURATION_S, rate_hz=RATE_HZ
         )
         for _ in runs:

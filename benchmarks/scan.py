@@ -17,7 +17,8 @@ import trimesh
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import ray_angles, scans_of
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import LidarSpec, RobotSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.sensors import LidarSpec
 
 POSES = 450
 """One minute at 7.5 turns a second."""

@@ -55,7 +55,7 @@ def magtwins() -> dict[str, Callable[[], int]]:
     from magtwin.path import path_named
     from magtwin.sim.motion import course, loop
     from magtwin.sim.motion.follow import course_along
-    from magtwin.spec.scene import DriveSpec
+    from magtwin.spec.drive import DriveSpec
 
     course.warm_up()
     room = walls()
@@ -100,7 +100,7 @@ def mujocos() -> dict[str, Callable[[], int]]:
     from magtwin.path import path_named
     from magtwin.sim.motion.controllers import guide_along
     from magtwin.sim.motion.drive import limiter, wheel_rates
-    from magtwin.spec.scene import DriveSpec
+    from magtwin.spec.drive import DriveSpec
 
     drive = DriveSpec()
     spec = mujoco.MjSpec.from_file(str(ROBOT / "turtlebot4.urdf"))

@@ -1,73 +1,104 @@
 """magtwin: magnetic digital twins of robots, authored in USD.
 
-A Scene goes in (lab, robot, map, sensors), a Run comes out (what every sensor would have read).
-Names are loaded when first used, so that `import magtwin` costs nothing.
+    import magtwin as mt
+
+    run = mt.simulate("lab.usda", "figure8", seed=1)
+    run.save("run.rrd")
+
+A scene describes a lab and a robot; `open_twin` opens it and `simulate` gives a `Run`. Names are loaded when
+first used, so that `import magtwin` is fast.
 """
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from magtwin.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from magtwin.errors import InputError, MismatchWarning
-    from magtwin.field.maps.map import AnomalyMap
-    from magtwin.figures.plotting import plot
-    from magtwin.path import Path
-    from magtwin.run.run import COLUMNS, Run
-    from magtwin.spec.scene import Scene
-    from magtwin.twin import (
-        Twin,
-        author_scene,
-        open_twin,
-        scene_from_toml,
-        simulate,
-        simulate_many,
-        simulate_robots,
-    )
+    from magtwin.author.from_urdf import from_urdf as from_urdf
+    from magtwin.errors import InputError as InputError
+    from magtwin.errors import MismatchWarning as MismatchWarning
+    from magtwin.field.fit.fit import fit as fit_map
+    from magtwin.field.maps.map import AnomalyMap as AnomalyMap
+    from magtwin.figures.plotting import plot as plot
+    from magtwin.io.formats import read_run as load_run
+    from magtwin.io.formats import write_run as save_run
+    from magtwin.io.surveys.readings import load_readings as read_survey
+    from magtwin.io.sweeps import save_runs as save_runs
+    from magtwin.run.run import COLUMNS as COLUMNS
+    from magtwin.run.run import Run as Run
+    from magtwin.spec.scene import Scene as Scene
+    from magtwin.twin import Twin as Twin
+    from magtwin.twin import author_scene as author_scene
+    from magtwin.twin import in_session as in_session
+    from magtwin.twin import open_twin as open_twin
+    from magtwin.twin import scene_from_toml as scene_from_toml
+    from magtwin.twin import simulate as simulate
+    from magtwin.twin import simulate_robots as simulate_robots
+    from magtwin.twin import sweep as sweep
+    from magtwin.usd.maps import load_map as load_map
+    from magtwin.usd.maps import save_map as save_map
 
-_HOME = {
-    "AnomalyMap": "magtwin.field.maps.map",
-    "COLUMNS": "magtwin.run.run",
-    "MismatchWarning": "magtwin.errors",
-    "Path": "magtwin.path",
-    "InputError": "magtwin.errors",
-    "Run": "magtwin.run.run",
-    "Scene": "magtwin.spec.scene",
-    "Twin": "magtwin.twin",
-    "author_scene": "magtwin.twin",
-    "open_twin": "magtwin.twin",
-    "plot": "magtwin.figures.plotting",
-    "scene_from_toml": "magtwin.twin",
-    "simulate": "magtwin.twin",
-    "simulate_many": "magtwin.twin",
-    "simulate_robots": "magtwin.twin",
+_NAMES = {
+    "AnomalyMap": "field.maps.map",
+    "COLUMNS": "run.run",
+    "InputError": "errors",
+    "MismatchWarning": "errors",
+    "Run": "run.run",
+    "Scene": "spec.scene",
+    "Twin": "twin",
+    "author_scene": "twin",
+    "fit_map": "field.fit.fit:fit",
+    "from_urdf": "author.from_urdf",
+    "in_session": "twin",
+    "load_map": "usd.maps",
+    "load_run": "io.formats:read_run",
+    "open_twin": "twin",
+    "plot": "figures.plotting",
+    "read_survey": "io.surveys.readings:load_readings",
+    "save_map": "usd.maps",
+    "save_run": "io.formats:write_run",
+    "save_runs": "io.sweeps",
+    "scene_from_toml": "twin",
+    "simulate": "twin",
+    "simulate_robots": "twin",
+    "sweep": "twin",
 }
+"""Module of each public name, and its name there if it differs."""
 
 __all__ = [
     "COLUMNS",
     "AnomalyMap",
     "InputError",
     "MismatchWarning",
-    "Path",
     "Run",
     "Scene",
     "Twin",
     "author_scene",
+    "fit_map",
+    "from_urdf",
+    "in_session",
+    "load_map",
+    "load_run",
     "open_twin",
     "plot",
+    "read_survey",
+    "save_map",
+    "save_run",
+    "save_runs",
     "scene_from_toml",
     "simulate",
-    "simulate_many",
     "simulate_robots",
+    "sweep",
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+def __getattr__(name: str) -> object:
+    if name not in _NAMES:
         raise AttributeError(f"module 'magtwin' has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOME[name]), name)
+    module, _, attribute = _NAMES[name].partition(":")
+    return getattr(importlib.import_module(f"magtwin.{module}"), attribute or name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME})
+    return sorted(__all__)

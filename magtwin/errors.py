@@ -1,26 +1,57 @@
-"""Refusals, and finding things by name."""
+"""Refusals of wrong input, and look-ups by name."""
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
 T = TypeVar("T")
 
+_PARAMETER = re.compile(r"`([a-z_][a-z0-9_]*)(?:=([^`]*))?`")
+"""A parameter in the text of a refusal: `force=True`, `map_layer`."""
+
 
 class InputError(ValueError):
-    """An input that magtwin will not work on; its text says what, where and what to do.
+    """An input that magtwin refuses. Its text says what is wrong, where, and what to do.
 
-    Everything a user can get wrong (a file, a name, a number) raises this class or a subclass of it.
-    The command line prints it as one line and exits with status 1.
+    Everything that a user can get wrong (a file, a name, a number) raises this class or a subclass. The
+    command line prints it as one line and exits with status 1.
+
+    A text names a parameter as a Python user writes it, in backticks: `` `force=True` ``. The command line
+    prints `in_flags` instead.
     """
+
+    parameter: str | None
+    """Name of the parameter that is wrong, or that would help. None if the error is about none."""
+
+    def __init__(self, text: str = "", *, parameter: str | None = None) -> None:
+        super().__init__(text)
+        self.parameter = parameter
+
+    def in_flags(self, flags: Mapping[str, str]) -> str:
+        """The text with parameters spelled as flags: `` `force=True` `` becomes `--force`.
+
+        Args:
+            flags: Flag of each parameter that the command has ({"force": "--force"}). Other words
+                in backticks stay as they are.
+        """
+
+        def flag(match: re.Match[str]) -> str:
+            name, value = match.groups()
+            if name not in flags:
+                return match.group()
+            value = (value or "").strip("\"'")
+            return f"{flags[name]} {value}" if value not in ("", "True") else flags[name]
+
+        return _PARAMETER.sub(flag, str(self))
 
 
 class MismatchWarning(UserWarning):
-    """A network is used with a map, at a place or on a robot that it did not learn on."""
+    """A network is used with a map, at a place or on a robot that it was not trained on."""
 
 
 class UnknownNameError(InputError, KeyError):
-    """A name that is not in a table; also a KeyError, so that mappings behave as Python's do."""
+    """A name that is not in a table. It is also a KeyError, as Python's mappings raise."""
 
     __str__ = InputError.__str__  # KeyError would show the text in quotes
 

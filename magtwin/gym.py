@@ -119,7 +119,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         num_envs: int = 1,
         *,
         scene: Twin | Scene | str | FilePath | None = None,
-        net: str | FilePath | None = None,
+        network: str | FilePath | None = None,
         magnetometer: Kind | None = None,
         model_error: bool = True,
         path: Path | str | FilePath | ArrayLike = "figure8",
@@ -137,7 +137,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         Args:
             num_envs: How many robots.
             scene: The file of a stage, a `Scene`, or what `magtwin.open_twin` gave.
-            net: As for `magtwin.open_twin`, where `scene` is a file.
+            network: As for `magtwin.open_twin`, where `scene` is a file.
             magnetometer: As for `magtwin.open_twin`, where `scene` is a file.
             model_error: As for `magtwin.simulate`; each episode is a session of its own to it.
             path: What the robots begin on and are rewarded by: a path, its name, a CSV file, or
@@ -161,12 +161,12 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             raise InputError("MagNav needs a scene: gymnasium.make('magtwin/MagNav-v0', scene='lab.usda')")
         if render_mode is not None:
             raise InputError(f"MagNav has no render_mode, got {render_mode!r}; write a Run and view that")
-        if isinstance(scene, Twin) and (net is not None or magnetometer is not None):
-            raise InputError("net and magnetometer go to open_twin where scene is a Twin")
+        if isinstance(scene, Twin) and (network is not None or magnetometer is not None):
+            raise InputError("give `network` and `magnetometer` to open_twin, since scene is a Twin")
         if isinstance(scene, Twin):
             twin = scene if model_error else without_model_error(scene)
         else:
-            twin = open_twin(scene, net=net, magnetometer=magnetometer, model_error=model_error)
+            twin = open_twin(scene, network=network, magnetometer=magnetometer, model_error=model_error)
         check_field(twin.scene, twin.field)
         if twin.magnetometer:
             _check_network(twin.magnetometer)

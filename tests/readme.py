@@ -123,14 +123,14 @@ def near(quoted: str, line: str) -> bool:
 def check_first_run(folder: Path) -> None:
     """The lab's neural magnetometer errs by at most `MOST_NT` on each named path, and its intervals hold."""
     from magtwin.path import PATHS
-    from magtwin.twin import open_twin, simulate_many
+    from magtwin.twin import open_twin, sweep
     from magtwin.verdict import Tally
 
     twin = open_twin(folder / "lab" / "lab.usda")
     failed = False
     for name in PATHS:
         tally = Tally()
-        for run in simulate_many(twin, name, range(SEEDS), rate_hz=20.0):
+        for run in sweep(twin, name, range(SEEDS), rate_hz=20.0):
             run.add_to(tally)
         mae, held = tally.error_nt / tally.readings, tally.within / tally.with_sd
         naive = tally.naive_nt / tally.readings

@@ -134,5 +134,5 @@ def test_a_fitted_run_is_repeated_to_the_bit(lab_scene, tmp_path, capsys):
 
 
 def test_a_run_on_the_default_lab_says_nothing_of_a_placing(lab_scene):
-    run = simulate(open_twin(lab_scene, net="none"), "figure8", duration_s=1.0, rate_hz=5.0)
+    run = simulate(open_twin(lab_scene, network="none"), "figure8", duration_s=1.0, rate_hz=5.0)
     assert "path_placing" not in run.metadata

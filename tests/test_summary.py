@@ -28,9 +28,12 @@ from magtwin.report import Figure, Report
 from magtwin.run.compare import compare
 from magtwin.run.run import Column, Run
 from magtwin.sim.motion.commands import Commands
-from magtwin.spec.scene import PlacedRobot, Scene, SourceSpec, spelled
+from magtwin.spec.base import spelled
+from magtwin.spec.magnetics import SourceSpec
+from magtwin.spec.robot import PlacedRobot
+from magtwin.spec.scene import Scene
 from magtwin.summary import LINES, WIDTH, Summarized
-from magtwin.twin import open_twin, scan, simulate, simulate_many
+from magtwin.twin import open_twin, scan, simulate, sweep
 
 HOSTILE = '<script>alert("1")</script>&amp;\x1b[31m\n\u2028name'
 WEIGHTS = sorted(shipped("weights").glob("*.safetensors"))
@@ -50,7 +53,7 @@ def run(twin):
 def learnt(twin, run, tmp_path_factory):
     """A data set of three drives, a model trained on it, and an evaluation."""
     physical = open_twin(twin.scene_file, magnetometer="physical")
-    drives = list(simulate_many(physical, "figure8", range(6), duration_s=20.0, rate_hz=20.0))
+    drives = list(sweep(physical, "figure8", range(6), duration_s=20.0, rate_hz=20.0))
     runs = {f"d{k}": drive for k, drive in enumerate(drives)}
     data = build_dataset(runs, twin.field, tmp_path_factory.mktemp("learnt") / "set")
     config = TrainConfig(model="linear", features="circular")
@@ -92,7 +95,7 @@ def nouns(twin, run, learnt):
         "path": path_named("A"),
         "commands": Commands("mine", np.array([[0.0, 0.1, 0.0], [2.0, 0.2, 0.1]])),
         "scans": scan(twin, run),
-        "runs": simulate_many(twin, "figure8", range(100), duration_s=5.0),
+        "runs": sweep(twin, "figure8", range(100), duration_s=5.0),
         "report": run.report(),
         "comparison": compare(run, run),
         "magnetometer": twin.magnetometer,

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+import magtwin
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.files import shipped
-from magtwin.twin import in_session, open_twin, simulate, simulate_many
+from magtwin.twin import in_session, open_twin, simulate, sweep
 
 
 def test_a_run_is_in_a_session_of_its_seed_unless_another_is_chosen(lab_scene):
@@ -32,13 +33,15 @@ def test_a_session_that_is_none_is_refused(lab_scene):
             in_session(twin, session)
     with pytest.raises(InputError, match="in session 2 already"):
         simulate(in_session(twin, 2), session="survey")
-    with pytest.raises(InputError, match="give robots or session, not both"):
-        simulate_many(twin, "figure8", [1], session=1, robots=twin.scene.robot)
+    with pytest.raises(InputError, match="give robots or sessions, not both"):
+        sweep(twin, "figure8", [1], sessions=1, robots=twin.scene.robot)
 
 
 def test_a_network_for_a_magnetometer_that_reads_none_is_refused(lab_scene):
-    with pytest.raises(InputError, match="net is for a neural magnetometer, not for 'physical'"):
-        open_twin(lab_scene, net=shipped("weights", "turtlebot4_paper.safetensors"), magnetometer="physical")
+    with pytest.raises(InputError, match="a 'physical' magnetometer has no network"):
+        open_twin(
+            lab_scene, network=shipped("weights", "turtlebot4_paper.safetensors"), magnetometer="physical"
+        )
 
 
 def test_a_survey_in_millimetres_is_doubted(tmp_path, capsys):
@@ -48,3 +51,40 @@ def test_a_survey_in_millimetres_is_doubted(tmp_path, capsys):
     np.savetxt(tmp_path / "mm.csv", rows, delimiter=",", header="x,y,yaw,b", comments="")
     main(["map", "fit", str(tmp_path / "mm.csv"), "--method", "trilinear", "--out", str(tmp_path / "m.usdc")])
     assert "are their positions in metres?" in capsys.readouterr().out
+
+
+def test_a_sweep_takes_paths_in_turn_and_deals_sessions_in_blocks(lab_scene):
+    twin = open_twin(lab_scene, magnetometer="physical")
+    runs = list(sweep(twin, ["sine", "figure8"], 4, seed=7, sessions=2, duration_s=1.0, rate_hz=5.0))
+    assert [run.metadata["path"] for run in runs] == ["sine", "figure8"] * 2
+    assert [run.metadata["seed"] for run in runs] == [7, 8, 9, 10]
+    sessions = [(run.metadata["session"], run.metadata["session_seed"]) for run in runs]
+    assert sessions == [(0, 7), (0, 7), (1, 7), (1, 7)]
+    again = simulate(in_session(twin, 1, seed=7), "figure8", seed=10, duration_s=1.0, rate_hz=5.0)
+    assert all(np.array_equal(runs[3][name], again[name], equal_nan=True) for name in ("t", "b_measured_nt"))
+
+
+def test_speeds_of_a_sweep_are_drawn_when_asked_for(lab_scene):
+    twin = open_twin(lab_scene, magnetometer="physical")
+    options = {"duration_s": 1.0, "rate_hz": 5.0, "sessions": "survey"}
+    drawn = [run.metadata["speed_m_s"] for run in sweep(twin, "sine", 3, speeds="drawn", **options)]
+    assert len(set(drawn)) == 3
+    assert all(0.2 <= speed <= 0.3 for speed in drawn)
+    assert drawn == [run.metadata["speed_m_s"] for run in sweep(twin, "sine", 3, speeds="drawn", **options)]
+    for wrong, text in (("fast", '"drawn"'), (0, None)):
+        with pytest.raises(InputError, match=text):
+            sweep(twin, "sine", 2, speeds=wrong, **options)
+    for wrong in (0, True, -1):
+        with pytest.raises(InputError):
+            sweep(twin, "sine", wrong)
+
+
+def test_a_sweep_saves_a_folder_that_lists_its_runs(lab_scene, tmp_path):
+    runs = sweep(open_twin(lab_scene, magnetometer="physical"), "sine", 2, duration_s=1.0, rate_hz=5.0)
+    report = runs.save(tmp_path / "runs")
+    lines = (tmp_path / "runs" / "runs.csv").read_text().splitlines()
+    assert lines[0] == "file,path,seed,session,speed_m_s,readings"
+    assert len(lines) == 3
+    again = magtwin.load_run(tmp_path / "runs" / "run_00001.parquet")
+    assert np.array_equal(again["b_measured_nt"], runs[1]["b_measured_nt"])
+    assert {figure.name: figure.value for figure in report.figures}["readings"] == 2 * again.rows

@@ -30,7 +30,9 @@ from magtwin.field.fit.fit import fit, raster
 from magtwin.field.survey.gridded import read_survey
 from magtwin.files import from_table, read_toml, shipped
 from magtwin.io.surveys.readings import read_readings
-from magtwin.spec.scene import EarthFieldSpec, LabSpec, Scene, SourceSpec
+from magtwin.spec.lab import LabSpec
+from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
+from magtwin.spec.scene import Scene
 from magtwin.usd.maps import save_map
 
 CONSOLE = Console()

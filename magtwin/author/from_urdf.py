@@ -9,7 +9,7 @@ from typing import Any
 
 from magtwin.author.robot import RobotSettings, build_robot, read_robot, read_settings
 from magtwin.files import existing, output
-from magtwin.spec.scene import RobotSpec
+from magtwin.spec.robot import RobotSpec
 from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.description.kinematics import link_poses
 from magtwin.urdf.options import DEFAULTS, DriveRule, Options

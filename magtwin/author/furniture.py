@@ -8,8 +8,8 @@ from pxr import Kind, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW
-from magtwin.spec.furniture import BODY, GENERIC, Part, parts_of
-from magtwin.spec.scene import FurnitureSpec, SourceSpec
+from magtwin.spec.furniture import BODY, GENERIC, FurnitureSpec, Part, parts_of
+from magtwin.spec.magnetics import SourceSpec
 from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
 from magtwin.usd.layers import WORLD
 from magtwin.usd.looks import define_box, define_looks, wear

@@ -4,7 +4,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, Vt
 
 from magtwin.frames import quat_from_rpy
-from magtwin.spec.scene import LabSpec
+from magtwin.spec.lab import LabSpec
 from magtwin.usd.attributes import read_figures, write_figures, write_pose
 from magtwin.usd.layers import WORLD
 from magtwin.usd.looks import define_box, define_looks, wear

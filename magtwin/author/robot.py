@@ -11,18 +11,11 @@ from pxr import Sdf, Usd, UsdPhysics
 from magtwin.author.shape import drive_of, footprint_of, stand_on_floor
 from magtwin.errors import InputError, hint
 from magtwin.files import existing, from_table, read_toml, sha256
-from magtwin.spec.scene import (
-    BatterySpec,
-    DriveSpec,
-    ImuSpec,
-    LidarSpec,
-    MagnetometerSpec,
-    MocapSpec,
-    MountSpec,
-    PlatformFieldSpec,
-    RobotSpec,
-    Spec,
-)
+from magtwin.spec.base import Spec
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.magnetics import PlatformFieldSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
 from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.options import DEFAULTS, Options
 from magtwin.urdf.report import ConversionReport

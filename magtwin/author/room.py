@@ -17,9 +17,11 @@ from magtwin.errors import InputError
 from magtwin.field.sources.bodies import mesh_moments
 from magtwin.files import existing, refused_at, shipped
 from magtwin.frames import IDENTITY_XYZW, quat_from_yaw, rotate
-from magtwin.spec.furniture import drawn_magnetization
+from magtwin.spec.base import ZERO3, Quat, Spec, Vec3
+from magtwin.spec.furniture import FurnitureSpec, drawn_magnetization
+from magtwin.spec.lab import LabSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import ZERO3, FurnitureSpec, LabSpec, PlacedRobot, Quat, Spec, Vec3
+from magtwin.spec.robot import PlacedRobot
 from magtwin.urdf.meshes.mesh import read_mesh
 from magtwin.usd.attributes import check_prim_name
 from magtwin.usd.maps import load_map

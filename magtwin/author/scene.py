@@ -24,23 +24,18 @@ from magtwin.author.room import (
     placed_furniture,
 )
 from magtwin.errors import InputError
+from magtwin.field.sources.magnets import body_of
 from magtwin.files import existing, from_table, output, read_toml, refused_at, sha256
 from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.path import resolve_path
 from magtwin.placement import Room, path_in
+from magtwin.spec.base import ZERO3, Vec3
+from magtwin.spec.furniture import FurnitureSpec
+from magtwin.spec.lab import LabSpec, SurveySpec
+from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import (
-    ZERO3,
-    EarthFieldSpec,
-    FurnitureSpec,
-    LabSpec,
-    PlacedRobot,
-    RobotSpec,
-    Scene,
-    SourceSpec,
-    SurveySpec,
-    Vec3,
-)
+from magtwin.spec.robot import PlacedRobot, RobotSpec
+from magtwin.spec.scene import Scene
 from magtwin.urdf.convert import THUMBNAILS
 from magtwin.usd.attributes import check_prim_name, plain_value, read_pose, target, write_pose
 from magtwin.usd.earth import checked, define_earth, read_earth
@@ -542,7 +537,7 @@ def _check_things(scene: Scene) -> None:
         raise InputError(f"source {LOOKS!r} has the name of the materials beside it; rename it")
     for source in scene.magnets:
         if source.susceptibility and scene.earth is None:
-            source.body()  # refuses
+            body_of(source)  # refuses
 
 
 def _check_map(scene: Scene, where: str = "") -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 from magtwin.usd.attributes import read_pose, write_pose
 
 ALIKE_M = 0.01

@@ -79,7 +79,7 @@ def drive(
     if gamepad is not None and existing(gamepad, "gamepad").is_dir():
         raise InputError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
     with output(out, force=force) as folder:
-        twin = in_session(open_twin(scene, net=net, model_error=model_error), session, seed=seed)
+        twin = in_session(open_twin(scene, network=net, model_error=model_error), session, seed=seed)
         robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
         errors = draw_wheel_errors(robot.drive, streams(np.random.default_rng(seed))["drive"])
         chassis = at_start(
@@ -109,7 +109,7 @@ def drive(
             commands=folder / "commands.csv",
             metadata={"commands_file": "commands.csv"},
             steps=announcer(quiet=json),
-            net=net,
+            network=net,
             model_error=model_error,
             seed=seed,
             session=session,

@@ -225,7 +225,7 @@ def _budget(
     """The error budget of a twin, as a section and in figures."""
     from magtwin.figures.budgets import section_of_budget
     from magtwin.learn.evaluation.budget import Truth, budgets, steps, true_errors
-    from magtwin.twin import Twin, check_figures, in_session_of, open_twin
+    from magtwin.twin import Twin, check_scene, in_session_of, open_twin
 
     twins: dict[Any, Twin] = {}
 
@@ -236,7 +236,7 @@ def _budget(
 
     def day_of(name: str, run: "Run") -> "Scene":
         day = in_session_of(opened(run.metadata.get("magnetometer")), run.metadata).scene
-        check_figures(day, run.metadata, name)
+        check_scene(day, run.metadata, name)
         return day
 
     truth = Truth(opened("physical").scene, day_of)

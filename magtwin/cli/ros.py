@@ -138,7 +138,7 @@ def sim(
 
     tell = announcer(quiet=False)
     tell(f"opening {scene}")
-    twin = open_twin(scene, net=net, model_error=model_error)
+    twin = open_twin(scene, network=net, model_error=model_error)
     with where.bus("magtwin_sim", duration=duration) as bus:
         node = Simulator(
             twin,
@@ -205,7 +205,7 @@ def magnetometer(
     values = settings_of(PARAMETERS, (f"units:={UNITS[profile]}", *settings))
     tell = announcer(quiet=False)
     tell(f"opening {scene}")
-    twin = open_twin(scene, net=net, model_error=False)  # it predicts, for a robot that reads
+    twin = open_twin(scene, network=net, model_error=False)  # it predicts, for a robot that reads
     sim_time = values["use_sim_time"]
     with where.bus("magtwin_magnetometer", sim_time=sim_time, duration=duration) as bus:
         Magnetometer(twin, bus, values, say=tell)

@@ -266,7 +266,7 @@ def run(
         "commands": commands,
         "replay": replay,
         "engine": "newton" if engine == "newton" else "kinematic",
-        "net": net,
+        "network": net,
         "magnetometer": magnetometer,
         "model_error": model_error,
         "seed": seed,
@@ -362,7 +362,7 @@ def _drive(
     scans: bool = False,
     commands: Path | None = None,
     replay: Path | None = None,
-    net: Path | None = None,
+    network: Path | None = None,
     magnetometer: Literal["physical", "neural", "map-only"] | None = None,
     model_error: bool = True,
     seed: int = 0,
@@ -388,7 +388,7 @@ def _drive(
         what = read_run(replay)
     else:
         way_of(path)  # refuses a name or file that is none before the scene is opened
-    twin = open_twin(scene_file, net=net, magnetometer=magnetometer, model_error=model_error)
+    twin = open_twin(scene_file, network=network, magnetometer=magnetometer, model_error=model_error)
     twin = in_session(twin, session, seed=seed)
     if commands is None and replay is None and path != "random":
         what = planned = way_of(path, room_of(twin), fit=fit)
@@ -442,7 +442,7 @@ def _run_together(
     if options.pop("engine") == "newton":
         raise InputError(f"--engine newton drives one robot by itself, and {scene_file} has several; drop it")
     commands, replay = options.pop("commands"), options.pop("replay")
-    opening = {name: options.pop(name) for name in ("net", "magnetometer", "model_error")}
+    opening = {name: options.pop(name) for name in ("network", "magnetometer", "model_error")}
     twin = open_twin(scene_file, **opening)
     ways: dict[str, Any] = {one.robot.name: one.path or "figure8" for one in twin.scene.robots}
     if robot is not None and (commands or replay or path):

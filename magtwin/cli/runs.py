@@ -1,22 +1,18 @@
 """`magtwin runs`: many seeded runs of a scene's robot into one folder, as a data set."""
 
-import csv
-import time
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Force, Json, Seed, Whole, announcer, print_report, progress, say
+from magtwin.errors import InputError
 
 Names = Annotated[list[str] | None, Parameter(consume_multiple=True, negative="")]
 
-MIXTURE = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
-"""Default paths: a model that learns from one kind of path does not know the others."""
-
 RUNS_A_SESSION = 5
-"""Default number of runs in each session, as many as there are paths."""
+"""Default number of runs per session: one for each default path."""
 
 
 @app.command
@@ -92,16 +88,9 @@ def runs(
     json
         Print the summary as JSON.
     """
-    import numpy as np
-
-    from magtwin.errors import InputError
-    from magtwin.files import existing, output
-    from magtwin.io.tables import write_parquet
-    from magtwin.report import Figure, Report
+    from magtwin.files import check_free, existing
     from magtwin.sim.motion.way import way_of
-    from magtwin.sim.session import draw_speed
-    from magtwin.twin import in_session, open_twin, room_of, simulate_many
-    from magtwin.verdict import HOLDS, HOLDS_ONE, Tally
+    from magtwin.twin import MIXTURE, open_twin, room_of, sweep
 
     existing(scene, "scene")
     for name, value, least in (("count", count, 1), ("sessions", sessions, 1), ("seed", seed, 0)):
@@ -109,74 +98,28 @@ def runs(
             raise InputError(f"--{name} must be a whole number from {least} up, got {value}")
     if sessions is not None and session is not None:
         raise InputError("--session survey is one session; drop --sessions")
+    check_free(out, force=force)
     for name in path or MIXTURE:
-        way_of(name)  # refuses a name or file that is none before the scene is opened
+        way_of(name)  # refuses a wrong name before the scene is opened
     steps = announcer(quiet=json)
-    with output(out, force=force) as folder:
-        steps("Opening the scene")
-        twin = open_twin(scene, net=net, magnetometer=magnetometer, model_error=model_error)
-        paths = [way_of(name, room_of(twin), fit=fit) for name in path or MIXTURE]
-        robot = twin.scene.robot
-        if session is not None:
-            drawn = [in_session(twin, session)]
-        else:
-            most = min(sessions or max(1, round(count / RUNS_A_SESSION)), count)
-            drawn = [in_session(twin, k, seed=seed) for k in range(most)]
-        of_run = [drawn[k * len(drawn) // count] for k in range(count)]
-        speeds = [0.2 if speed is None else speed] * count
-        if session is None and speed is None:
-            draws = np.random.default_rng((seed, 1)).spawn(2)[1]  # which no run draws from
-            speeds = [draw_speed(robot.drive, rng) for rng in draws.spawn(count)]
-        steps(f"Driving {count} runs")
-        made = simulate_many(
-            twin,
-            [paths[k % len(paths)] for k in range(count)],
-            range(seed, seed + count),
-            speeds=speeds,
-            robots=of_run,
-            columns=columns,
-            duration_s=duration,
-            rate_hz=rate_hz,
-            lidar=lidar,
-            outside=outside,
-        )
-        folder.mkdir()
-        tally = Tally()
-        readings, seconds, start = 0, 0.0, time.monotonic()
-        with (
-            progress("Driving", "runs") as advance,
-            open(folder / "runs.csv", "w", encoding="utf-8", newline="") as listing,
-        ):
-            table: Any = csv.writer(listing, lineterminator="\n")
-            table.writerow(("file", "path", "seed", "session", "speed_m_s", "readings"))
-            advance(0, count)
-            for k, run in enumerate(made):
-                file = f"run_{k:05d}.parquet"
-                write_parquet(run, folder / file)
-                run.add_to(tally)
-                listed = (run.metadata[name] for name in ("path", "seed", "session", "speed_m_s"))
-                table.writerow((file, *listed, run.rows))
-                readings, seconds = readings + run.rows, seconds + float(run.metadata["duration_s"])
-                advance(k + 1, count)
-    took = time.monotonic() - start
-    report = Report(
-        f"{count} runs in {scene}",
-        (
-            Figure("runs", count),
-            Figure("readings", readings),
-            Figure("driven", seconds, "s"),
-            Figure("took", round(took, 3), "s"),
-            Figure("rate", count / took, "runs/s"),
-        ),
-        {
-            "paths": ", ".join(getattr(one, "name", "random") for one in paths),
-            "sessions": session or len(drawn),
-        },
-        tally.verdict(
-            f"the exact field of {count} runs in {len(drawn)} sessions",
-            holds=HOLDS_ONE if len(drawn) == 1 else HOLDS,
-        ),
+    steps("Opening the scene")
+    twin = open_twin(scene, network=net, magnetometer=magnetometer, model_error=model_error)
+    steps(f"Driving {count} runs")
+    made = sweep(
+        twin,
+        [way_of(name, room_of(twin), fit=fit) for name in path or MIXTURE],
+        count,
+        seed=seed,
+        sessions=session or sessions or max(1, round(count / RUNS_A_SESSION)),
+        speeds=speed if speed is not None else 0.2 if session else "drawn",
+        columns=columns,
+        duration_s=duration,
+        rate_hz=rate_hz,
+        lidar=lidar,
+        outside=outside,
     )
+    with progress("Driving", "runs") as advance:
+        report = made.save(out, force=force, progress=advance)
     print_report(report, json)
     if not json:
         say(f"Wrote {out}")

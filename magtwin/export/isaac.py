@@ -17,7 +17,10 @@ from magtwin.errors import InputError
 from magtwin.export.ogn import Graph
 from magtwin.frames import IDENTITY_XYZW
 from magtwin.sim.sensors.battery import current_a, open_voltage
-from magtwin.spec.scene import ZERO3, BatterySpec, MountSpec, RobotSpec, Scene
+from magtwin.spec.base import ZERO3
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import BatterySpec, MountSpec
 from magtwin.usd.layers import WORLD
 from magtwin.usd.schema import only_prim_with, place, prims_with
 from magtwin.usd.sensors import BASE, IMU_TYPE, LIDAR_TYPE

@@ -16,7 +16,7 @@ from magtwin.errors import InputError
 from magtwin.figures.cutaway import Cutaway
 from magtwin.files import output
 from magtwin.frames import rotate
-from magtwin.spec.scene import Vec3
+from magtwin.spec.base import Vec3
 from magtwin.usd.geometry import (
     ColourScale,
     Shape,

@@ -38,7 +38,7 @@ from magtwin.files import output
 from magtwin.frames import matrix_from_quat, quat_from_yaw
 from magtwin.run.compare import FIELDS, HEADINGS, POSITIONS
 from magtwin.run.run import Run
-from magtwin.spec.scene import Vec3
+from magtwin.spec.base import Vec3
 from magtwin.usd.geometry import ColourScale, Link, Shape, read_colour_scale, read_links, read_shapes
 from magtwin.usd.layers import open_stage
 

@@ -91,7 +91,7 @@ def repeat(run: Run, scene: str | FilePath | None = None, *, near: str | FilePat
     """Make a run once more, from what its metadata say, and compare.
 
     Args:
-        run: A run that `simulate`, `simulate_many` or a command made.
+        run: A run that `simulate`, `sweep` or a command made.
         scene: Where its scene lies now; None looks where the metadata say.
         near: The run's own file: files that its metadata name are looked for in its folder too.
 

@@ -6,7 +6,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
-from magtwin.field.maps.lookup import EDGE, TURN, Lookup, blend, sides_of
+from magtwin.field.maps.lookup import EDGE, TURN, Lookup, blend, sides
 from magtwin.field.maps.map import AnomalyMap, Outside
 from magtwin.field.sources.harmonic import SHAPES, HarmonicField
 from magtwin.field.sources.point_dipoles import MU_0_OVER_4_PI, NT_PER_T
@@ -99,8 +99,8 @@ class TorchMap(torch.nn.Module):
             if len(self.holes):
                 holes = self._corners(self.holes, node)
                 known = known & ~(blend(holes, wx, wy, wh) > EDGE)
-                sides = sides_of(holes, wx, wy, wh, 1.0)
-                unknown = [~known | ((r != 0) & (s > EDGE)) for r, s in zip(rates, sides, strict=True)]
+                across = sides(holes, wx, wy, wh, 1.0)
+                unknown = [~known | ((r != 0) & (s > EDGE)) for r, s in zip(rates, across, strict=True)]
         moved = (*p.unbind(-1), yaw)
         found = zip(moved, (wx, wy, wh), rates, unknown, strict=True)
         wx, wy, wh = (_Weight.apply(*of) for of in found)

@@ -26,7 +26,9 @@ from magtwin.sim.interference import (
     wheel_torques_nm,
 )
 from magtwin.sim.motion.drive import wheel_rates
-from magtwin.spec.scene import PlatformFieldSpec, RobotSpec, Scene
+from magtwin.spec.magnetics import PlatformFieldSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
 from magtwin.verdict import verdict
 
 Array = NDArray[np.float64]

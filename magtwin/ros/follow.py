@@ -19,7 +19,7 @@ from magtwin.sim.motion.controllers import Guide, guide_along
 from magtwin.sim.motion.follow import CONTROL_RATE_HZ
 from magtwin.sim.motion.loop import RELEASE
 from magtwin.sim.motion.plan import NODE_M
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 
 ESTIMATE = replace(POSE, name="/robot/estimate/pose")
 """Where a localizer thinks that the robot is."""

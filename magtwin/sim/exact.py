@@ -33,7 +33,8 @@ from magtwin.sim.interference import (
 )
 from magtwin.sim.motion.drive import Moment
 from magtwin.sim.motion.sampling import Moving
-from magtwin.spec.scene import ZERO9, Scene
+from magtwin.spec.base import ZERO9
+from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 

@@ -11,21 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.field.maps.plane import Plane
 from magtwin.field.sources.bodies import Bodies
+from magtwin.field.sources.magnets import body_of
 from magtwin.field.sources.point_dipoles import dipole_field_nt
 from magtwin.sim.motion.drive import Moment, wheel_rates
 from magtwin.sim.motion.sampling import Moving, moment_at
 from magtwin.sim.sensors.battery import current_a
-from magtwin.spec.scene import (
-    ZERO3,
-    BatterySpec,
-    DriveSpec,
-    EarthFieldSpec,
-    PlatformFieldSpec,
-    RobotSpec,
-    Scene,
-    SourceSpec,
-    Vec3,
-)
+from magtwin.spec.base import ZERO3, Vec3
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import BatterySpec
 
 Array = NDArray[np.float64]
 
@@ -170,7 +166,7 @@ def _bodies(magnets: tuple[SourceSpec, ...], earth: EarthFieldSpec) -> Bodies:
     """What is magnetised, ready to be evaluated."""
     points = [source for source in magnets if source.shape == "point"]
     return Bodies(
-        [source.body(earth.b_world_nt) for source in magnets if source.shape != "point"],
+        [body_of(source, earth.b_world_nt) for source in magnets if source.shape != "point"],
         [source.p_world for source in points],
         [source.m_world for source in points],
     )

@@ -8,9 +8,11 @@ import numpy as np
 
 from magtwin.field.maps.holes import filled
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.sources.magnets import body_of
 from magtwin.sim.survey import sensor_height_m, survey
+from magtwin.spec.lab import SurveySpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import Scene, SurveySpec
+from magtwin.spec.scene import Scene
 
 FLOOR_M = 0.01
 """What does not rise above this is driven over [m]."""
@@ -143,7 +145,7 @@ def in_steel(scene: Scene, p: np.ndarray, height_m: float) -> np.ndarray:
     for source in scene.magnets:
         if source.shape == "point":
             continue
-        body = replace(source, susceptibility=0.0).body()
+        body = body_of(replace(source, susceptibility=0.0))
         middle = body.p_world + body.rotation @ body.middle
         half = np.abs(body.rotation) @ (body.size_m / 2)
         near = np.flatnonzero(np.all(np.abs(p - middle[:2]) < half[:2] + radius, axis=1))

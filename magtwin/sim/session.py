@@ -13,7 +13,8 @@ import numpy as np
 
 from magtwin.sim.interference import draw_platform
 from magtwin.sim.motion.drive import draw_wheel_errors
-from magtwin.spec.scene import DriveSpec, RobotSpec
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.robot import RobotSpec
 
 YAW_ZERO = (np.pi, 0.3)
 """Mean and standard deviation of the heading at which the IMU is switched on [rad].

@@ -3,13 +3,16 @@
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from types import MappingProxyType
 
 import numpy as np
 
 from magtwin.errors import InputError, find
+from magtwin.frames import IDENTITY_XYZW, rotate
+from magtwin.spec.base import ZERO3, Quat, Spec, Vec3
+from magtwin.spec.magnetics import SourceSpec
 
-Vec3 = tuple[float, float, float]
 Face = tuple[int, int, int]
 
 
@@ -278,3 +281,95 @@ def drawn_magnetization(name: str, parts: Iterable[Part], *, seed: int = 0) -> t
             size = rng.uniform(*DRAWN_A_M) * rng.choice((-1.0, 1.0)) * part.fill
             drawn.append(float(np.copysign(max(round(abs(size)), 1), size)))
     return tuple(drawn)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FurnitureSpec(Spec):
+    """A piece of furniture or of the building; `magtwin.spec.furniture` says what each kind consists of."""
+
+    name: str
+    """Name of its prim."""
+
+    kind: str
+    """What it is, a name of `magtwin.spec.furniture.KINDS`, or "box", "cylinder" or "mesh"."""
+
+    p_world: Vec3
+    """Where it stands: the middle of its footprint, on the floor [m]."""
+
+    q_world_xyzw: Quat = IDENTITY_XYZW
+    """Its axes in world: x is its front, z up."""
+
+    magnetization: tuple[float, ...] = ()
+    """Magnetization of its steel parts, each along its longest side, in their order [A/m]; () for none."""
+
+    susceptibility: float = 0.0
+    """Volume susceptibility of its steel parts [1]."""
+
+    material: str = ""
+    """What a box, cylinder or mesh is made of, a name of `magtwin.spec.furniture.MATERIALS`."""
+
+    size_m: Vec3 = ZERO3
+    """Size of a box along its own x, y and z, or diameter, diameter and height of a cylinder [m]."""
+
+    vertices_m: tuple[Vec3, ...] = ()
+    """Vertices of a mesh about the middle of its box [m], in single precision; it stands on the floor."""
+
+    faces: tuple[tuple[int, int, int], ...] = ()
+    """Corners of a mesh's triangles, counter-clockwise from outside."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._unit("q_world_xyzw")
+        self._not_negative("susceptibility")
+        steel = [part.name for part in self.parts if part.steel]
+        fits = len(self.magnetization) in (0, len(steel))
+        what = f"have one number for each of {', '.join(steel)}" if steel else "be left out: it has no steel"
+        self._require("magnetization", fits, what, self.magnetization)
+        if not any(self.magnetization):
+            object.__setattr__(self, "magnetization", ())
+        if self.faces:
+            object.__setattr__(self, "vertices_m", self.parts[0].vertices_m)
+            self.sources()  # refuses a steel mesh that is not closed
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """What it consists of."""
+        return parts_of(
+            self.kind,
+            material=self.material,
+            size_m=self.size_m,
+            vertices_m=self.vertices_m,
+            faces=self.faces,
+        )
+
+    def sources(self, *, in_world: bool = True) -> tuple[SourceSpec, ...]:
+        """Its steel, a source each, named after the piece and the part.
+
+        Args:
+            in_world: Whether they stand where it does; otherwise they are in its own axes.
+        """
+        steel = [part for part in self.parts if part.steel]
+        turn = self.q_world_xyzw if in_world else IDENTITY_XYZW
+        sources = []
+        for part, m in zip(steel, self.magnetization or (0.0,) * len(steel), strict=True):
+            x, y, z = rotate(turn, part.p) + self.p_world if in_world else map(float, part.p)
+            sources.append(
+                SourceSpec(
+                    name=f"{self.name}_{part.name}",
+                    p_world=(float(x), float(y), float(z)),
+                    shape=part.shape,
+                    q_world_xyzw=turn,
+                    size_m=ZERO3 if part.faces else part.size_m,
+                    vertices_m=part.vertices_m,
+                    faces=part.faces,
+                    magnetization=tuple(m * (k == part.along) for k in range(3)),  # type: ignore[arg-type]
+                    susceptibility=self.susceptibility,
+                )
+            )
+        return tuple(sources)
+
+
+@lru_cache(maxsize=1024)
+def steel_of(piece: FurnitureSpec) -> tuple[SourceSpec, ...]:
+    """`piece.sources()`, kept, as every run of a furnished lab asks for them."""
+    return tuple(piece.sources())

@@ -12,7 +12,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 
 from magtwin.errors import InputError
 from magtwin.files import check_free, output, sha256
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 from magtwin.urdf.description.description import Description, origin_of, read_description
 from magtwin.urdf.description.tag import Tags
 from magtwin.urdf.layout import GEOMETRIES, PAYLOADS, check_payloads, write_layers

@@ -15,7 +15,8 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdRender, Vt
 
 from magtwin.errors import InputError, hint
 from magtwin.frames import matrix_from_quat, quat_from_rpy
-from magtwin.spec.scene import ZERO3, ImuSpec, LidarSpec, MagnetometerSpec
+from magtwin.spec.base import ZERO3
+from magtwin.spec.sensors import ImuSpec, LidarSpec, MagnetometerSpec
 from magtwin.urdf.description.tag import Element, Tags
 from magtwin.urdf.meshes.mesh_layer import free_name
 from magtwin.urdf.shape import pose_of

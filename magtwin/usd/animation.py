@@ -29,7 +29,7 @@ from magtwin.files import existing, output
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
 from magtwin.run.resample import grid
 from magtwin.run.run import COLUMNS, Column, Run, check_clock
-from magtwin.spec.scene import Quat, Vec3
+from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.attributes import read_pose, target
 from magtwin.usd.geometry import BASE_LINK, read_links
 from magtwin.usd.layers import SUFFIXES, WORLD, describe_stage, open_stage

@@ -12,7 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from magtwin.errors import InputError
 from magtwin.frames import wxyz_from_xyzw, xyzw_from_wxyz
-from magtwin.spec.scene import Quat, Vec3
+from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.layers import relative_asset
 from magtwin.usd.schema import attribute_name, place, require_api
 

@@ -6,7 +6,8 @@ from pxr import Sdf, Usd, UsdGeom
 
 from magtwin.errors import InputError
 from magtwin.field.sources.earth import earth_field_nt
-from magtwin.spec.scene import ZERO3, EarthFieldSpec
+from magtwin.spec.base import ZERO3
+from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.usd.attributes import read_figures, write_figures
 from magtwin.usd.schema import apply_api, attribute_name, place
 

@@ -10,7 +10,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
 from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW, canonical
-from magtwin.spec.scene import ZERO3, Quat, Vec3
+from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.usd.layers import open_stage
 
 SEGMENTS = 32

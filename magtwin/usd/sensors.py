@@ -14,19 +14,11 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from magtwin.errors import InputError, hint
 from magtwin.frames import IDENTITY_XYZW, canonical, xyzw_from_wxyz
-from magtwin.spec.scene import (
-    BatterySpec,
-    DriveSpec,
-    ImuSpec,
-    LidarSpec,
-    MagnetometerSpec,
-    MocapSpec,
-    MountSpec,
-    PlatformFieldSpec,
-    Quat,
-    RobotSpec,
-    Vec3,
-)
+from magtwin.spec.base import Quat, Vec3
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.magnetics import PlatformFieldSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
 from magtwin.usd.attributes import read_figures, read_pose, target, write_figures, write_pose
 from magtwin.usd.schema import NOUNS, apply_api, attribute_name, only_prim_with, place, require_api
 

@@ -7,8 +7,10 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from magtwin.errors import InputError
 from magtwin.field.sources.bodies import mesh_moments
+from magtwin.field.sources.magnets import body_of
 from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multiply, rotate, xyzw_from_wxyz
-from magtwin.spec.scene import ZERO3, Quat, SourceSpec, Vec3
+from magtwin.spec.base import ZERO3, Quat, Vec3
+from magtwin.spec.magnetics import SourceSpec
 from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
 from magtwin.usd.layers import WORLD
 from magtwin.usd.looks import define_looks, wear
@@ -153,7 +155,7 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
         if own["moment"] != ZERO3:
             if own["magnetization"] != ZERO3:
                 raise InputError("has both a moment and a magnetization; give one of them")
-            own["magnetization"] = _over(own["moment"], SourceSpec(**spec).body().volume_m3)
+            own["magnetization"] = _over(own["moment"], body_of(SourceSpec(**spec)).volume_m3)
         return SourceSpec(
             **spec, magnetization=own["magnetization"], susceptibility=figures["susceptibility"]
         )

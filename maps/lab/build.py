@@ -25,8 +25,12 @@ from magtwin.files import output, shipped
 from magtwin.frames import quat_from_rpy
 from magtwin.report import Report
 from magtwin.sim.survey import survey_readings
-from magtwin.spec.furniture import parts_of
-from magtwin.spec.scene import ZERO3, EarthFieldSpec, FurnitureSpec, LabSpec, RobotSpec, Scene, SourceSpec
+from magtwin.spec.base import ZERO3
+from magtwin.spec.furniture import FurnitureSpec, parts_of
+from magtwin.spec.lab import LabSpec
+from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
 from magtwin.usd.earth import derived
 from magtwin.usd.maps import save_map
 

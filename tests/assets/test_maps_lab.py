@@ -10,11 +10,12 @@ from numpy.testing import assert_allclose
 
 from magtwin.author.scene import read_sources
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.sources.magnets import body_of
 from magtwin.files import from_table, read_toml, shipped
 from magtwin.path import path_named
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.survey import field_at_rest_nt
-from magtwin.spec.scene import EarthFieldSpec
+from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.usd.maps import load_map
 
 LAB = shipped("maps", "lab")
@@ -130,7 +131,7 @@ def test_the_lab_is_furnished_and_its_steel_is_as_strong_as_steel_is():
 def test_no_steel_lies_where_the_robot_drives(script):
     half = np.array([3.0, 1.75])
     for source in script.scene(script.robot()).magnets:
-        body = source.body((0.0, 0.0, 0.0))
+        body = body_of(source, (0.0, 0.0, 0.0))
         corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
         world = corners * body.size_m @ body.rotation.T + body.p_world
         beside = np.any(world.min(axis=0)[:2] > half) or np.any(world.max(axis=0)[:2] < -half)

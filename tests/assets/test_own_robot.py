@@ -10,7 +10,8 @@ from magtwin.author.from_urdf import RobotSettings, from_urdf
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.files import shipped
-from magtwin.spec.scene import DriveSpec, MagnetometerSpec
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.sensors import MagnetometerSpec
 
 CART = DATA / "robots" / "cart.urdf"
 

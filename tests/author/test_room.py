@@ -18,11 +18,19 @@ from magtwin.errors import InputError
 from magtwin.field.maps.holes import filled
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.bodies import Bodies
+from magtwin.field.sources.magnets import body_of
 from magtwin.files import shipped
 from magtwin.sim.contradiction import contradiction_nt
 from magtwin.sim.survey import field_at_rest_nt
-from magtwin.spec.furniture import DRAWN_A_M, KINDS, MATERIALS, STEEL, drawn_magnetization, parts_of
-from magtwin.spec.scene import FurnitureSpec
+from magtwin.spec.furniture import (
+    DRAWN_A_M,
+    KINDS,
+    MATERIALS,
+    STEEL,
+    FurnitureSpec,
+    drawn_magnetization,
+    parts_of,
+)
 from magtwin.twin import author_scene, new_scene, open_twin, scene_from_toml, simulate
 from magtwin.usd.maps import save_map
 
@@ -118,7 +126,7 @@ def test_each_kind_of_furniture_makes_some_microtesla_beside_it_by_default(kind)
             p_world=(0, 0, 0),
             magnetization=drawn_magnetization(kind, parts, seed=seed),
         )
-        field = Bodies([source.body() for source in spec.sources()]).field_nt(at)
+        field = Bodies([body_of(source) for source in spec.sources()]).field_nt(at)
         largest.append(np.linalg.norm(field, axis=1).max())
     assert 300 < np.median(largest) < 40_000
 

@@ -22,18 +22,11 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.earth import earth_field_nt
 from magtwin.files import sha256, shipped
 from magtwin.frames import IDENTITY_XYZW, quat_from_rpy, quat_multiply
-from magtwin.spec.scene import (
-    BatterySpec,
-    DriveSpec,
-    EarthFieldSpec,
-    ImuSpec,
-    LabSpec,
-    LidarSpec,
-    MagnetometerSpec,
-    PlatformFieldSpec,
-    Scene,
-    SourceSpec,
-)
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.lab import LabSpec
+from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec
 from magtwin.twin import open_twin, simulate
 from magtwin.usd import sensors
 from magtwin.usd.attributes import write_pose
@@ -801,8 +794,8 @@ def test_a_twin_is_opened_with_other_weights_or_none_where_the_scenes_own_are_go
     root = author_scene(full_scene(parts), tmp_path / "s")
     (tmp_path / "s" / "weights" / "net.pth").unlink()
     others = shipped("weights", "turtlebot4_hybrid.safetensors")
-    assert open_twin(root, net=others).scene.robot.magnetometer.network == others
-    assert open_twin(root, net="none").magnetometer is None
+    assert open_twin(root, network=others).scene.robot.magnetometer.network == others
+    assert open_twin(root, network="none").magnetometer is None
     with pytest.raises(InputError, match=r"net\.pth, which is not there"):
         open_twin(root)
 
@@ -837,9 +830,9 @@ def test_a_twin_loads_a_network_only_for_a_neural_magnetometer(lab_scene, tmp_pa
         twin = open_twin(lab_scene, magnetometer=kind)
         assert twin.magnetometer is None
         assert twin.scene.robot.magnetometer.kind == kind
-    assert open_twin(lab_scene, net="none").scene.robot.magnetometer.kind == "physical"
-    with pytest.raises(InputError, match="a neural magnetometer that names no network"):
-        open_twin(lab_scene, net="none", magnetometer="neural")
+    assert open_twin(lab_scene, network="none").scene.robot.magnetometer.kind == "physical"
+    with pytest.raises(InputError, match="a neural magnetometer without a network"):
+        open_twin(lab_scene, network="none", magnetometer="neural")
     with pytest.raises(InputError, match=r"kind of MagnetometerSpec must be a known kind .*'physical'"):
         open_twin(lab_scene, magnetometer="physicall")  # type: ignore[arg-type]
     run = simulate(open_twin(lab_scene, magnetometer="map-only"), duration_s=1.0)

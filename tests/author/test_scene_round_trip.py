@@ -7,7 +7,7 @@ import pytest
 from magtwin.author.scene import author_scene, read_scene
 from magtwin.errors import InputError
 from magtwin.files import shipped
-from magtwin.spec.scene import PlacedRobot
+from magtwin.spec.robot import PlacedRobot
 from magtwin.twin import scene_from_toml
 
 DERIVED = (

@@ -225,7 +225,7 @@ def test_run_takes_the_kind_of_magnetometer(lab_scene, tmp_path, capsys):
         assert (run["b_disturbance_nt"] == 0).all() == (kind == "map-only")
     capsys.readouterr()
     line = refused(capsys, "run", lab_scene, "--net", "none", "--magnetometer", "neural", "--duration", "1")
-    assert "a neural magnetometer that names no network" in line
+    assert "a neural magnetometer without a network" in line
 
 
 def test_options_come_from_the_environment_and_from_magtwin_toml(tmp_path, monkeypatch, capsys, lab_scene):

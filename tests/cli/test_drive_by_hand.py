@@ -20,8 +20,8 @@ from magtwin.io.tables import read_parquet
 from magtwin.sim.motion.commands import read_commands
 from magtwin.sim.motion.follow import play
 from magtwin.sim.motion.manual import Gamepad, Keyboard, Recorder, at_start
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec
 from magtwin.twin import open_twin
 
 DRIVE = DriveSpec()
@@ -138,7 +138,7 @@ def test_a_folder_is_no_gamepad(tmp_path, lab_scene, capsys):
 
 
 def test_a_viewer_that_listens_shows_the_drive_while_it_goes_on(lab_scene):
-    scene = open_twin(lab_scene, net="none").scene
+    scene = open_twin(lab_scene, network="none").scene
     try:
         with live_viewer(headless=True) as (address, client), streamed(scene, lab_scene, address) as show:
             for k in range(20):

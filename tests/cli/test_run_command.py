@@ -78,7 +78,7 @@ def test_outputs_that_cannot_all_be_written_leave_none(lab_scene, tmp_path, caps
 
 
 def test_a_run_that_lacks_columns_is_shown_in_its_lab_all_the_same(lab_scene, tmp_path):
-    twin = open_twin(lab_scene, net="none")
+    twin = open_twin(lab_scene, network="none")
     t = np.arange(200) / 50
     posed = {
         "p_world_base": np.column_stack([t / 10, t / 20, 0 * t]),

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from magtwin.cli import main
-from magtwin.cli.runs import MIXTURE
 from magtwin.io.tables import read_parquet
 from magtwin.path import path_named
-from magtwin.twin import in_session, open_twin, simulate
+from magtwin.twin import MIXTURE, in_session, open_twin, simulate
 
 SHORT = ("--duration", "1", "--magnetometer", "physical")
 

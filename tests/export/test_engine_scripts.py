@@ -108,7 +108,7 @@ def rms(error):
 @pytest.mark.physics
 @lacking
 def test_the_robot_in_newton_is_where_the_kinematic_one_is_within_5_cm_at_equal_times(driven, lab_scene):
-    drive = open_twin(lab_scene, net="none").scene.robot.drive
+    drive = open_twin(lab_scene, network="none").scene.robot.drive
     motion = follow(figure8(), drive, speed=0.2)
     assert abs(motion.duration_s - driven["t"][-1]) < 1.0
     t = driven["t"][driven["t"] < motion.duration_s]

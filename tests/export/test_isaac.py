@@ -15,7 +15,7 @@ from magtwin.export.isaac import GRAPHS, author_graph
 from magtwin.export.ogn import Graph, faults, fits, message_fields, node_types
 from magtwin.io.bags.messages import SCAN, TOPICS, TYPES, sender_of
 from magtwin.ros.magnetometer import INPUTS
-from magtwin.spec.scene import PlacedRobot
+from magtwin.spec.robot import PlacedRobot
 from magtwin.usd.layers import open_stage
 from magtwin.usd.schema import only_prim_with
 

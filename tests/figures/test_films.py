@@ -21,7 +21,7 @@ from magtwin.figures.scenery import WALL_M, Scenery, View, _free_share, picture_
 from magtwin.files import shipped
 from magtwin.io.tables import write_parquet
 from magtwin.run.run import Run
-from magtwin.spec.scene import PlacedRobot
+from magtwin.spec.robot import PlacedRobot
 from magtwin.twin import open_twin, scene_from_toml, simulate
 
 SIZE = (160, 90)

@@ -210,7 +210,7 @@ def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_sce
     stray = run.with_metadata(scene_file="gone.usda")
     write_run(stray, tmp_path / "stray.parquet")
     main(["convert", str(tmp_path / "stray.parquet"), str(tmp_path / "d.usdc")])
-    assert "without a scene: gone.usda: the scene of the run is not there" in capsys.readouterr().err
+    assert "without a scene: gone.usda: the scene of the run is missing" in capsys.readouterr().err
     main(["convert", str(tmp_path / "stray.parquet"), str(tmp_path / "e.usdc"), "--scene", str(lab_scene)])
     assert Usd.Stage.Open(str(tmp_path / "e.usdc")).GetPrimAtPath("/World/turtlebot4/base_link").IsValid()
 

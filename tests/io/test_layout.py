@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from rerun.blueprint import Corner2D
 
 from magtwin.io.rerun.layout import lab_eye, legend_corner, value_range
-from magtwin.spec.scene import LabSpec
+from magtwin.spec.lab import LabSpec
 
 TIMES = np.linspace(0, 100, 1001)
 RAMP = np.linspace(0, 1, 1001)[:, None]

@@ -43,7 +43,7 @@ def test_a_run_names_its_files_with_checksums(run, lab_scene, twin):
 
 
 def test_a_run_of_a_network_named_by_hand_says_its_file(lab_scene):
-    twin = open_twin(lab_scene, net=open_twin(lab_scene).scene.robot.magnetometer.network)
+    twin = open_twin(lab_scene, network=open_twin(lab_scene).scene.robot.magnetometer.network)
     network = simulate(twin, "figure8", **BRIEF).metadata["network_file"]
     assert sha256(network) == twin.metadata["network_sha256"]
 
@@ -206,7 +206,7 @@ def test_a_run_is_found_beside_its_scene_when_both_have_moved(run, lab_scene, tm
     moved.parent.symlink_to(lab_scene.parent)
     monkeypatch.chdir(tmp_path)
     told = run.with_metadata(scene_file=f"scene/{lab_scene.name}")
-    with pytest.raises(InputError, match="the scene of the run is not there; name it"):
+    with pytest.raises(InputError, match="the scene of the run is missing; name it"):
         repeat(told)
     assert repeat(told, near=there / "run.parquet").equal
     assert repeat(told, near=there).equal
@@ -216,7 +216,7 @@ def test_a_run_is_found_beside_its_scene_when_both_have_moved(run, lab_scene, tm
 def test_a_twin_is_opened_as_the_run_had_it_or_refused(run, lab_scene):
     assert twin_of(run).scene.robot.magnetometer.kind == "map-only"
     changed = run.with_metadata(scene_sha256="0" * 64)
-    with pytest.raises(InputError, match="the scene is not what the run came from: scene_sha256 is "):
+    with pytest.raises(InputError, match="the scene changed since the run: scene_sha256 is "):
         twin_of(changed)
     assert twin_of(changed, check=False).scene_file == lab_scene
 
@@ -232,7 +232,7 @@ def test_what_is_no_longer_at_hand_is_refused(twin, run):
     lost = replace(run, metadata={k: v for k, v in run.metadata.items() if k != "seed"})
     with pytest.raises(InputError, match="the run does not say its seed"):
         repeat(lost)
-    with pytest.raises(InputError, match="does not say which scene it came from"):
+    with pytest.raises(InputError, match="does not name its scene"):
         repeat(Run(run.columns, {"seed": 1}))
     with pytest.raises(InputError, match="do not say how it was made: could not convert"):
         repeat(run.with_metadata(rate_hz="often"))

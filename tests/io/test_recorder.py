@@ -42,7 +42,7 @@ with Recorder([RrdWriter(f"{folder}/run.rrd"), table, bag]) as recorder:
 
 @pytest.fixture(scope="module")
 def twin(lab_scene):
-    return open_twin(lab_scene, net="none")
+    return open_twin(lab_scene, network="none")
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,9 @@ from magtwin.io.rerun.viewer import headless_viewer, screenshot
 from magtwin.io.tables import write_parquet
 from magtwin.path import figure8
 from magtwin.run.run import COLUMNS, Run
-from magtwin.spec.scene import MagnetometerSpec, RobotSpec, Scene
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.twin import Twin, scan
 
 HEADER = """#usda 1.0

@@ -19,7 +19,7 @@ from magtwin.twin import open_twin, scan, simulate
 
 @pytest.fixture(scope="module")
 def twin(lab_scene):
-    return open_twin(lab_scene, net="none")
+    return open_twin(lab_scene, network="none")
 
 
 @pytest.fixture(scope="module")

@@ -329,7 +329,7 @@ def test_numpy_reads_the_npz_without_pickle(tables):
     with np.load(tables / "run.npz", allow_pickle=False) as arrays:
         assert np.array_equal(arrays["p_world_base"], some_run()["p_world_base"])
         told = json.loads(str(arrays["magtwin"]))
-    assert told["metadata"] == FACTS
+    assert told["facts"] == FACTS
     assert told["columns"]["b_total_nt"]["unit"] == "nT"
 
 

@@ -19,7 +19,7 @@ from magtwin.ros.follow import Follower
 from magtwin.ros.simulate import Simulator
 from magtwin.ros.teleop import Teleop
 from magtwin.sim.motion.manual import Keyboard
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 from magtwin.twin import Twin, open_twin
 
 pytest.importorskip("cyclonedds", reason="extra ros is not installed")

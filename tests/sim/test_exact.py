@@ -18,14 +18,10 @@ from magtwin.sim.exact import DIP, ExactField, check_field, check_read
 from magtwin.sim.interference import draw_platform
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.session import draw_session
-from magtwin.spec.scene import (
-    EarthFieldSpec,
-    MagnetometerSpec,
-    PlatformFieldSpec,
-    RobotSpec,
-    Scene,
-    SourceSpec,
-)
+from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import MagnetometerSpec
 
 EARTH = EarthFieldSpec(
     b_world_nt=(-2_600.0, 24_000.0, -38_000.0),

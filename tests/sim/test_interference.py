@@ -21,16 +21,12 @@ from magtwin.sim.interference import (
     wheel_torques_nm,
 )
 from magtwin.sim.motion.drive import Motion
-from magtwin.spec.scene import (
-    BatterySpec,
-    DriveSpec,
-    EarthFieldSpec,
-    FurnitureSpec,
-    PlatformFieldSpec,
-    RobotSpec,
-    Scene,
-    SourceSpec,
-)
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.furniture import FurnitureSpec
+from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import BatterySpec
 
 EARTH = EarthFieldSpec(
     b_world_nt=(-2_745.6, 24_067.1, -38_418.4),

@@ -20,7 +20,9 @@ from magtwin.sim.interference import draw_platform, platform_field_nt
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.session import draw_session, draw_speed
 from magtwin.sim.survey import survey
-from magtwin.spec.scene import MagnetometerSpec, PlatformFieldSpec, Scene
+from magtwin.spec.magnetics import PlatformFieldSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import MagnetometerSpec
 
 SETTINGS = shipped("robots", "turtlebot4", "robot.toml")
 DAYS = 5

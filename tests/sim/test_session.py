@@ -11,7 +11,11 @@ from magtwin.learn.data.features import FULL, features
 from magtwin.path import PATHS, path_named
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.session import LEAST_CHARGE, SPEEDS, draw_session, draw_speed
-from magtwin.spec.scene import DriveSpec, EarthFieldSpec, LidarSpec, RobotSpec, Scene
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.magnetics import EarthFieldSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import LidarSpec
 
 REAL = {
     "yaw_deg": (180.295, 101.551),

@@ -8,19 +8,16 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.field.maps.difference import difference
+from magtwin.field.sources.magnets import body_of
 from magtwin.field.sources.point_dipoles import dipole_field_nt
 from magtwin.frames import quat_from_yaw, rotate
 from magtwin.sim.interference import ambient_gradient_nt_m
 from magtwin.sim.survey import field_at_rest_nt, pose_error_nt2, survey, survey_readings
-from magtwin.spec.scene import (
-    EarthFieldSpec,
-    LabSpec,
-    MagnetometerSpec,
-    PlatformFieldSpec,
-    RobotSpec,
-    Scene,
-    SourceSpec,
-)
+from magtwin.spec.lab import LabSpec
+from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import MagnetometerSpec
 
 EARTH = EarthFieldSpec(
     b_world_nt=(-2_745.6, 24_067.1, -38_418.4),
@@ -255,7 +252,7 @@ def test_a_desk_moved_in_the_stage_changes_the_next_survey_by_what_its_steel_say
     place = np.concatenate([p, np.full((*yaw.shape, 1), robot.base_height_m)], axis=-1)
     place += rotate(turn, np.broadcast_to(robot.p_base_magnetometer, place.shape))
     flat = place.reshape(-1, 3)
-    steel = [sum(s.body().exact_field_nt(flat) for s in piece.sources()) for piece in (desk, moved)]
+    steel = [sum(body_of(s).exact_field_nt(flat) for s in piece.sources()) for piece in (desk, moved)]
     world = ambient_field_nt(before, flat) - steel[0] + steel[1]
     body = rotate(quat_conjugate(turn.reshape(-1, 4)), world)
     platform = robot.platform

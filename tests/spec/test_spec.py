@@ -1,42 +1,52 @@
 """Specs: what makes no sense is refused at birth, by field, class and value."""
 
+import importlib
 import math
+import pkgutil
 from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 
+import magtwin.spec as spec
 from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW
-from magtwin.spec import scene as spec
+from magtwin.spec.base import Spec
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.furniture import FurnitureSpec
+from magtwin.spec.lab import LabSpec, SurveySpec
+from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.robot import PlacedRobot, RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
 
-ROBOT = spec.RobotSpec(name="robot", asset=Path("robot.usda"))
-EARTH = spec.EarthFieldSpec(
+ROBOT = RobotSpec(name="robot", asset=Path("robot.usda"))
+EARTH = EarthFieldSpec(
     b_world_nt=(0.0, 2e4, -4e4), latitude_deg=29.6, longitude_deg=-82.3, height_m=20.0, date="2026-01-01"
 )
 SPECS = (
-    spec.MagnetometerSpec(),
-    spec.ImuSpec(),
-    spec.LidarSpec(),
-    spec.BatterySpec(),
-    spec.MocapSpec(),
-    spec.SurveySpec(),
-    spec.DriveSpec(),
-    spec.PlatformFieldSpec(),
+    MagnetometerSpec(),
+    ImuSpec(),
+    LidarSpec(),
+    BatterySpec(),
+    MocapSpec(),
+    SurveySpec(),
+    DriveSpec(),
+    PlatformFieldSpec(),
     ROBOT,
-    spec.LabSpec(),
+    LabSpec(),
     EARTH,
-    spec.SourceSpec(name="beam", p_world=(0.0, 0.0, 0.0), m_world=(0.0, 0.0, 1.0)),
-    spec.SourceSpec(
+    SourceSpec(name="beam", p_world=(0.0, 0.0, 0.0), m_world=(0.0, 0.0, 1.0)),
+    SourceSpec(
         name="crate",
         p_world=(0.0, 0.0, 0.0),
         shape="cuboid",
         size_m=(1.0, 1.0, 1.0),
         magnetization=(1.0, 0, 0),
     ),
-    spec.FurnitureSpec(name="desk", kind="desk", p_world=(0.0, 0.0, 0.0), magnetization=(1e3,) * 6),
-    spec.PlacedRobot(robot=ROBOT),
-    spec.Scene(name="lab", map_layer=Path("map.usdc"), robot=ROBOT),
+    FurnitureSpec(name="desk", kind="desk", p_world=(0.0, 0.0, 0.0), magnetization=(1e3,) * 6),
+    PlacedRobot(robot=ROBOT),
+    Scene(name="lab", map_layer=Path("map.usdc"), robot=ROBOT),
 )
 
 
@@ -48,8 +58,11 @@ def numbers() -> list:
 
 
 def test_every_spec_is_checked_here():
-    public = {v for v in vars(spec).values() if isinstance(v, type) and issubclass(v, spec.Spec)}
-    assert public - {spec.Spec, spec.MountSpec} == {type(s) for s in SPECS}
+    modules = [
+        vars(importlib.import_module(f"magtwin.spec.{m.name}")) for m in pkgutil.iter_modules(spec.__path__)
+    ]
+    public = {v for m in modules for v in m.values() if isinstance(v, type) and issubclass(v, Spec)}
+    assert public - {Spec, MountSpec} == {type(s) for s in SPECS}
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
@@ -65,8 +78,8 @@ def test_no_number_of_a_spec_may_be_infinite_or_none(given, name, bad):
 @pytest.mark.parametrize(
     ("given", "change", "said"),
     [
-        (spec.ImuSpec(), {"q_link_sensor_xyzw": (0.0, 0.0, 0.0, 0.0)}, "must be a unit quaternion, got"),
-        (spec.LidarSpec(), {"q_link_sensor_xyzw": (0.0, 0.0, 1.0, 2e-3)}, "must be a unit quaternion, got"),
+        (ImuSpec(), {"q_link_sensor_xyzw": (0.0, 0.0, 0.0, 0.0)}, "must be a unit quaternion, got"),
+        (LidarSpec(), {"q_link_sensor_xyzw": (0.0, 0.0, 1.0, 2e-3)}, "must be a unit quaternion, got"),
         (ROBOT, {"q_base_imu_link_xyzw": (0.0, 0.0, 0.0, 2.0)}, "of RobotSpec must be a unit quaternion"),
         (EARTH, {"latitude_deg": -90.1}, r"latitude_deg of EarthFieldSpec must lie in -90\.\.90, got -90\.1"),
         (
@@ -82,44 +95,44 @@ def test_no_number_of_a_spec_may_be_infinite_or_none(given, name, bad):
         (EARTH, {"date": "20260101"}, "must be a day as YYYY-MM-DD, got '20260101'"),
         (EARTH, {"date": ""}, "must be a day as YYYY-MM-DD, got ''"),
         (
-            spec.LidarSpec(),
+            LidarSpec(),
             {"range_min_m": 12.0},
             r"range_min_m of LidarSpec must be below range_max_m 12\.0, got 12",
         ),
         (
-            spec.BatterySpec(),
+            BatterySpec(),
             {"voltage_full_v": 12.0},
             r"voltage_full_v of BatterySpec must not be below voltage_empty_v 12\.44, got 12\.0",
         ),
         (
-            spec.DriveSpec(),
+            DriveSpec(),
             {"left_wheel_joint": "right_wheel_joint"},
             "right_wheel_joint of DriveSpec must be another joint than the left wheel's, got",
         ),
-        (spec.BatterySpec(), {"initial_fraction": 1.5}, r"must lie in 0\.\.1, got 1\.5"),
+        (BatterySpec(), {"initial_fraction": 1.5}, r"must lie in 0\.\.1, got 1\.5"),
         *(
             (given, {"rate_hz": rate}, rf"rate_hz of {type(given).__name__} must be above 0, got")
-            for given in (spec.MagnetometerSpec(), spec.ImuSpec(), spec.BatterySpec(), spec.MocapSpec())
+            for given in (MagnetometerSpec(), ImuSpec(), BatterySpec(), MocapSpec())
             for rate in (0.0, -62.0)
         ),
-        (spec.DriveSpec(), {"odometry_rate_hz": 0.0}, "odometry_rate_hz of DriveSpec must be above 0, got 0"),
-        (spec.DriveSpec(), {"odometry_scale": (1.0, 0.0)}, r"odometry_scale .* must be above 0, got \(1"),
-        (spec.DriveSpec(), {"wheel_errors": (0.0, -1.0)}, r"wheel_errors .* must be above -1, got \(0"),
-        (spec.ImuSpec(), {"latency_s": -0.1}, r"latency_s of ImuSpec must not be below 0, got -0\.1"),
-        (spec.ImuSpec(), {"accel_vibration": (1.0, -1.0, 1.0)}, "accel_vibration .* must not be below 0"),
-        (spec.LidarSpec(), {"scan_rate_hz": 0.0}, "scan_rate_hz of LidarSpec must be above 0"),
-        (spec.LidarSpec(), {"rays": 0}, r"rays of LidarSpec must lie in 1\.\.100000, got 0"),
-        (spec.LidarSpec(), {"rays": 90.5}, r"rays of LidarSpec must be a whole number, got 90\.5"),
+        (DriveSpec(), {"odometry_rate_hz": 0.0}, "odometry_rate_hz of DriveSpec must be above 0, got 0"),
+        (DriveSpec(), {"odometry_scale": (1.0, 0.0)}, r"odometry_scale .* must be above 0, got \(1"),
+        (DriveSpec(), {"wheel_errors": (0.0, -1.0)}, r"wheel_errors .* must be above -1, got \(0"),
+        (ImuSpec(), {"latency_s": -0.1}, r"latency_s of ImuSpec must not be below 0, got -0\.1"),
+        (ImuSpec(), {"accel_vibration": (1.0, -1.0, 1.0)}, "accel_vibration .* must not be below 0"),
+        (LidarSpec(), {"scan_rate_hz": 0.0}, "scan_rate_hz of LidarSpec must be above 0"),
+        (LidarSpec(), {"rays": 0}, r"rays of LidarSpec must lie in 1\.\.100000, got 0"),
+        (LidarSpec(), {"rays": 90.5}, r"rays of LidarSpec must be a whole number, got 90\.5"),
         (
-            spec.BatterySpec(),
+            BatterySpec(),
             {"model": "magic"},
             """model of BatterySpec must be "power" or "linear", got 'magic'""",
         ),
-        (spec.BatterySpec(), {"discharge": (0.0, 0.6, 0.5, 1.0)}, "discharge .* must rise from 0 to 1"),
-        (spec.BatterySpec(), {"discharge": ()}, "discharge .* must rise from 0 to 1"),
-        (spec.BatterySpec(), {"motor_efficiency": 1.1}, r"motor_efficiency .* must lie in 0\.\.1, got 1\.1"),
-        (spec.MocapSpec(), {"dropout_s": -1.0}, r"dropout_s of MocapSpec must not be below 0, got -1\.0"),
-        (spec.LabSpec(), {"floor_m": (6.0, 0.0)}, r"floor_m of LabSpec must be above 0 m each way, got"),
+        (BatterySpec(), {"discharge": (0.0, 0.6, 0.5, 1.0)}, "discharge .* must rise from 0 to 1"),
+        (BatterySpec(), {"discharge": ()}, "discharge .* must rise from 0 to 1"),
+        (BatterySpec(), {"motor_efficiency": 1.1}, r"motor_efficiency .* must lie in 0\.\.1, got 1\.1"),
+        (MocapSpec(), {"dropout_s": -1.0}, r"dropout_s of MocapSpec must not be below 0, got -1\.0"),
+        (LabSpec(), {"floor_m": (6.0, 0.0)}, r"floor_m of LabSpec must be above 0 m each way, got"),
     ],
 )
 def test_what_makes_no_sense_is_refused(given, change, said):
@@ -129,6 +142,6 @@ def test_what_makes_no_sense_is_refused(given, change, said):
 
 def test_a_turn_in_single_precision_and_a_battery_of_constant_voltage_are_taken():
     third = 0.577350258827209  # 1 / sqrt 3 to single precision
-    assert spec.ImuSpec(q_link_sensor_xyzw=(third, third, third, 0.0)).q_link_sensor_xyzw[0] == third
-    assert spec.BatterySpec(voltage_empty_v=12.0, voltage_full_v=12.0).voltage_full_v == 12.0
+    assert ImuSpec(q_link_sensor_xyzw=(third, third, third, 0.0)).q_link_sensor_xyzw[0] == third
+    assert BatterySpec(voltage_empty_v=12.0, voltage_full_v=12.0).voltage_full_v == 12.0
     assert ROBOT.q_base_magnetometer_xyzw == ROBOT.q_base_imu_xyzw == IDENTITY_XYZW

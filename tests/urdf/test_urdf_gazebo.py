@@ -528,7 +528,7 @@ def test_the_real_robot_passes_the_validators_and_nothing_is_silent(turtlebot, t
 
 def test_settings_come_before_tags_and_leave_one_sensor_of_each_kind(tmp_path, real_data):
     from magtwin.author.robot import RobotSettings, build_robot, read_robot
-    from magtwin.spec.scene import ImuSpec, LidarSpec, MagnetometerSpec
+    from magtwin.spec.sensors import ImuSpec, LidarSpec, MagnetometerSpec
 
     settings = RobotSettings(
         lidar=LidarSpec(link="rplidar_link", scan_rate_hz=7.5),
@@ -550,7 +550,7 @@ def test_settings_come_before_tags_and_leave_one_sensor_of_each_kind(tmp_path, r
 
 def test_a_robot_without_settings_takes_its_sensors_and_drive_from_its_tags(tmp_path, real_data):
     from magtwin.author.robot import RobotSettings, build_robot, read_robot
-    from magtwin.spec.scene import MagnetometerSpec
+    from magtwin.spec.sensors import MagnetometerSpec
 
     settings = RobotSettings(
         magnetometer=MagnetometerSpec(link="tower_sensor_plate"),

@@ -17,7 +17,7 @@ from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
 from magtwin.frames import rotate
 from magtwin.run.run import COLUMNS, Column, Run
-from magtwin.spec.scene import PlacedRobot
+from magtwin.spec.robot import PlacedRobot
 from magtwin.twin import open_twin, simulate
 from magtwin.usd import animation
 from magtwin.usd.animation import is_animation, read_animation, write_animation

@@ -12,23 +12,27 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils, Vt
 from magtwin.errors import InputError
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.files import shipped
-from magtwin.spec import scene as spec
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.lab import LabSpec
+from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec
 from magtwin.usd import schema, sensors
 from magtwin.usd.attributes import plain_value, write_pose
 from magtwin.usd.earth import DERIVED_FROM
 from magtwin.usd.schema import generate
 
 SPECS = {
-    "magnetometer": spec.MagnetometerSpec,
-    "imu": spec.ImuSpec,
-    "lidar": spec.LidarSpec,
-    "source": spec.SourceSpec,
-    "earth": spec.EarthFieldSpec,
-    "battery": spec.BatterySpec,
-    "mocap": spec.MocapSpec,
-    "drive": spec.DriveSpec,
-    "platform": spec.PlatformFieldSpec,
-    "lab": spec.LabSpec,
+    "magnetometer": MagnetometerSpec,
+    "imu": ImuSpec,
+    "lidar": LidarSpec,
+    "source": SourceSpec,
+    "earth": EarthFieldSpec,
+    "battery": BatterySpec,
+    "mocap": MocapSpec,
+    "drive": DriveSpec,
+    "platform": PlatformFieldSpec,
+    "lab": LabSpec,
     "harmonic": HarmonicField,
 }
 """The spec whose figures each noun's attributes hold."""
@@ -197,7 +201,7 @@ def test_fallbacks_are_the_defaults_of_the_spec(noun):
 
 def test_the_footprints_fallback_is_the_default_of_the_robot():
     _, prim = stage_with("robot")
-    default = next(f.default for f in fields(spec.RobotSpec) if f.name == "footprint_radius_m")
+    default = next(f.default for f in fields(RobotSpec) if f.name == "footprint_radius_m")
     assert sensors.read_footprint(prim) == default
 
 
@@ -250,7 +254,7 @@ names = ("drive:vMax", "drive:wheelSeparationM", "drive:wheelRadiusM", "robot:fo
 print([prim.GetAttribute(f"magtwin:{name}").Get() for name in names])
 """
     done = subprocess.run([sys.executable, "-c", reader, asset], capture_output=True, text=True, check=True)
-    drive = spec.DriveSpec()
+    drive = DriveSpec()
     wanted = [drive.v_max, drive.wheel_separation_m, drive.wheel_radius_m, 0.171]
     assert json.loads(done.stdout) == wanted
 

@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
-from magtwin.spec.scene import (
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.magnetics import PlatformFieldSpec
+from magtwin.spec.sensors import (
     MAGNETOMETER_KINDS,
     BatterySpec,
-    DriveSpec,
     ImuSpec,
     LidarSpec,
     MagnetometerSpec,
     MocapSpec,
-    PlatformFieldSpec,
 )
 from magtwin.usd import sensors
 from magtwin.usd.attributes import read_pose

@@ -13,9 +13,10 @@ from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade
 from magtwin.author.furniture import FURNITURE, define_furniture, read_magnets
 from magtwin.errors import InputError
 from magtwin.field.sources.earth import earth_field_nt
+from magtwin.field.sources.magnets import body_of
 from magtwin.frames import rotate
-from magtwin.spec.furniture import KINDS, parts_of
-from magtwin.spec.scene import EarthFieldSpec, FurnitureSpec, SourceSpec
+from magtwin.spec.furniture import KINDS, FurnitureSpec, parts_of
+from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.usd.earth import DERIVED_FROM, checked, define_earth, read_earth
 from magtwin.usd.schema import apply_api
 from magtwin.usd.sources import SOURCES, define_source, define_sources, read_source
@@ -249,7 +250,7 @@ def test_a_cylinders_axis_and_scale_are_its_shape_and_leave_its_magnetization(ax
 def test_a_bodys_moment_is_its_magnetization_times_its_volume():
     stage = stage_of(replace(BAR, magnetization=(0.0, 0.0, 0.0)))
     the_source(stage).GetAttribute("magtwin:source:moment").Set((0, 0, 3.0))
-    body = read_magnets(stage)[0][0].body()
+    body = body_of(read_magnets(stage)[0][0])
     assert body.volume_m3 == pytest.approx(np.pi * 0.01**2 * 0.8)
     assert_allclose(body.volume_m3 * body.magnetization, (0, 0, 3), rtol=1e-12)
 
@@ -263,7 +264,7 @@ def test_a_mesh_with_doubled_vertices_polygons_and_faces_turned_inwards_is_the_s
     mesh.CreateFaceVertexCountsAttr([4] * 6)
     mesh.CreateFaceVertexIndicesAttr(list(range(24)))
     apply_api(mesh.GetPrim(), "source").GetAttribute("magtwin:source:magnetization").Set((0, 0, 1e3))
-    body = read_source(mesh.GetPrim()).body()
+    body = body_of(read_source(mesh.GetPrim()))
     assert body.vertices.shape == (8, 3)
     assert body.volume_m3 == pytest.approx(1.0)
 

@@ -1,15 +1,13 @@
 """Plane: the field at one height, where robots drive, computed once a place and looked up from then on."""
 
-from contextlib import suppress
 from functools import cache
 from threading import Lock
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.maps.lookup import Lookup, warm_up
+from magtwin.field.maps.lookup import AS_MANY, LOOPS
 from magtwin.field.sources.bodies import CELL_M, FARTHEST_CELL, Bodies
 from magtwin.field.sources.point_dipoles import dipole_block, in_blocks, in_two_threads
 
@@ -32,9 +30,9 @@ MOST_SQUARES = 40_000
 BLOCK = 32_768
 """Points worked on at a time; they lie in fewer squares than are kept."""
 
-PAYS, PER_SQUARE = 800_000, 100
-"""Points in numpy that take as long as opening the compiled code, and how many of them as long as a square
-does beside its points."""
+PER_SQUARE = 100
+"""Points in numpy that take as long as a square takes beside its points; a point takes as long as `AS_MANY`
+poses of a map."""
 
 ERROR, SLOPE_ERROR = 2e-7, 2e-5
 """What interpolation errs by at most, over the greatest field and slope that a source makes at the distance
@@ -55,7 +53,6 @@ class Plane:
         """Take in what is magnetised, and the height of the plane above the floor [m]."""
         self.bodies, self.height_m = bodies, float(height_m)
         self._lock = Lock()
-        self._points = 0
         self._forget()
 
     def _forget(self) -> None:
@@ -100,10 +97,10 @@ class Plane:
         with self._lock:
             slots = self._slots_of(keys)
             table, close = self._table, self._close
-        compiled = self._opened(len(p) + PER_SQUARE * len(keys))
-        if compiled:
+        code = LOOPS.after(AS_MANY * (len(p) + PER_SQUARE * len(keys)))
+        if code is not None:
             u, w = np.ascontiguousarray(local.T)
-            compiled.polynomials(table, slots[which], u, w, 1 / HALF_M, out)
+            code.polynomials(table, slots[which], u, w, 1 / HALF_M, out)
         else:
             order = np.argsort(which, kind="stable")
             for slot, rows in zip(
@@ -172,15 +169,6 @@ class Plane:
             self._table[slot] = sums.reshape(NODES, -1)
 
         in_two_threads(fit, works, pairs=sum(NODES**2 * len(work[2]) for work in works))
-
-    def _opened(self, points: int) -> ModuleType | None:
-        """The compiled code where it is open, or where it pays to open it."""
-        if Lookup.compiled is None and self._points < PAYS:
-            self._points += points
-            if self._points >= PAYS:
-                with suppress(ImportError):
-                    warm_up()
-        return Lookup.compiled
 
 
 @cache

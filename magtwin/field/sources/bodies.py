@@ -51,15 +51,13 @@ STEP_M = 1e-5
 """Step of the differences that give the rate of change near a body [m]; along an edge of a box 1 cm away they
 err by (1e-5 / 1e-2)^2 / 6, 2e-7 of it."""
 
-SHAPES = ("cuboid", "cylinder", "sphere", "mesh")
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Body:
     """A uniformly magnetised body in world."""
 
     shape: str
-    """One of `SHAPES`."""
+    """One of `magtwin.spec.magnetics.SHAPES`."""
 
     size_m: Array
     """Sides of its box along its own axes [m], shape (3,); a cylinder's axis is its own z."""
@@ -135,45 +133,11 @@ def _magnet(body: Body) -> Any:
         vertices=body.vertices,
         faces=body.faces,
         polarization=polarization,
-        check_open="ignore",  # check_mesh did
+        check_open="ignore",  # spec.mesh.check_mesh did
         check_disconnected="ignore",
         check_selfintersecting="skip",
         reorient_faces="skip",
     )
-
-
-def check_mesh(vertices: Array, faces: Triangles, what: str) -> None:
-    """Refuse a mesh that encloses no volume: open, of several minds about its sides, inside out or flat.
-
-    Raises:
-        InputError: It is one; the text begins with `what`.
-    """
-    if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
-        raise InputError(
-            f"{what} needs vertices (V, 3) and triangles (F, 3), got {vertices.shape} and {faces.shape}"
-        )
-    if not np.isfinite(vertices).all():
-        raise InputError(
-            f"{what} must have finite vertices, got {vertices[~np.isfinite(vertices).all(axis=1)][0]}"
-        )
-    if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(
-            f"{what} has {len(faces)} triangles that name corners beyond its {len(vertices)} vertices"
-        )
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    there, seen = np.unique(edges @ [len(vertices), 1], return_counts=True)
-    back = np.unique(edges[:, ::-1] @ [len(vertices), 1])
-    lone = np.setxor1d(there, back)
-    if len(lone) or seen.max() > 1:
-        edge = int(lone[0]) if len(lone) else int(there[seen.argmax()])
-        a, b = (np.round(vertices[k], 6).tolist() for k in divmod(edge, len(vertices)))
-        raise InputError(
-            f"{what} is not a closed mesh: the edge from {a} to {b} has not one triangle on either side; "
-            "close its holes, merge its doubled vertices and make its faces look outwards"
-        )
-    volume, extent = mesh_moments(vertices, faces)[0], np.ptp(vertices, axis=0)
-    if not volume > 1e-9 * max(extent.max() ** 3, np.finfo(float).tiny):
-        raise InputError(f"{what} encloses no volume: {volume:g} m3; its faces must look outwards")
 
 
 def mesh_moments(vertices: Array, faces: Triangles) -> tuple[float, Array, Array]:

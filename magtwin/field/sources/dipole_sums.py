@@ -4,15 +4,12 @@
 which costs half a second where its machine code was kept from an earlier time, else a few.
 """
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 from numba import types
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.compiled import compiled, in_threads
 from magtwin.errors import InputError
-from magtwin.field.compiled import compiled
 from magtwin.field.sources.point_dipoles import MU_0_OVER_4_PI, NT_PER_T
 
 Array = NDArray[np.float64]
@@ -21,9 +18,7 @@ BLOCK = 256
 """Points worked on at a time, all dipoles for each block: their sums stay in the first-level cache."""
 
 SHARE = 262_144
-"""Point-dipole pairs from which on a thread is worth its start."""
-
-MOST_THREADS = 8
+"""Pairs of a point and a dipole that a thread takes at a time."""
 
 _IN = types.Array(types.float64, 2, "C", readonly=True)
 _OUT = types.Array(types.float64, 2, "C")
@@ -92,20 +87,11 @@ def _sum(
     points = p.reshape(-1, 3)
     field = np.empty(points.shape)
     five = np.empty((len(points) if gradient else 0, 5))
-    shares = min(len(points) * len(place) // SHARE, MOST_THREADS)
-    if shares > 1:
-        shares = min(shares, os.cpu_count() or 1)
-    shares = max(shares, 1)
-    ends = [len(points) * n // shares for n in range(shares + 1)]
 
-    def work(start: int, stop: int) -> None:
-        _dipoles(points[start:stop], place, moment, field[start:stop], five[start:stop])
+    def work(rows: slice) -> None:
+        _dipoles(points[rows], place, moment, field[rows], five[rows])
 
-    if shares == 1:
-        work(0, len(points))
-    else:
-        with ThreadPoolExecutor(shares) as pool:
-            list(pool.map(work, ends[:-1], ends[1:]))
+    in_threads(work, len(points), max(1, SHARE // max(1, len(place))))
     scale = MU_0_OVER_4_PI * NT_PER_T
     field *= scale
     five *= scale

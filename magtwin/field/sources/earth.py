@@ -7,11 +7,7 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.field.days import parse_day
 from magtwin.frames import quat_from_yaw, rotate
-
-MODEL = "the IGRF-14"
-
-SPAN = (datetime.date(1900, 1, 1), datetime.date(2030, 1, 1))
-"""First and last day of its coefficients."""
+from magtwin.spec.magnetics import MODEL, SPAN
 
 
 def earth_field_nt(

@@ -16,8 +16,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.frames import quat_conjugate, quat_multiply, rotate
-from magtwin.spec.scene import IDENTITY_XYZW, ZERO3, Quat, RobotSpec, Vec3
+from magtwin.frames import IDENTITY_XYZW, quat_conjugate, quat_multiply, rotate
+from magtwin.spec.base import ZERO3, Quat, Vec3
+from magtwin.spec.robot import RobotSpec
 
 Array = NDArray[np.float64]
 Columns = Mapping[str, NDArray[Any]]

@@ -21,7 +21,8 @@ from magtwin.io.rerun.series import (
     entity_of,
 )
 from magtwin.run.run import COLUMNS, Run
-from magtwin.spec.scene import LabSpec, Vec3
+from magtwin.spec.base import Vec3
+from magtwin.spec.lab import LabSpec
 
 Array = NDArray[np.float64]
 

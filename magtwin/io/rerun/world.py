@@ -18,7 +18,7 @@ from magtwin.io.rerun.series import TIMELINE, entity_of, nanoseconds, send
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
-from magtwin.spec.scene import RobotSpec
+from magtwin.spec.robot import RobotSpec
 from magtwin.twin import Twin
 from magtwin.usd.geometry import BASE_LINK, Link, Shape, read_links, read_shapes, srgb_from_linear
 from magtwin.usd.maps import HEAT_MAP, HEAT_MAP_HEIGHT_M

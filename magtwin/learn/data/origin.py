@@ -17,7 +17,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import into_base
 from magtwin.run.run import Metadata
-from magtwin.spec.scene import RobotSpec
+from magtwin.spec.robot import RobotSpec
 
 Array = NDArray[np.float64]
 

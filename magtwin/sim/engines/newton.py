@@ -22,7 +22,7 @@ from magtwin.sim.motion.course import Course
 from magtwin.sim.motion.drive import limiter, wheel_rates
 from magtwin.sim.motion.loop import LATE_S, REST_M_S, wrapped
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import RobotSpec
+from magtwin.spec.robot import RobotSpec
 
 STEP_S = 0.001
 """Length of a physics step, about [s]; a control step has a whole number of them."""

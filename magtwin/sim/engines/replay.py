@@ -15,7 +15,7 @@ from magtwin.run.run import Run
 from magtwin.sim.engines.sampled import SampledMotion
 from magtwin.sim.motion.drive import wheel_rates
 from magtwin.sim.motion.follow import CONTROL_RATE_HZ
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 
 
 def replayed(run: Run, drive: DriveSpec) -> SampledMotion:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.files import existing, output
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 from magtwin.summary import Summarized, Summary
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from magtwin.errors import InputError, find
 from magtwin.path import Path
 from magtwin.sim.motion import loop
 from magtwin.sim.motion.plan import LIMIT_SHARE, drivable, plan
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 
 Array = NDArray[np.float64]
 

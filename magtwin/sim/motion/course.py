@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps import lookup
-from magtwin.field.maps.lookup import Lookup
 from magtwin.sim.motion import loop
 from magtwin.sim.motion.controllers import Guide
 from magtwin.sim.motion.drive import Motion, Pose, limits
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec
 
 Array = NDArray[np.float64]
 
@@ -181,7 +180,7 @@ def _opened(courses: Sequence[Course]) -> ModuleType | None:
     """The compiled loop, if it is open or is now worth opening."""
     if _Loop.compiled is not None:
         return _Loop.compiled
-    pays = PAYS if Lookup.compiled is None else PAYS / NUMBA
+    pays = PAYS if lookup.LOOPS.code is None else PAYS / NUMBA
     if _Loop.made + sum(course.least_steps for course in courses) >= pays:
         try:
             warm_up()

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.sim.motion.loop import limited
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]

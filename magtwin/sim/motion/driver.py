@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.sim.motion.drive import Pose
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from magtwin.sim.motion.course import Course
 from magtwin.sim.motion.drive import Pose
 from magtwin.sim.motion.engine import Engine, Kinematic, Travel
 from magtwin.sim.motion.plan import SLOWEST, drivable
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec
 
 CONTROL_RATE_HZ = 50.0
 """Control steps a second [Hz]."""

@@ -9,8 +9,8 @@ import numpy as np
 from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.controllers import guide_by_commands
 from magtwin.sim.motion.course import Chassis, Course
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec
 
 V_STEP, W_STEP = 0.05, 0.25
 """By how much a key changes speed [m/s] and yaw rate [rad/s]."""

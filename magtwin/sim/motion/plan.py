@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.path import Path
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 
 Array = NDArray[np.float64]
 

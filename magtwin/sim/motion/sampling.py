@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat
 from magtwin.sim.motion.drive import Moment
-from magtwin.spec.scene import Quat
+from magtwin.spec.base import Quat
 
 Array = NDArray[np.float64]
 Columns = dict[str, NDArray[np.float64]]

@@ -21,7 +21,8 @@ from magtwin.sim.interference import NEAREST_M, sensor_places
 from magtwin.sim.motion.drive import Moment
 from magtwin.sim.motion.engine import Travel
 from magtwin.sim.motion.sampling import Moving, moment_at
-from magtwin.spec.scene import RobotSpec, Scene
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 

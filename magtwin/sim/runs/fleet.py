@@ -41,7 +41,8 @@ from magtwin.sim.sensors.lidar import lidar_on
 from magtwin.sim.sensors.magnetometer import rounded
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import RobotSpec, Scene
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 

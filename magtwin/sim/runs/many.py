@@ -1,15 +1,17 @@
-"""simulate_many: thousands of robots, each as if it were alone, driven at once and read in blocks.
+"""sweep: thousands of robots, each as if it were alone, driven at once and read in blocks.
 
 A robot's bits depend on nothing but its own scene, path and seed: the closed loop drives each as it would
 alone, sensors draw from generators of its own, and a network gives a row the same whatever is beside it. So
 runs can be made in any order, in blocks of any size, and any of them anew.
 """
 
+import importlib
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from typing import Literal, overload
+from typing import Any, Literal, overload
 
 import numpy as np
 
@@ -23,8 +25,9 @@ from magtwin.sim.motion.drive import Motion, Pose, draw_wheel_errors
 from magtwin.sim.motion.engine import Kinematic, Travel
 from magtwin.sim.motion.follow import check_arrived, course_along, course_by
 from magtwin.sim.runs.simulate import Sensed, check_run, sense, streams, travel
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec, Scene
+from magtwin.spec.scene import Scene
 from magtwin.summary import Summarized, Summary, listed
 
 BLOCK = 16
@@ -144,6 +147,10 @@ class Runs(Summarized, Sequence[Run]):
 
     def __iter__(self) -> Iterator[Run]:
         return self._made(range(len(self)))
+
+    def save(self, out: str | os.PathLike[str], **options: Any) -> Any:
+        """Write the runs to a folder as Parquet files; see `magtwin.io.sweeps.save_runs`."""
+        return importlib.import_module("magtwin").save_runs(self, out, **options)
 
     def _made(self, numbers: Sequence[int]) -> Iterator[Run]:
         """Runs by number, in their order."""

@@ -27,8 +27,9 @@ from magtwin.sim.sensors.lidar import Scans, lidar_on, scan
 from magtwin.sim.sensors.magnetometer import LOCK_RATE_HZ, rounded
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.sim.sensors.online_sensors import Battery, Imu, Magnetometer, Markov, Mocap, Odometry, Samples
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec, Scene
+from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 Network = Callable[[Run], tuple[NDArray[Any], NDArray[Any], "NDArray[np.bool_] | None"]]

@@ -40,7 +40,8 @@ from magtwin.sim.sensors.mocap import sense_mocap
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.sim.sensors.odometry import sense_odometry
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import RobotSpec, Scene
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
 

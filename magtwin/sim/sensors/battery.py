@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.sim.motion.sampling import Columns, Moving, held
-from magtwin.spec.scene import BatterySpec, DriveSpec
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.sensors import BatterySpec
 
 Array = NDArray[np.float64]
 

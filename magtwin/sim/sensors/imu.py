@@ -6,7 +6,8 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.frames import canonical, quat_from_rpy, quat_multiply
 from magtwin.sim.motion.sampling import Columns, Moving, axes_in_base, held, into_sensor, moment_at
 from magtwin.sim.sensors.noise import gauss_markov, random_walk
-from magtwin.spec.scene import ImuSpec, Quat
+from magtwin.spec.base import Quat
+from magtwin.spec.sensors import ImuSpec
 
 Array = NDArray[np.float64]
 

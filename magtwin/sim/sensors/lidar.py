@@ -11,7 +11,8 @@ from magtwin.frames import matrix_from_quat, quat_from_yaw, quat_multiply, rotat
 from magtwin.run.run import Run
 from magtwin.sim.motion.sampling import check_count
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import LidarSpec, RobotSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.sensors import LidarSpec
 from magtwin.summary import Summarized, Summary, span
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.sim.sensors.noise import first_order, gauss_markov
-from magtwin.spec.scene import MagnetometerSpec
+from magtwin.spec.sensors import MagnetometerSpec
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -216,7 +216,7 @@ def latched_nt(spec: MagnetometerSpec, lost: Flags, rng: np.random.Generator) ->
         Readings [nT], shape (N,); of use where lock is lost.
     """
     begins = lost & ~np.concatenate([[False], lost[:-1]])
-    values = spec.latched_nt + spec.latched_std_nt * rng.standard_normal(int(begins.sum()) + 1)
+    values = spec.stuck_nt + spec.stuck_std_nt * rng.standard_normal(int(begins.sum()) + 1)
     return np.asarray(values[np.cumsum(begins)])
 
 

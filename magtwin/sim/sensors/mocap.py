@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.frames import canonical, quat_from_rpy, quat_from_yaw, quat_multiply
 from magtwin.sim.motion.sampling import Moving, check_count, held, moment_at
-from magtwin.spec.scene import MocapSpec
+from magtwin.spec.sensors import MocapSpec
 
 _ROUND = 64
 """Dropouts drawn at a time."""

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.frames import quat_from_yaw, wrap_angle
 from magtwin.sim.motion.sampling import Columns, Moving, held, moment_at
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 
 Array = NDArray[np.float64]
 

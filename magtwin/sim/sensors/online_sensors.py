@@ -26,7 +26,9 @@ from magtwin.sim.sensors.magnetometer import (
     vector_gain,
 )
 from magtwin.sim.sensors.mocap import taken_for_base
-from magtwin.spec.scene import BatterySpec, DriveSpec, ImuSpec, MagnetometerSpec, MocapSpec, Quat
+from magtwin.spec.base import Quat
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.sensors import BatterySpec, ImuSpec, MagnetometerSpec, MocapSpec
 
 Array = NDArray[np.float64]
 Columns = dict[str, NDArray[Any]]
@@ -350,7 +352,7 @@ class Magnetometer:
         self._axes = np.full(3, np.nan)
         self._was_lost, self._latched = (
             False,
-            spec.latched_nt + spec.latched_std_nt * self._latch.standard_normal(),
+            spec.stuck_nt + spec.stuck_std_nt * self._latch.standard_normal(),
         )
         self._known: list[float] = []
         self._low: tuple[float, float] | None = None
@@ -404,7 +406,7 @@ class Magnetometer:
         read = b + noise
         for k in range(len(read)):
             if lost[k] and not self._was_lost:
-                self._latched = spec.latched_nt + spec.latched_std_nt * self._latch.standard_normal()
+                self._latched = spec.stuck_nt + spec.stuck_std_nt * self._latch.standard_normal()
             self._was_lost = bool(lost[k])
             if lost[k]:
                 read[k] = self._latched

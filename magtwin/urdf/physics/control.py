@@ -12,7 +12,7 @@ import numpy as np
 from pxr import Usd
 
 from magtwin.errors import InputError, hint
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 from magtwin.urdf.description.model import Link
 from magtwin.urdf.description.tag import Element, Tags
 from magtwin.urdf.options import DriveRule

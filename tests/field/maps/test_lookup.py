@@ -2,7 +2,6 @@
 
 import copy
 import math
-import os
 import pickle
 import subprocess
 import sys
@@ -13,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
+from magtwin import compiled
 from magtwin.errors import InputError
 from magtwin.field.maps import lookup
-from magtwin.field.maps.lookup import Lookup, warm_up
+from magtwin.field.maps.lookup import LOOPS, warm_up
 from magtwin.field.maps.map import AnomalyMap
 
 QUARTERS = (0.0, 90.0, 180.0, 270.0)
@@ -24,7 +24,8 @@ QUARTERS = (0.0, 90.0, 180.0, 270.0)
 @pytest.fixture(autouse=True)
 def _closed(monkeypatch):
     """Each test begins as a program does, without compiled code."""
-    monkeypatch.setattr(Lookup, "compiled", None)
+    monkeypatch.setattr(LOOPS, "code", None)
+    monkeypatch.setattr(LOOPS, "pays", math.inf)
 
 
 def field_map(*, degrees=QUARTERS, shape=(6, 9), seed=0, masked=0.0, cell=(0.25, 0.1)):
@@ -63,12 +64,12 @@ def by_each_way(field, p, yaw, outside):
     python = np.array([field.at_with_gradient(*row, outside=outside) for row in rows])
     alone = np.array([field.at(*row, outside=outside) for row in rows])
     warm_up()
-    compiled = field.lookup_with_gradient(p, yaw, outside=outside)
+    many = field.lookup_with_gradient(p, yaw, outside=outside)
     compiled_alone = np.array([field.at(*row, outside=outside) for row in rows])
     compiled_one = np.array([field.at_with_gradient(*row, outside=outside) for row in rows])
-    fields = [in_numpy[0], python[:, 0], alone, compiled[0], compiled_alone, compiled_one[:, 0]]
+    fields = [in_numpy[0], python[:, 0], alone, many[0], compiled_alone, compiled_one[:, 0]]
     fields.append(field.lookup(p, yaw, outside=outside))
-    return fields, [in_numpy[1], python[:, 1:], compiled[1], compiled_one[:, 1:]]
+    return fields, [in_numpy[1], python[:, 1:], many[1], compiled_one[:, 1:]]
 
 
 maps = st.builds(
@@ -86,7 +87,7 @@ maps = st.builds(
 @given(field=maps, seed=st.integers(0, 99), outside=st.sampled_from(["nan", "clamp"]))
 @settings(max_examples=80, deadline=None)
 def test_numpy_plain_python_and_compiled_code_give_the_same_bytes(field, seed, outside):
-    Lookup.compiled = None
+    LOOPS.code = None
     fields, gradients = by_each_way(field, *poses(field, 150, seed), outside)
     for other in fields[1:]:
         assert_array_equal(other, fields[0])
@@ -104,64 +105,28 @@ def test_a_pose_gives_the_same_bytes_alone_and_among_others():
 
 
 @pytest.mark.parametrize("masked", [0.0, 0.05])
-def test_how_many_threads_work_changes_no_byte(monkeypatch, masked):
+def test_the_number_of_threads_changes_no_byte(monkeypatch, masked):
     field = field_map(masked=masked)
     p, yaw = poses(field, 20_011)
     warm_up()
     alone = field.lookup_with_gradient(p, yaw)
     monkeypatch.setattr(lookup, "SHARE", 1_000)
-    for processors in (1, 2, 3, 8, None):
-        monkeypatch.setattr(lookup.os, "cpu_count", lambda processors=processors: processors)
-        for got, want in zip(field.lookup_with_gradient(p, yaw), alone, strict=True):
-            assert_array_equal(got, want)
+    for got, want in zip(field.lookup_with_gradient(p, yaw), alone, strict=True):
+        assert_array_equal(got, want)
 
 
-def test_compiled_code_is_opened_after_as_many_poses_as_it_costs_and_not_before(monkeypatch):
-    monkeypatch.setattr(lookup, "PAYS", 1_000)
+def test_poses_in_numpy_and_one_by_one_open_the_compiled_code_once_it_pays(monkeypatch):
+    monkeypatch.setattr(LOOPS, "pays", 1_000 * compiled.NUMBA_SHARE)
     field = field_map()
     p, yaw = poses(field, 400)
-    field.lookup(p, yaw)
-    field.lookup(p, yaw)
-    assert Lookup.compiled is None
-    field.lookup(p, yaw)
-    assert Lookup.compiled is not None
-
-
-def test_poses_one_by_one_open_the_compiled_code_too(monkeypatch):
-    monkeypatch.setattr(lookup, "PAYS", 10 * lookup.AS_MANY)
-    field = field_map()
-    values = [field.at(0.0, 0.7, 1.0) for _ in range(9)]
-    assert Lookup.compiled is None
-    values += [field.at(0.0, 0.7, 1.0) for _ in range(3)]
-    assert Lookup.compiled is not None
-    assert len(set(values)) == 1
-
-
-def test_where_numba_does_not_work_lookups_stay_in_numpy(monkeypatch):
-    monkeypatch.setattr(lookup, "PAYS", 100)
-    monkeypatch.setitem(sys.modules, "magtwin.field.compiled", None)  # importing it raises ImportError
-    monkeypatch.delattr("magtwin.field.compiled", raising=False)
-    field = field_map()
-    p, yaw = poses(field, 400)
-    assert_array_equal(field.lookup(p, yaw), field.lookup(p, yaw))
-    assert Lookup.compiled is None
-    with pytest.raises(ImportError):
-        warm_up()
-
-
-def test_compiled_code_needs_no_folder_to_be_kept_in(tmp_path):
-    (tmp_path / "__pycache__").write_text("a file, as in no installation, but as unwritable as in some")
-    (tmp_path / "probe.py").write_text(
-        "from numba import types\n"
-        "from magtwin.field.compiled import compiled\n"
-        "@compiled(types.float64)\n"
-        "def twice(x):\n"
-        "    return x + x\n"
-        "assert twice(2.5) == 5.0\n"
-    )
-    home = {"HOME": str(tmp_path / "probe.py"), "XDG_CACHE_HOME": str(tmp_path / "probe.py" / "cache")}
-    subprocess.run([sys.executable, tmp_path / "probe.py"], check=True, env={**os.environ, **home})
-    assert {file.name for file in tmp_path.iterdir()} == {"__pycache__", "probe.py"}
+    for count in (0, 400, 800):
+        monkeypatch.setattr(LOOPS, "done", count)
+        field.lookup(p, yaw)
+        assert (LOOPS.code is not None) == (count == 800)
+    monkeypatch.setattr(LOOPS, "code", None)
+    monkeypatch.setattr(LOOPS, "done", 1_000 - lookup.AS_MANY)
+    assert field.at(0.0, 0.7, 1.0) == field.at(0.0, 0.7, 1.0)
+    assert LOOPS.code is not None
 
 
 def test_lookup_loads_no_numba_of_its_own_accord():

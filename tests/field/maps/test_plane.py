@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.field.maps import lookup, plane
-from magtwin.field.maps.lookup import Lookup
+from magtwin.field.maps.lookup import LOOPS
 from magtwin.field.maps.plane import CLEAR_M, ERROR, HALF_M, SLOPE_ERROR, Plane
 from magtwin.field.sources.bodies import CELL_M, Bodies, Body
 from magtwin.field.sources.dipole_sums import dipole_field_and_gradient_nt
@@ -55,7 +55,8 @@ def floor():
 
 @pytest.fixture
 def in_numpy(monkeypatch):
-    monkeypatch.setattr(Lookup, "compiled", None)
+    monkeypatch.setattr(LOOPS, "code", None)
+    monkeypatch.setattr(LOOPS, "pays", np.inf)
 
 
 def test_interpolation_errs_by_less_than_is_stated_wherever_its_source_stands():
@@ -136,24 +137,12 @@ def test_what_a_point_is_told_does_not_depend_on_company_order_or_memory(room, f
 def test_compiled_code_gives_the_bytes_of_numpy(room, floor, in_numpy, monkeypatch):
     table = Plane(room, HEIGHT_M)
     field, slopes = table.field_and_slopes_nt(floor)
-    assert Lookup.compiled is None
-    monkeypatch.setattr(plane, "PAYS", 1)
+    assert LOOPS.code is None
     lookup.warm_up()
-    assert Lookup.compiled is not None
+    assert LOOPS.code is not None
     compiled = table.field_and_slopes_nt(floor)
     assert compiled[0].tobytes() == field.tobytes()
     assert compiled[1].tobytes() == slopes.tobytes()
-
-
-def test_compiled_code_is_opened_once_it_pays(room, floor, in_numpy, monkeypatch):
-    monkeypatch.setattr(plane, "PAYS", 3 * len(floor))
-    monkeypatch.setattr(plane, "PER_SQUARE", 0)
-    table = Plane(room, HEIGHT_M)
-    for _ in range(2):
-        table.field_and_slopes_nt(floor)
-        assert Lookup.compiled is None
-    table.field_and_slopes_nt(floor)
-    assert Lookup.compiled is not None
 
 
 def test_threads_that_ask_at_once_are_told_the_same(room, floor):

@@ -15,13 +15,13 @@ from magtwin.field.sources.bodies import (
     TOLERANCE,
     Bodies,
     Body,
-    check_mesh,
     demagnetising,
     induced_magnetization,
     mesh_moments,
 )
 from magtwin.field.sources.point_dipoles import dipole_field_nt
 from magtwin.frames import quat_from_rpy, rotate
+from magtwin.spec.mesh import check_mesh
 
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float) / 2
 QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]

@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from magtwin.errors import InputError
-from magtwin.field.sources.earth import SPAN, earth_field_nt
+from magtwin.field.sources.earth import earth_field_nt
+from magtwin.spec.magnetics import SPAN
 
 GAINESVILLE = (29.65, -82.35, 50.0)
 

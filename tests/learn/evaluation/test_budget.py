@@ -22,7 +22,7 @@ from magtwin.learn.evaluation.evaluate import (
 )
 from magtwin.run.run import Run
 from magtwin.sim.survey import field_at_rest_nt
-from magtwin.twin import check_figures, in_session_of, open_twin, simulate
+from magtwin.twin import check_scene, in_session_of, open_twin, simulate
 
 SEED = 11
 
@@ -48,7 +48,7 @@ def drives(twin):
 def truth(twin):
     def day_of(name, run):
         scene = in_session_of(twin, run.metadata).scene
-        check_figures(scene, run.metadata, name)
+        check_scene(scene, run.metadata, name)
         return scene
 
     return Truth(twin.scene, day_of)

@@ -11,7 +11,7 @@ from magtwin.learn.data.features import FULL, features
 from magtwin.learn.magnetometer import NeuralMagnetometer
 from magtwin.learn.models.perceptron import in_threads
 from magtwin.sim.session import session_of
-from magtwin.twin import open_twin, simulate_many
+from magtwin.twin import open_twin, sweep
 
 
 def forward64(net, x):
@@ -157,7 +157,7 @@ def new_days():
     """Two of the paper's test paths, each on a day of its own, by physics."""
     twin = open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="physical")
     days = [session_of(twin.scene.robot, 77, day) for day in range(2)]
-    runs = simulate_many(twin, ["narrow_figure8", "curvilinear"], (5, 6), robots=days, rate_hz=5.0)
+    runs = sweep(twin, ["narrow_figure8", "curvilinear"], (5, 6), robots=days, rate_hz=5.0)
     return [run.take(np.flatnonzero(~run["flag_outside_map"])) for run in runs]
 
 

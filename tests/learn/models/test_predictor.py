@@ -23,7 +23,7 @@ from magtwin.learn.models.linear import Linear
 from magtwin.learn.models.network import load_net
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.learn.models.temporal import Convolutions, Temporal
-from magtwin.twin import open_twin, simulate, simulate_many
+from magtwin.twin import open_twin, simulate, sweep
 
 NAMES = SETS["gradient"]
 KINDS = ("mlp", "linear", "hybrid", "base alone", "ensemble", "tcn")
@@ -131,13 +131,13 @@ def test_one_look_back_lasts_as_long_at_twice_the_rate():
 @pytest.mark.parametrize("kind", ["hybrid", "tcn"])
 def test_a_simulation_is_read_by_any_kind_and_many_as_one(lab_scene, tmp_path, kind):
     a_predictor(kind).save(tmp_path / "n.safetensors")
-    twin = open_twin(lab_scene, net=tmp_path / "n.safetensors")
+    twin = open_twin(lab_scene, network=tmp_path / "n.safetensors")
     one = simulate(twin, seed=3, duration_s=1.0)
     assert one.metadata["network_kind"] == kind
     x = features(one, NAMES)
     noise = twin.scene.robot.magnetometer.noise_density_nt * math.sqrt(135 / 2)
     assert_allclose(one["b_sd_nt"], np.hypot(twin.magnetometer.net.predict(x)[1], noise))
-    both = simulate_many(twin, ["figure8", "figure8"], [8, 3], duration_s=1.0)
+    both = sweep(twin, ["figure8", "figure8"], [8, 3], duration_s=1.0)
     for name in ("b_disturbance_nt", "b_sd_nt", "b_measured_nt", "flag_out_of_distribution"):
         assert_array_equal(both[1][name], one[name])
 
@@ -148,7 +148,7 @@ def test_robots_that_step_together_have_no_network_that_looks_back(lab_scene, tm
 
     a_predictor("tcn").save(tmp_path / "n.safetensors")
     with pytest.raises(InputError, match=r"n\.safetensors: a tcn looks at 6 earlier readings"):
-        MagNavEnv(scene=lab_scene, net=tmp_path / "n.safetensors")
+        MagNavEnv(scene=lab_scene, network=tmp_path / "n.safetensors")
 
 
 @pytest.mark.parametrize("inputs", SETS)
@@ -159,9 +159,9 @@ def test_robots_that_step_together_read_every_set_of_inputs_but_the_vector_axes(
     a_predictor("hybrid", SETS[inputs]).save(tmp_path / "h.safetensors")
     if inputs == "vector":
         with pytest.raises(InputError, match="reads b_vector_measured_nt, which MagNav does not simulate"):
-            MagNavEnv(scene=lab_scene, net=tmp_path / "h.safetensors")
+            MagNavEnv(scene=lab_scene, network=tmp_path / "h.safetensors")
         return
-    env = MagNavEnv(scene=lab_scene, net=tmp_path / "h.safetensors")
+    env = MagNavEnv(scene=lab_scene, network=tmp_path / "h.safetensors")
     env.reset(seed=0)
     assert np.isfinite(env.step(np.array([0.2, 0.1], np.float32))[0]).all()
 

@@ -27,7 +27,10 @@ from magtwin.learn.tolles_lawson import (
 from magtwin.path import path_named
 from magtwin.run.run import Run
 from magtwin.sim.runs.simulate import simulate
-from magtwin.spec.scene import EarthFieldSpec, LidarSpec, PlatformFieldSpec, RobotSpec, Scene
+from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import LidarSpec
 
 RATE_HZ = 20.0
 EARTH_NT = np.array([-2700.0, 24000.0, -38400.0])

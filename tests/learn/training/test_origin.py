@@ -16,8 +16,9 @@ from magtwin.learn.data.origin import label_frame, map_metadata, mismatches, sha
 from magtwin.learn.models.network import FieldNet
 from magtwin.sim.runs.simulate import robot_metadata
 from magtwin.sim.session import draw_session
-from magtwin.spec.scene import MocapSpec
-from magtwin.twin import _platform_sha256, in_session, open_twin, simulate_many
+from magtwin.spec.sensors import MocapSpec
+from magtwin.twin import in_session, open_twin, sweep
+from magtwin.twin.opening import _platform_sha256
 from magtwin.usd.maps import save_map
 
 ROBOT = read_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
@@ -153,7 +154,7 @@ def test_a_run_tells_its_robot_and_motion_capture_as_it_was_in_the_session(lab_s
     short = {"duration_s": 0.5, "rate_hz": 20.0}
     drawn = simulate(twin, "sine", session=2, **short)
     surveyed = simulate(twin, "sine", session="survey", **short)
-    (many,) = simulate_many(twin, "sine", [0], robots=in_session(twin, 2), **short)
+    (many,) = sweep(twin, "sine", [0], robots=in_session(twin, 2), **short)
     assert drawn.metadata["robot_name"] == "turtlebot4"
     assert drawn.metadata["mocap_offset_m"] == many.metadata["mocap_offset_m"] == "0.055, -0.03"
     assert surveyed.metadata["mocap_offset_m"] == "0, 0"
@@ -179,7 +180,7 @@ def strange(tmp_path):
 
 def test_open_twin_warns_and_runs_keep_what_it_said(lab_scene, strange):
     with pytest.warns(MismatchWarning) as told:
-        twin = open_twin(lab_scene, net=strange)
+        twin = open_twin(lab_scene, network=strange)
     texts = [str(one.message) for one in told]
     assert texts[0].startswith("WRONG ROBOT")
     assert "differ by 300 nT RMS" in texts[1]

@@ -20,8 +20,8 @@ from magtwin.sim.motion.controllers import guide_by_commands
 from magtwin.sim.motion.driver import Driver
 from magtwin.sim.motion.engine import Kinematic
 from magtwin.sim.motion.follow import course_along, follow, play
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec
 from magtwin.twin import open_twin, simulate
 
 DRIVE = DriveSpec()
@@ -29,7 +29,7 @@ DRIVE = DriveSpec()
 
 @pytest.fixture(scope="module")
 def twin(lab_scene):
-    return open_twin(lab_scene, net="none")
+    return open_twin(lab_scene, network="none")
 
 
 def test_a_run_that_is_replayed_has_the_poses_of_the_run_to_the_last_bit(twin):
@@ -55,7 +55,7 @@ def test_a_run_without_commands_is_not_replayed_for_a_network_that_reads_them(la
     told = Run({"t": t, "p_world_base": p, "yaw": 0 * t})
     with pytest.raises(InputError, match=r"has no 'v_cmd', and the network turtlebot4_hybrid\.safetensors"):
         simulate(neural, told)
-    paper = open_twin(lab_scene, net=shipped("weights", "turtlebot4_paper.safetensors"))
+    paper = open_twin(lab_scene, network=shipped("weights", "turtlebot4_paper.safetensors"))
     assert np.isfinite(simulate(paper, told)["b_total_nt"]).all()
 
 

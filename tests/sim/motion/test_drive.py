@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from magtwin.errors import InputError
 from magtwin.sim.motion.drive import Motion, advance, integrate_twist, limiter, wheel_rates
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 
 DRIVE = DriveSpec()
 speeds, turns = st.floats(-0.5, 0.5), st.floats(-3, 3)

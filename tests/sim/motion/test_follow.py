@@ -14,7 +14,7 @@ from magtwin.sim.motion.controllers import CONTROLLERS, guide_along
 from magtwin.sim.motion.drive import Motion, advance, limiter
 from magtwin.sim.motion.follow import follow
 from magtwin.sim.motion.plan import corners, drivable, plan
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 
 REAL = DriveSpec()
 """With motors that lag and wheels that slip."""

@@ -16,8 +16,8 @@ from magtwin.sim.motion.controllers import CONTROLLERS, guide_by_commands
 from magtwin.sim.motion.course import Chassis, Course, run_courses
 from magtwin.sim.motion.drive import Motion, draw_wheel_errors
 from magtwin.sim.motion.follow import course_along, follow, play
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import DriveSpec
 
 REAL = DriveSpec()
 IDEAL = dataclasses.replace(REAL, motor_lag_s=0.0, slip_s2_m=0.0, yaw_slip=0.0)
@@ -164,14 +164,14 @@ def test_courses_are_not_changed_by_running_them(way):
 def test_the_loop_opens_its_machine_code_when_that_has_paid(monkeypatch):
     monkeypatch.setattr(courses._Loop, "compiled", None)
     monkeypatch.setattr(courses._Loop, "made", 0)
-    monkeypatch.setattr(courses.Lookup, "compiled", None)
+    monkeypatch.setattr(courses.lookup.LOOPS, "code", None)
     monkeypatch.setattr(courses, "PAYS", 6000)
     path = path_named("figure8")
     first = follow(path, REAL, speed=0.2, duration_s=60.0)
     assert courses._Loop.compiled is None
     second = follow(path, REAL, speed=0.2, duration_s=60.0)
     assert courses._Loop.compiled is not None
-    assert courses.Lookup.compiled is not None  # which costs little more then
+    assert courses.lookup.LOOPS.code is not None  # which costs little more then
     assert_same(first, second)
 
 
@@ -482,7 +482,7 @@ def test_a_shipped_scene_refuses_a_path_through_its_wall_or_its_furniture():
     from magtwin.files import shipped
     from magtwin.twin import open_twin, simulate
 
-    twin = open_twin(shipped("scenes", "lab", "lab.usda"), net="none")
+    twin = open_twin(shipped("scenes", "lab", "lab.usda"), network="none")
     desk = next(i for i, name in enumerate(twin.obstacles.names) if "desk" in name)
     x, y = twin.obstacles.outlines[desk].mean(axis=0)
     scene = dataclasses.replace(twin.scene, lab=dataclasses.replace(twin.scene.lab, floor_m=(40.0, 40.0)))
@@ -497,7 +497,7 @@ def test_a_run_tells_which_controller_drove(name):
     from magtwin.twin import open_twin, simulate
 
     run = simulate(
-        open_twin(shipped("scenes", "lab", "lab.usda"), net="none"), duration_s=5.0, controller=name
+        open_twin(shipped("scenes", "lab", "lab.usda"), network="none"), duration_s=5.0, controller=name
     )
     assert run.metadata["controller"] == name
     assert not run["flag_bump"].any()

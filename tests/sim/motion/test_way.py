@@ -15,7 +15,7 @@ from magtwin.path import Path, path_named, path_of_points, read_path_csv
 from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.way import way_of, ways_of
-from magtwin.twin import open_twin, scan, scene_from_toml, simulate, simulate_many, simulate_robots
+from magtwin.twin import open_twin, scan, scene_from_toml, simulate, simulate_robots, sweep
 
 POINTS = [[-1.0, -0.5], [0.25, 0.5], [1.0, 0.125], [0.5, -0.75]]
 SHORT = {"duration_s": 3.0, "rate_hz": 20.0}
@@ -55,8 +55,8 @@ def test_a_scene_that_no_file_holds_runs_as_its_stage_does(tmp_path):
     assert same(a, b)
     assert a.metadata["scene_sha256"] == b.metadata["scene_sha256"]
     assert simulate(scene, commands, **physical).metadata == a.metadata
-    many = list(simulate_many(scene, commands, [0], **physical))
-    assert same(many[0], next(iter(simulate_many(file, commands, [0], **physical))))
+    many = list(sweep(scene, commands, [0], **physical))
+    assert same(many[0], next(iter(sweep(file, commands, [0], **physical))))
 
 
 def test_every_writer_and_the_lidar_take_the_twin_of_a_scene(lab_scene, tmp_path):
@@ -94,9 +94,9 @@ def test_points_give_the_run_of_their_csv(twin, tmp_path):
         assert run.metadata["path"] == "points"
         assert run.metadata["path_sha256"] == read.metadata["path_sha256"]
         assert "path_file" not in run.metadata
-    many = simulate_many(twin, POINTS, [0, 1], **SHORT)
+    many = sweep(twin, POINTS, [0, 1], **SHORT)
     assert same(many[0], read)
-    mixed = simulate_many(twin, ["sine", np.array(POINTS)], [0, 0], **SHORT)
+    mixed = sweep(twin, ["sine", np.array(POINTS)], [0, 0], **SHORT)
     assert same(mixed[1], read)
     name = twin.scene.robot.name
     assert same(simulate_robots(twin, {name: POINTS}, **SHORT)[name], read)

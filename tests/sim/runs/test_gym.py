@@ -237,7 +237,7 @@ def test_a_reward_of_ones_own_is_asked_for_each_step(twin):
     ("options", "text"),
     [
         ({"scene": None}, "needs a scene"),
-        ({"net": "none"}, "go to open_twin"),
+        ({"network": "none"}, "to open_twin"),
         ({"signals": ("b_mesured_nt",)}, "did you mean 'b_measured_nt'"),
         ({"signals": ()}, "signals are empty"),
         ({"step_s": 0.03}, "multiple of the control step"),

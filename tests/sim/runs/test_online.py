@@ -17,7 +17,7 @@ from magtwin.sim.sensors.model_error import ModelError
 from magtwin.sim.sensors.noise import gauss_markov
 from magtwin.sim.sensors.online_sensors import Held, Magnetometer, Markov
 from magtwin.sim.session import draw_session
-from magtwin.spec.scene import MagnetometerSpec
+from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.twin import Twin, open_twin
 
 SEED = 3
@@ -140,8 +140,8 @@ def test_a_magnetometer_with_every_fault_reads_the_same_in_blocks() -> None:
         clock_offset_s=0.011,
         heading_error_nt=3.0,
         dead_zone_axis=0.3,
-        latched_nt=35650.0,
-        latched_std_nt=50.0,
+        stuck_nt=35650.0,
+        stuck_std_nt=50.0,
         dropout_share=0.05,
         vector_noise_density_nt=0.03,
     )

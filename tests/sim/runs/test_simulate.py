@@ -14,16 +14,11 @@ from magtwin.path import Path, path_named
 from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.interference import ambient_gradient_nt_m
 from magtwin.sim.runs.simulate import simulate
-from magtwin.spec.scene import (
-    EarthFieldSpec,
-    ImuSpec,
-    LabSpec,
-    MagnetometerSpec,
-    PlatformFieldSpec,
-    RobotSpec,
-    Scene,
-    SourceSpec,
-)
+from magtwin.spec.lab import LabSpec
+from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import ImuSpec, MagnetometerSpec
 
 EARTH_NT = np.array([-2_600.0, 24_000.0, -38_000.0])
 EARTH = EarthFieldSpec(
@@ -380,7 +375,7 @@ STEEP = SourceSpec(name="beam", p_world=(0.0, 0.35, 0.36), m_world=(0.0, 0.0, 3.
 
 
 def test_lock_is_lost_beside_steel_and_found_again_farther_on():
-    spec = MagnetometerSpec(gradient_max_nt_m=60e3, gradient_relock_nt_m=30e3, latched_std_nt=20.0)
+    spec = MagnetometerSpec(gradient_max_nt_m=60e3, gradient_relock_nt_m=30e3, stuck_std_nt=20.0)
     scene = with_robot(dataclasses.replace(KNOWN, sources=(STEEP,)), magnetometer=spec)
     run = drive(scene)
     lost, b = run["flag_lost_lock"], run["b_measured_nt"]

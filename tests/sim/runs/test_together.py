@@ -22,15 +22,11 @@ from magtwin.sim.motion.drive import Motion
 from magtwin.sim.runs.companions import Companion, approaches, companions_field_nt, iron_moments
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.runs.together import simulate_together
-from magtwin.spec.scene import (
-    DriveSpec,
-    EarthFieldSpec,
-    MagnetometerSpec,
-    PlacedRobot,
-    PlatformFieldSpec,
-    RobotSpec,
-    Scene,
-)
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec
+from magtwin.spec.robot import PlacedRobot, RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.twin import Twin, scene_from_toml, simulate_robots
 from magtwin.twin import simulate as simulate_one
 

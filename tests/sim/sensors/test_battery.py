@@ -18,7 +18,8 @@ from magtwin.sim.sensors.battery import (
     sense_battery,
     wheels_energy_j,
 )
-from magtwin.spec.scene import BatterySpec, DriveSpec
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.sensors import BatterySpec
 
 DRIVE = DriveSpec()
 STILL = Motion(DRIVE, 0.02, np.zeros(10), np.zeros(10))

@@ -15,7 +15,8 @@ from magtwin.frames import (
 from magtwin.sim.motion.drive import Motion
 from magtwin.sim.motion.sampling import held
 from magtwin.sim.sensors.imu import sense_imu
-from magtwin.spec.scene import DriveSpec, ImuSpec
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.sensors import ImuSpec
 
 T = np.arange(135 * 60) / 135.0
 CIRCLE = Motion(DriveSpec(), 0.02, np.full(3000, 0.2), np.full(3000, 0.5), (1.0, -1.0, 2.0))

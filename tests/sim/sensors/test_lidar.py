@@ -14,7 +14,8 @@ from magtwin.frames import quat_from_rpy, quat_from_yaw, rotate
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import lidar_on, ray_angles, scan, scans_of
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import LidarSpec, RobotSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.sensors import LidarSpec
 
 QUIET = LidarSpec(range_noise_std_m=0.0, latency_s=0.0, jitter_s=0.0)
 LEVEL = (0.0, 0.0, 0.0, 1.0)

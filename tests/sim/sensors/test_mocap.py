@@ -9,7 +9,8 @@ from magtwin.frames import canonical, quat_conjugate, quat_from_yaw, quat_multip
 from magtwin.sim.motion.drive import Motion
 from magtwin.sim.motion.sampling import held
 from magtwin.sim.sensors.mocap import dropouts, sense_mocap
-from magtwin.spec.scene import DriveSpec, MocapSpec
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.sensors import MocapSpec
 
 T = np.arange(135 * 60) / 135.0
 CIRCLE = Motion(DriveSpec(), 0.02, np.full(3000, 0.2), np.full(3000, 0.5), (1.0, -1.0, 2.0))

@@ -8,7 +8,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 import magtwin
-from magtwin import simulate, simulate_many
+from magtwin import simulate, sweep
 from magtwin.errors import MismatchWarning
 from magtwin.io.provenance import repeat
 from magtwin.learn.models.network import FieldNet
@@ -36,7 +36,7 @@ def net(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def twin(lab_scene, net) -> Twin:
-    return open_twin(lab_scene, net=net)
+    return open_twin(lab_scene, network=net)
 
 
 def test_the_variance_is_that_of_the_prediction_whatever_that_is():
@@ -74,9 +74,7 @@ def test_the_process_forgets_in_its_time_at_any_rate(rate_hz):
 
 
 def test_readings_lie_in_their_intervals_on_many_sessions(twin):
-    runs = simulate_many(
-        twin, "figure8", range(150), columns=["b_total_nt", "b_measured_nt", "b_sd_nt"], **SHORT
-    )
+    runs = sweep(twin, "figure8", range(150), columns=["b_total_nt", "b_measured_nt", "b_sd_nt"], **SHORT)
     off = np.array([(run["b_measured_nt"] - run["b_total_nt"]) / run["b_sd_nt"] for run in runs])
     # 150 sessions are 150 draws of a constant that has 44 % of the variance
     assert np.mean(np.abs(off) <= 1.6449) == pytest.approx(0.9, abs=0.04)
@@ -101,7 +99,7 @@ def test_readings_add_up_and_everything_else_is_as_without_the_error(twin):
 def offsets(lab_scene, tmp_path, of):
     """The constants of runs whose error is an offset alone."""
     net = weights(tmp_path, residual_sd_nt=SD, metadata=FACTS | {"residual_offset_sd_nt": SD})
-    runs = of(open_twin(lab_scene, net=net))
+    runs = of(open_twin(lab_scene, network=net))
     for run in runs:
         assert np.ptp(run["b_model_error_nt"]) < 1e-9
     return [float(run["b_model_error_nt"][0]) for run in runs]
@@ -111,7 +109,7 @@ def test_a_session_has_one_offset_and_another_session_another(lab_scene, tmp_pat
     def of(twin):
         first, second = (in_session(twin, k, seed=5) for k in (0, 1))
         made = [simulate(one, "sine", seed=seed, **SHORT) for seed in (1, 2) for one in (first, second)]
-        many = simulate_many(twin, "sine", [1, 2], robots=[first, second], **SHORT)
+        many = sweep(twin, "sine", [1, 2], robots=[first, second], **SHORT)
         return [*made, *many]
 
     a, b, again, other, many_a, many_b = offsets(lab_scene, tmp_path, of)
@@ -121,7 +119,7 @@ def test_a_session_has_one_offset_and_another_session_another(lab_scene, tmp_pat
 
 
 def test_sessions_that_are_drawn_from_the_seed_have_offsets_of_the_right_size(lab_scene, tmp_path):
-    made = offsets(lab_scene, tmp_path, lambda twin: list(simulate_many(twin, "sine", range(100), **SHORT)))
+    made = offsets(lab_scene, tmp_path, lambda twin: list(sweep(twin, "sine", range(100), **SHORT)))
     assert np.std(made) == pytest.approx(SD, rel=0.2)  # 7 %
     assert len(set(made)) == 100
 
@@ -134,8 +132,8 @@ def test_a_physical_magnetometer_has_no_model_error(lab_scene):
 
 @pytest.mark.parametrize("options", [{"residual_sd_nt": SD}, {"metadata": FACTS}])
 def test_weights_that_do_not_say_how_their_error_varies_draw_none_and_warn(lab_scene, tmp_path, options):
-    with pytest.warns(MismatchWarning, match="does not say how its error varies in time"):
-        twin = open_twin(lab_scene, net=weights(tmp_path, **options))
+    with pytest.warns(MismatchWarning, match="has no statistics of its error"):
+        twin = open_twin(lab_scene, network=weights(tmp_path, **options))
     run = simulate(twin, "sine", **SHORT)
     assert_array_equal(run["b_model_error_nt"], 0)
     assert run.metadata["model_error"] is False
@@ -144,7 +142,7 @@ def test_weights_that_do_not_say_how_their_error_varies_draw_none_and_warn(lab_s
 def test_figures_that_cannot_be_are_refused(lab_scene, tmp_path):
     net = weights(tmp_path, residual_sd_nt=SD, metadata=FACTS | {"residual_time_s": -1.0})
     with pytest.raises(magtwin.InputError, match="residual_time_s"):
-        open_twin(lab_scene, net=net)
+        open_twin(lab_scene, network=net)
 
 
 @pytest.mark.parametrize("model_error", [True, False])

@@ -10,7 +10,7 @@ from magtwin.frames import yaw_from_quat
 from magtwin.sim.motion.drive import Motion
 from magtwin.sim.motion.sampling import held
 from magtwin.sim.sensors.odometry import sense_odometry
-from magtwin.spec.scene import DriveSpec
+from magtwin.spec.drive import DriveSpec
 
 T = np.arange(135 * 60) / 135.0
 QUIET = DriveSpec(

@@ -15,7 +15,7 @@ from magtwin.sim.sensors.magnetometer import (
     sensor_noise_nt,
     vector_gain,
 )
-from magtwin.spec.scene import MagnetometerSpec
+from magtwin.spec.sensors import MagnetometerSpec
 
 RATE_HZ = 135.0
 QUIET = MagnetometerSpec(noise_density_nt=0.0, resolution_nt=0.0, vector_noise_density_nt=0.0)
@@ -161,7 +161,7 @@ def test_the_share_of_readings_that_drop_out_is_as_said():
 
 # Lock
 
-STEEP = replace(QUIET, gradient_max_nt_m=20e3, gradient_relock_nt_m=12e3, latched_std_nt=40.0)
+STEEP = replace(QUIET, gradient_max_nt_m=20e3, gradient_relock_nt_m=12e3, stuck_std_nt=40.0)
 
 
 def test_lock_is_lost_above_one_gradient_and_found_below_another():

@@ -15,8 +15,10 @@ from magtwin.sim.sensors.imu import sense_imu
 from magtwin.sim.sensors.lidar import scans_of
 from magtwin.sim.sensors.mocap import sense_mocap
 from magtwin.sim.sensors.odometry import sense_odometry
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.scene import BatterySpec, DriveSpec, ImuSpec, LidarSpec, MocapSpec, RobotSpec
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MocapSpec
 
 T = np.arange(135 * 60) / 135.0
 LEVEL = (0.0, 0.0, 0.0, 1.0)

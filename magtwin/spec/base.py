@@ -1,0 +1,88 @@
+"""What every spec has: the base class, and the types of its fields.
+
+A spec is plain data between `usd/`, which authors and reads it, and `sim/`, which runs it. Every field
+stands for one attribute of a prim and is checked when the spec is made. Lengths are metres, angles radians,
+fields nT.
+"""
+
+import math
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+from magtwin.errors import InputError
+
+Vec2 = tuple[float, float]
+
+
+Vec3 = tuple[float, float, float]
+
+
+Quat = tuple[float, float, float, float]
+
+
+Matrix3 = tuple[float, float, float, float, float, float, float, float, float]
+"""Rows of a 3 x 3 matrix, one after the other."""
+
+
+ZERO3: Vec3 = (0.0, 0.0, 0.0)
+
+
+ZERO9: Matrix3 = (0.0,) * 9  # type: ignore[assignment]
+
+
+UNIT_TOLERANCE = 1e-6
+"""How far the square of a unit quaternion's length may be from 1: single precision passes."""
+
+
+class Spec:
+    """What every spec has: all of its numbers are finite."""
+
+    def __post_init__(self) -> None:
+        for f in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, f.name)
+            numbers = value if isinstance(value, tuple) else (value,)
+            finite = all(abs(x) < math.inf for x in numbers if isinstance(x, int | float))
+            self._require(f.name, finite, "be finite", value)
+
+    def _require(self, name: str, holds: bool, what: str, seen: Any) -> None:
+        if not holds:
+            kind = type(self).__name__.lstrip("_")
+            raise InputError(f"{name} of {kind} must {what}, got {seen!r}")
+
+    def _above_zero(self, *names: str) -> None:
+        for name in names:
+            value = getattr(self, name)
+            self._require(name, _least(value) > 0, "be above 0", value)
+
+    def _not_negative(self, *names: str) -> None:
+        for name in names:
+            value = getattr(self, name)
+            self._require(name, _least(value) >= 0, "not be below 0", value)
+
+    def _within(self, name: str, least: float, most: float) -> None:
+        value = getattr(self, name)
+        self._require(name, least <= value <= most, f"lie in {least:g}..{most:g}", value)
+
+    def _unit(self, *names: str) -> None:
+        for name in names:
+            q = getattr(self, name)
+            off = abs(sum(c * c for c in q) - 1)
+            self._require(name, off <= UNIT_TOLERANCE, "be a unit quaternion", q)
+
+
+def _least(value: float | tuple[float, ...]) -> float:
+    return min(value) if isinstance(value, tuple) else value
+
+
+def spelled(value: Any) -> str:
+    """Every value of a spec as text, the input of its checksum.
+
+    It is the `repr` of a plain dataclass, even if the class has its own `repr`. Runs keep the checksum, so
+    the spelling must not change.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        values = ", ".join(f"{f.name}={spelled(getattr(value, f.name))}" for f in fields(value) if f.repr)
+        return f"{type(value).__qualname__}({values})"
+    if type(value) is tuple:
+        return f"({', '.join(map(spelled, value))}{',' * (len(value) == 1)})"
+    return repr(value)

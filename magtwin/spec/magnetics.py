@@ -1,0 +1,226 @@
+"""What makes the field: the Earth, magnetised things, and the robot itself."""
+
+import datetime
+from dataclasses import dataclass
+
+import numpy as np
+
+from magtwin.errors import hint
+from magtwin.frames import IDENTITY_XYZW
+from magtwin.spec.base import ZERO3, ZERO9, Matrix3, Quat, Spec, Vec3
+from magtwin.spec.mesh import check_mesh
+from magtwin.summary import Summarized
+
+MODEL = "the IGRF-14"
+"""Model of the Earth's field."""
+
+SPAN = (datetime.date(1900, 1, 1), datetime.date(2030, 1, 1))
+"""First and last day of the model."""
+
+SHAPES = ("cuboid", "cylinder", "sphere", "mesh")
+"""Shapes of a magnetised body."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlatformFieldSpec(Spec):
+    """The robot's own magnetic field at its magnetometer, in base_link axes.
+
+    B = (1 + S) b + h + E db/dt + (terms of motors, LiDAR, electronics and iron that turns), b the ambient
+    field in base_link axes: the permanent, induced and eddy parts of Tolles and Lawson (1950), then what an
+    aircraft need not mind. `magtwin.sim.interference` says how each enters.
+    """
+
+    hard_iron_nt: Vec3 = ZERO3
+    """Permanent part h [nT]."""
+
+    soft_iron: Matrix3 = ZERO9
+    """Induced part S, by rows [nT per nT]."""
+
+    eddy_s: Matrix3 = ZERO9
+    """Eddy-current part E, by rows [nT per nT/s]."""
+
+    left_motor_nt_nm: Vec3 = ZERO3
+    """Field of the left motor for each N m of torque at its wheel, which its current is in proportion to
+    [nT/(N m)]."""
+
+    right_motor_nt_nm: Vec3 = ZERO3
+    """Field of the right motor for each N m of torque at its wheel [nT/(N m)]."""
+
+    lidar_nt: Vec3 = ZERO3
+    """Steady field of the LiDAR and its supply while it is on [nT]."""
+
+    lidar_cos_nt: Vec3 = ZERO3
+    """Field of the LiDAR's turning motor when its angle is 0 [nT]; at angle a it is cos(a) of this."""
+
+    lidar_sin_nt: Vec3 = ZERO3
+    """Field of the LiDAR's turning motor a quarter turn on [nT]; at angle a it is sin(a) of this."""
+
+    lidar_phase: float = 0.0
+    """Angle of the LiDAR's motor at the start of a run [rad]."""
+
+    battery_nt: Vec3 = ZERO3
+    """Field of the supply current, for each ampere above that at rest with a full pack [nT/A]."""
+
+    left_wheel_moment: float = 0.0
+    """Magnetic moment of the left wheel's iron across its axle [A m2]: it turns with the wheel."""
+
+    left_wheel_phase: float = 0.0
+    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
+
+    right_wheel_moment: float = 0.0
+    """Magnetic moment of the right wheel's iron across its axle [A m2]."""
+
+    right_wheel_phase: float = 0.0
+    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
+
+    caster_moment: float = 0.0
+    """Magnetic moment of the caster's iron across the way [A m2]; it rolls as the robot drives."""
+
+    caster_phase: float = 0.0
+    """Angle from up, forwards, at which that moment is at the start of a run [rad]."""
+
+    p_base_caster: Vec3 = ZERO3
+    """Middle of the caster in base_link [m]."""
+
+    caster_radius_m: float = 0.01
+    """Radius that the caster rolls on [m]."""
+
+    hard_iron_change_nt: Vec3 = ZERO3
+    """Part of h that came after the survey of the map [nT]; 0 in the survey's session. A map that this robot
+    surveyed holds h without it."""
+
+    hard_iron_drift_nt: Vec3 = ZERO3
+    """Mean change of h from the day of a survey to the days of driving that follow [nT]: handling, docking
+    and tools magnetise or demagnetise."""
+
+    hard_iron_std_nt: float = 0.0
+    """Standard deviation of each part of h from one day of driving to another [nT]."""
+
+    current_std: float = 0.0
+    """Relative standard deviation of what motors, LiDAR and battery add, from one day to another: wires lie
+    otherwise."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._above_zero("caster_radius_m")
+        self._not_negative("hard_iron_std_nt", "current_std")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EarthFieldSpec(Spec):
+    """The Earth's field in the lab, uniform over it."""
+
+    b_world_nt: Vec3
+    """Field in world axes [nT]."""
+
+    latitude_deg: float
+    """Geodetic latitude of the room, north positive [deg]."""
+
+    longitude_deg: float
+    """Longitude of the room, east positive [deg]."""
+
+    height_m: float
+    """Height above the WGS 84 ellipsoid [m]."""
+
+    date: str
+    """Date of the field, YYYY-MM-DD."""
+
+    north_deg: float = 0.0
+    """Angle from the world's y to true north, counter-clockwise seen from above [deg]."""
+
+    measured: bool = False
+    """Whether the field was measured, so that it may differ from the model's."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._within("latitude_deg", -90, 90)
+        self._within("longitude_deg", -180, 360)
+        self._within("north_deg", -360, 360)
+        self._require("date", _is_day(self.date), "be a day as YYYY-MM-DD", self.date)
+        first, last = SPAN
+        if not self.measured:
+            within = first <= datetime.date.fromisoformat(self.date) <= last
+            self._require("date", within, f"lie in {MODEL}'s span, {first} to {last}", self.date)
+
+
+def _is_day(text: str) -> bool:
+    try:
+        return datetime.date.fromisoformat(text).isoformat() == text
+    except ValueError:
+        return False
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class SourceSpec(Summarized, Spec):
+    """A magnetised thing: a point dipole, or a uniformly magnetised body of some shape."""
+
+    name: str
+    """Name of its prim: letters, digits and _, no digit first."""
+
+    p_world: Vec3
+    """Where it is: the middle of all but a mesh [m]."""
+
+    m_world: Vec3 = ZERO3
+    """Dipole moment of a point, in world axes [A m2]."""
+
+    shape: str = "point"
+    """"point", "cuboid", "cylinder", "sphere" or "mesh"."""
+
+    q_world_xyzw: Quat = IDENTITY_XYZW
+    """Axes of a body in world; a cylinder's axis is its own z."""
+
+    size_m: Vec3 = ZERO3
+    """Sides of the box about a body along its own axes [m]; follows from the vertices of a mesh."""
+
+    magnetization: Vec3 = ZERO3
+    """Remanent magnetization of a body in its own axes [A/m]."""
+
+    susceptibility: float = 0.0
+    """Volume susceptibility of a body's material [1]; see
+    `magtwin.field.sources.bodies.induced_magnetization`."""
+
+    vertices_m: tuple[Vec3, ...] = ()
+    """Vertices of a mesh in its own axes [m], in single precision, as USD has them."""
+
+    faces: tuple[tuple[int, int, int], ...] = ()
+    """Corners of a mesh's triangles, counter-clockwise seen from outside."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        kinds = ("point", *SHAPES)
+        self._require(
+            "shape", self.shape in kinds, f"be a known shape ({hint(self.shape, kinds)})", self.shape
+        )
+        self._unit("q_world_xyzw")
+        self._not_negative("susceptibility")
+        if self.shape == "point":
+            self._check_point()
+            return
+        self._require("m_world", self.m_world == ZERO3, f"not be given for a {self.shape}", self.m_world)
+        if self.shape == "mesh":
+            vertices = np.asarray(np.asarray(self.vertices_m, np.float32), float).reshape(-1, 3)
+            check_mesh(vertices, np.asarray(self.faces, int).reshape(-1, 3), f"source {self.name!r}")
+            object.__setattr__(self, "vertices_m", tuple(map(tuple, vertices.tolist())))
+            object.__setattr__(self, "size_m", tuple(np.ptp(vertices, axis=0).tolist()))
+        else:
+            self._require("vertices_m", not (self.vertices_m or self.faces), "go with shape mesh", "some")
+            self._require(
+                "size_m", min(self.size_m) > 0, "be above 0 m each way: no volume, no field", self.size_m
+            )
+        x, y, z = self.size_m
+        if self.shape == "cylinder":
+            self._require("size_m", x == y, "be as wide in y as in x for a cylinder", self.size_m)
+        if self.shape == "sphere":
+            self._require("size_m", x == y == z, "be alike each way for a sphere", self.size_m)
+
+    def _check_point(self) -> None:
+        for name, none in {"size_m": ZERO3, "magnetization": ZERO3, "susceptibility": 0.0}.items():
+            seen = getattr(self, name)
+            self._require(
+                name, seen == none, "be given with a shape: a point has no volume, only m_world", seen
+            )
+        turned = self.q_world_xyzw != IDENTITY_XYZW
+        self._require(
+            "q_world_xyzw", not turned, "not turn a point, whose m_world is in world axes", "a turn"
+        )
+        self._require("vertices_m", not (self.vertices_m or self.faces), "go with shape mesh", "some")

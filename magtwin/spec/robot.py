@@ -1,0 +1,115 @@
+"""A robot: its asset, drive, sensors and magnetic field; and its place in a scene."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from magtwin.frames import IDENTITY_XYZW, quat_multiply
+from magtwin.spec.base import ZERO3, Quat, Spec, Vec3
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.magnetics import PlatformFieldSpec
+from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec
+from magtwin.summary import Summarized, Summary
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class RobotSpec(Summarized, Spec):
+    """A robot: the USD asset that shows it, and what the simulator needs to drive it."""
+
+    name: str
+    """Name of its prim."""
+
+    asset: Path
+    """USD file of the articulation."""
+
+    footprint_radius_m: float = 0.171
+    """Radius of the circle that must stay clear of walls [m]."""
+
+    base_height_m: float = 0.0
+    """Height of base_link above the floor that the robot stands on [m]; read from the asset."""
+
+    p_base_magnetometer: Vec3 = ZERO3
+    """Magnetometer's origin in base_link at rest, through the links between [m]; read from the asset."""
+
+    q_base_magnetometer_link_xyzw: Quat = IDENTITY_XYZW
+    """Axes of the link that carries the magnetometer, in base_link; read from the asset."""
+
+    q_base_imu_link_xyzw: Quat = IDENTITY_XYZW
+    """Axes of the link that carries the IMU, in base_link; read from the asset."""
+
+    p_base_lidar: Vec3 = ZERO3
+    """LiDAR's origin in base_link at rest [m]; read from the asset."""
+
+    q_base_lidar_link_xyzw: Quat = IDENTITY_XYZW
+    """Axes of the link that carries the LiDAR, in base_link; read from the asset."""
+
+    drive: DriveSpec = field(default_factory=DriveSpec)
+    battery: BatterySpec = field(default_factory=BatterySpec)
+    platform: PlatformFieldSpec = field(default_factory=PlatformFieldSpec)
+    magnetometer: MagnetometerSpec = field(default_factory=MagnetometerSpec)
+    imu: ImuSpec = field(default_factory=ImuSpec)
+    lidar: LidarSpec = field(default_factory=LidarSpec)
+    mocap: MocapSpec = field(default_factory=MocapSpec)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._above_zero("footprint_radius_m")
+        self._unit("q_base_magnetometer_link_xyzw", "q_base_imu_link_xyzw", "q_base_lidar_link_xyzw")
+
+    @property
+    def q_base_magnetometer_xyzw(self) -> Quat:
+        """Magnetometer's axes in base_link."""
+        return _product(self.q_base_magnetometer_link_xyzw, self.magnetometer.q_link_sensor_xyzw)
+
+    @property
+    def q_base_imu_xyzw(self) -> Quat:
+        """IMU's axes in base_link."""
+        return _product(self.q_base_imu_link_xyzw, self.imu.q_link_sensor_xyzw)
+
+    @property
+    def q_base_lidar_xyzw(self) -> Quat:
+        """LiDAR's axes in base_link."""
+        return _product(self.q_base_lidar_link_xyzw, self.lidar.q_link_sensor_xyzw)
+
+    def _summary(self) -> Summary:
+        """Name and magnetometer; drive; other sensors; the field that it makes itself."""
+        sensor, drive = self.magnetometer, self.drive
+        network = "" if sensor.network is None else f" ({sensor.network.name})"
+        x, y, z = self.p_base_magnetometer
+        return Summary(
+            f"RobotSpec {self.name}: {sensor.kind} magnetometer{network} at {sensor.rate_hz:g} Hz",
+            (
+                (
+                    "sensor",
+                    f"({x:.3g}, {y:.3g}, {z:.3g}) m in base_link, {sensor.noise_density_nt:.3g} nT/sqrt(Hz)",
+                ),
+                (
+                    "drive",
+                    f"{drive.v_max:.3g} m/s, {drive.w_max:.3g} rad/s, radius {self.footprint_radius_m:.3g} m",
+                ),
+                (
+                    "others",
+                    f"LiDAR {self.lidar.rays} rays, IMU {self.imu.rate_hz:g} Hz, "
+                    f"battery {self.battery.capacity_wh:g} Wh",
+                ),
+                ("asset", str(self.asset)),
+            ),
+        )
+
+
+def _product(a: Quat, b: Quat) -> Quat:
+    x, y, z, w = quat_multiply(a, b).tolist()
+    return (x, y, z, w)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class PlacedRobot(Summarized, Spec):
+    """A robot in a scene: what it is, where it begins, and what it drives."""
+
+    robot: RobotSpec
+
+    start: Vec3 = ZERO3
+    """First x [m], y [m] and yaw [rad] in world, where a path does not say."""
+
+    path: str | Path = ""
+    """What it drives unless told otherwise: a name of `magtwin.path.PATHS`, "random", or a CSV file; "" for
+    what whoever runs the scene takes."""

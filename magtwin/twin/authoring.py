@@ -1,0 +1,169 @@
+"""Authoring: a scene from its TOML, surveyed and checked against its own sources."""
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING, Any
+
+from magtwin.errors import find
+from magtwin.files import check_free, output, sha256, shipped
+from magtwin.spec.lab import SurveySpec
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.scene import Scene
+
+if TYPE_CHECKING:
+    from tempfile import TemporaryDirectory
+
+NOTED_NT = 50.0
+"""RMS difference of a map from its sources that is reported [nT]; above the error of a careful survey."""
+
+_WORKSHOPS: "list[TemporaryDirectory[str]]" = []
+"""Temporary folders of scenes, deleted when Python ends."""
+
+Report = Callable[[str], Any]
+Progress = Callable[[int, int, str], Any]
+
+
+def scene_from_toml(
+    path: str | FilePath,
+    *,
+    map_layer: str | FilePath | None = None,
+    network: str | FilePath | None = None,
+    workshop: str | FilePath | None = None,
+    report: Report = lambda text: None,
+    progress: Progress = lambda done, total, what: None,
+) -> Scene:
+    """Read the TOML of a scene.
+
+    A scene without a map is surveyed by its own robot; this needs its Earth field. If the TOML names a map
+    and also an Earth field, sources or furniture, the map is compared with their field.
+
+    Args:
+        path: The TOML, or the name of a scene that ships with magtwin ("lab", "aprilab"). File names in it
+            are relative to its folder.
+        map_layer: Map that replaces the one of the TOML.
+        network: Weights (.safetensors or .pth) that replace those of the TOML.
+        workshop: Folder for a robot converted from a URDF and for the map of a survey. Default: a temporary
+            folder, deleted when Python ends; `author_scene` copies from it.
+        report: Called with a line about the survey, and about a map that differs from the sources.
+        progress: Called during a survey with headings done, headings in all, and the current step.
+
+    Raises:
+        InputError: A key is misspelt or missing, a file is missing or invalid, there is neither a map nor an
+            Earth field, or the map contradicts the sources; the text gives the difference.
+    """
+    from magtwin.author.scene import scene_from_toml as read_toml_scene
+    from magtwin.sim.contradiction import check_agrees
+    from magtwin.usd.maps import load_map
+
+    if workshop is None:
+        _WORKSHOPS.append(tempfile.TemporaryDirectory(prefix="magtwin-"))
+        workshop = _WORKSHOPS[-1].name
+
+    def inputs_of(weights: FilePath) -> tuple[str, ...]:
+        from magtwin.learn.models.predictor import load_predictor
+
+        return load_predictor(weights).features
+
+    def survey_of(scene: Scene, spec: SurveySpec, seed: int, obstacles: Obstacles) -> FilePath:
+        from magtwin.sim.room_survey import survey_room
+        from magtwin.usd.maps import save_map
+
+        source = f"{FilePath(path).name} sha256:{sha256(path)}"
+        surveyed = survey_room(scene, spec, seed=seed, obstacles=obstacles, source=source, progress=progress)
+        layer = FilePath(workshop) / f"{scene.name}.map.usdc"
+        save_map(surveyed.field, layer)
+        report(f"{scene.name} names no map: {surveyed}")
+        return layer
+
+    path = _file_of(path)
+    scene = read_toml_scene(
+        path,
+        map_layer=map_layer,
+        network=network,
+        workshop=workshop,
+        inputs_of=inputs_of,
+        survey_of=survey_of,
+    )
+    if scene.map_layer.parent != FilePath(workshop):
+        where = f"{path} with {map_layer or scene.map_layer.name}"
+        difference = check_agrees(scene, load_map(scene.map_layer), where)
+        if difference and difference.rms_nt >= NOTED_NT:
+            report(f"Note: the map differs from the field of the scene's sources by {difference}")
+    return scene
+
+
+def _file_of(path: str | FilePath) -> FilePath:
+    """The TOML that a path or the name of a shipped scene leads to."""
+    file = FilePath(path)
+    if file.suffix or file.exists():
+        return file
+    return find("scene", str(path), {toml.stem: toml for toml in sorted(shipped("scenes").glob("*.toml"))})
+
+
+def author_scene(
+    scene: Scene | str | FilePath,
+    out: str | FilePath,
+    *,
+    map_layer: str | FilePath | None = None,
+    network: str | FilePath | None = None,
+    force: bool = False,
+    report: Report = lambda text: None,
+    progress: Progress = lambda done, total, what: None,
+) -> FilePath:
+    """Write a scene as a folder of USD layers that needs no file outside it.
+
+    Args:
+        scene: A `Scene`, or a TOML as for `scene_from_toml`.
+        out: Folder to make.
+        map_layer: As for `scene_from_toml`, if `scene` is a TOML.
+        network: As for `scene_from_toml`, if `scene` is a TOML.
+        force: Whether to replace a folder that exists.
+        report: As for `scene_from_toml`.
+        progress: As for `scene_from_toml`.
+
+    Returns:
+        The root layer, `out/<name>.usda`.
+
+    Raises:
+        InputError: The folder exists, or as for `scene_from_toml`.
+    """
+    from magtwin.author.scene import author_scene as write_scene
+
+    check_free(out, force=force)
+    if isinstance(scene, Scene):
+        return write_scene(scene, out, force=force)
+    with tempfile.TemporaryDirectory() as workshop:
+        read = scene_from_toml(
+            scene,
+            map_layer=map_layer,
+            network=network,
+            workshop=workshop,
+            report=report,
+            progress=progress,
+        )
+        return write_scene(read, out, force=force)
+
+
+def new_scene(out: str | FilePath, *, force: bool = False) -> FilePath:
+    """Write a TOML with comments that describes a small furnished room, to start from.
+
+    Args:
+        out: TOML to write. The scene is named after it.
+        force: Whether to replace a file that exists.
+
+    Returns:
+        The file.
+
+    Raises:
+        InputError: The file exists, or its name cannot name a scene.
+    """
+    from magtwin.author.room import check_name
+
+    name = FilePath(out).stem
+    check_name(name)
+    text = shipped("scenes", "starter.toml").read_text(encoding="utf-8")
+    text = text.replace('name = "room"', f'name = "{name}"', 1)
+    with output(out, force=force) as aside:
+        aside.write_text(text, encoding="utf-8")
+    return FilePath(out)

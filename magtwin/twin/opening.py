@@ -1,0 +1,307 @@
+"""Opening: a stage, its map and its network become a Twin."""
+
+import dataclasses
+import hashlib
+import shutil
+import tempfile
+import warnings
+import weakref
+from collections.abc import Mapping
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING, Any
+
+from magtwin.errors import InputError, MismatchWarning
+from magtwin.files import existing, git_revision, sha256
+from magtwin.run.run import Run
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.twin.twin import Kind, Metadata, Twin, scene_sha256, without_model_error
+
+if TYPE_CHECKING:
+    from magtwin.learn.magnetometer import NeuralMagnetometer
+
+_CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_sha256": "the scene"}
+
+
+def open_twin(
+    scene: Scene | str | FilePath,
+    *,
+    network: str | FilePath | None = None,
+    magnetometer: Kind | None = None,
+    model_error: bool = True,
+) -> Twin:
+    """Open a scene with the map and the network that it names.
+
+    A network that was trained on another map, another robot or another sensor position causes a
+    `magtwin.MismatchWarning` with the expected error. Runs keep its text as `network_mismatch`.
+
+    Args:
+        scene: Root layer of a scene; or a `Scene`, which is authored to a temporary folder first. Colliders
+            that were added to a stage by hand are not part of a `Scene`.
+        network: Weights (.safetensors or .pth) that replace those of the scene; or "none" for a physical
+            magnetometer.
+        magnetometer: Kind that replaces the scene's: "physical", "neural" or "map-only".
+        model_error: Whether readings of a neural magnetometer include the model's error on recordings that
+            it was not trained on; see `magtwin.sim.sensors.model_error`.
+
+    Raises:
+        InputError: The stage, its map or its weights are missing or broken, or a checksum does not match.
+    """
+    options: Any = {"network": network, "magnetometer": magnetometer, "model_error": model_error}
+    if isinstance(scene, Scene):
+        return _open_in_memory(scene, **options)
+    from magtwin.author.scene import read_scene
+    from magtwin.usd.layers import stage_sha256
+    from magtwin.usd.maps import load_map
+    from magtwin.usd.obstacles import read_obstacles
+
+    file = FilePath(scene)
+    read = read_scene(file, check_network=network is None and magnetometer in (None, "neural"))
+    read = dataclasses.replace(
+        read,
+        robot=_with_magnetometer(read.robot, network, magnetometer),
+        others=tuple(
+            dataclasses.replace(other, robot=_with_magnetometer(other.robot, network, magnetometer))
+            for other in read.others
+        ),
+    )
+    obstacles, field, predictor = read_obstacles(file), load_map(read.map_layer), _magnetometer(read)
+    metadata: Metadata = {"scene_file": file.as_posix(), "scene_sha256": stage_sha256(file)}
+    if revision := git_revision(file.parent):
+        metadata["git_revision"] = revision
+    metadata |= {"map": field.name, "map_sha256": sha256(read.map_layer)}
+    platforms = {placed.robot.name: _platform_sha256(placed.robot) for placed in read.robots}
+    metadata["platform_sha256"] = platforms[read.robot.name]
+    twin = _with_network(Twin(read, file, field, predictor, obstacles, metadata, platforms, model_error))
+    if predictor and network is not None:
+        named = {**twin.metadata, "network_file": FilePath(network).as_posix()}
+        return dataclasses.replace(twin, metadata=named)
+    return twin
+
+
+def opened(
+    twin: Twin | Scene | str | FilePath,
+    network: str | FilePath | None,
+    magnetometer: Kind | None,
+    model_error: bool,
+    function: str,
+) -> Twin:
+    """The twin, opened if it is a scene; `function` is named in the refusal of options that come too late."""
+    if not isinstance(twin, Twin):
+        return open_twin(twin, network=network, magnetometer=magnetometer, model_error=model_error)
+    if network is not None or magnetometer is not None:
+        raise InputError(
+            f"give `network` and `magnetometer` to open_twin, not to {function}, which got a Twin"
+        )
+    return twin if model_error else without_model_error(twin)
+
+
+class _TemporaryStage:
+    """A temporary folder that is deleted with the last twin that uses it."""
+
+    def __init__(self) -> None:
+        self.folder = FilePath(tempfile.mkdtemp(prefix="magtwin-"))
+        weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+
+    def __reduce__(self) -> tuple[type[FilePath], tuple[str]]:
+        return FilePath, (str(self.folder),)  # a copy in another process must not delete it
+
+
+def _open_in_memory(scene: Scene, **options: Any) -> Twin:
+    """The twin of a scene without a file, authored to a temporary folder."""
+    from magtwin.author.scene import author_scene
+
+    stage = _TemporaryStage()
+    twin = open_twin(author_scene(scene, stage.folder / "scene"), **options)
+    metadata = {name: value for name, value in twin.metadata.items() if name != "scene_file"}
+    return dataclasses.replace(twin, metadata=metadata, stage=stage)
+
+
+def _platform_sha256(robot: RobotSpec) -> str:
+    """Checksum of a robot's platform field.
+
+    Values equal to their default are left out, so that a field added by a later version changes nothing.
+    """
+    spec = robot.platform
+    values = [(field.name, getattr(spec, field.name), field.default) for field in dataclasses.fields(spec)]
+    text = repr(sorted((name, value) for name, value, default in values if value != default))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _platform_of(twin: Twin, robot: RobotSpec) -> str:
+    return twin.platforms.get(robot.name) or _platform_sha256(robot)
+
+
+def _with_network(twin: Twin) -> Twin:
+    """The twin with the metadata, warnings and error statistics of its network."""
+    network = twin.magnetometer
+    if network is None:
+        return twin
+    from magtwin.learn.data.origin import mismatches
+
+    mismatched = mismatches(
+        network.net.metadata,
+        network.name,
+        residual_sd_nt=network.residual_sd_nt,
+        field=twin.field,
+        map_sha256=str(twin.metadata["map_sha256"]),
+        robot=twin.scene.robot,
+        platform_sha256=_platform_of(twin, twin.scene.robot),
+    )
+    metadata = {**twin.metadata, **network.metadata}
+    texts = [mismatch.text for mismatch in mismatched]
+    if mismatched:
+        metadata["network_mismatch"] = "; ".join(texts)
+    statistics = network.model_error() if twin.errors else None
+    if twin.errors and statistics is None:
+        texts.append(
+            f"{network.name} has no statistics of its error, so readings differ from its predictions by "
+            "sensor noise only; train it again to include model error"
+        )
+    for text in texts:
+        warnings.warn(text, MismatchWarning, stacklevel=3)
+    metadata["model_error"] = statistics is not None
+    return dataclasses.replace(twin, metadata=metadata, model_error=statistics)
+
+
+def _with_magnetometer(robot: RobotSpec, network: str | FilePath | None, kind: Kind | None) -> RobotSpec:
+    """A robot whose magnetometer has another network or kind; arguments as for `open_twin`."""
+    spec = robot.magnetometer
+    if network is not None:
+        if FilePath(network).is_dir():
+            raise InputError(f"{network}: a folder; name the weights file in it")
+        physical = str(network) == "none"
+        spec = dataclasses.replace(
+            spec,
+            kind="physical" if physical else "neural",
+            network=None if physical else FilePath(network).resolve(),
+            network_sha256="",
+            inputs=(),
+        )
+    if kind is not None:
+        if kind != "neural" and network is not None and str(network) != "none":
+            raise InputError(f"a {kind!r} magnetometer has no network; drop `magnetometer` or `network`")
+        spec = dataclasses.replace(spec, kind=kind)
+    return dataclasses.replace(robot, magnetometer=spec)
+
+
+def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
+    """The predictor of the scene's magnetometer. None if it is not neural."""
+    spec = scene.robot.magnetometer
+    if spec.kind != "neural":
+        return None
+    if spec.network is None:
+        raise InputError(
+            f"scene {scene.name!r} has a neural magnetometer without a network; name one with `network`, or "
+            'take the kind "physical" or "map-only"'
+        )
+    from magtwin.learn.magnetometer import NeuralMagnetometer
+
+    magnetometer = NeuralMagnetometer.load(spec.network, sha256=spec.network_sha256)
+    if spec.inputs and spec.inputs != magnetometer.features:
+        raise InputError(
+            f"{spec.network}: takes {', '.join(magnetometer.features)}, but the scene's magnetometer names "
+            f"{', '.join(spec.inputs)}; author the scene again with this network"
+        )
+    return magnetometer
+
+
+def led_by(twin: Twin, name: str) -> Twin:
+    """The twin with another robot of its scene as the first one, with that robot's network.
+
+    Raises:
+        InputError: The scene has no robot of that name, or its weights cannot be used.
+    """
+    scene = twin.scene.led_by(name)
+    if name == twin.scene.robot.name:
+        return twin
+    ours, its = twin.scene.robot.magnetometer, scene.robot.magnetometer
+    same = (its.kind, its.network, its.network_sha256) == (ours.kind, ours.network, ours.network_sha256)
+    network = twin.magnetometer if same else _magnetometer(scene)
+    own = {"model_error", "network_mismatch", *(twin.magnetometer.metadata if twin.magnetometer else ())}
+    metadata: Metadata = {key: value for key, value in twin.metadata.items() if key not in own}
+    metadata["platform_sha256"] = _platform_of(twin, scene.robot)
+    return _with_network(
+        dataclasses.replace(twin, scene=scene, magnetometer=network, metadata=metadata, model_error=None)
+    )
+
+
+def twin_of(
+    run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None, check: bool = True
+) -> Twin:
+    """The twin that made a run: the scene in its metadata, with the run's network and magnetometer.
+
+    Args:
+        run: A run that `simulate` made, loaded from any format.
+        scene: Where the scene is now. Default: where the metadata say.
+        near: File of the run. Names in the metadata are also looked for in its folder.
+        check: Whether the checksums of scene, map and network must match those of the run.
+
+    Raises:
+        InputError: The metadata name no scene, a file is missing, or a checksum does not match.
+    """
+    metadata, scene = run.metadata, scene_of(run, scene, near=near)
+    kind: Any = metadata.get("magnetometer")
+    network = str(metadata["network_file"]) if "network_file" in metadata else None
+    twin = open_twin(
+        scene,
+        network=network if network is None else locate(network, near) or network,
+        magnetometer=kind if network is None else None,
+        model_error=bool(metadata.get("model_error", False)),
+    )
+    for name, what in _CHECKSUMS.items() if check else ():
+        if metadata.get(name, "") != twin.metadata.get(name, ""):
+            raise InputError(
+                f"{scene}: {what} changed since the run: {name} is {twin.metadata.get(name, 'none')}, "
+                f"the run has {metadata.get(name, 'none')}"
+            )
+    return twin
+
+
+def check_scene(scene: Scene, metadata: Mapping[str, str | int | float | bool], name: str) -> None:
+    """Refuse a scene whose values differ from those that a run was made with.
+
+    Args:
+        scene: The scene, its robot in the run's session.
+        metadata: Metadata of the run.
+        name: Name of the run.
+
+    Raises:
+        InputError: The checksum of the scene's values differs, or the run has none.
+    """
+    ours, its = scene_sha256(scene), metadata.get("config_sha256", "none")
+    if ours != its:
+        raise InputError(
+            f"{name}: was made in a scene whose values have the sha256 {its}; those of {scene.name!r} in its "
+            f"session have {ours}; name the scene that it was made in"
+        )
+
+
+def scene_of(
+    run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None
+) -> FilePath:
+    """File of the scene that a run was made in; arguments as for `twin_of`.
+
+    Raises:
+        InputError: The metadata name none, or it is missing.
+    """
+    if scene is not None:
+        return existing(scene, "scene")
+    if "scene_file" not in run.metadata:
+        raise InputError("the run does not name its scene; name it with `scene`", parameter="scene")
+    place = locate(str(run.metadata["scene_file"]), near)
+    if place is None:
+        name = run.metadata["scene_file"]
+        raise InputError(f"{name}: the scene of the run is missing; name it with `scene`", parameter="scene")
+    return place
+
+
+def locate(file: str, near: str | FilePath | None = None) -> FilePath | None:
+    """A file or folder named in metadata, relative to here or to the folder of `near`. None if missing.
+
+    Devices and pipes count as missing: metadata may be hostile, and reading one might never end.
+    """
+    places = [FilePath(file)]
+    if near is not None:  # a run may itself be a folder
+        places += [FilePath(near) / file, FilePath(near).parent / file]
+    return next((place for place in places if place.is_file() or place.is_dir()), None)

@@ -1,0 +1,331 @@
+"""Simulate: a twin and a path become a Run."""
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError, find
+from magtwin.path import Path
+from magtwin.run.run import Run
+from magtwin.sim.motion.way import way_of
+from magtwin.spec.scene import Scene
+from magtwin.twin.opening import led_by, open_twin, opened
+from magtwin.twin.twin import (
+    Kind,
+    Metadata,
+    Session,
+    Twin,
+    checked_seed,
+    in_session,
+    in_session_of,
+    model_error_of,
+    room_of,
+    scene_sha256,
+)
+from magtwin.version import __version__
+
+if TYPE_CHECKING:
+    from magtwin.learn.magnetometer import NeuralMagnetometer, Read
+    from magtwin.sim.motion.commands import Commands
+    from magtwin.sim.motion.controllers import Controller
+    from magtwin.sim.motion.engine import Engine
+    from magtwin.sim.runs.simulate import Predict
+    from magtwin.sim.sensors.lidar import Scans
+
+
+def simulate(
+    twin: Twin | Scene | str | FilePath,
+    path: "Path | Commands | Run | str | FilePath | ArrayLike" = "figure8",
+    *,
+    seed: int = 0,
+    session: Session | None = None,
+    speed: float = 0.2,
+    duration_s: float | None = None,
+    rate_hz: float | None = None,
+    network: str | FilePath | None = None,
+    magnetometer: Kind | None = None,
+    model_error: bool = True,
+    lidar: Literal["schedule", "on", "off"] = "schedule",
+    outside: Literal["nan", "clamp", "raise"] = "nan",
+    controller: "str | Controller" = "follower",
+    engine: "Literal['kinematic', 'newton'] | Engine" = "kinematic",
+    progress: Callable[[int, int, str], Any] | None = None,
+) -> Run:
+    """Drive the scene's robot along a path and read every sensor.
+
+    Args:
+        twin: An opened twin, a `Scene`, or the file of a stage.
+        path: What to drive: the name of a path, a CSV file of x, y [m], points in world [m], shape (N, 2), or
+            a `Path`; "random" for a random drive; `Commands` to play back; or a `Run` to drive again as
+            recorded, with the scene's sensors.
+        seed: Seed of all noise. The same seed gives byte-identical output.
+        session: Session of the robot, as for `in_session`. Default: one drawn from the seed. "survey" is the
+            robot as it was when the map was surveyed; a network trained on later sessions does not fit it.
+        speed: Forward speed on straight parts [m/s].
+        duration_s: Duration [s]. Default: once along the path. A longer duration drives further laps.
+        rate_hz: Magnetometer readings per second [Hz]. Default: the scene's.
+        network: As for `open_twin`, if `twin` is a file.
+        magnetometer: As for `open_twin`, if `twin` is a file.
+        model_error: Whether readings of a neural magnetometer include model error; see `open_twin`.
+        lidar: Whether the LiDAR follows its schedule, or stays on or off.
+        outside: What the map reads outside its extent: nan, the nearest value inside, or an error.
+        controller: "follower", "release", "stanley" or "pure_pursuit", or a custom
+            `magtwin.sim.motion.controllers.Controller`.
+        engine: "kinematic"; "newton" for physics in the stage (extra `physics`); or a custom
+            `magtwin.sim.motion.engine.Engine`.
+        progress: As for `engine_named`.
+
+    Returns:
+        A Run with the columns of `magtwin.COLUMNS`. Its metadata record everything needed to reproduce it.
+
+    Raises:
+        InputError: The path leaves the floor, hits an obstacle or leaves the map so that there is nothing to
+            read; an option is out of range; or the scene's field is constant.
+    """
+    from magtwin.sim.exact import check_field, check_read
+    from magtwin.sim.runs.simulate import simulate as run_scene
+
+    seed = checked_seed(seed)
+    twin = opened(twin, network, magnetometer, model_error, "simulate")
+    twin = in_session(twin, session, seed=seed)
+    check_field(twin.scene, twin.field)
+    path = way_of(path, room_of(twin))
+    check_commands(path, twin.magnetometer)
+    reads: list[Read] = []
+    run = run_scene(
+        twin.scene,
+        path,
+        anomaly_map=twin.field,
+        rng=np.random.default_rng(seed),
+        speed=speed,
+        duration_s=duration_s,
+        rate_hz=rate_hz,
+        disturbance_nt=_predict(twin.magnetometer, reads),
+        model_error=model_error_of(twin, seed),
+        outside=outside,
+        lidar=lidar,
+        obstacles=twin.obstacles,
+        controller=controller,
+        engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
+    )
+    check_read(run, twin.field)
+    return finished(twin, run, path, reads[-1] if reads else None, seed=seed, duration_s=duration_s)
+
+
+def simulate_robots(
+    twin: Twin | Scene | str | FilePath,
+    paths: "Mapping[str, Path | Commands | Run | str | FilePath | ArrayLike] | None" = None,
+    *,
+    robots: Iterable[str] | None = None,
+    meet: Literal["refuse", "flag"] = "refuse",
+    seed: int = 0,
+    session: Session | None = None,
+    speed: float = 0.2,
+    duration_s: float | None = None,
+    rate_hz: float | None = None,
+    network: str | FilePath | None = None,
+    magnetometer: Kind | None = None,
+    model_error: bool = True,
+    lidar: Literal["schedule", "on", "off"] = "schedule",
+    outside: Literal["nan", "clamp", "raise"] = "nan",
+    controller: str = "follower",
+) -> dict[str, Run]:
+    """Drive all robots of a scene at the same time. Each robot gets a Run.
+
+    Each magnetometer also reads the iron of the other robots. The first robot draws what `simulate` draws
+    with the same seed; each other robot has a generator of its own.
+
+    Args:
+        twin: An opened twin, a `Scene`, or the file of a stage.
+        paths: What each robot drives, by name, as for `simulate`. Default: the path in the scene, else
+            "figure8".
+        robots: Names of the robots whose sensors are read. Default: all. All robots drive.
+        meet: What happens where footprints overlap: "refuse" raises an error with time and place; "flag"
+            sets flag_bump of both robots, which then drive through each other.
+        seed: As for `simulate`.
+        session: As for `simulate`; each robot is drawn independently.
+        speed: As for `simulate`, of each robot.
+        duration_s: As for `simulate`, of each robot.
+        rate_hz: As for `simulate`.
+        network: As for `open_twin`, if `twin` is a file; of each robot.
+        magnetometer: As for `open_twin`, if `twin` is a file; of each robot.
+        model_error: As for `simulate`.
+        lidar: As for `simulate`.
+        outside: As for `simulate`.
+        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`.
+
+    Returns:
+        Runs by robot name, in the scene's order. The metadata of each also name the robot, the nearest other
+        robot, and the time and clearance of their closest approach.
+
+    Raises:
+        InputError: A name is not that of a robot, robots would meet, or `simulate` would refuse one of them.
+    """
+    from magtwin.sim.exact import check_field, check_read
+    from magtwin.sim.runs.together import simulate_together
+
+    seed = checked_seed(seed)
+    twin = opened(twin, network, magnetometer, model_error, "simulate_robots")
+    twin = in_session(twin, session, seed=seed)
+    check_field(twin.scene, twin.field)
+    placed = {other.robot.name: other for other in twin.scene.robots}
+    for name in (*(paths or {}), *(robots or ())):
+        find("robot", name, placed)
+    twins = {name: led_by(twin, name) for name in placed}
+    driven = {
+        name: way_of((paths or {}).get(name, robot.path or "figure8"), room_of(twins[name]))
+        for name, robot in placed.items()
+    }
+    for name, path in driven.items():
+        check_commands(path, twins[name].magnetometer)
+    reads: dict[str, list[Read]] = {name: [] for name in placed}
+    runs = simulate_together(
+        twin.scene,
+        driven,
+        anomaly_map=twin.field,
+        rngs={name: np.random.default_rng((seed, 2, k) if k else seed) for k, name in enumerate(placed)},
+        wanted=[name for name in placed if robots is None or name in set(robots)],
+        meet=meet,
+        speed=speed,
+        duration_s=duration_s,
+        rate_hz=rate_hz,
+        obstacles=twin.obstacles,
+        controller=controller,
+        disturbances_nt={name: _predict(own.magnetometer, reads[name]) for name, own in twins.items()},
+        model_errors={name: model_error_of(twins[name], seed, which=k) for k, name in enumerate(placed)},
+        outside=outside,
+        lidar=lidar,
+    )
+    for name, run in runs.items():
+        check_read(run, twin.field)
+        read = reads[name][-1] if reads[name] else None
+        runs[name] = finished(twins[name], run, driven[name], read, seed=seed, duration_s=duration_s)
+    return runs
+
+
+def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Scans":
+    """The scans of the robot's LiDAR during a run, one per revolution while it was on.
+
+    Args:
+        twin: An opened twin in the run's session; or a `Scene` or the file of a stage.
+        run: A run with t, p_world_base, yaw and lidar_on.
+        seed: Seed of the noise.
+    """
+    from magtwin.sim.runs.simulate import streams
+    from magtwin.sim.sensors.lidar import scans_of
+
+    if not isinstance(twin, Twin):
+        twin = in_session_of(open_twin(twin, magnetometer="map-only"), run.metadata)
+    rng = streams(np.random.default_rng(seed))["lidar"]
+    return scans_of(run, twin.scene.robot, twin.obstacles, rng)
+
+
+def engine_named(
+    name: str, twin: Twin, *, progress: Callable[[int, int, str], Any] | None = None
+) -> "Engine":
+    """The engine that moves a twin's robot.
+
+    Args:
+        name: "kinematic" or "newton".
+        twin: The twin that it moves in.
+        progress: Called by slow engines with steps done, steps at most, and the simulated time as text.
+
+    Raises:
+        InputError: No engine has that name, or it is not installed; the text names the extra.
+    """
+    from magtwin.sim.engines.newton import Newton, check_installed
+    from magtwin.sim.motion.engine import Kinematic
+
+    find("engine", name, {"kinematic": None, "newton": None})
+    if name == "kinematic":
+        return Kinematic()
+    check_installed()
+    return Newton(twin.scene_file, twin.scene.robot, progress)
+
+
+def path_metadata(path: "Path | Commands | Run | str") -> Metadata:
+    """File and checksum of what was driven."""
+    if isinstance(path, str):
+        return {}
+    if isinstance(path, Run):
+        arrays: Iterable[NDArray[Any]] = (array for _, array in sorted(path.items()))
+        kind, file = "replay", ""
+    elif isinstance(path, Path):
+        arrays, kind, file = (path.p_xy, np.array([path.closed])), "path", path.file
+    else:
+        arrays, kind, file = (path.rows,), "commands", path.file
+    metadata: Metadata = {f"{kind}_file": file} if file else {}
+    if isinstance(path, Path) and path.placing:
+        metadata["path_placing"] = " ".join(map(repr, path.placing))
+    checksum = hashlib.sha256()
+    for array in arrays:
+        checksum.update(np.ascontiguousarray(array).tobytes())
+    return {**metadata, f"{kind}_sha256": checksum.hexdigest()}
+
+
+def finished(
+    twin: Twin,
+    run: Run,
+    path: "Path | Commands | Run | str",
+    read: "Read | None",
+    *,
+    seed: int,
+    duration_s: float | None,
+    config_sha256: str | None = None,
+    add: bool = True,
+) -> Run:
+    """A run with the columns that its network adds and the metadata that reproduce it.
+
+    Args:
+        twin: The twin in its session.
+        run: What the simulator made.
+        path: What was driven.
+        read: What the network read. None without a network.
+        seed: Seed of the run.
+        duration_s: Duration that was asked for [s].
+        config_sha256: `scene_sha256` of the twin's scene, if it is known already.
+        add: Whether to add columns that the run lacks, or only replace those that it has.
+    """
+    if read is not None:
+        spec = twin.scene.robot.magnetometer
+        noise = spec.noise_density_nt * np.sqrt(float(run.metadata["rate_hz"]) / 2)
+        columns: dict[str, NDArray[Any]] = {"b_sd_nt": np.hypot(read.sd_nt, noise)}
+        if read.outside is not None:
+            columns["flag_out_of_distribution"] = read.outside
+        run = run.with_columns(**{name: array for name, array in columns.items() if add or name in run})
+    metadata: Metadata = {"magtwin": __version__, "numpy": np.__version__, "seed": seed}
+    if duration_s is not None:
+        metadata["asked_duration_s"] = float(duration_s)
+    metadata |= dict(twin.session) | path_metadata(path) | dict(twin.metadata)
+    metadata["config_sha256"] = config_sha256 or scene_sha256(twin.scene)
+    return run.with_metadata(**metadata)
+
+
+def check_commands(path: "Path | Commands | Run | str", network: "NeuralMagnetometer | None") -> None:
+    """Refuse to replay a run without commands if the network reads them."""
+    if network is None or not isinstance(path, Run):
+        return
+    for column in ("v_cmd", "w_cmd"):
+        if column in network.columns and column not in path:
+            raise InputError(
+                f"the run to replay has no column {column!r}, which the network {network.name} reads; take a "
+                'network that does not, such as the paper\'s, or `network="none"`',
+                parameter="network",
+            )
+
+
+def _predict(network: "NeuralMagnetometer | None", reads: "list[Read]") -> "Predict | None":
+    """A function that predicts the disturbance of a run and appends what the network read to `reads`."""
+    if network is None:
+        return None
+
+    def predict(run: Run) -> tuple[NDArray[Any], NDArray[Any]]:
+        (read,) = network.read([run])
+        reads.append(read)
+        return read.disturbance_nt, read.sd_nt
+
+    return predict
