@@ -367,20 +367,20 @@ def _noise(tags: Tags, element: Element | None) -> float:
         places: tuple[str, ...] = ("",)
     else:
         places = ("noise/", *(f"{axis}/noise/" for axis in "xyz"))
-    found = []
+    deviations = []
     for place in places:
         tags.nothing(element, *(f"{place}{tag}" for tag in ("mean", "bias_mean", "bias_stddev")))
         if place:
             tags.find(element, f"{place}type")
         value = tags.number(element, f"{place}stddev", least=0.0)
         if value is not None:
-            found.append(value)
-    if len(set(found)) > 1:
-        words = ", ".join(f"{value:g}" for value in found)
-        tags.description.note(
-            f"{tags.description.where(element)}: noise {words} of the axes becomes their RMS"
-        )
-    return found[0] if len(set(found)) == 1 else float(np.sqrt(np.mean(np.square(found or [0.0]))))
+            deviations.append(value)
+    deviations = deviations or [0.0]
+    if len(set(deviations)) == 1:
+        return deviations[0]
+    words, where = ", ".join(f"{value:g}" for value in deviations), tags.description.where(element)
+    tags.description.note(f"{where}: noise {words} of the axes becomes their RMS")
+    return float(np.sqrt(np.mean(np.square(deviations))))
 
 
 def _fan(tags: Tags, element: Element | None) -> Fan:
@@ -403,22 +403,22 @@ def _pose(tags: Tags, element: Element) -> NDArray[np.float64]:
     Raises:
         InputError: It is not six finite numbers, or is relative to another frame.
     """
-    found, T = tags.find(element, "pose"), np.eye(4)
-    if found is None or not (found.text or "").strip():
+    tag, T = tags.find(element, "pose"), np.eye(4)
+    if tag is None or not (tag.text or "").strip():
         return T
-    where = tags.description.where(found)
-    frame = found.get("relative_to") or found.get("frame")
+    where = tags.description.where(tag)
+    frame = tag.get("relative_to") or tag.get("frame")
     if frame:
         raise InputError(
             f"{where}: a pose relative to {frame!r} is not supported; give it in the link's frame"
         )
     try:
-        values = [float(word) for word in (found.text or "").split()]
+        values = [float(word) for word in (tag.text or "").split()]
     except ValueError:
         values = []
     if len(values) != 6 or not np.isfinite(values).all():
-        raise InputError(f"{where}: a pose is x y z roll pitch yaw, got {(found.text or '').strip()!r}")
-    angles = np.radians(values[3:]) if found.get("degrees", "").lower() in ("true", "1") else values[3:]
+        raise InputError(f"{where}: a pose is x y z roll pitch yaw, got {(tag.text or '').strip()!r}")
+    angles = np.radians(values[3:]) if tag.get("degrees", "").lower() in ("true", "1") else values[3:]
     T[:3, :3], T[:3, 3] = matrix_from_quat(quat_from_rpy(angles)), values[:3]
     return T
 

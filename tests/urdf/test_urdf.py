@@ -305,7 +305,7 @@ NAMED = """
 <joint name="w 1" type="continuous"><parent link="底座"/><child link="1st wheel"/></joint>"""
 
 
-def test_no_name_is_refused_and_one_that_usd_has_no_place_for_is_shown(tmp_path):
+def test_any_name_is_accepted_and_invalid_usd_names_become_display_names(tmp_path):
     stage, robot = convert(urdf(tmp_path, NAMED, "my robot"))
     notes = read_notes(tmp_path / "my robot.usda")
     renamed = {

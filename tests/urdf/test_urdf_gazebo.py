@@ -79,7 +79,7 @@ def test_friction_bounce_and_compliance_reach_the_collider(tmp_path):
     assert_valid(tmp_path / "cart.usda", tmp_path)
 
 
-def test_a_figure_may_stand_in_an_attribute_called_value(tmp_path):
+def test_a_number_may_be_in_the_attribute_value(tmp_path):
     _, robot, report = cart(tmp_path, on("left_wheel", '<mu1 value="0.7"/><selfCollide value="true"/>'))
     collider = robot.GetPrimAtPath("left_wheel/collisions").GetChildren()[0]
     grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0].GetPrim()
@@ -88,7 +88,7 @@ def test_a_figure_may_stand_in_an_attribute_called_value(tmp_path):
     assert not report.unknown_tags
 
 
-def test_tags_about_nothing_that_is_there_are_a_loss_that_names_it(tmp_path):
+def test_tags_of_an_unknown_link_are_a_loss(tmp_path):
     _, _, report = cart(tmp_path, on("left_weel", "<mu1>1</mu1>"))
     (loss,) = report.losses
     assert loss.startswith(
@@ -170,7 +170,7 @@ def test_a_partial_scan_keeps_its_azimuths_across_zero(tmp_path):
     assert core(lidar, "patternFiringRateHz") == 360 * 8  # 240 steps of one degree, round the whole turn
 
 
-def test_a_range_finder_is_a_fixed_grid_of_rays_and_none_of_magtwins(tmp_path):
+def test_a_range_finder_is_a_fixed_grid_of_rays_without_magtwins_schema(tmp_path):
     text = LIDAR.format(type="gpu_lidar", tag="lidar", samples=5, least=-0.2, most=0.2, lines=3)
     _stage, robot, _ = cart(tmp_path, on("eye", text))
     assert not prims_with(robot, "lidar")
@@ -181,7 +181,7 @@ def test_a_range_finder_is_a_fixed_grid_of_rays_and_none_of_magtwins(tmp_path):
     assert_allclose(core(lidar, "emitterState:s001:azimuthDeg"), np.tile(azimuth, 3), atol=1e-5)
 
 
-def test_only_the_first_scanner_is_magtwins(tmp_path):
+def test_only_the_first_scanner_gets_magtwins_schema(tmp_path):
     text = LIDAR.format(type="gpu_lidar", tag="lidar", samples=360, least=-3, most=3, lines=1)
     stage, robot, report = cart(tmp_path, on("eye", text) + on("base_link", text))
     assert len(prims_with(robot, "lidar")) == 1
@@ -250,7 +250,7 @@ def test_a_sensor_without_a_counterpart_is_kept_as_text_on_its_link_and_counted(
     assert any("sensor 'gps' of link 'eye' is of type 'navsat'" in note for note in report.notes)
 
 
-def test_what_a_sensor_says_beyond_its_figures_is_counted(tmp_path):
+def test_unknown_tags_of_a_sensor_are_counted(tmp_path):
     text = IMU.replace("<imu>", "<topic>imu</topic><visualize>1</visualize><imu>")
     _stage, robot, report = cart(tmp_path, on("eye", text))
     assert report.unknown_tags == {"gazebo/sensor/topic": 1, "gazebo/sensor/visualize": 1}
@@ -305,7 +305,7 @@ def test_older_plugins_give_a_diameter_and_limits_come_from_the_wheels(tmp_path,
     assert any("TurtleBot 4's values are used for a_max" in note for note in report.notes)
 
 
-def test_a_size_that_no_plugin_tells_is_measured_on_the_robot(tmp_path):
+def test_sizes_missing_in_a_plugin_are_measured_on_the_robot(tmp_path):
     plugin = GZ.replace("<wheel_separation>0.31</wheel_separation>", "")
     plugin = plugin.replace("<wheel_radius>0.041</wheel_radius>", "")
     _stage, robot, report = cart(tmp_path, plugin)
@@ -360,7 +360,7 @@ def test_settings_that_are_missing_are_a_loss_that_names_them(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "gains"), [("velocity", (0, 5)), ("position", (100, 10)), ("effort", (0, 0))]
 )
-def test_command_interfaces_say_what_a_drive_holds(tmp_path, tags, kind, gains):
+def test_command_interfaces_choose_the_drive(tmp_path, tags, kind, gains):
     stage, _, _ = cart(tmp_path, tags.format(kind, kind.capitalize()))
     drive = UsdPhysics.DriveAPI(stage.GetPrimAtPath("/cart/joints/left"), "angular")
     per_rad = np.array([drive.GetStiffnessAttr().Get(), drive.GetDampingAttr().Get()]) * 180 / np.pi
@@ -480,7 +480,7 @@ def test_bad_settings_are_refused(tmp_path, text, message):
         cart(tmp_path, CONTROL)
 
 
-def test_settings_that_grow_without_end_are_no_settings(tmp_path):
+def test_settings_that_grow_exponentially_are_ignored(tmp_path):
     lines = ["a0: &a0 {x: 1}"] + [f"a{i}: &a{i} {{l: *a{i - 1}, r: *a{i - 1}}}" for i in range(1, 60)]
     (tmp_path / "control.yaml").write_text("\n".join(lines))
     _stage, robot, _ = cart(tmp_path, CONTROL)

@@ -142,7 +142,7 @@ def test_two_materials_of_a_wavefront_file_become_two_subsets_of_one_mesh(tmp_pa
     assert_valid(stage.GetRootLayer().realPath, tmp_path)
 
 
-def test_a_texture_lies_beside_the_asset_and_colours_the_mesh_where_it_did(tmp_path):
+def test_a_texture_is_copied_beside_the_asset_and_keeps_its_place_on_the_mesh(tmp_path):
     bytes_in = picture(tmp_path / "tiles.png").read_bytes()
     file = squares(tmp_path, MTL + "map_Kd -s 1 1 1 tiles.png\n")
     stage = robot(tmp_path, visual(file))
@@ -171,7 +171,7 @@ def test_a_single_file_has_its_textures_beside_it_too(tmp_path):
     assert_valid(stage.GetRootLayer().realPath, tmp_path)
 
 
-def test_two_pictures_of_one_name_stay_two_and_one_in_two_places_becomes_one(tmp_path):
+def test_images_are_shared_by_content_not_by_name(tmp_path):
     (tmp_path / "a").mkdir()
     picture(tmp_path / "t.png")
     picture(tmp_path / "copy.png")
@@ -204,7 +204,7 @@ LOST = {
 
 
 @pytest.mark.parametrize("case", LOST)
-def test_what_is_wrong_with_a_material_is_noted_and_the_mesh_arrives(tmp_path, case):
+def test_material_errors_are_noted_and_the_mesh_is_kept(tmp_path, case):
     line, note = LOST[case]
     inside = tmp_path / "robot"
     inside.mkdir()
@@ -217,7 +217,7 @@ def test_what_is_wrong_with_a_material_is_noted_and_the_mesh_arrives(tmp_path, c
     assert not list((inside / "out").rglob("*.png"))
 
 
-def test_a_library_or_material_that_is_not_there_is_noted(tmp_path):
+def test_a_missing_library_or_material_is_noted(tmp_path):
     (tmp_path / "o.obj").write_text(SQUARES.replace("paint.mtl", "no.mtl") + "l 1 2\n")
     notes = notes_of(robot(tmp_path, visual("o.obj")))
     assert "o.obj: material library 'no.mtl' is missing; shown without it" in notes
@@ -711,7 +711,7 @@ def test_a_piece_under_any_map_encloses_its_volume_and_its_normals_stand_on_its_
 # --- materials of the URDF ------------------------------------------------------------------------
 
 
-def test_a_urdf_material_dresses_what_its_mesh_file_leaves_bare(tmp_path):
+def test_a_urdf_material_applies_to_parts_without_a_material(tmp_path):
     trimesh.Trimesh(POINTS, FACES, process=False).export(tmp_path / "t.stl")
     (tmp_path / "half.obj").write_text(SQUARES.replace("usemtl blue\n", "").replace("usemtl red\n", ""))
     (tmp_path / "paint.mtl").write_text(MTL)
@@ -742,7 +742,7 @@ def test_a_robot_wide_material_is_found_by_its_name(tmp_path):
     assert_allclose(read_shapes(stage)[0].colour, [0, 1, 0, 1], atol=1e-5)
 
 
-def test_a_material_that_one_visual_tells_of_holds_for_others_that_name_it_and_else_is_noted(tmp_path):
+def test_a_material_defined_in_one_visual_applies_to_others_that_name_it(tmp_path):
     trimesh.Trimesh(POINTS, FACES, process=False).export(tmp_path / "t.stl")
     told = '<material name="green"><color rgba="0 1 0 1"/></material>'
     looks = (told, '<material name="green"/>', '<material name="geren"/>')

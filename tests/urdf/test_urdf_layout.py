@@ -138,7 +138,7 @@ def test_the_files_are_those_of_isaac_sims_structure(tmp_path):
     assert not interface.nameChildren  # the interface holds arcs, no opinions
 
 
-def test_each_layer_holds_what_it_is_for(tmp_path):
+def test_each_layer_contains_its_own_opinions(tmp_path):
     out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda")
     folder = out.parent / "payloads"
     physical = ("physics:", "drive:", "newton:", "physx", "isaac:")
@@ -228,7 +228,7 @@ def test_a_conversion_that_fails_leaves_nothing(tmp_path):
     assert not list((tmp_path / "made").iterdir())
 
 
-def test_what_the_asset_says_of_itself_is_from_its_package_unless_given(tmp_path, monkeypatch):
+def test_metadata_come_from_the_package_by_default(tmp_path, monkeypatch):
     (tmp_path / "package.xml").write_text(
         "<package><name>arms</name><author>A. Maker</author><license>BSD-3-Clause</license></package>"
     )
@@ -249,7 +249,7 @@ def test_what_the_asset_says_of_itself_is_from_its_package_unless_given(tmp_path
         ({"qcode": "robot"}, "metadata 'qcode' must be an item of Wikidata, such as Q11012, got 'robot'"),
     ],
 )
-def test_metadata_that_is_none_is_refused(tmp_path, given, message):
+def test_invalid_metadata_is_refused(tmp_path, given, message):
     with pytest.raises(InputError, match=message):
         convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda", options=Options(metadata=given))
 
