@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from magtwin.files import shipped
-from magtwin.io.bags.messages import COMMAND, MAGNITUDE, TF, TF_STATIC, Qos
+from magtwin.io.bags.topics import COMMAND, MAGNITUDE, TF, TF_STATIC, Qos
 from magtwin.ros.bus import Message, open_bus
 from magtwin.ros.diagnostics import KIND, from_message
 from magtwin.ros.follow import command_bytes
@@ -54,7 +54,7 @@ def main() -> None:
         [*magtwin, "magnetometer", scene, "use_sim_time:=true"], stderr=subprocess.DEVNULL
     )
     sim = subprocess.Popen(
-        [*magtwin, "sim", scene, "--no-magnetometer", "--lidar", "on"], stderr=subprocess.DEVNULL
+        [*magtwin, "sim", scene, "--magnetometer", "none", "--lidar", "on"], stderr=subprocess.DEVNULL
     )
     bus = open_bus("benchmark", backend="cyclonedds")
     heard: dict[str, list[Message]] = defaultdict(list)

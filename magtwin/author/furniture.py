@@ -1,177 +1,237 @@
-"""Furniture on a stage: what each piece looks like, what of it collides, and what of it is magnetised."""
+"""Furniture of a scene's TOML: its table, its default magnetization, and whether it stands on the slab."""
 
-from dataclasses import replace
-from typing import Any
+import hashlib
+import math
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
-from pxr import Kind, Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from magtwin.errors import InputError
-from magtwin.frames import IDENTITY_XYZW
-from magtwin.spec.furniture import BODY, GENERIC, FurnitureSpec, Part, parts_of
-from magtwin.spec.magnetics import SourceSpec
-from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
-from magtwin.usd.layers import WORLD
-from magtwin.usd.looks import define_box, define_looks, wear
-from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, prims_with
-from magtwin.usd.sources import (
-    LOOKS,
-    SOURCES,
-    define_source,
-    define_triangles,
-    placement,
-    read_source,
-    source_prims,
-)
+from magtwin.field.sources.bodies import mesh_moments
+from magtwin.files import existing, refused_at
+from magtwin.frames import IDENTITY_XYZW, quat_from_yaw, rotate
+from magtwin.spec.base import ZERO3, Quat, Spec, Vec3
+from magtwin.spec.furniture import BODY, FurnitureSpec, Part
+from magtwin.spec.lab import LabSpec
+from magtwin.urdf.meshes.mesh import read_mesh
+from magtwin.usd.attributes import check_prim_name
 
-FURNITURE = WORLD.AppendChild("Furniture")
-KIND = attribute_name("furniture", "kind")
-MATERIAL = attribute_name("furniture", "material")
-SIZE = attribute_name("furniture", "size_m")
+LARGEST_M = 1000.0
+"""A larger room or piece of furniture is probably in mm [m]."""
+
+SATURATION_A_M = 2.2e6
+"""Magnetization that no material exceeds [A/m]; iron saturates at 1.7e6."""
+
+DRAWN_A_M = (500.0, 5000.0)
+"""Range of the default magnetization of a steel part [A/m]: usual for desks, chairs and cabinets."""
+
+WALL_M = 0.002
+"""Thickness of the steel of a box, cylinder or mesh, since most are hollow [m]."""
 
 
-def define_furniture(stage: Usd.Stage, furniture: tuple[FurnitureSpec, ...]) -> None:
-    """Author pieces of furniture under /World/Furniture, each an Xform that can be moved as one.
+@dataclass(frozen=True, kw_only=True)
+class FurnitureTable(Spec):
+    """A piece of furniture or of the building; see the kinds above."""
+
+    name: str
+    """Name of the piece, used once: letters, digits and _, not starting with a digit."""
+
+    kind: str
+    """desk, chair, cabinet, column, radiator, door_frame or shelf; or box, cylinder or mesh."""
+
+    p_world: Vec3
+    """Middle of the footprint, and height of the underside above the floor [m]."""
+
+    yaw: float = 0.0
+    """Direction of the front, counter-clockwise from the world's x [rad]."""
+
+    q_world_xyzw: Quat = IDENTITY_XYZW
+    """Orientation as a quaternion, instead of yaw."""
+
+    magnetization: tuple[float, ...] | None = None
+    """Magnetization of each steel part along its longest side [A/m]. Default: drawn from the seed, 500 to
+    5000 A/m of either sign, less for wide hollow sections. [] means none."""
+
+    susceptibility: float = 0.0
+    """Volume susceptibility of the steel [1]. Above 0, the Earth's field magnetises it too."""
+
+    material: str = ""
+    """Material of a box, cylinder or mesh: steel, painted_steel, wood, concrete, brick, plastic or aluminium.
+    Only the steels are magnetised."""
+
+    size_m: Vec3 = ZERO3
+    """Depth, width and height of a box; diameter, diameter and height of a cylinder [m]."""
+
+    file: Path | None = None
+    """File of a mesh: .stl, .obj, .ply, .dae, .glb or .gltf. The mesh is put on the floor, the middle of its
+    footprint at p_world. A steel mesh must be closed."""
+
+    scale: float = 1.0
+    """Factor on the coordinates of a mesh file; 0.001 for a file in mm."""
+
+    seed: int | None = None
+    """Seed of the magnetization. Default: the scene's."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_prim_name(self.name, "furniture")
+        self._above_zero("scale")
+        degrees = f"be in radians, at most 2 pi; {self.yaw:g} deg are {math.radians(self.yaw):.4f} rad"
+        self._require("yaw", abs(self.yaw) <= 2 * math.pi + 1e-6, degrees, self.yaw)
+        both = self.yaw != 0 and self.q_world_xyzw != IDENTITY_XYZW
+        self._require("yaw", not both, "be left out beside q_world_xyzw", self.yaw)
+        self._require("seed", self.seed is None or self.seed >= 0, "not be below 0", self.seed)
+        strong = max(map(abs, self.magnetization or ()), default=0.0)
+        self._require(
+            "magnetization",
+            strong <= SATURATION_A_M,
+            "be in A/m; iron saturates at 1.7e6",
+            self.magnetization,
+        )
+        if self.kind == "mesh" and self.file is None:
+            raise InputError('kind "mesh" needs file = "FILE.stl"')
+        if self.kind != "mesh" and (self.file is not None or self.scale != 1):
+            raise InputError(f'file and scale are for kind "mesh", not for a {self.kind}')
+        object.__setattr__(self, "_piece", self._made())
+
+    def _made(self) -> FurnitureSpec:
+        """The piece, with the magnetization of the table or none."""
+        given = {
+            f.name: getattr(self, f.name)
+            for f in fields(FurnitureSpec)
+            if hasattr(self, f.name) and f.name != "magnetization"
+        }
+        given["magnetization"] = self.magnetization or ()
+        if self.yaw:
+            given["q_world_xyzw"] = tuple(map(float, quat_from_yaw(self.yaw)))
+        if self.file is not None:
+            points, faces = _mesh_of(self.file, self.scale)
+            largest = float(np.ptp(points, axis=0).max())
+            if largest > LARGEST_M:
+                raise InputError(
+                    f"scale is missing: {self.file.name} would be {largest:,.0f} m large; if it is in mm, "
+                    "give scale = 0.001"
+                )
+            given |= {
+                "vertices_m": tuple(map(tuple, points.tolist())),
+                "faces": tuple(map(tuple, faces.tolist())),
+            }
+        return FurnitureSpec(**given)
+
+    def spec(self, seed: int) -> FurnitureSpec:
+        """The piece, with the magnetization of the table or the default drawn from the scene's seed."""
+        piece: FurnitureSpec = self._piece  # type: ignore[attr-defined]
+        if self.magnetization is not None:
+            return piece
+        drawn = drawn_magnetization(self.name, piece.parts, seed=seed if self.seed is None else self.seed)
+        return replace(piece, magnetization=drawn)
+
+
+def _mesh_of(file: Path, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [m] and triangles of a mesh file, facing outwards."""
+    mesh = read_mesh(existing(file, "mesh file"))
+    points, faces = mesh.points.astype(float) * scale, mesh.faces
+    return points, faces[:, ::-1] if mesh_moments(points, faces)[0] < 0 else faces
+
+
+def drawn_magnetization(name: str, parts: Iterable[Part], *, seed: int = 0) -> tuple[float, ...]:
+    """Default magnetization of a piece's steel parts, each along its longest side.
+
+    Uniform in `DRAWN_A_M` with a random sign, times the fraction of steel, rounded to 1 A/m. It depends on
+    seed and name alone, so adding, removing or moving another piece changes nothing.
 
     Args:
-        stage: Written to in its edit target.
-        furniture: The pieces.
+        name: Name of the piece.
+        parts: Its parts.
+        seed: Seed of the scene.
+
+    Returns:
+        One number for each steel part, in order [A/m].
+    """
+    words = np.frombuffer(hashlib.sha256(name.encode()).digest(), "<u4").tolist()
+    rng = np.random.default_rng([seed, *words])
+    drawn = list[float]()
+    for part in parts:
+        if part.steel:
+            size = rng.uniform(*DRAWN_A_M) * rng.choice((-1.0, 1.0)) * _steel_fraction(part)
+            drawn.append(float(np.copysign(max(round(abs(size)), 1), size)))
+    return tuple(drawn)
+
+
+def _steel_fraction(part: Part) -> float:
+    """Fraction of a part's volume that is steel; a generic part is a shell of `WALL_M`."""
+    if part.name != BODY:
+        return part.fill
+    if not part.faces:
+        inner = [max(side - 2 * WALL_M, 0.0) / side for side in part.size_m]
+        return 1 - inner[0] * inner[1] * inner[2]
+    corner = np.array(part.vertices_m)[np.array(part.faces)]
+    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    volume = abs(float(np.einsum("fi,fi->", corner[:, 0], across)) / 6)
+    shell = WALL_M * float(np.linalg.norm(across, axis=1).sum()) / 2
+    return min(1.0, shell / volume) if volume else 1.0
+
+
+def check_stands(piece: FurnitureSpec, lab: LabSpec) -> None:
+    """Refuse a piece of furniture that does not stand on the slab.
 
     Raises:
-        InputError: A name cannot name a prim.
+        InputError: It does not; the text has the size of the slab.
     """
-    Usd.ModelAPI(UsdGeom.Xform.Define(stage, FURNITURE)).SetKind(Kind.Tokens.group)
-    for spec in furniture:
-        path = FURNITURE.AppendChild(check_prim_name(spec.name, "furniture"))
-        piece = UsdGeom.Xform.Define(stage, path).GetPrim()
-        Usd.ModelAPI(piece).SetKind(Kind.Tokens.component)
-        turn = None if spec.q_world_xyzw == IDENTITY_XYZW else spec.q_world_xyzw
-        write_pose(piece, spec.p_world, turn)
-        apply_api(piece, "furniture").GetAttribute(KIND).Set(spec.kind)
-        if spec.kind in GENERIC:
-            piece.GetAttribute(MATERIAL).Set(spec.material)
-            piece.GetAttribute(SIZE).Set(spec.size_m)
-        parts = spec.parts
-        define_looks(stage, path.AppendChild(LOOKS), dict.fromkeys(part.look for part in parts))
-        steel = {source.name.removeprefix(f"{spec.name}_"): source for source in spec.sources(in_world=False)}
-        for part in parts:
-            prim = _define_part(stage, path, part, steel.get(part.name))
-            UsdPhysics.CollisionAPI.Apply(prim)
+    signs = np.array(np.meshgrid((-1, 1), (-1, 1), (-1, 1))).reshape(3, -1).T
+    corners = np.concatenate(
+        [np.asarray(part.p) + signs * np.asarray(part.size_m) / 2 for part in piece.parts]
+    )
+    world = rotate(piece.q_world_xyzw, corners) + piece.p_world
+    half = np.array(lab.floor_m) / 2 + lab.wall_thickness_m + lab.apron_m
+    beyond = float(np.max(np.abs(world[:, :2]) - half))
+    if beyond > 1e-6:
+        x, y = piece.p_world[:2]
+        raise InputError(
+            f"p_world of {piece.name!r} is ({x:g}, {y:g}): it reaches {beyond:.2f} m beyond the slab, "
+            f"which is {2 * half[0]:g} x {2 * half[1]:g} m about the origin; move it, or enlarge floor_m or "
+            "apron_m of [lab]"
+        )
 
 
-def _define_part(stage: Usd.Stage, piece: Sdf.Path, part: Part, source: SourceSpec | None) -> Usd.Prim:
-    """One part, with the source that it is where it is steel."""
-    path, look = piece.AppendChild(part.name), piece.AppendChild(LOOKS).AppendChild(part.look)
-    if source is not None:
-        return define_source(stage, piece, _named(source, part.name), look=part.look)
-    if part.shape == "cuboid":
-        return define_box(stage, path, part.p, part.size_m, look)
-    if part.shape == "mesh":
-        mesh = UsdGeom.Mesh.Define(stage, path)
-        define_triangles(mesh, part.vertices_m, part.faces)
-        write_pose(mesh.GetPrim(), part.p)
-        wear(mesh, look)
-        return mesh.GetPrim()
-    cylinder = UsdGeom.Cylinder.Define(stage, path)
-    radius, half = part.size_m[0] / 2, part.size_m[2] / 2
-    cylinder.CreateRadiusAttr(radius)
-    cylinder.CreateHeightAttr(2 * half)
-    cylinder.CreateAxisAttr(UsdGeom.Tokens.z)
-    cylinder.CreateExtentAttr(Vt.Vec3fArray([(-radius, -radius, -half), (radius, radius, half)]))
-    write_pose(cylinder.GetPrim(), part.p)
-    wear(cylinder, look)
-    return cylinder.GetPrim()
+def placed_furniture(
+    tables: Sequence[FurnitureTable], lab: LabSpec | None, path: str | os.PathLike[str], *, seed: int
+) -> tuple[FurnitureSpec, ...]:
+    """The pieces of [[furniture]] tables, with their magnetization.
 
-
-def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[FurnitureSpec, ...]]:
-    """Every magnetised thing of a stage: sources, wherever they stand, and furniture whose steel is its own.
-
-    A piece of furniture that was moved or turned is that piece at its new place. One of which a part was
-    moved, scaled, added or magnetised in its own way comes back as the sources that it consists of.
+    Args:
+        tables: The tables, in order.
+        lab: Room whose slab they must stand on. None skips the check.
+        path: The file of the tables, for error messages.
+        seed: Seed of the scene.
 
     Raises:
-        InputError: A source is part of a robot, or as for `read_source`.
+        InputError: A piece does not stand on the slab; the text has its line.
     """
-    robots = [prim.GetPath() for prim in prims_with(stage.GetPseudoRoot(), "robot")]
-    prims = source_prims(stage)
-    pieces, taken = [], set()
-    for root in stage.Traverse(Usd.TraverseInstanceProxies()):
-        if root.HasAPI(NOUNS["furniture"]) and (piece := _whole(root, prims)):
-            pieces.append(piece)
-            taken |= {prim.GetPath() for prim in prims if prim.GetPath().HasPrefix(root.GetPath())}
-    sources: list[SourceSpec] = []
-    names: set[str] = set()
-    for prim in prims:
-        if robot := next((r for r in robots if prim.GetPath().HasPrefix(r)), None):
+    pieces = []
+    for number, table in enumerate(tables):
+        pieces.append(table.spec(seed))
+        try:
+            if lab is not None:
+                check_stands(pieces[-1], lab)
+        except InputError as error:
+            raise refused_at(path, "p_world", str(error), section="furniture", number=number) from error
+    return tuple(pieces)
+
+
+def check_names(pieces: Iterable[FurnitureSpec], path: str | os.PathLike[str]) -> None:
+    """Refuse two pieces of furniture with the same name.
+
+    Raises:
+        InputError: Two have the same name.
+    """
+    seen = set()
+    for piece in pieces:
+        if piece.name in seen:
             raise InputError(
-                f"{place(prim)}: a magnetic source on the robot {robot}, which carries it about; say it as "
-                "the robot's platform field"
+                f"{path}: two pieces of furniture are called {piece.name!r}; give each its own name"
             )
-        if prim.GetPath() not in taken:
-            sources.append(read_source(prim, name=_name(prim, names)))
-            names.add(sources[-1].name)
-    return tuple(sources), tuple(pieces)
-
-
-def _whole(root: Usd.Prim, prims: list[Usd.Prim]) -> FurnitureSpec | None:
-    """The piece of furniture at a prim; none where its steel is not as that kind's."""
-    own = [prim for prim in prims if prim.GetPath().HasPrefix(root.GetPath())]
-    p, q, scale = placement(root)
-    if max(abs(s - 1) for s in scale) > 1e-9 or any(prim.GetParent() != root for prim in own):
-        return None
-    kind = plain_value(root.GetAttribute(KIND))
-    if kind not in GENERIC:
-        parts_of(kind)  # refuses a kind that magtwin does not know
-    try:
-        bare = FurnitureSpec(
-            name=root.GetName(), kind=kind, p_world=p, q_world_xyzw=q, **_generic(root, kind)
-        )
-        along = {part.name: part.along for part in bare.parts if part.steel}
-        found = [read_source(prim, local=True) for prim in own]
-        strength = tuple(source.magnetization[along.get(source.name, 0)] for source in found)
-        spec = replace(
-            bare,
-            magnetization=strength if any(strength) else (),
-            susceptibility=found[0].susceptibility if found else 0.0,
-        )
-    except InputError:  # it has more parts, or fewer
-        return None
-    wanted = [
-        _named(source, source.name.removeprefix(f"{spec.name}_")) for source in spec.sources(in_world=False)
-    ]
-    return spec if found == wanted else None
-
-
-def _generic(root: Usd.Prim, kind: str) -> dict[str, Any]:
-    """Material and size of a generic piece, or vertices and faces; nothing for the other kinds."""
-    if kind not in GENERIC:
-        return {}
-    given: dict[str, Any] = {"material": plain_value(root.GetAttribute(MATERIAL))}
-    if kind != "mesh":
-        return given | {"size_m": plain_value(root.GetAttribute(SIZE))}
-    mesh = UsdGeom.Mesh(root.GetStage().GetPrimAtPath(root.GetPath().AppendChild(BODY)))
-    if not mesh:
-        raise InputError(f"{place(root)}: a mesh without its {BODY}")
-    points = np.array(mesh.GetPointsAttr().Get() or [], float).reshape(-1, 3)
-    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], int)
-    if (mesh.GetFaceVertexCountsAttr().Get() or [0]) != [3] * (len(faces) // 3):
-        raise InputError(f"{place(root)}: its {BODY} is not of triangles")
-    return given | {
-        "vertices_m": tuple(map(tuple, points.tolist())),
-        "faces": tuple(map(tuple, faces.reshape(-1, 3).tolist())),
-    }
-
-
-def _named(source: SourceSpec, name: str) -> SourceSpec:
-    return SourceSpec(**{**vars(source), "name": name})
-
-
-def _name(prim: Usd.Prim, taken: set[str]) -> str:
-    """What a source is called: its prim under /World/Sources, else the prims down to it; each name once."""
-    path = prim.GetPath()
-    anchor = SOURCES if path.GetParentPath() == SOURCES else WORLD if path.HasPrefix(WORLD) else Sdf.Path("/")
-    name = path.MakeRelativePath(anchor).pathString.replace("/", "_")
-    number, free = 2, name
-    while free in taken:
-        number, free = number + 1, f"{name}_{number}"
-    return free
+        seen.add(piece.name)

@@ -1,13 +1,15 @@
-"""Contents: every file that a stage is made of, brought into one folder, each named relative to it."""
+"""The files of a stage, copied into one folder with relative names."""
 
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
 from pxr import Sdf, UsdUtils
+from safetensors import SafetensorError, safe_open
 
 from magtwin.errors import InputError
 from magtwin.usd.layers import SUFFIXES, open_stage
@@ -22,15 +24,15 @@ KINDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "sounds": (".m4a", ".mp3", ".wav"),
     }
 )
-"""What a stage names beside layers, by the folder that it comes to lie in. Nothing else is carried: a stage
-of a stranger's could otherwise put any file of this machine into what is handed on."""
+"""Suffixes of files other than layers, by their folder in the export. Other files are not exported: an
+untrusted stage could otherwise leak any file of this machine."""
 
 THUMBNAIL = Path(".thumbs", "256x256")
-"""Where the picture of a layer lies beside it."""
+"""Folder of a layer's thumbnail, relative to the layer."""
 
 
 def kind_of(file: str | os.PathLike[str]) -> str:
-    """What a file is by its suffix: a key of `KINDS`, or "" for none."""
+    """Kind of a file by its suffix: a key of `KINDS`, or ""."""
     suffix = Path(file).suffix.lower()
     return next((kind for kind, suffixes in KINDS.items() if suffix in suffixes), "")
 
@@ -38,23 +40,22 @@ def kind_of(file: str | os.PathLike[str]) -> str:
 def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> Path:
     """Copy a stage and every file that it names, in any variant, into a folder.
 
-    What lies below the stage's own folder stays as it was arranged. Other layers come into a folder called as
-    theirs was, other files into one by their kind. A layer whose names stay right keeps its bytes, and so
-    its checksum.
+    Files below the stage's folder keep their arrangement. Other layers are copied to a folder named
+    after their own, other files to a folder by kind. A layer whose paths stay valid keeps its bytes.
 
     Args:
         root: The stage's root layer.
-        folder: Folder that exists and is empty.
-        within: Folder that the stage may not reach out of; anywhere unless given.
+        folder: An existing empty folder.
+        within: Folder that must contain all files. None allows any.
 
     Returns:
         The root layer's copy.
 
     Raises:
-        InputError: A file that is named is not there, is of no kind that is carried or lies outside of
-            `within`; or the stage cannot be opened. Says the layer and the prim.
+        InputError: A file is missing, of a kind that is not exported, or outside `within`; or the stage
+            cannot be opened. The text has layer and prim.
     """
-    open_stage(root)  # refuses
+    open_stage(root)  # raises if a layer is missing
     root = root.resolve()
     layers, assets, lost = dependencies(root)
     files = {Path(layer.realPath).resolve(): layer for layer in layers}
@@ -62,8 +63,7 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
     for name in lost:
         if not _is_library(name):
             raise InputError(
-                f"{_namer(layers, name)}: names {name}, which is not there; put it there, or take the name "
-                "out"
+                f"{_namer(layers, name)}: names {name}, which does not exist; add the file or remove the name"
             )
     for file in (*files, *others):
         _check_carried(file, layers, within)
@@ -71,47 +71,71 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
     for file, layer in files.items():
         _copy_layer(file, layer, folder, places)
     for file in others:
-        _copied(file, folder / places[file])
+        copied(file, folder / places[file])
     return folder / places[root]
 
 
 def dependencies(root: Path) -> tuple[list[Sdf.Layer], list[str], list[str]]:
-    """A stage's layers, in any variant, the other files that they name, and names of what is not there."""
-    heard = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
+    """Layers of a stage in any variant, other files that they name, and names of missing files."""
+    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's warnings off the terminal
     try:
         layers, assets, lost = UsdUtils.ComputeAllDependencies(str(root))
     finally:
-        heard.TakeUncoalescedDiagnostics()
+        diagnostics.TakeUncoalescedDiagnostics()
     return layers, assets, lost
 
 
-def assets_of(layer: Sdf.Layer) -> Iterator[tuple[Sdf.Path, str]]:
-    """Every asset that a layer's properties name, in any variant, with the path of the property."""
-    found: list[tuple[Sdf.Path, str]] = []
+@dataclass(frozen=True)
+class NamedFile:
+    """A file that a layer names."""
+
+    path: str
+    """The asset path, as it is written."""
+
+    where: str
+    """Path of the prim or property that names it; "" for the layer itself."""
+
+
+def named_files(layer: Sdf.Layer) -> list[NamedFile]:
+    """Every asset path that a layer authors, in any variant, in order of the layer."""
+    files = [NamedFile(path, "") for path in layer.subLayerPaths]
 
     def visit(path: Sdf.Path) -> None:
-        spec = layer.GetObjectAtPath(path) if path.IsPropertyPath() else None
-        if not isinstance(spec, Sdf.AttributeSpec) or spec.typeName not in _ASSETS:
-            return
-        values = [spec.default, *(layer.QueryTimeSample(path, t) for t in layer.ListTimeSamplesForPath(path))]
-        for value in values:
-            named = [value] if isinstance(value, Sdf.AssetPath) else list(value or ())
-            found.extend((path, asset.path) for asset in named if asset.path)
+        spec = layer.GetObjectAtPath(path)
+        if isinstance(spec, Sdf.PrimSpec):
+            for arcs in (spec.referenceList, spec.payloadList):
+                named = [arc.assetPath for arc in arcs.GetAddedOrExplicitItems() if arc.assetPath]
+                files.extend(NamedFile(name, str(path)) for name in named)
+        elif isinstance(spec, Sdf.AttributeSpec) and spec.typeName in _ASSETS:
+            times = layer.ListTimeSamplesForPath(path)
+            for value in [spec.default, *(layer.QueryTimeSample(path, time) for time in times)]:
+                assets = [value] if isinstance(value, Sdf.AssetPath) else value or ()
+                files.extend(NamedFile(asset.path, str(path)) for asset in assets if asset.path)
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
-    return iter(found)
+    seen = {file.path for file in files}
+    copy = Sdf.Layer.CreateAnonymous(".usda")
+    copy.TransferContent(layer)
+
+    def keep(path: str) -> str:  # paths in metadata, such as clips
+        if path and path not in seen:
+            files.append(NamedFile(path, ""))
+        return path
+
+    UsdUtils.ModifyAssetPaths(copy, keep)
+    return files
 
 
 _ASSETS = (Sdf.ValueTypeNames.Asset, Sdf.ValueTypeNames.AssetArray)
 
 
 def _is_library(name: str) -> bool:
-    """Whether a name is of a material that Omniverse itself brings, such as OmniPBR.mdl."""
+    """Whether a name is a material of Omniverse, such as OmniPBR.mdl."""
     return Path(name).suffix == ".mdl" and "/" not in name
 
 
 def _check_carried(file: Path, layers: Iterable[Sdf.Layer], within: Path | None) -> None:
-    """Refuse a file that must not be handed on."""
+    """Refuse a file that must not be exported."""
     if "[" in file.as_posix() or file.suffix == ".usdz":
         raise InputError(
             f"{_namer(layers, str(file))}: names {file}, a part of a package; unpack that with "
@@ -119,26 +143,23 @@ def _check_carried(file: Path, layers: Iterable[Sdf.Layer], within: Path | None)
         )
     if within is not None and not file.is_relative_to(within.resolve()):
         raise InputError(
-            f"{_namer(layers, str(file))}: names {file}, outside of its package; it must bring all it names"
+            f"{_namer(layers, str(file))}: names {file}, outside its package"
+            "; a package must contain all of its files"
         )
     if file.suffix not in SUFFIXES and not kind_of(file):
         raise InputError(
             f"{_namer(layers, str(file))}: names {file}, which is no layer, texture, network or path, so it "
-            "is not handed on; take the name out"
+            "is not exported; remove the name"
         )
 
 
 def _namer(layers: Iterable[Sdf.Layer], name: str) -> str:
-    """Which layer, and which property of it, names a file."""
+    """Which layer, and which prim or property of it, names a file."""
     layers = list(layers)
     for layer in layers:
-        for path, asset in assets_of(layer):
-            if name in (asset, layer.ComputeAbsolutePath(asset), str(_resolved(layer, asset))):
-                return f"{layer.realPath} <{path}>"
-    for layer in layers:
-        for asset in layer.GetExternalReferences():
-            if name in (asset, layer.ComputeAbsolutePath(asset), str(_resolved(layer, asset))):
-                return str(layer.realPath)
+        for file in named_files(layer):
+            if name in (file.path, layer.ComputeAbsolutePath(file.path), str(_resolved(layer, file.path))):
+                return f"{layer.realPath} <{file.where}>" if file.where else str(layer.realPath)
     return str(layers[0].realPath)
 
 
@@ -147,7 +168,7 @@ def _resolved(layer: Sdf.Layer, asset: str) -> Path:
 
 
 def _places(root: Path, layers: Iterable[Path], others: Iterable[Path]) -> dict[Path, Path]:
-    """Where in the folder each file comes to lie."""
+    """Place of each file in the folder."""
     everything = sorted({*layers, *others}, key=lambda file: (len(file.parts), file))
     inside = {file.relative_to(root.parent).parts[0] for file in everything if root.parent in file.parents}
     groups = {root.parent: Path()}
@@ -166,14 +187,14 @@ def _places(root: Path, layers: Iterable[Path], others: Iterable[Path]) -> dict[
 
 
 def _copy_layer(file: Path, layer: Sdf.Layer, folder: Path, places: Mapping[Path, Path]) -> None:
-    """Copy a layer, with what it names as it lies now."""
+    """Copy a layer, with its asset paths changed to the new places."""
     place = places[file]
     changed = False
 
     def moved(asset: str) -> str:
         nonlocal changed
         target = places.get(_resolved(layer, asset)) if asset else None
-        if target is None and "<UDIM>" in asset:  # stands for several files of one folder
+        if target is None and "<UDIM>" in asset:  # a pattern for several files of one folder
             target = _udim(_resolved(layer, asset), places)
         if target is None:
             return asset
@@ -188,14 +209,14 @@ def _copy_layer(file: Path, layer: Sdf.Layer, folder: Path, places: Mapping[Path
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
         copy.Export(str(folder / place))
     else:
-        _copied(file, folder / place)
+        copied(file, folder / place)
     picture = THUMBNAIL / f"{file.name}.png"
     if (file.parent / picture).is_file():
-        _copied(file.parent / picture, folder / place.parent / picture)
+        copied(file.parent / picture, folder / place.parent / picture)
 
 
 def _udim(pattern: Path, places: Mapping[Path, Path]) -> Path | None:
-    """Where the tiles of a texture come to lie, as a pattern."""
+    """The new place of a texture's tiles, as a pattern."""
     begin, end = pattern.name.split("<UDIM>")
     for file, place in places.items():
         if file.parent == pattern.parent and file.name.startswith(begin) and file.name.endswith(end):
@@ -203,6 +224,16 @@ def _udim(pattern: Path, places: Mapping[Path, Path]) -> Path | None:
     return None
 
 
-def _copied(file: Path, place: Path) -> None:
+def copied(file: Path, place: Path) -> None:
+    """Copy a file, and make its folder."""
     place.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(file, place)
+
+
+def weights_metadata(file: Path) -> dict[str, str]:
+    """Metadata in the header of a safetensors file; empty if it has none or cannot be read."""
+    try:
+        with safe_open(file, framework="numpy") as weights:
+            return weights.metadata() or {}
+    except (OSError, SafetensorError):
+        return {}

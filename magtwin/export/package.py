@@ -1,28 +1,26 @@
-"""Package: a stage with all that it needs, as other programs take it: a folder, a .usdz, a layer, a .glb."""
+"""Export a stage with all that it needs: as a folder, a .usdz, a layer or a .glb."""
 
 import json
 import os
 import shutil
-import struct
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from tempfile import TemporaryDirectory
 from typing import Literal
 
+from jinja2 import Template
 from pxr import Sdf, Usd, UsdGeom
 
-from magtwin.author.scene import read_scene
 from magtwin.errors import InputError, find
 from magtwin.export.attached import attach, detach
-from magtwin.export.contents import THUMBNAIL, bring_together
+from magtwin.export.contents import THUMBNAIL, bring_together, copied, weights_metadata
 from magtwin.export.flatten import flatten
 from magtwin.export.glb import write_glb
-from magtwin.export.howto import howto
 from magtwin.export.isaac import GRAPHS, author_graph
 from magtwin.export.structure import structure
-from magtwin.export.units import to_metres_z_up
 from magtwin.export.usdz import pack, unpack
 from magtwin.export.validation.inspection import inspect
 from magtwin.files import check_free, existing, output, sha256
@@ -32,53 +30,50 @@ from magtwin.urdf.simready import UNKNOWN
 from magtwin.usd.animation import write_animation
 from magtwin.usd.layers import open_stage, stage_sha256
 from magtwin.usd.maps import read_map
+from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import FOLDER as SCHEMA
 from magtwin.usd.schema import attribute_name, place, prims_with
-from magtwin.usd.sensors import MAP_CHECKSUM
 from magtwin.version import __version__
 
 Profile = Literal["omniverse", "isaac", "newton", "viewer"]
 PROFILES: dict[str, str] = {
     "omniverse": "the stage with its layers, variants and instances",
-    "isaac": "that, robots in Isaac Sim's asset structure 3.0, an Action Graph a robot for ROS 2",
-    "newton": "that of omniverse, with the network as ONNX for whoever steps Newton",
-    "viewer": "one layer, nothing in it that a simple viewer may not know",
+    "isaac": "as omniverse, with Isaac Sim's asset structure 3.0 and a ROS 2 Action Graph for each robot",
+    "newton": "as omniverse, with an example that steps Newton and evaluates the network",
+    "viewer": "one layer for simple viewers, without variants and instances",
 }
-"""What each profile makes."""
+"""Contents of each profile."""
 
 KINDS = {"": "folder", ".usdz": "package", ".usd": "layer", ".usdc": "layer", ".glb": "web"}
-"""What is made, by the suffix of where to."""
+"""Kind of export by the suffix of the output."""
 
 NETWORK, NETWORK_SHA256 = (attribute_name("magnetometer", name) for name in ("network", "network_sha256"))
 PLUGIN = Path("plugin", "magtwin")
 GENERATED = ("plugInfo.json", "generatedSchema.usda")
-"""What a program needs to know magtwin's schemas, and where it lies."""
+"""Files of the schema plugin."""
 
-HOWTO = "HOWTO.md"
+README = "README.md"
 
 SCRIPTS = Path(__file__).resolve().parent / "scripts"
-"""Examples of what to do with an export, which need no magtwin; those called as a profile go with it."""
-
-HEADER_MAX = 10_000_000
-"""Bytes of the header of a safetensors file that are read for a licence."""
+"""Examples that need no magtwin; the ones whose names begin with the profile are exported too."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What an export made."""
+    """The result of an export."""
 
     files: tuple[Path, ...]
-    """What was asked for, then the folder that lies beside it, if any."""
+    """The output, then the folder beside it, if any."""
 
     root: Path
-    """What to open: a layer, a package or a .glb."""
+    """File to open: a layer, a package or a .glb."""
 
     profile: str
     licences: dict[str, str]
-    """By file, as it is called in the export."""
+    """Licence by file name in the export."""
 
     notes: tuple[str, ...] = ()
-    """What may need a look."""
+    """Warnings."""
 
     def report(self) -> Report:
         """The files with their sizes, profile, licences and notes."""
@@ -101,41 +96,40 @@ def export_scene(
     animation: Run | None = None,
     to_onnx: Callable[[Path, Path], object] | None = None,
     thumbnail: Callable[[Path, Path], object] | None = None,
-    convert_units: bool = False,
     trusted: bool = False,
     force: bool = False,
     progress: Callable[[str], object] = lambda step: None,
 ) -> Exported:
-    """Write a stage with all that it needs, so that it can be moved anywhere.
+    """Write a stage with everything that it needs, so that it can be moved anywhere.
 
     Args:
         scene_file: Root layer of a scene or of any other stage, or a .usdz.
         out: What to make: a folder (no suffix), a package .usdz, one layer .usd or .usdc, or a .glb. Beside
-            a package lies a folder `<name>_magtwin` with the schema plugin, the how-to and the network.
-        profile: For whom, see `PROFILES`; omniverse for folders and packages, viewer for the others, unless
-            given.
-        animation: A run that plays over the stage; in a folder as a layer of its own, `<name>_run.usdc`.
-        to_onnx: Writes a network as ONNX, which then lies beside its weights: called with the weights and the
-            file to make. What it refuses becomes a note.
-        thumbnail: Draws a folder's stage: called with its root layer and the PNG to make, 256 pixels square.
-            What it refuses becomes a note.
-        convert_units: Whether a stage that is not in metres with Z up is converted, see `to_metres_z_up`.
-        trusted: Whether the stage was made here. Otherwise it is first read in a process of its own, as a
-            damaged layer can end its reader; that takes a second.
-        force: Whether what exists is replaced.
-        progress: Called with what is done next.
+            a package lies a folder `<name>_magtwin` with the schema plugin, README.md and the network.
+        profile: A key of `PROFILES`. Default: omniverse for folders and packages, else viewer.
+        animation: A run that plays over the stage; in a folder it is a separate layer, `<name>_run.usdc`.
+        to_onnx: Function of weights and output that writes a network as ONNX beside its weights. If it raises
+            InputError, the export has a note.
+        thumbnail: Function of root layer and output that draws a PNG of 256 x 256 pixels. If it raises
+            InputError, the export has a note.
+        trusted: Whether the stage was made here. Otherwise another process reads it first, since a damaged
+            layer can crash its reader; that takes a second.
+        force: Whether to replace existing files.
+        progress: Function that is called with the name of each step.
 
     Raises:
-        InputError: The stage cannot be opened, names what is not there, is not what its checksums say, or
-            is not in metres with Z up and `convert_units` was not given; or `out` exists, or cannot hold what
-            the stage has. Nothing is written.
+        InputError: The stage cannot be opened, names missing files, differs from its checksums, or is not in
+            metres with Z up; or `out` exists, or cannot hold the stage. Nothing is written.
     """
     scene_file, out = Path(scene_file), Path(out)
     kind = KINDS.get(out.suffix) or _no_kind(out)
     name: str = profile or ("omniverse" if kind in ("folder", "package") else "viewer")
     find("profile", name, PROFILES)
     if kind in ("layer", "web") and name != "viewer":
-        raise InputError(f"{out}: {out.suffix} is for viewers; give a folder or a .usdz for --profile {name}")
+        raise InputError(
+            f"{out}: {out.suffix} is for viewers; give a folder or a .usdz for `profile='{name}'`",
+            parameter="profile",
+        )
     beside = out.with_name(f"{out.stem}_magtwin") if kind == "package" and name != "viewer" else None
     for target in filter(None, (out, beside)):
         check_free(target, force=force)
@@ -146,16 +140,16 @@ def export_scene(
         )
     for target in filter(None, (out, beside)):
         if target.resolve() in (scene_file.resolve(), *scene_file.resolve().parents):
-            raise InputError(f"{target}: is or holds the stage that is exported; name another place")
-    with TemporaryDirectory() as scratch, _told_of(Path(scratch, "stage"), scene_file):
+            raise InputError(f"{target}: is or contains the exported stage; give another output")
+    with TemporaryDirectory() as scratch, _renamed(Path(scratch, "stage"), scene_file):
         work = _Work(Path(scratch, "stage"), scene_file, name, progress)
-        work.gather(convert_units=convert_units, trusted=trusted)
+        work.gather(trusted=trusted)
         work.check()
         if to_onnx is not None and name != "viewer":
             work.onnx_of(to_onnx)
         if name == "isaac":
             work.for_isaac()
-        work.tell_origin()
+        work.write_origin()
         if animation is not None:
             work.animate(animation)
         with ExitStack() as outputs:
@@ -180,8 +174,8 @@ def _no_kind(out: Path) -> str:
 
 
 @contextmanager
-def _told_of(copy: Path, scene_file: Path) -> Iterator[None]:
-    """Refusals of the copy that is worked on name the stage that was given."""
+def _renamed(copy: Path, scene_file: Path) -> Iterator[None]:
+    """Make errors about the working copy name the original stage."""
     try:
         yield
     except InputError as error:
@@ -194,7 +188,7 @@ def _told_of(copy: Path, scene_file: Path) -> Iterator[None]:
 
 
 class _Work:
-    """A copy of a stage, made ready step by step."""
+    """A working copy of a stage, prepared step by step."""
 
     def __init__(
         self, folder: Path, scene_file: Path, profile: str, progress: Callable[[str], object]
@@ -208,9 +202,9 @@ class _Work:
         self.scripts = sorted(SCRIPTS.glob(f"{profile}_*.py"))
         self.checksum = ""
 
-    def gather(self, *, convert_units: bool, trusted: bool) -> None:
-        """Bring the stage together, in metres with Z up."""
-        self.progress("Gathering what the stage names")
+    def gather(self, *, trusted: bool) -> None:
+        """Copy the stage and all that it names into the folder."""
+        self.progress("Gathering files")
         self.folder.mkdir()
         if self.source.suffix == ".usdz":
             package = self.folder.with_name("package")
@@ -222,7 +216,7 @@ class _Work:
             self.checksum = sha256(self.source)
             self.root = bring_together(root, self.folder, within=package)
             for file in unnamed:
-                _copied(file, self.folder / file.relative_to(root.parent))
+                copied(file, self.folder / file.relative_to(root.parent))
         else:
             if not trusted:
                 inspect(self.source, ())
@@ -233,39 +227,14 @@ class _Work:
         metres, up = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)
         if UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters) and up == UsdGeom.Tokens.z:
             return
-        if not convert_units:
-            said = stage.HasAuthoredMetadata("metersPerUnit") and stage.HasAuthoredMetadata("upAxis")
-            raise InputError(
-                f"{self.source}: has {metres:g} m a unit and {up} up{'' if said else ', as it says none'}; "
-                "magtwin hands on metres with Z up: give --convert-units to convert its points and transforms"
-            )
-        self.progress("Converting to metres with Z up")
-        stale = self._map_stamps(stage)
-        del stage
-        self.notes += to_metres_z_up(self.root)
-        self._stamp(stale)
-
-    def _map_stamps(self, stage: Usd.Stage) -> list[tuple[Sdf.Path, Path]]:
-        """The attributes that hold the checksum of a map's file, where it fits."""
-        fits = []
-        maps = prims_with(stage.GetPseudoRoot(), "anomalyMap")
-        for prim in prims_with(stage.GetPseudoRoot(), "magnetometer"):
-            stamp = prim.GetAttribute(MAP_CHECKSUM)
-            fits += [
-                (stamp.GetPath(), file) for file in map(_values_layer, maps) if stamp.Get() == sha256(file)
-            ]
-        return fits
-
-    def _stamp(self, stamps: list[tuple[Sdf.Path, Path]]) -> None:
-        if not stamps:
-            return
-        stage = open_stage(self.root)
-        for path, layer in stamps:
-            stage.GetAttributeAtPath(path).Set(sha256(layer))
-        stage.GetRootLayer().Save()
+        authored = stage.HasAuthoredMetadata("metersPerUnit") and stage.HasAuthoredMetadata("upAxis")
+        raise InputError(
+            f"{self.source}: has {metres:g} m a unit and {up} up{'' if authored else ', the defaults of USD'}"
+            "; an export is in metres with Z up: convert the stage first, in Blender or Omniverse"
+        )
 
     def check(self) -> None:
-        """Refuse a scene, map or network that is not what its checksums say."""
+        """Check the scene, and map and networks against their checksums; collect licences."""
         self.progress("Checking map and network")
         stage = open_stage(self.root)
         world = stage.GetPseudoRoot()
@@ -274,7 +243,7 @@ class _Work:
             read_map(prim)
             self.map = self.map or str(prim.GetPath())
             licence = prim.GetAttribute(attribute_name("anomalyMap", "licence")).Get()
-            self.licences[self._said(_values_layer(prim))] = licence or UNKNOWN
+            self.licences[self._relative(_values_layer(prim))] = licence or UNKNOWN
         magnetometers = prims_with(world, "magnetometer")
         self.magnetometer = str(magnetometers[0].GetPath()) if magnetometers else ""
         self.networks: list[Path] = []
@@ -283,56 +252,56 @@ class _Work:
             if not named or not named.path:
                 continue
             file = Path(named.resolvedPath)
-            checksum, seen = prim.GetAttribute(NETWORK_SHA256).Get(), sha256(file)
-            if checksum and checksum.lower() != seen:
+            checksum, actual = prim.GetAttribute(NETWORK_SHA256).Get(), sha256(file)
+            if checksum and checksum.lower() != actual:
                 raise InputError(
-                    f"{place(prim)}: its network {named.path} has SHA-256 {seen}, the stage was made with "
+                    f"{place(prim)}: its network {named.path} has SHA-256 {actual}, the stage was made with "
                     f"{checksum}; put that network back, or make the scene anew"
                 )
             if file not in self.networks:
                 self.networks.append(file)
-                self.licences[self._said(file)] = licence_of(file) or UNKNOWN
+                self.licences[self._relative(file)] = licence_of(file) or UNKNOWN
         for layer in stage.GetUsedLayers():
             metadata = layer.customLayerData.get("SimReady_Metadata", {})
             if layer.realPath and metadata.get("asset_license"):
-                self.licences[self._said(Path(layer.realPath))] = metadata["asset_license"]
+                self.licences[self._relative(Path(layer.realPath))] = metadata["asset_license"]
         self.licences = dict(sorted(self.licences.items()))
         is_scene = all(prims_with(world, noun) for noun in ("lab", "robot", "magnetometer"))
         self.scene = read_scene(self.root) if is_scene else None
 
-    def _said(self, file: Path) -> str:
+    def _relative(self, file: Path) -> str:
         return file.resolve().relative_to(self.folder.resolve()).as_posix()
 
     def onnx_of(self, write: Callable[[Path, Path], object]) -> None:
-        """Lay networks as ONNX beside their weights."""
+        """Write networks as ONNX beside their weights."""
         for weights in self.networks:
             out = weights.with_suffix(".onnx")
             try:
-                if not out.exists():  # of a package that was unpacked
+                if not out.exists():  # a package may contain it
                     self.progress(f"Writing {weights.stem} as ONNX")
                     write(weights, out)
                 self.onnx.append(out)
             except InputError as error:
-                self.notes.append(f"{self._said(weights)} has no ONNX beside it: {error}")
+                self.notes.append(f"{self._relative(weights)} has no ONNX beside it: {error}")
 
     def for_isaac(self) -> None:
         """Give robots Isaac Sim's asset structure, and the scene its Action Graphs."""
         if self.scene is None:
             raise InputError(
-                f"{self.source}: is no scene of magtwin's, with lab, robot and magnetometer, which --profile "
-                "isaac is for; take --profile omniverse"
+                f"{self.source}: has no lab, robot and magnetometer, which profile isaac needs; use "
+                "`profile='omniverse'`"
             )
-        self.progress("Authoring what Isaac Sim needs")
+        self.progress("Authoring for Isaac Sim")
         for asset in {placed.robot.asset for placed in self.scene.robots}:
             structure(asset)
         stage = open_stage(self.root)
         author_graph(stage, self.scene)
         stage.GetRootLayer().Save()
 
-    def tell_origin(self) -> None:
-        """Write into the root layer what it was made from, by what, and under which licences."""
+    def write_origin(self) -> None:
+        """Write source, version and licences to the metadata of the root layer."""
         layer = Sdf.Layer.FindOrOpen(str(self.root))
-        said = {
+        origin = {
             "version": __version__,
             "profile": self.profile,
             "source": self.source.name,
@@ -341,12 +310,12 @@ class _Work:
         }
         metadata = dict(layer.customLayerData)
         metadata["creator"] = metadata.get("creator", "magtwin")
-        metadata["magtwin"] = {**dict(metadata.get("magtwin", {})), "export": said}
+        metadata["magtwin"] = {**dict(metadata.get("magtwin", {})), "export": origin}
         layer.customLayerData = metadata
         layer.Save()
 
     def animate(self, run: Run) -> None:
-        """Lay a run over the stage."""
+        """Write a run over the stage."""
         self.progress("Writing the run")
         self.run, self.plays = self.root.with_name(f"{self.root.stem}_run.usdc"), True
         write_animation(run, self.run, self.root)
@@ -355,7 +324,7 @@ class _Work:
         layer.Save()
 
     def flat(self) -> None:
-        """Become one layer, with the files that it names."""
+        """Replace the stage by one layer and the files that it names."""
         self.progress("Flattening the stage")
         flat = self.folder.with_name("flat") / f"{self.source.stem}.usdc"
         flat.parent.mkdir()
@@ -371,7 +340,8 @@ class _Work:
         for file in self.folder.rglob("*"):
             if file.is_file() and file != self.root:
                 raise InputError(
-                    f"{self.source}: {self._said(file)} cannot lie in a layer; give a folder or a .usdz"
+                    f"{self.source}: {self._relative(file)} cannot be part of a layer; "
+                    "give a folder or a .usdz"
                 )
         if out.suffix == ".usd":
             self.root = self.root.rename(self.root.with_suffix(".usd"))
@@ -382,8 +352,8 @@ class _Work:
         if beside is not None:
             beside.mkdir()
             for file in [*self.networks, *self.onnx]:
-                _copied(file, beside / "weights" / file.name)
-            self._explain(beside, out.name, attached=True)
+                copied(file, beside / "weights" / file.name)
+            self._write_readme(beside, out.name, attached=True)
         attach(self.root, *self.onnx)
         if self.profile == "viewer":
             self.flat()
@@ -393,35 +363,38 @@ class _Work:
         """Write a folder."""
         if self.profile == "viewer":
             self.flat()
-        self._explain(self.folder, self.root.name, attached=False)
+        self._write_readme(self.folder, self.root.name, attached=False)
         shutil.move(self.folder, out)
         if thumbnail is not None:
             self.progress("Drawing its thumbnail")
             picture = out / THUMBNAIL / f"{self.root.name}.png"
             picture.parent.mkdir(parents=True, exist_ok=True)
-            picture.unlink(missing_ok=True)  # of a folder that was exported before
+            picture.unlink(missing_ok=True)  # an old one
             try:
                 thumbnail(out / self.root.name, picture)
-            except InputError as error:  # there is nothing to draw, or nothing to draw with
+            except InputError as error:  # nothing to draw, or no renderer
                 self.notes.append(f"no thumbnail was drawn: {str(error).replace(f'{out}{os.sep}', '')}")
                 if not any(picture.parent.iterdir()):
                     shutil.rmtree(picture.parents[1])
 
-    def _explain(self, folder: Path, root: str, *, attached: bool) -> None:
-        """Lay the how-to into a folder, and the schema plugin where programs can use it."""
+    def _write_readme(self, folder: Path, root: str, *, attached: bool) -> None:
+        """Write the README page and the schema plugin to a folder."""
         viewer = self.profile == "viewer"
-        run = root if attached or self.run is None else self.run.name  # what plays it
+        run = root if attached or self.run is None else self.run.name  # file that plays the run
         if not viewer:
             for name in GENERATED:
-                _copied(SCHEMA / name, folder / PLUGIN / name)
-        page = howto(
+                copied(SCHEMA / name, folder / PLUGIN / name)
+        template = Template(
+            (Path(__file__).with_name("readme.md.jinja")).read_text(encoding="utf-8"), trim_blocks=True
+        )
+        page = template.render(
             name=self.source.stem,
             version=__version__,
             root=root,
             run=run if self.plays else "",
             flat=viewer,
             plugin=not viewer,
-            map_prim=self.map,
+            map=self.map,
             magnetometer=self.magnetometer if self.networks else "",
             attached=attached,
             graphs=str(GRAPHS) if self.profile == "isaac" else "",
@@ -429,12 +402,13 @@ class _Work:
             checksum=self.checksum,
             licences=self.licences,
             scripts=[script.name for script in self.scripts],
-            onnx=self._said(self.onnx[0]) if self.onnx else "",
+            stage=quote(f"../{root}" if attached else root),
+            onnx=quote(self._relative(self.onnx[0]) if self.onnx else "NETWORK.onnx"),
             notes=self.notes,
         )
-        (folder / HOWTO).write_text(page, encoding="utf-8")
+        (folder / README).write_text(page, encoding="utf-8")
         for script in self.scripts:
-            _copied(script, folder / script.name)
+            copied(script, folder / script.name)
 
 
 def _values_layer(prim: Usd.Prim) -> Path:
@@ -444,22 +418,8 @@ def _values_layer(prim: Usd.Prim) -> Path:
 
 
 def licence_of(network: Path) -> str:
-    """The licence that the metadata of a network's weights say, "" where they say none."""
-    if network.suffix != ".safetensors":
-        return ""
-    with open(network, "rb") as file:
-        head = file.read(8)
-        size = struct.unpack("<Q", head)[0] if len(head) == 8 else 0
-        if not 0 < size <= HEADER_MAX:
-            return ""
-        text = file.read(size)
+    """The licence in the metadata of a network's weights; "" if there is none."""
     try:
-        metadata = json.loads(json.loads(text)["__metadata__"]["magtwin"])["facts"]
-        return str(metadata.get("licence", ""))
+        return str(json.loads(weights_metadata(network)["magtwin"])["facts"].get("licence", ""))
     except (ValueError, KeyError, TypeError, AttributeError):
         return ""
-
-
-def _copied(file: Path, place: Path) -> None:
-    place.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(file, place)

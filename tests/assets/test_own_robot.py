@@ -46,14 +46,14 @@ def test_a_scene_that_names_a_urdf_is_driven_in_two_commands(tmp_path, capsys):
     main(["scene", str(scene(tmp_path)), "--out", str(tmp_path / "mine")])
     main(
         [
-            *("run", str(tmp_path / "mine" / "mine.usda"), "--duration", "3", "--json"),
-            *("--parquet", str(tmp_path / "run.parquet"), "--rrd", str(tmp_path / "run.rrd")),
+            *("run", str(tmp_path / "mine" / "mine.usda"), "--duration-s", "3", "--json"),
+            *("--out", str(tmp_path / "run.parquet"), "--out", str(tmp_path / "run.rrd")),
         ]
     )
     out = capsys.readouterr().out
     metadata = json.loads(out[out.rindex('{\n  "title"') :])["metadata"]
     assert metadata["scene"] == "mine"
-    from magtwin.author.scene import read_scene
+    from magtwin.usd.scene import read_scene
 
     robot = read_scene(tmp_path / "mine" / "mine.usda").robot
     assert robot.name == "cart"
@@ -70,7 +70,7 @@ def test_a_scene_that_names_a_urdf_is_driven_in_two_commands(tmp_path, capsys):
         ('joint = "left"', 'joint = "lft"', r"no joint 'lft' for left_wheel_joint; did you mean 'left'"),
         ("cart.urdf", "cat.urdf", r"cat.urdf: no such .*did you mean 'cart.urdf'"),
         ("urdf =", "udrf =", r"mine.toml:6: \[robot\] unknown key 'udrf'; did you mean 'urdf'"),
-        ("urdf =", 'asset = "a.usda"\nurdf =', "needs asset .* or urdf .* one of the two"),
+        ("urdf =", 'asset = "a.usda"\nurdf =', "needs asset .* or urdf .* and not both"),
         ('[robot.magnetometer]\nlink = "mast"', "[robot.magnetometer]", "no link 'magnetometer_link'"),
     ],
 )
@@ -85,11 +85,11 @@ def test_a_scene_that_does_not_fit_its_urdf_is_refused_and_nothing_is_written(
 
 
 def test_keys_of_a_urdf_are_refused_beside_an_asset(tmp_path):
-    from magtwin.author.scene import scene_from_toml
+    from magtwin.author.scene_file import scene_from_toml
 
     asset = shipped("robots", "turtlebot4", "turtlebot4.usda")
     file = scene(tmp_path, SCENE.replace(f'urdf = "{CART}"', f'asset = "{asset}"'))
-    with pytest.raises(InputError, match=r"\[robot\] drive goes with urdf; the asset says it already"):
+    with pytest.raises(InputError, match=r"\[robot\] drive goes with urdf; an asset has it already"):
         scene_from_toml(file)
 
 
@@ -155,7 +155,7 @@ def test_options_of_the_command_reach_the_conversion(tmp_path, capsys):
         [
             *("robot", str(CART), "--out", str(tmp_path / "cart"), "--fix-base", "--report", str(report)),
             "--thumbnail",
-            *("--drive", "left:position:stiffness=7:damping=2:max_force=4", "--mass", "9"),
+            *("--drive", "left:position:stiffness=7:damping=2:max_force=4", "--mass-kg", "9"),
         ]
     )
     stage = Usd.Stage.Open(str(tmp_path / "cart" / "cart.usda"))
@@ -178,9 +178,9 @@ def test_options_of_the_command_reach_the_conversion(tmp_path, capsys):
         (["--drive", "left:fast"], "velocity, position, none"),
         (["--drive", "left:velocity:dampening=3"], "PATTERN:TYPE"),
         (["--drive", "left:velocity:damping=much"], "PATTERN:TYPE"),
-        (["--package", "mine"], "expected NAME=VALUE"),
-        (["--density", "-1"], "density must be above 0"),
-        (["--density", "inf"], "density must be above 0, got inf"),
+        (["--package", "mine"], "NAME=VALUE is wanted"),
+        (["--density-kg-m3", "-1"], "density must be above 0"),
+        (["--density-kg-m3", "inf"], "density must be above 0, got inf"),
         (["--report", "report.txt"], "a report ends in .json"),
     ],
 )

@@ -30,7 +30,7 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
         (
             "magnetometer",
             "lab.usda units:=nT --ros-args -r __ns:=/tb4 -r __node:=m -p use_sim_time:=true",
-            "ros magnetometer lab.usda units:=nT use_sim_time:=true --namespace=tb4 --name=m",
+            "ros magnetometer lab.usda units:=nT use_sim_time:=true --namespace=tb4 --node-name=m",
         ),
         (
             "sim",
@@ -44,8 +44,8 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
         ),
         (
             "magnetometer",
-            "--ros-args --log-level warn -p scene:=lab.usda -p duration:=5 --disable-stdout-logs odom:=o",
-            "ros magnetometer lab.usda --duration=5 --remap odom:=o",
+            "--ros-args --log-level warn -p scene:=lab.usda -p duration_s:=5 --disable-stdout-logs odom:=o",
+            "ros magnetometer lab.usda --duration-s=5 --remap odom:=o",
         ),
         ("replay", "a.mcap --ros-args -p use_sim_time:=true -r x:__ns:=/", "ros replay a.mcap --namespace="),
     ],
@@ -63,7 +63,9 @@ def test_parameters_of_a_file_are_read_where_they_are_the_nodes(arguments, tmp_p
     file = tmp_path / "settings.yaml"
     file.write_text(yaml.safe_dump(sections))
     given = f"lab.usda --ros-args -r __ns:=/tb4 -r __node:=m --params-file {file} -p lidar:=on".split()
-    wanted = "ros magnetometer lab.usda lidar:=on rate_hz:=50.0 use_sim_time:=true --namespace=tb4 --name=m"
+    wanted = (
+        "ros magnetometer lab.usda lidar:=on rate_hz:=50.0 use_sim_time:=true --namespace=tb4 --node-name=m"
+    )
     assert arguments("magnetometer", given) == wanted.split()
 
 
@@ -124,7 +126,7 @@ def called(name: str):
 
 
 def test_the_package_is_one_of_format_3_and_names_every_package_whose_messages_are_said() -> None:
-    from magtwin.io.bags.messages import TYPES
+    from magtwin.io.bags.topics import TOPICS
 
     root = ElementTree.parse(PACKAGE / "package.xml").getroot()
     assert (root.tag, root.get("format")) == ("package", "3")
@@ -134,7 +136,10 @@ def test_the_package_is_one_of_format_3_and_names_every_package_whose_messages_a
     assert root.findtext("export/build_type") == "ament_python"
     assert "@" in root.find("maintainer").get("email")  # type: ignore[union-attr, operator]
     depends = {element.text for element in root.findall("exec_depend")}
-    assert {kind.partition("/")[0] for kind in TYPES} | {"tf2_msgs", "std_srvs", "rclpy"} <= depends
+    assert {kind.partition("/")[0] for topic in TOPICS.values() for kind in (topic.kind, *topic.reads)} | {
+        "std_srvs",
+        "rclpy",
+    } <= depends
 
 
 def test_all_that_setup_installs_is_there() -> None:

@@ -527,8 +527,9 @@ def test_the_real_robot_passes_the_validators_and_nothing_is_silent(turtlebot, t
 
 
 def test_settings_come_before_tags_and_leave_one_sensor_of_each_kind(tmp_path, real_data):
-    from magtwin.author.robot import RobotSettings, build_robot, read_robot
+    from magtwin.author.robot import RobotSettings, build_robot
     from magtwin.spec.sensors import ImuSpec, LidarSpec, MagnetometerSpec
+    from magtwin.usd.robot import load_robot
 
     settings = RobotSettings(
         lidar=LidarSpec(link="rplidar_link", scan_rate_hz=7.5),
@@ -539,18 +540,17 @@ def test_settings_come_before_tags_and_leave_one_sensor_of_each_kind(tmp_path, r
     urdf = real_data / "turtlebot4" / "turtlebot4_gazebo_tags.urdf"
     out = tmp_path / "turtlebot4" / "turtlebot4.usda"
     report = build_robot(urdf, settings, out)
-    spec = read_robot(out)  # needs one of each
+    spec = load_robot(out)  # needs one of each
     assert (spec.lidar.scan_rate_hz, spec.imu.link, spec.drive.v_max) == (7.5, "oakd_imu_frame", 0.46)
-    assert "lidar 'rplidar' of link 'rplidar_link': the settings say what it is, not the URDF's tags" in (
-        report.notes
-    )
+    assert "lidar 'rplidar' of link 'rplidar_link': the settings replace the URDF's tags" in (report.notes)
     assert "imu 'imu' of link 'imu_link' is not simulated here: the settings name another" in report.notes
     assert_valid(out, tmp_path)
 
 
 def test_a_robot_without_settings_takes_its_sensors_and_drive_from_its_tags(tmp_path, real_data):
-    from magtwin.author.robot import RobotSettings, build_robot, read_robot
+    from magtwin.author.robot import RobotSettings, build_robot
     from magtwin.spec.sensors import MagnetometerSpec
+    from magtwin.usd.robot import load_robot
 
     settings = RobotSettings(
         magnetometer=MagnetometerSpec(link="tower_sensor_plate"),
@@ -558,6 +558,6 @@ def test_a_robot_without_settings_takes_its_sensors_and_drive_from_its_tags(tmp_
     )
     out = tmp_path / "turtlebot4" / "turtlebot4.usda"
     build_robot(real_data / "turtlebot4" / "turtlebot4_gazebo_tags.urdf", settings, out)
-    spec = read_robot(out)
+    spec = load_robot(out)
     assert (spec.imu.link, spec.imu.rate_hz, spec.lidar.link) == ("imu_link", 62, "rplidar_link")
     assert (spec.drive.wheel_radius_m, spec.drive.v_max) == (0.03575, 0.46)

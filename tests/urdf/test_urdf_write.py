@@ -247,16 +247,13 @@ def test_what_a_urdf_cannot_hold_is_refused_and_nothing_is_written(tmp_path, cha
 
 def test_the_command_converts_both_ways_and_lists_what_is_left_out(tmp_path, capfd):
     out = tmp_path / "back.urdf"
-    main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), "--to-urdf", str(out), "--json"])
+    main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), "--out", str(out), "--json"])
     said = json.loads(capfd.readouterr().out)
     assert said["figures"]["links"]["value"] == len(read_description(out).links)
     assert "MagtwinMagnetometerAPI" in said["metadata"]["notes"][0]
     for words, message in (
-        ([], "give one of them"),
-        (["--out", "x", "--to-urdf", "y.urdf"], "give one of them"),
-        (["--to-urdf", str(out), "--mass", "3"], "leave the other options out"),
-        (["--to-urdf", str(out)], "exists already"),
-        (["--to-urdf", "a.xml"], "a URDF ends in .urdf"),
+        (["--out", str(out), "--mass-kg", "3"], "without other options than --force"),
+        (["--out", str(out)], "exists already"),
     ):
         with pytest.raises(SystemExit):
             main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), *words])

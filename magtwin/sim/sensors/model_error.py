@@ -1,17 +1,16 @@
-"""Model error: how a neural magnetometer's reading is off what its network predicts.
+"""Model error: the error of a network's prediction in the reading of a neural magnetometer.
 
-A network gives the mean of the disturbance and the standard deviation of its error. A reading is one draw
-from that distribution, not its mean. The error has a part that stays for a session and a part that changes
-over seconds, as on recordings that the network never saw.
+A network gives the mean of the disturbance and the standard deviation of its error. A reading is a draw from
+that distribution. The error has a part that is constant in a session and a part that changes over seconds, as
+on held-out recordings.
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.sim.sensors.noise import gauss_markov
+from magtwin.sim.sensors.noise import GaussMarkov
 
 Array = NDArray[np.float64]
 
@@ -27,7 +26,7 @@ class ModelError:
     """Correlation time of the rest [s]."""
 
     offset: float = 0.0
-    """The session's own number, standard normal; see `in_session`."""
+    """Standard normal number of the session; see `in_session`."""
 
     def in_session(self, rng: np.random.Generator) -> "ModelError":
         """The same statistics with the number of one session drawn."""
@@ -38,14 +37,12 @@ class ModelError:
 
             e_t = c_t o + sqrt(sd_t^2 - c_t^2) u_t,   c_t = min(offset_sd, sd_t)
 
-        so that e_t has the variance sd_t^2 everywhere, and its offset is a constant wherever sd_t is above
-        offset_sd.
+        so that e_t has the variance sd_t^2, and a constant offset wherever sd_t is above offset_sd.
 
         Args:
-            sd_nt: Predicted standard deviations [nT], shape (N,); where unknown (nan) the error is 0.
+            sd_nt: Predicted standard deviations [nT], shape (N,); the error is 0 where it is nan.
             process: u at each reading, shape (N,).
-            offset: o of each reading, shape (N,), where readings are of several sessions; default: the
-                session's own.
+            offset: o of each reading, shape (N,), if readings belong to several sessions. Default: `offset`.
 
         Returns:
             Errors [nT], shape (N,).
@@ -56,15 +53,11 @@ class ModelError:
         o = self.offset if offset is None else np.asarray(offset, float)
         return np.asarray(constant * o + rest * np.asarray(process, float))
 
-    def process(self, white: ArrayLike, rate_hz: float) -> Array:
-        """U of successive readings, a Gauss-Markov process of correlation time `time_s`.
+    def process(self, rng: np.random.Generator, rate_hz: float) -> GaussMarkov:
+        """The process u of successive readings, of correlation time `time_s`.
 
         Args:
-            white: Standard normal numbers, shape (N,).
+            rng: Source of the process.
             rate_hz: Readings a second [Hz].
         """
-        return gauss_markov(white, self.time_s, rate_hz)
-
-    def decay(self, step_s: float) -> float:
-        """Share of u that is left after a step [s]."""
-        return math.exp(-step_s / self.time_s) if self.time_s > 0 else 0.0
+        return GaussMarkov(rng, self.time_s, rate_hz)

@@ -6,7 +6,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_gp import survey, truth
 
 from magtwin.errors import InputError
-from magtwin.field.fit.fit import METHODS, fit, grid_report, raster
+from magtwin.field.fit.fit import fit, grid_report, raster
+from magtwin.field.fit.methods import METHODS, map_method
 from magtwin.field.survey.readings import Readings
 
 QUICK = ("trilinear", "cubic", "gp")
@@ -138,12 +139,12 @@ def test_a_map_has_its_surveys_frame_and_datum_and_a_height_only_where_the_surve
         assert (field.frame, field.datum, field.height_m) == ("world: x east", "the door", None)
 
 
-def test_a_latched_hole_is_masked_at_every_heading_and_a_node_read_at_one_is_not():
+def test_a_stuck_hole_is_masked_at_every_heading_and_a_node_read_at_one_is_not():
     readings = survey()
     node = readings.node
     hole = (node[:, 1] >= 2) & (node[:, 1] <= 4) & (node[:, 2] >= 3) & (node[:, 2] <= 5)
-    latched = hole | ((node[:, 0] > 0) & (node[:, 1] == 5) & (node[:, 2] == 1))
-    readings = readings.with_(good=~latched)
+    stuck = hole | ((node[:, 0] > 0) & (node[:, 1] == 5) & (node[:, 2] == 1))
+    readings = readings.with_(good=~stuck)
     field = raster(
         fit(readings, "gp"), readings, spacing_m=0.125, headings_rad=np.radians(np.arange(0, 360, 15))
     )
@@ -154,3 +155,15 @@ def test_a_latched_hole_is_masked_at_every_heading_and_a_node_read_at_one_is_not
     assert not known[:, masked].any()
     assert known[:, 10, 2].all()
     assert known[:, ~masked].mean() > 0.9
+
+
+def test_a_method_of_the_users_own_fits_by_its_name(monkeypatch):
+    monkeypatch.setattr(METHODS, "_loaded", {})
+
+    @map_method("plane")
+    def fit_plane(readings, *, level_nt=0.0):
+        return readings.name, level_nt
+
+    assert fit(survey(), "plane", level_nt=5.0) == (survey().name, 5.0)
+    with pytest.raises(InputError, match="method 'plane' has no option 'levl_nt'; did you mean 'level_nt'"):
+        fit(survey(), "plane", levl_nt=1.0)

@@ -8,9 +8,9 @@ from scipy.optimize import approx_fprime
 from magtwin.errors import InputError
 from magtwin.field.fit.covariance import Covariance
 from magtwin.field.fit.gp import fit_gp
+from magtwin.field.fit.roughness import local_mean
 from magtwin.field.grid import Grid
 from magtwin.field.survey.readings import Readings
-from magtwin.field.survey.roughness import local_mean
 
 KERNELS = ("matern", "poisson")
 PATCHES, APART = np.array([[-0.5, 0.0], [0.6, 0.4], [0.3, -0.8]]), 0.9
@@ -190,13 +190,6 @@ def test_a_whole_turn_changes_nothing_and_nan_gives_nan():
     assert np.isnan(model.predict([[np.nan, 0.0], [0.0, 0.0]], [0.0, np.nan])).all()
 
 
-def test_the_same_readings_give_the_same_bytes():
-    one, other = (fit_gp(survey(rows=5, columns=5)) for _ in range(2))
-    assert_array_equal(one.figures, other.figures)
-    at, yaw, _ = some(30)
-    assert_array_equal(one.predict(at, yaw), other.predict(at, yaw))
-
-
 def test_one_heading_has_no_harmonics_and_holds_for_all():
     whole = survey()
     only = whole.take(whole.node[:, 0] == 0).with_(yaw=np.zeros(56))
@@ -232,7 +225,7 @@ def test_an_unknown_kernel_and_readings_without_an_area_are_refused():
         fit_gp(survey(), kernel="rbf")
     with pytest.raises(InputError, match="3 good readings"):
         fit_gp(survey().take(np.arange(3)))
-    with pytest.raises(InputError, match="latched or stuck"):
+    with pytest.raises(InputError, match="stuck"):
         fit_gp(survey().with_(good=np.zeros(224, bool)))
     with pytest.raises(InputError, match="a stuck sensor"):
         fit_gp(survey().with_(b_nt=np.full(224, 4e4)))

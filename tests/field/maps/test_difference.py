@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.errors import InputError
 from magtwin.field.maps.difference import FALSE_SHARE, difference
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.field.sources.dipoles import dipole_field_nt
 
 FOUR = np.radians([0.0, 90.0, 180.0, 270.0])
 NOISE_NT = 20.0
@@ -134,15 +134,6 @@ def test_turned_about_it_tells_the_opposite(seed, variance):
     assert [r.nodes for r in there.regions] == [r.nodes for r in back.regions]
 
 
-def test_a_map_against_itself_has_no_change():
-    field = pair()[0]
-    for one in (field, replace(field, variance_nt2=None)):
-        found = difference(one, one)
-        assert not found.changed.any()
-        assert found.regions == ()
-        assert_array_equal(found.local_nt, 0)
-
-
 def test_nodes_masked_in_either_survey_and_off_either_grid_are_left_out():
     before, after = pair()
     valid = np.ones(before.values_nt.shape, bool)
@@ -174,7 +165,7 @@ def test_surveys_on_other_grids_meet_on_the_coarser_one_in_the_fewer_headings():
         ({"valid": np.zeros((4, 15, 25), bool)}, "no valid node in common"),
         ({"frame": "map"}, "map 'a' has the frame 'world' and 'a' 'map', so that one x and y are two places"),
         ({"datum": "the door"}, "has the datum 'the wall' and 'a' 'the door', .* with one --datum"),
-        ({"height_m": 0.5}, r"'a' is of 0\.35 m above the floor and 'a' of 0\.5 m; .*magtwin map continue"),
+        ({"height_m": 0.5}, r"'a' is of 0\.35 m above the floor and 'a' of 0\.5 m; .*magtwin map upward"),
     ],
 )
 def test_surveys_that_cannot_be_compared_are_refused(change, said):
@@ -196,8 +187,8 @@ def test_the_report_tells_where_when_and_what_is_doubtful_and_is_json():
     assert "about (1.0" in told.note
     assert told.note.endswith(" nodes")
     assert report.metadata["caution"] == [
-        "height unknown in one map, taken for one",
-        "datum unknown in both maps, taken for one",
+        "height unknown in one map; assumed equal",
+        "datum unknown in both maps; assumed equal",
     ]
     told = json.loads(report.to_json())["figures"]["surest local change"]
     assert "at (1, -0.5) m, heading" in told["note"]

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from magtwin.field.grid import Grid
-from magtwin.field.survey.reading_errors import PLACE_M, node_errors
+from magtwin.field.survey.node_errors import PLACE_M, node_errors
 from magtwin.field.survey.readings import Readings
 
 FOUR = (0.0, 90.0, 180.0, 270.0)
@@ -53,7 +53,7 @@ def told(readings, values):
 def test_the_survey_tells_how_far_its_robot_stood_off_its_nodes(headings, place_m):
     readings, values, off = surveyed(headings, place_m=place_m)
     found = told(readings, values)
-    assert found.told
+    assert found.estimated
     assert found.place_m == pytest.approx(place_m, rel=0.12)
     assert found.mean_nt2 == pytest.approx(np.mean(off**2), rel=0.15)
     z = off / np.sqrt(found.variance_nt2)
@@ -86,7 +86,7 @@ def test_a_survey_without_errors_has_hardly_any():
 def test_of_one_heading_a_centimetre_is_taken_for_granted():
     readings, values, off = surveyed((0.0,), place_m=0.01)
     found = told(readings, values)
-    assert not found.told
+    assert not found.estimated
     assert found.place_m == PLACE_M
     assert found.mean_nt2 == pytest.approx(np.mean(off**2), rel=0.25)
 
@@ -112,10 +112,10 @@ def test_nodes_without_a_reading_have_the_mean_and_spoil_no_other():
 
 
 def test_the_real_survey_stood_within_a_centimetre(real_data):
-    from magtwin.field.survey.gridded import node_map, read_grid
-    from magtwin.field.survey.stuck import mask_latched
+    from magtwin.field.survey.folder import node_map, read_grid
+    from magtwin.field.survey.stuck import mask_stuck
 
-    readings, _ = mask_latched(read_grid(real_data / "aprilab" / "maps"))
+    readings, _ = mask_stuck(read_grid(real_data / "aprilab" / "maps"))
     field_map = node_map(readings)
     found = told(readings, np.where(field_map.valid, field_map.values_nt, np.nan))
     assert 0.003 < found.place_m < 0.01

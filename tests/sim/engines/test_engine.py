@@ -19,7 +19,7 @@ from magtwin.sim.motion.commands import Commands, read_commands, write_commands
 from magtwin.sim.motion.controllers import guide_by_commands
 from magtwin.sim.motion.driver import Driver
 from magtwin.sim.motion.engine import Kinematic
-from magtwin.sim.motion.follow import course_along, follow, play
+from magtwin.sim.motion.follow import follow, loop_along, play
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.twin import open_twin, simulate
@@ -53,7 +53,7 @@ def test_a_run_without_commands_is_not_replayed_for_a_network_that_reads_them(la
     t = np.arange(200) / 20.0
     p = np.column_stack([0.2 * t - 1, 0 * t, 0.05 + 0 * t])
     told = Run({"t": t, "p_world_base": p, "yaw": 0 * t})
-    with pytest.raises(InputError, match=r"has no 'v_cmd', and the network turtlebot4_hybrid\.safetensors"):
+    with pytest.raises(InputError, match="no column 'v_cmd', which the network turtlebot4_hybrid"):
         simulate(neural, told)
     paper = open_twin(lab_scene, network=shipped("weights", "turtlebot4_paper.safetensors"))
     assert np.isfinite(simulate(paper, told)["b_total_nt"]).all()
@@ -98,7 +98,7 @@ def test_a_replay_between_its_samples_is_the_drive_itself():
 
 @pytest.mark.parametrize(
     ("t", "x", "what"),
-    [([0, 1, 1], [0, 1, 2], "row 3"), ([0, 1, 2], [0, np.nan, 2], "row 2"), ([0], [0], "two or more")],
+    [([0, 1, 1], [0, 1, 2], "row 3"), ([0, 1, 2], [0, np.nan, 2], "row 2"), ([0], [0], "at least two rows")],
 )
 def test_a_run_that_cannot_be_replayed_is_refused(t, x, what):
     zero = np.zeros(len(t))
@@ -122,11 +122,11 @@ def test_commands_are_read_as_they_were_written(tmp_path):
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        ("t,v,w\n0,0.1,0\n0.5,0.1,0\n0.4,0.1,0\n", ":4: time must go on"),
+        ("t,v,w\n0,0.1,0\n0.5,0.1,0\n0.4,0.1,0\n", ":4: times must ascend"),
         ("0,nan,0\n", ":1: a command must be finite"),
         ("0,0.1\n", ":1: a command is three numbers"),
         ("t,v,w\nx,y,z\n", ":2: not a number"),
-        ("-1,0.1,0\n", ":1: time must go on"),
+        ("-1,0.1,0\n", ":1: times must ascend"),
         ("t,v,w\n", "no commands"),
     ],
 )
@@ -183,7 +183,7 @@ ROOM = (box("desk", 1.5, 0.9, 0.4), box("chair", -1.2, -0.6, 0.2), box("cabinet"
 OBSTACLES = Obstacles(tuple(n for n, _ in ROOM), tuple(np.array(o) for _, o in ROOM))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_driver_covers_the_floor_and_never_bumps(seed):
     errors = np.random.default_rng(seed).normal(0, [0.004, 0.006]).tolist()
     motion = drive_about(seed, obstacles=OBSTACLES, wheel_errors=tuple(errors))
@@ -276,7 +276,7 @@ def physics(test):
 def by_equal_commands(twin, path, wheel_errors=(0.0, 0.0)):
     """What both engines make of the commands of a drive without slip, at the same times."""
     drive = replace(twin.scene.robot.drive, slip_s2_m=0.0, yaw_slip=0.0)
-    course = replace(course_along(path, drive, speed=0.2), wheel_errors=wheel_errors)
+    course = replace(loop_along(path, drive, speed=0.2), wheel_errors=wheel_errors)
     want = Kinematic().drive(course, None, None)
     rows = np.column_stack([np.arange(len(want.v)) * course.dt, want.v_cmd, want.w_cmd])
     scripted = replace(course, guide=guide_by_commands(rows, drive), steps=len(want.v))

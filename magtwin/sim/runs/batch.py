@@ -1,0 +1,252 @@
+"""Runs: many runs, driven at once and read in blocks when they are asked for.
+
+The bytes of a run depend only on its own scene, path and seed: the closed loop drives each robot as if it
+were alone, sensors draw from their own generators, and a network treats each row by itself. So runs can be
+made in any order and in blocks of any size, and any run can be made again.
+"""
+
+import importlib
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from typing import Any, overload
+
+import numpy as np
+
+from magtwin.errors import InputError, find
+from magtwin.path import Path
+from magtwin.run.run import COLUMNS, Run
+from magtwin.sim.motion.closed_loop import LOOPS, ClosedLoop, run_loops, warm_up
+from magtwin.sim.motion.commands import Commands
+from magtwin.sim.motion.controllers import CONTROLLERS, CUSTOM_CONTROLLERS
+from magtwin.sim.motion.drive import Pose, draw_wheel_errors
+from magtwin.sim.motion.drive_input import DriveInput
+from magtwin.sim.motion.engine import Travel
+from magtwin.sim.motion.follow import check_arrived, loop_along, loop_by_commands
+from magtwin.sim.runs.sensing import Conditions, Sensing, streams
+from magtwin.sim.runs.simulate import Metadata, Sensed, check_run, sense_all, travel
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.scene import Scene
+from magtwin.summary import Summarized, Summary, listed
+
+BLOCK = 16
+"""Runs made at a time: 130,000 readings of a minute each, 0.1 GB, and work for every thread."""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A run to be made."""
+
+    scene: Scene
+    """Lab, robot and sensors."""
+
+    path: DriveInput
+    """What to drive, as for `magtwin.sim.runs.simulate.simulate`."""
+
+    seed: int
+    """Seed of all noise."""
+
+    speed: float
+    """Forward speed on straight parts of the path [m/s]."""
+
+
+Finish = Callable[[Sequence[Job], Sequence[Sensed]], list[Run]]
+"""From jobs and their sensed runs to whole runs: where a network predicts, for all rows at once."""
+
+
+class Runs(Summarized, Sequence[Run]):
+    """Runs that are made when they are asked for.
+
+    `runs[i]` makes one run. `for run in runs` makes all, block by block, so that memory stays bounded.
+    `list(runs)` keeps them. A run that is asked for again is made again, with the same bytes. While one block
+    goes through the network, the next is driven and sensed.
+    """
+
+    def __init__(
+        self,
+        jobs: Sequence[Job],
+        conditions: Conditions,
+        finish: Finish,
+        *,
+        columns: Iterable[str] | None = None,
+        block: int = BLOCK,
+    ) -> None:
+        """Check every job; nothing is driven yet.
+
+        Args:
+            jobs: The runs, at least one.
+            conditions: What they have in common; the engine is the kinematic one.
+            finish: Makes whole runs of sensed ones.
+            columns: Columns to keep beside t. Default: all.
+            block: Runs made at a time.
+
+        Raises:
+            InputError: There is no job, a column or `block` is wrong, or `simulate` would refuse a job; the
+                text then has its number.
+        """
+        if not jobs:
+            raise InputError("no runs are asked for; give a seed for each")
+        if not isinstance(block, int) or block < 1:
+            raise InputError(f"block must be a whole number from 1 up, got {block!r}")
+        self._jobs, self._conditions, self._finish, self._block = jobs, conditions, finish, block
+        self._columns = frozenset(COLUMNS if columns is None else {"t", *columns})
+        for name in sorted(self._columns):
+            find("column", name, COLUMNS)
+        self._planned: dict[tuple[Path | Commands, float, DriveSpec, float, Pose], ClosedLoop] = {}
+        self._loops: list[ClosedLoop | None] = []
+        checked = set()
+        for i, job in enumerate(jobs):
+            with self._numbered(i):
+                key = (id(job.scene), id(job.path))
+                if key not in checked:
+                    check_run(job.scene, job.path, conditions)
+                    checked.add(key)
+                self._loops.append(self._closed_loop(job))
+        if sum(planned.least_steps for planned in self._loops if planned) >= LOOPS.pays:
+            with suppress(ImportError):  # plain Python gives the same bytes
+                warm_up()
+
+    def __len__(self) -> int:
+        return len(self._jobs)
+
+    @overload
+    def __getitem__(self, index: int) -> Run: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Run]: ...
+
+    def __getitem__(self, index: int | slice) -> Run | list[Run]:
+        numbers = range(len(self))[index]
+        if isinstance(numbers, int):
+            return self._finish([self._jobs[numbers]], self._sensed([numbers]))[0]
+        return list(self._made(numbers))
+
+    def __iter__(self) -> Iterator[Run]:
+        return self._made(range(len(self)))
+
+    def save(self, out: str | os.PathLike[str], **options: Any) -> Any:
+        """Write the runs to a folder as Parquet files; see `magtwin.io.sweeps.save_runs`."""
+        return importlib.import_module("magtwin").save_runs(self, out, **options)
+
+    def _made(self, numbers: Sequence[int]) -> Iterator[Run]:
+        """Runs by number, in their order."""
+        blocks = [numbers[k : k + self._block] for k in range(0, len(numbers), self._block)]
+        if not blocks:
+            return
+        with ThreadPoolExecutor(1) as pool:
+            ahead = pool.submit(self._sensed, blocks[0])
+            for block, after in zip(blocks, [*blocks[1:], None], strict=True):
+                sensed = ahead.result()
+                if after is not None:
+                    ahead = pool.submit(self._sensed, after)
+                yield from self._finish([self._jobs[i] for i in block], sensed)
+
+    def _sensed(self, numbers: Sequence[int]) -> list[Sensed]:
+        """Drive and sense some runs."""
+        common = self._conditions
+        draws = {i: streams(np.random.default_rng(self._jobs[i].seed)) for i in numbers}
+        loops: dict[int, ClosedLoop] = {}
+        for i in numbers:
+            if (planned := self._loops[i]) is not None:
+                drive = self._jobs[i].scene.robot.drive
+                errors = draw_wheel_errors(drive, draws[i]["drive"])
+                loops[i] = replace(planned, drive=drive, wheel_errors=errors)
+        motions = dict(zip(loops, run_loops(list(loops.values()), common.obstacles), strict=True))
+        sensed = []
+        for i in numbers:
+            job = self._jobs[i]
+            with self._numbered(i):
+                motion: Travel
+                if i in motions:
+                    motion, metadata = motions.pop(i), self._metadata(job)
+                    if isinstance(job.path, Path) and common.duration_s is None:
+                        check_arrived(job.path, job.speed, loops[i], motion)
+                else:
+                    motion, metadata = travel(job.scene, job.path, draws[i], job.speed, common)
+                sensing = Sensing(job.scene, draws[i], common, wanted=self._columns)
+                sensed.append(sense_all(sensing, motion, metadata))
+        return sensed
+
+    def _metadata(self, job: Job) -> Metadata:
+        """As `travel` gives it for a closed loop that was planned."""
+        if isinstance(job.path, Commands):
+            return {"path": job.path.name, "controller": "commands"}
+        assert isinstance(job.path, Path)
+        name = str(self._conditions.controller)
+        return {"path": job.path.name, "controller": name, "speed_m_s": float(job.speed)}
+
+    def _closed_loop(self, job: Job) -> ClosedLoop | None:
+        """The closed loop of a job without its wheels' errors, planned once for all jobs that share it.
+
+        None if it cannot be planned: a random driver, a custom controller, or a run that is driven again.
+        """
+        common, radius = self._conditions, job.scene.robot.footprint_radius_m
+        alike = replace(
+            job.scene.robot.drive,
+            wheel_errors=(0.0, 0.0),
+            wheel_radius_error_std=0.0,
+            wheel_separation_error_std=0.0,
+            odometry_scale=(1.0, 1.0),
+            odometry_noise_std=0.0,
+        )
+        if isinstance(job.path, Run):
+            return None
+        if isinstance(job.path, str):
+            stand = [[0.0, 0.0, 0.0]]
+            loop_by_commands(stand, alike, start=job.scene.start, footprint_radius_m=radius).check(
+                common.obstacles
+            )
+            return None
+        key = (job.path, job.speed, alike, radius, job.scene.start)
+        if key in self._planned:
+            return self._planned[key]
+        if isinstance(job.path, Path):
+            if not isinstance(common.controller, str) or (
+                common.controller not in CONTROLLERS and common.controller in CUSTOM_CONTROLLERS
+            ):
+                return None
+            planned = loop_along(
+                job.path,
+                alike,
+                speed=job.speed,
+                duration_s=common.duration_s,
+                controller=common.controller,
+                obstacles=common.obstacles,
+                footprint_radius_m=radius,
+            )
+        else:
+            planned = loop_by_commands(
+                job.path.rows,
+                alike,
+                start=job.scene.start,
+                duration_s=common.duration_s,
+                footprint_radius_m=radius,
+            )
+            planned.check(common.obstacles)
+        self._planned[key] = planned
+        return planned
+
+    @contextmanager
+    def _numbered(self, index: int) -> Iterator[None]:
+        """Put the number of the run into refusals."""
+        try:
+            yield
+        except InputError as error:
+            text = f"run {index} of {len(self)}, counted from 0: {error}"
+            raise InputError(text, parameter=error.parameter) from error
+
+    def _summary(self) -> Summary:
+        names = dict.fromkeys(
+            getattr(job.path, "name", job.path) if not isinstance(job.path, Run) else "a recorded run"
+            for job in self._jobs
+        )
+        return Summary(
+            f"Runs: {len(self):,}, made when they are asked for",
+            (
+                ("paths", listed([str(name) for name in names])),
+                ("seeds", listed([str(job.seed) for job in self._jobs])),
+                ("columns", listed([name for name in COLUMNS if name in self._columns])),
+            ),
+        )

@@ -1,0 +1,177 @@
+"""Furniture on a stage: looks, colliders and magnetised parts."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from pxr import Kind, Sdf, Usd, UsdGeom, UsdPhysics, Vt
+
+from magtwin.errors import InputError
+from magtwin.frames import IDENTITY_XYZW
+from magtwin.spec.furniture import BODY, GENERIC, FurnitureSpec, Part, parts_of
+from magtwin.spec.magnetics import SourceSpec
+from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
+from magtwin.usd.layers import WORLD
+from magtwin.usd.looks import define_box, define_looks, wear
+from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, prims_with
+from magtwin.usd.sources import (
+    LOOKS,
+    SOURCES,
+    define_source,
+    define_triangles,
+    read_source,
+    read_transform,
+    source_prims,
+)
+
+FURNITURE = WORLD.AppendChild("Furniture")
+KIND = attribute_name("furniture", "kind")
+MATERIAL = attribute_name("furniture", "material")
+SIZE = attribute_name("furniture", "size_m")
+
+
+def define_furniture(stage: Usd.Stage, furniture: tuple[FurnitureSpec, ...]) -> None:
+    """Author pieces of furniture under /World/Furniture, each an Xform that can be moved as one.
+
+    Args:
+        stage: Written to in its edit target.
+        furniture: The pieces.
+
+    Raises:
+        InputError: A name cannot name a prim.
+    """
+    Usd.ModelAPI(UsdGeom.Xform.Define(stage, FURNITURE)).SetKind(Kind.Tokens.group)
+    for spec in furniture:
+        path = FURNITURE.AppendChild(check_prim_name(spec.name, "furniture"))
+        piece = UsdGeom.Xform.Define(stage, path).GetPrim()
+        Usd.ModelAPI(piece).SetKind(Kind.Tokens.component)
+        turn = None if spec.q_world_xyzw == IDENTITY_XYZW else spec.q_world_xyzw
+        write_pose(piece, spec.p_world, turn)
+        apply_api(piece, "furniture").GetAttribute(KIND).Set(spec.kind)
+        if spec.kind in GENERIC:
+            piece.GetAttribute(MATERIAL).Set(spec.material)
+            piece.GetAttribute(SIZE).Set(spec.size_m)
+        parts = spec.parts
+        define_looks(stage, path.AppendChild(LOOKS), dict.fromkeys(part.look for part in parts))
+        steel = {source.name.removeprefix(f"{spec.name}_"): source for source in spec.sources(in_world=False)}
+        for part in parts:
+            prim = _define_part(stage, path, part, steel.get(part.name))
+            UsdPhysics.CollisionAPI.Apply(prim)
+
+
+def _define_part(stage: Usd.Stage, piece: Sdf.Path, part: Part, source: SourceSpec | None) -> Usd.Prim:
+    """One part; a steel part is a source."""
+    path, look = piece.AppendChild(part.name), piece.AppendChild(LOOKS).AppendChild(part.look)
+    if source is not None:
+        return define_source(stage, piece, _named(source, part.name), look=part.look)
+    if part.shape == "cuboid":
+        return define_box(stage, path, part.p, part.size_m, look)
+    if part.shape == "mesh":
+        mesh = UsdGeom.Mesh.Define(stage, path)
+        define_triangles(mesh, part.vertices_m, part.faces)
+        write_pose(mesh.GetPrim(), part.p)
+        wear(mesh, look)
+        return mesh.GetPrim()
+    cylinder = UsdGeom.Cylinder.Define(stage, path)
+    radius, half = part.size_m[0] / 2, part.size_m[2] / 2
+    cylinder.CreateRadiusAttr(radius)
+    cylinder.CreateHeightAttr(2 * half)
+    cylinder.CreateAxisAttr(UsdGeom.Tokens.z)
+    cylinder.CreateExtentAttr(Vt.Vec3fArray([(-radius, -radius, -half), (radius, radius, half)]))
+    write_pose(cylinder.GetPrim(), part.p)
+    wear(cylinder, look)
+    return cylinder.GetPrim()
+
+
+def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[FurnitureSpec, ...]]:
+    """Every magnetised thing of a stage: its sources, and its furniture.
+
+    A piece that was moved or turned as a whole is read at its new place. A piece with a part that was moved,
+    scaled, added or magnetised differently is read as separate sources.
+
+    Raises:
+        InputError: A source is part of a robot, or as for `read_source`.
+    """
+    robots = [prim.GetPath() for prim in prims_with(stage.GetPseudoRoot(), "robot")]
+    prims = source_prims(stage)
+    pieces, taken = [], set()
+    for root in stage.Traverse(Usd.TraverseInstanceProxies()):
+        if root.HasAPI(NOUNS["furniture"]) and (piece := _whole(root, prims)):
+            pieces.append(piece)
+            taken |= {prim.GetPath() for prim in prims if prim.GetPath().HasPrefix(root.GetPath())}
+    sources: list[SourceSpec] = []
+    names: set[str] = set()
+    for prim in prims:
+        if robot := next((r for r in robots if prim.GetPath().HasPrefix(r)), None):
+            raise InputError(
+                f"{place(prim)}: a magnetic source on the robot {robot}, which moves; author it as the "
+                "robot's platform field"
+            )
+        if prim.GetPath() not in taken:
+            sources.append(read_source(prim, name=_name(prim, names)))
+            names.add(sources[-1].name)
+    return tuple(sources), tuple(pieces)
+
+
+def _whole(root: Usd.Prim, prims: list[Usd.Prim]) -> FurnitureSpec | None:
+    """The piece of furniture at a prim; None if its steel parts are not those of its kind."""
+    own = [prim for prim in prims if prim.GetPath().HasPrefix(root.GetPath())]
+    p, q, scale = read_transform(root)
+    if max(abs(s - 1) for s in scale) > 1e-9 or any(prim.GetParent() != root for prim in own):
+        return None
+    kind = plain_value(root.GetAttribute(KIND))
+    if kind not in GENERIC:
+        parts_of(kind)  # raises if the kind is unknown
+    try:
+        bare = FurnitureSpec(
+            name=root.GetName(), kind=kind, p_world=p, q_world_xyzw=q, **_generic(root, kind)
+        )
+        along = {part.name: part.along for part in bare.parts if part.steel}
+        steel = [read_source(prim, local=True) for prim in own]
+        strength = tuple(source.magnetization[along.get(source.name, 0)] for source in steel)
+        spec = replace(
+            bare,
+            magnetization=strength if any(strength) else (),
+            susceptibility=steel[0].susceptibility if steel else 0.0,
+        )
+    except InputError:  # it has more parts, or fewer
+        return None
+    wanted = [
+        _named(source, source.name.removeprefix(f"{spec.name}_")) for source in spec.sources(in_world=False)
+    ]
+    return spec if steel == wanted else None
+
+
+def _generic(root: Usd.Prim, kind: str) -> dict[str, Any]:
+    """Material and size of a generic piece, or vertices and faces; empty for other kinds."""
+    if kind not in GENERIC:
+        return {}
+    given: dict[str, Any] = {"material": plain_value(root.GetAttribute(MATERIAL))}
+    if kind != "mesh":
+        return given | {"size_m": plain_value(root.GetAttribute(SIZE))}
+    mesh = UsdGeom.Mesh(root.GetStage().GetPrimAtPath(root.GetPath().AppendChild(BODY)))
+    if not mesh:
+        raise InputError(f"{place(root)}: a mesh without its {BODY}")
+    points = np.array(mesh.GetPointsAttr().Get() or [], float).reshape(-1, 3)
+    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], int)
+    if (mesh.GetFaceVertexCountsAttr().Get() or [0]) != [3] * (len(faces) // 3):
+        raise InputError(f"{place(root)}: its {BODY} is not of triangles")
+    return given | {
+        "vertices_m": tuple(map(tuple, points.tolist())),
+        "faces": tuple(map(tuple, faces.reshape(-1, 3).tolist())),
+    }
+
+
+def _named(source: SourceSpec, name: str) -> SourceSpec:
+    return SourceSpec(**{**vars(source), "name": name})
+
+
+def _name(prim: Usd.Prim, taken: set[str]) -> str:
+    """Unique name of a source: its prim's below /World/Sources, else the path of prims down to it."""
+    path = prim.GetPath()
+    anchor = SOURCES if path.GetParentPath() == SOURCES else WORLD if path.HasPrefix(WORLD) else Sdf.Path("/")
+    name = path.MakeRelativePath(anchor).pathString.replace("/", "_")
+    number, free = 2, name
+    while free in taken:
+        number, free = number + 1, f"{name}_{number}"
+    return free

@@ -1,0 +1,142 @@
+"""The room in USD: floor, low walls, motion-capture frame, lights and physics scene."""
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, Vt
+
+from magtwin.frames import quat_from_rpy
+from magtwin.spec.lab import LabSpec
+from magtwin.usd.attributes import read_spec, write_pose, write_spec
+from magtwin.usd.layers import WORLD
+from magtwin.usd.looks import define_box, define_looks, wear
+from magtwin.usd.schema import apply_api
+
+LAB = WORLD.AppendChild("Lab")
+PHYSICS_SCENE = WORLD.AppendChild("PhysicsScene")
+LOOKS = LAB.AppendChild("Looks")
+FLOOR, WALL, POST, CAMERA, LENS = map(LOOKS.AppendChild, ("Floor", "Wall", "Post", "Camera", "Lens"))
+
+GRAVITY_M_S2 = 9.81
+FLOOR_THICKNESS_M = 0.1
+POST_WIDTH_M = 0.04
+"""Width of the aluminium profile of the motion-capture frame."""
+
+CAMERA_SIZE_M = (0.07, 0.09, 0.09)
+LAMP_SIZE_M = (1.2, 0.3)
+LAMP_HEIGHT_M = 2.8
+
+
+def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
+    """Author the room at /World/Lab and the physics scene at /World/PhysicsScene.
+
+    The top of the floor is at z = 0, its centre at the world's origin. The walls stand outside the floor.
+
+    Args:
+        stage: Written to in its edit target; metres, Z up.
+        spec: The room's size.
+
+    Returns:
+        The prim of the lab.
+    """
+    lab = write_spec(apply_api(UsdGeom.Xform.Define(stage, LAB).GetPrim(), "lab"), "lab", spec)
+    _define_physics_scene(stage)
+    define_looks(stage, LOOKS, [look.name for look in (FLOOR, WALL, POST, CAMERA, LENS)])
+    _define_floor(stage, spec)
+    _define_walls(stage, spec)
+    _define_frame(stage, spec)
+    _define_lights(stage, spec)
+    return lab
+
+
+def read_lab(prim: Usd.Prim) -> LabSpec:
+    """The spec of an authored lab.
+
+    Raises:
+        InputError: The prim is no lab, or a value is out of range.
+    """
+    return read_spec(LabSpec, prim, "lab")
+
+
+def _define_physics_scene(stage: Usd.Stage) -> None:
+    scene = UsdPhysics.Scene.Define(stage, PHYSICS_SCENE)
+    scene.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
+    scene.CreateGravityMagnitudeAttr(GRAVITY_M_S2)
+
+
+def _define_floor(stage: Usd.Stage, spec: LabSpec) -> None:
+    x, y = spec.floor_m
+    edge = 2 * (spec.wall_thickness_m + spec.apron_m)  # walls and posts stand on the slab too
+    size = (x + edge, y + edge, FLOOR_THICKNESS_M)
+    define_box(stage, LAB.AppendChild("Floor"), (0, 0, -FLOOR_THICKNESS_M / 2), size, FLOOR, collides=True)
+
+
+def _define_walls(stage: Usd.Stage, spec: LabSpec) -> None:
+    if not spec.wall_height_m:
+        return
+    (x, y), thick, high = spec.floor_m, spec.wall_thickness_m, spec.wall_height_m
+    walls = {
+        "East": ((x + thick) / 2, 0, thick, y),
+        "West": (-(x + thick) / 2, 0, thick, y),
+        "North": (0, (y + thick) / 2, x + 2 * thick, thick),
+        "South": (0, -(y + thick) / 2, x + 2 * thick, thick),
+    }
+    for name, (at_x, at_y, size_x, size_y) in walls.items():
+        path = UsdGeom.Xform.Define(stage, LAB.AppendChild("Walls")).GetPath().AppendChild(name)
+        define_box(stage, path, (at_x, at_y, high / 2), (size_x, size_y, high), WALL, collides=True)
+
+
+def _define_frame(stage: Usd.Stage, spec: LabSpec) -> None:
+    """Posts at the corners and in the middle of the long sides, rails on top, a camera on each post."""
+    if not spec.post_height_m:
+        return
+    half = np.array(spec.floor_m) / 2 + spec.wall_thickness_m + POST_WIDTH_M / 2
+    corners = [(sx * half[0], sy * half[1]) for sx in (-1, 1) for sy in (-1, 1)]
+    along_x = spec.floor_m[0] >= spec.floor_m[1]
+    amid = [(0.0, s * half[1]) if along_x else (s * half[0], 0.0) for s in (-1, 1)]
+    root = UsdGeom.Xform.Define(stage, LAB.AppendChild("CaptureFrame")).GetPath()
+    high, width = spec.post_height_m, POST_WIDTH_M
+    for i, (x, y) in enumerate(corners + amid):
+        size = (width, width, high)
+        define_box(stage, root.AppendChild(f"Post_{i}"), (x, y, high / 2), size, POST, collides=True)
+        _camera(stage, root.AppendChild(f"Camera_{i}"), np.array([x, y, high]))
+    rail = high - width / 2
+    for name, side in (("South", -1), ("North", 1)):
+        size = (2 * half[0] - width, width, width)
+        define_box(stage, root.AppendChild(f"Rail_{name}"), (0, side * half[1], rail), size, POST)
+    for name, side in (("West", -1), ("East", 1)):
+        size = (width, 2 * half[1] - width, width)
+        define_box(stage, root.AppendChild(f"Rail_{name}"), (side * half[0], 0, rail), size, POST)
+
+
+def _camera(stage: Usd.Stage, path: Sdf.Path, post_top: np.ndarray) -> None:
+    """A camera below the top of a post, which looks at the middle of the floor."""
+    inward = -post_top[:2] / np.linalg.norm(post_top[:2])
+    at = post_top + np.array([*(0.1 * inward), -0.08])
+    yaw = np.arctan2(-at[1], -at[0])
+    pitch = np.arctan2(at[2], np.hypot(at[0], at[1]))  # a positive turn about y looks down
+    prim = UsdGeom.Xform.Define(stage, path).GetPrim()
+    write_pose(prim, tuple(at), tuple(quat_from_rpy((0.0, pitch, yaw))))  # type: ignore[arg-type]
+    define_box(stage, path.AppendChild("Body"), (0, 0, 0), CAMERA_SIZE_M, CAMERA)
+    lens = UsdGeom.Cylinder.Define(stage, path.AppendChild("Lens"))
+    radius, height = 0.032, 0.02
+    lens.CreateAxisAttr(UsdGeom.Tokens.x)
+    lens.CreateRadiusAttr(radius)
+    lens.CreateHeightAttr(height)
+    lens.CreateExtentAttr(Vt.Vec3fArray([(-height / 2, -radius, -radius), (height / 2, radius, radius)]))
+    lens.AddTranslateOp().Set(Gf.Vec3d((CAMERA_SIZE_M[0] + height) / 2, 0, 0))
+    wear(lens, LENS)
+
+
+def _define_lights(stage: Usd.Stage, spec: LabSpec) -> None:
+    """An even sky, and four lamps in two rows above the floor."""
+    root = UsdGeom.Xform.Define(stage, LAB.AppendChild("Lights")).GetPath()
+    sky = UsdLux.DomeLight.Define(stage, root.AppendChild("Sky"))
+    sky.CreateIntensityAttr(350.0)
+    sky.CreateColorAttr(Gf.Vec3f(0.92, 0.96, 1.0))
+    quarter = np.array(spec.floor_m) / 4
+    for i, (sx, sy) in enumerate([(-1, -1), (-1, 1), (1, -1), (1, 1)]):
+        lamp = UsdLux.RectLight.Define(stage, root.AppendChild(f"Lamp_{i}"))  # shines along -z
+        lamp.CreateWidthAttr(LAMP_SIZE_M[0])
+        lamp.CreateHeightAttr(LAMP_SIZE_M[1])
+        lamp.CreateIntensityAttr(4000.0)
+        lamp.CreateColorAttr(Gf.Vec3f(1.0, 0.97, 0.92))
+        lamp.AddTranslateOp().Set(Gf.Vec3d(sx * quarter[0], sy * quarter[1], LAMP_HEIGHT_M))

@@ -1,0 +1,503 @@
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.errors import InputError
+from magtwin.field.grid import Grid
+from magtwin.field.survey.readings import SHAPES, Readings
+from magtwin.files import sha256
+from magtwin.frames import quat_from_rpy, quat_from_yaw, quat_multiply
+from magtwin.io.surveys.columns import Columns
+from magtwin.io.surveys.readings import load_readings, read_readings, readings_of_run, save_readings
+from magtwin.run.run import Run
+
+ROWS = "x,y,heading,field\n0,0,0.5,41000\n1,0,1.5,41500\n0,1,-3,40500\n"
+WORLD = np.array([12_000.0, 20_000.0, -38_000.0])
+
+
+def file(tmp_path, text, name="a.csv"):
+    (tmp_path / name).write_text(text)
+    return tmp_path / name
+
+
+def same(a, b):
+    """Whether two Readings are equal to the last bit."""
+    arrays = all(
+        (getattr(a, k) is None and getattr(b, k) is None)
+        or (getattr(a, k).dtype == getattr(b, k).dtype and getattr(a, k).tobytes() == getattr(b, k).tobytes())
+        for k in SHAPES
+    )
+    plain = ("runs", "grid", "height_m", "name", "source", "licence", "created")
+    return arrays and all(getattr(a, k) == getattr(b, k) for k in plain)
+
+
+def test_a_table_becomes_readings_with_file_and_checksum_as_their_source(tmp_path):
+    path = file(tmp_path, ROWS)
+    readings = read_readings(path, licence="CC0-1.0", created="2026-11-21", height_m=0.4, name="hall")
+    assert_array_equal(readings.p_xy, [[0, 0], [1, 0], [0, 1]])
+    assert_array_equal(readings.yaw, [0.5, 1.5, -3])
+    assert_array_equal(readings.b_nt, [41_000, 41_500, 40_500])
+    assert readings.source == f"a.csv sha256:{sha256(path)}"
+    assert (readings.licence, readings.created, readings.height_m) == ("CC0-1.0", "2026-11-21", 0.4)
+    assert (readings.name, readings.runs) == ("hall", ("a",))
+    assert readings.b_body_nt is None
+    assert readings.grid is None
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("nT", 1), ("uT", 1e3), ("T", 1e9), ("mG", 1e2), ("G", 1e5)])
+def test_units_are_turned_into_nt(tmp_path, unit, factor):
+    path = file(tmp_path, f"x,y,yaw,b\n0,0,0,{41_000 / factor!r}\n")
+    assert_allclose(read_readings(path, columns=Columns(field="b", unit=unit)).b_nt, [41_000], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("value", "said", "wanted"),
+    [
+        ("41", "nT", "uT"),
+        ("4.1e-5", "nT", "T"),
+        ("0.41", "nT", "G"),
+        ("410", "uT", "mG"),
+        ("41000", "T", "nT"),
+    ],
+)
+def test_a_mistaken_unit_is_refused_by_the_one_that_would_fit(tmp_path, value, said, wanted):
+    path = file(tmp_path, f"x,y,yaw,field\n0,0,0,{value}\n")
+    with pytest.raises(InputError, match=f"a.csv: the mean of field .* in {wanted} .*--unit {wanted}$"):
+        read_readings(path, columns=Columns(unit=said))
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "factor"),
+    [("41000", "nT", 1), ("41", "uT", 1e3), ("4.1e-5", "T", 1e9), ("410", "mG", 1e2), ("0.41", "G", 1e5)],
+)
+def test_a_unit_that_is_not_given_follows_from_the_size_and_is_told(tmp_path, value, unit, factor):
+    readings = read_readings(file(tmp_path, f"x,y,yaw,field\n0,0,0,{value}\n"))
+    assert_allclose(readings.b_nt, float(value) * factor)
+    told = f"taken field in {unit}, by its size (--unit)"
+    assert (told in readings.source) == (unit != "nT")
+
+
+def test_a_size_of_no_unit_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"a\.csv: the mean of field is 3 nT, .*no usual unit makes it"):
+        read_readings(file(tmp_path, "x,y,yaw,field\n0,0,0,3\n"))
+
+
+@pytest.mark.parametrize("name", ["b_total", "B", "|B|", "b_uT", "Total_Field"])
+def test_a_magnitude_is_found_by_its_usual_names(tmp_path, name):
+    readings = read_readings(file(tmp_path, f"Timestamp,x,y,Yaw,{name}\n5.5,0,0,0.25,41\n"))
+    assert (readings.b_nt[0], readings.yaw[0], readings.t[0]) == (41e3, 0.25, 5.5)
+
+
+def test_components_are_found_by_their_usual_names_where_there_is_no_magnitude(tmp_path):
+    rows = "timestamp,x,y,yaw,bx,by,bz\n0,0,0,0,3,4,-40\n"
+    readings = read_readings(file(tmp_path, rows))
+    assert_allclose(readings.b_body_nt, [[3e3, 4e3, -40e3]])
+    assert "taken bx,by,bz as the field in the robot's axes" in readings.source
+    both = read_readings(file(tmp_path, "x,y,yaw,field,bx,by,bz\n0,0,0,40000,3,4,-40\n"))
+    assert both.b_body_nt is None, "a magnitude that is there is what is read"
+
+
+@pytest.mark.parametrize(("said", "fits"), [(None, "world"), ("body", "world"), ("world", "body")])
+def test_vectors_in_other_axes_than_those_that_were_said_are_refused(tmp_path, said, fits):
+    yaw = np.linspace(0, 6, 20)
+    b = 20.0 * np.exp(1j * (1.2 - yaw * (fits == "body")))
+    rows = "".join(f"0,0,{a:.4f},{c.real:.4f},{c.imag:.4f},-40\n" for a, c in zip(yaw, b, strict=True))
+    path = file(tmp_path, "x,y,yaw,bx,by,bz\n" + rows)
+    with pytest.raises(InputError, match=rf"a\.csv: bx,by,bz .* one direction .*give --axes {fits}"):
+        read_readings(path, columns=Columns(axes=said))
+    assert len(read_readings(path, columns=Columns(axes=fits))) == 20
+
+
+def test_headings_in_degrees_are_refused_until_said_so_and_turns_that_count_are_taken(tmp_path):
+    path = file(tmp_path, "x,y,heading,field\n0,0,1,41000\n1,0,90,41500\n")
+    with pytest.raises(InputError, match=r"a\.csv:3: heading 90 is beyond a full turn in radians"):
+        read_readings(path)
+    assert_allclose(read_readings(path, columns=Columns(heading_unit="deg")).yaw, np.radians([1, 90]))
+    assert_array_equal(read_readings(path, columns=Columns(heading_unit="rad")).yaw, [1, 90])
+
+
+def test_columns_go_by_number_where_there_is_no_header(tmp_path):
+    path = file(tmp_path, "7,0,0,0.5,41000\n8,1,0,1.5,41500\n")
+    columns = Columns(time="1", x="2", y="3", heading="4", field="5")
+    readings = read_readings(path, columns=columns)
+    assert_array_equal(readings.t, [7, 8])
+    assert_array_equal(readings.b_nt, [41_000, 41_500])
+
+
+@settings(max_examples=30, deadline=None)
+@given(yaw=st.floats(-3, 3), roll=st.floats(-0.3, 0.3), pitch=st.floats(-0.3, 0.3))
+def test_a_vector_in_body_axes_with_a_quaternion_is_the_world_vector_turned_back_by_the_heading(
+    tmp_path_factory, yaw, roll, pitch
+):
+    from magtwin.frames import quat_conjugate, rotate
+
+    q = quat_multiply(quat_from_yaw(yaw), quat_from_rpy([roll, pitch, 0.0]))
+    body = rotate(quat_conjugate(q), WORLD)
+    folder = tmp_path_factory.mktemp("q")
+    row = ",".join(repr(float(v)) for v in (0, 0, *q, *body))
+    path = file(folder, f"x,y,qx,qy,qz,qw,bx,by,bz\n{row}\n")
+    readings = read_readings(path, columns=Columns(quaternion="qx,qy,qz,qw", vector="bx,by,bz"))
+    c, s = np.cos(yaw), np.sin(yaw)
+    level = [c * WORLD[0] + s * WORLD[1], -s * WORLD[0] + c * WORLD[1], WORLD[2]]
+    assert_allclose(readings.b_body_nt, [level], atol=1e-6)
+    assert_allclose(np.cos(readings.yaw - yaw), 1, atol=1e-12)
+    assert_allclose(readings.b_nt, np.linalg.norm(WORLD))
+
+
+def test_a_vector_in_world_axes_needs_no_heading_and_turns_with_one(tmp_path):
+    bare = file(tmp_path, "x,y,bx,by,bz\n0,0,12,20,-38\n")
+    columns = Columns(vector="bx,by,bz", axes="world", unit="uT")
+    assert_allclose(read_readings(bare, columns=columns).b_body_nt, [WORLD])
+    turned = file(tmp_path, f"x,y,heading,bx,by,bz\n0,0,{np.pi / 2},12,20,-38\n", "b.csv")
+    assert_allclose(read_readings(turned, columns=columns).b_body_nt, [[20_000, -12_000, -38_000]])
+
+
+def test_rows_without_a_value_are_left_out_and_the_source_tells_how_many(tmp_path):
+    path = file(tmp_path, ROWS + "2,2,,41000\n3,nan,0,41000\n4,4,0,\n")
+    readings = read_readings(path)
+    assert len(readings) == 3
+    assert readings.source.endswith("(3 of 6 rows without a value left out)")
+    with pytest.raises(InputError, match="no row is complete; all 1 have a cell"):
+        read_readings(file(tmp_path, "x,y,heading,field\n0,0,0,nan\n", "b.csv"))
+
+
+def test_a_column_tells_runs_apart(tmp_path):
+    path = file(tmp_path, "x,y,yaw,field,day\n0,0,0,41000,tue\n1,0,0,41500,mon\n2,0,0,41200,tue\n")
+    readings = read_readings(path, columns=Columns(run_column="day"))
+    assert readings.runs == ("a tue", "a mon")
+    assert_array_equal(readings.run, [0, 1, 0])
+
+
+def test_several_files_are_several_runs(tmp_path):
+    a, b = file(tmp_path, ROWS), file(tmp_path, ROWS, "b.csv")
+    readings = read_readings(a, b)
+    assert readings.runs == ("a", "b")
+    assert_array_equal(readings.run, [0, 0, 0, 1, 1, 1])
+    assert "b.csv sha256:" in readings.source
+
+
+def test_files_joined_by_a_plus_stand_side_by_side(tmp_path):
+    for name, text in (
+        ("1-t.csv", "5\n6\n"),
+        ("1-p.csv", "0,0\n1,0\n"),
+        ("1-m.csv", "12,20,-38\n12,21,-38\n"),
+    ):
+        file(tmp_path, text, name)
+    columns = Columns(time="1", x="2", y="3", vector="4,5,6", axes="world", unit="uT")
+    readings = read_readings(f"{tmp_path / '1-t.csv'}+1-p.csv+1-m.csv", columns=columns)
+    assert_allclose(readings.b_body_nt[1], [12_000, 21_000, -38_000])
+    assert_array_equal(readings.t, [5, 6])
+    assert readings.source.count("sha256:") == 3
+    whole = "+".join(str(tmp_path / name) for name in ("1-t.csv", "1-p.csv", "1-m.csv"))
+    assert same(read_readings(whole, columns=columns), readings)
+    with pytest.raises(InputError, match=r"1-x\.csv: no such file of readings"):
+        read_readings(f"{tmp_path / '1-t.csv'}+1-x.csv", columns=columns)
+    file(tmp_path, "0,0\n", "1-q.csv")
+    with pytest.raises(InputError, match=r"1-q\.csv: 1 rows, but .*1-t\.csv has 2"):
+        read_readings(f"{tmp_path / '1-t.csv'}+1-q.csv", columns=columns)
+
+
+def test_the_real_vector_survey_is_read_from_its_triples(real_data):
+    data = real_data / "magnetic-data"
+    sources = [f"{data / f'{k}-time.csv'}+{k}-loc.csv+{k}-mag.csv" for k in range(1, 6)]
+    columns = Columns(time="1", x="2", y="3", vector="4,5,6", axes="world", unit="uT")
+    readings = read_readings(*sources, columns=columns)
+    assert len(readings) == 43_029
+    assert np.bincount(readings.run).tolist() == [8_875, 9_105, 9_404, 7_332, 8_313]
+    raw = np.loadtxt(data / "3-mag.csv", delimiter=",") * 1e3
+    assert_allclose(readings.b_body_nt[readings.run == 2], raw, rtol=1e-15)
+    assert_allclose(readings.b_nt[readings.run == 2], np.linalg.norm(raw, axis=1), rtol=1e-15)
+
+
+def test_a_gridded_folder_keeps_recorded_headings_beside_its_nodes(real_data):
+    readings = read_readings(real_data / "aprilab/maps", licence="MIT")
+    table = np.loadtxt(real_data / "aprilab/maps/90_map.csv", delimiter=",")
+    rows = readings.run == 1
+    assert readings.runs[1] == "90_map.csv"
+    assert_array_equal(readings.yaw[rows], table[:, 2])
+    assert_array_equal(readings.b_nt[rows], table[:, 3])
+    p, yaw = readings.grid.poses()
+    assert_allclose(p[tuple(readings.node.T)], readings.p_xy, atol=1e-12)
+    assert_allclose(yaw[tuple(readings.node[rows].T)], np.pi / 2)
+
+
+def test_a_run_becomes_readings_at_the_true_poses_with_lost_lock_not_good(lab_scene, tmp_path):
+    import magtwin
+    from magtwin.io.tables import write_parquet
+
+    run = magtwin.simulate(lab_scene, "figure8", seed=1, duration_s=4)
+    lost = np.zeros(run.rows, bool)
+    lost[10:20] = True
+    b = run["b_measured_nt"].copy()
+    b[3] = np.nan
+    run = run.with_columns(flag_lost_lock=lost, b_measured_nt=b)
+    write_parquet(run, tmp_path / "run.parquet")
+    readings = read_readings(tmp_path / "run.parquet")
+    kept = np.arange(run.rows) != 3
+    assert_array_equal(readings.p_xy, run["p_world_base"][kept, :2])
+    assert_array_equal(readings.b_nt, b[kept])
+    assert_array_equal(readings.good, ~lost[kept])
+    assert readings.source.endswith(f"(1 of {run.rows} rows without a value left out)")
+
+
+def test_a_run_whose_field_is_unknown_throughout_is_refused():
+    unknown = {"t": [0.0], "p_world_base": [[0, 0, 0]], "yaw": [0.0], "b_total_nt": [np.nan]}
+    with pytest.raises(InputError, match="b_measured_nt and b_total_nt hold no field"):
+        readings_of_run(Run(unknown))
+
+
+@st.composite
+def some_readings(draw):
+    n = draw(st.integers(1, 6))
+    number = st.floats(-1e3, 1e3)
+    field = st.floats(1, 1e5)
+    rows = lambda strategy, width: np.array(  # noqa: E731
+        draw(st.lists(st.lists(strategy, min_size=width, max_size=width), min_size=n, max_size=n))
+    )
+    grid = draw(st.booleans())
+    given = {"p_xy": rows(number, 2), "yaw": rows(number, 1)[:, 0], "b_nt": rows(field, 1)[:, 0]}
+    if draw(st.booleans()):
+        given["b_body_nt"] = rows(number, 3)
+    if draw(st.booleans()):
+        given["t"] = rows(number, 1)[:, 0]
+    if grid:
+        headings = (0.1, 2.5)
+        given["grid"] = Grid(
+            origin_m=(0.1, -0.3), cell_m=(0.25, 0.3), headings_rad=headings, rows=2, columns=3
+        )
+        given["node"] = np.column_stack([rows(st.integers(0, 1), 2), rows(st.integers(0, 2), 1)])
+    return Readings(
+        **given,
+        run=rows(st.integers(0, 1), 1)[:, 0],
+        runs=("a", draw(st.text(st.characters(codec="utf-8"), max_size=5))),
+        good=rows(st.booleans(), 1)[:, 0],
+        height_m=draw(st.none() | st.floats(0, 2)),
+        name=draw(st.text(st.characters(codec="utf-8"), max_size=5)),
+        source="a.csv sha256:0; b",
+        licence="MIT",
+        created="2026-11-21",
+    )
+
+
+@settings(max_examples=50, deadline=None)
+@given(readings=some_readings())
+def test_readings_survive_parquet_to_the_last_bit(tmp_path_factory, readings):
+    path = tmp_path_factory.mktemp("r") / "a.parquet"
+    save_readings(readings, path)
+    assert same(load_readings(path), readings)
+    assert same(read_readings(path), readings)
+
+
+def test_the_same_readings_give_the_same_bytes_with_units_on_every_column(tmp_path):
+    readings = read_readings(file(tmp_path, ROWS))
+    for name in "ab":
+        save_readings(readings, tmp_path / f"{name}.parquet")
+    assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
+    schema = pq.read_schema(tmp_path / "a.parquet")
+    assert schema.field("b_nt").metadata[b"unit"] == b"nT"
+    assert schema.field("p_xy_x").metadata[b"unit"] == b"m"
+    assert json.loads(schema.metadata[b"magtwin_readings"])["source"] == readings.source
+    with pytest.raises(InputError, match=r"a\.parquet: exists already; give `force=True`"):
+        save_readings(readings, tmp_path / "a.parquet")
+
+
+def test_readings_of_other_programs_parquet_go_by_column_names(tmp_path):
+    import pyarrow as pa
+
+    pq.write_table(
+        pa.table({"px": [0.0, 1.0], "py": [0, 1], "yaw": [0.0, 1.0], "b": [41.0, 42.0]}), tmp_path / "a.pq"
+    )
+    readings = read_readings(tmp_path / "a.pq", columns=Columns(x="px", y="py", field="b", unit="uT"))
+    assert_array_equal(readings.b_nt, [41_000, 42_000])
+    with pytest.raises(InputError, match="no Readings: metadata 'magtwin_readings' is missing"):
+        load_readings(tmp_path / "a.pq")
+
+
+@pytest.mark.parametrize("change", ["{", "[]", "{}", '{"grid": {"rows": "no"}}', "null"])
+def test_damaged_metadata_is_refused(tmp_path, change):
+    readings = read_readings(file(tmp_path, ROWS))
+    save_readings(readings, tmp_path / "a.parquet")
+    table = pq.read_table(tmp_path / "a.parquet")
+    pq.write_table(table.replace_schema_metadata({"magtwin_readings": change}), tmp_path / "b.parquet")
+    with pytest.raises(InputError, match=r"b\.parquet: metadata 'magtwin_readings' is damaged"):
+        read_readings(tmp_path / "b.parquet")
+
+
+def test_readings_whose_columns_do_not_fit_are_refused_with_the_file(tmp_path):
+    save_readings(read_readings(file(tmp_path, ROWS)), tmp_path / "a.parquet")
+    table = pq.read_table(tmp_path / "a.parquet")
+    wrong = table.set_column(table.column_names.index("b_nt"), "b_nt", [[-1.0, 2.0, 3.0]])
+    pq.write_table(wrong, tmp_path / "b.parquet")
+    with pytest.raises(InputError, match=r"b\.parquet: b_nt of Readings is a magnitude"):
+        load_readings(tmp_path / "b.parquet")
+    pq.write_table(table.drop_columns(["yaw"]), tmp_path / "c.parquet")
+    with pytest.raises(InputError, match=r"c\.parquet: no column 'yaw'"):
+        load_readings(tmp_path / "c.parquet")
+
+
+REFUSALS = {
+    "missing": (None, {}, r"a\.csv: no such source of readings"),
+    "no x": ("px,y,yaw,field\n0,0,0,41000\n", {}, r"a\.csv: no column 'x'; did you mean 'px'"),
+    "no heading": (
+        "x,y,field\n0,0,41000\n",
+        {},
+        r"a\.csv: no heading: no column is called heading, yaw, theta",
+    ),
+    "no field": (
+        "x,y,yaw,strength\n0,0,0,41000\n",
+        {},
+        r"a\.csv: no column of the field .*x, y, yaw, strength.*--field NAME, or .*--vector BX,BY,BZ",
+    ),
+    "body vector without heading": (
+        "x,y,bx,by,bz\n0,0,12000,20000,1\n",
+        {"vector": "bx,by,bz"},
+        r"a\.csv: no heading",
+    ),
+    "nought": ("x,y,yaw,field\n0,0,0,41000\n0,0,0,0\n", {}, r"a\.csv:3: a magnitude is above 0, got 0 nT"),
+    "negative": ("x,y,yaw,field\n0,0,0,-41000\n", {}, r"a\.csv:2: a magnitude is above 0, got -41000 nT"),
+    "quaternion": (
+        "x,y,a,b,c,d,field\n0,0,0,0,0,1,41000\n0,0,1,1,0,0,41000\n",
+        {"quaternion": "a,b,c,d"},
+        r"a\.csv:3: a quaternion's length is 1, got 1\.414",
+    ),
+    "far away": (
+        "x,y,yaw,field\n0,0,0,41000\n1e308,0,0,41000\n",
+        {},
+        r"a\.csv:3: x and y are metres, within",
+    ),
+    "vectors of another size": (
+        "x,y,yaw,field,bx,by,bz\n0,0,0,41000,12,20,-33\n1,0,0,41000,12,20,-33\n",
+        {"vector": "bx,by,bz", "field": "field"},
+        r"a\.csv: bx,by,bz is 0\.000986 times as long as field .median.; give both in one unit",
+    ),
+    "word": ("x,y,yaw,field\n0,0,0,high\n", {}, r"a\.csv:2: field must be a finite number, got 'high'"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_a_table_that_makes_no_readings_is_refused(tmp_path, case):
+    text, options, what = REFUSALS[case]
+    if text is not None:
+        file(tmp_path, text)
+    with pytest.raises(InputError, match=what):
+        read_readings(tmp_path / "a.csv", columns=Columns(**options))
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"vector": "bx,by"}, "vector takes 3 columns with commas between, got 'bx,by'"),
+        ({"quaternion": "q"}, "quaternion takes 4 columns"),
+        (
+            {"quaternion": "a,b,c,d", "heading": "yaw"},
+            "give either the heading's column or the quaternion's",
+        ),
+    ],
+)
+def test_columns_that_cannot_be_are_refused_at_birth(options, what):
+    with pytest.raises(InputError, match=what):
+        Columns(**options)
+
+
+def test_columns_are_refused_for_sources_whose_columns_are_known(tmp_path):
+    save_readings(read_readings(file(tmp_path, ROWS)), tmp_path / "a.parquet")
+    (tmp_path / "maps").mkdir()
+    for source in ("a.parquet", "maps"):
+        with pytest.raises(InputError, match="its columns are known; drop the options"):
+            read_readings(tmp_path / source, columns=Columns(x="px"))
+
+
+def test_a_gridded_survey_is_not_one_of_several_sources(tmp_path, real_data):
+    with pytest.raises(InputError, match="survey 'maps' is gridded and cannot be one of several sources"):
+        read_readings(real_data / "aprilab/maps", file(tmp_path, ROWS))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"created": "last May"}, "created of Readings must be a day YYYY-MM-DD, got 'last May'"),
+        ({"created": 20260102}, "created of Readings must be a text, got 20260102"),
+        ({"licence": None}, "licence of Readings must be a text, got None"),
+        ({"p_xy": [[0.0, -1e9]]}, r"p_xy of Readings lies within 1e\+08 m of the origin, got .* in row 0"),
+    ],
+)
+def test_what_a_survey_says_of_itself_has_its_form(changes, said):
+    given = {"p_xy": [[0.0, 0.0]], "yaw": [0.0], "b_nt": [4e4]}
+    with pytest.raises(InputError, match=said):
+        Readings(**{**given, **changes})
+
+
+def test_rows_of_two_units_are_refused_by_the_first_line_that_is_off(tmp_path):
+    rows = [f"{k},0,0,{41_000 + k if k % 3 else 41 + k / 1e3}\n" for k in range(1, 40)]
+    path = file(tmp_path, "x,y,yaw,field\n" + "".join(rows))
+    said = (
+        r"a\.csv:4: field is 41\.003 nT, where most readings are about 41,0.* it and 12 more would fit in uT"
+    )
+    with pytest.raises(InputError, match=said):
+        read_readings(path)
+
+
+def test_an_outlier_is_no_row_of_another_unit(tmp_path):
+    rows = [f"{k},0,0,{41_000 + k if k != 7 else 410}\n" for k in range(1, 300)]
+    assert len(read_readings(file(tmp_path, "x,y,yaw,field\n" + "".join(rows)))) == 299
+
+
+def test_a_scale_takes_the_values_of_a_normalised_sensor_to_nt(tmp_path):
+    path = file(tmp_path, "x,y,yaw,b,bx,by,bz\n0,0,0,0.9,0.3,0.2,-0.8\n1,0,1,1.1,0.5,0,-1\n")
+    scaled = read_readings(path, columns=Columns(field="b", scale=45_000.0))
+    assert_allclose(scaled.b_nt, [40_500, 49_500])
+    body = read_readings(path, columns=Columns(vector="bx,by,bz", scale=45_000.0)).b_body_nt
+    assert_allclose(body, 45_000 * np.array([[0.3, 0.2, -0.8], [0.5, 0, -1]]))
+
+
+def test_a_scale_takes_a_folder_of_csvs_to_nt(tmp_path):
+    text = "# x,y,theta,scalar_mag\n0,0,{0},1\n1,0,{0},1.1\n0,1,{0},0.9\n1,1,{0},1\n"
+    for heading in (0, 90, 180, 270):
+        file(tmp_path, text.format(np.radians(heading)), f"{heading}_map.csv")
+    readings = read_readings(tmp_path, columns=Columns(scale=45_000.0))
+    assert_allclose(np.unique(readings.b_nt), [40_500, 45_000, 49_500])
+
+
+def test_a_scale_that_cannot_be_is_refused_with_one_that_could(tmp_path):
+    path = file(tmp_path, "x,y,yaw,b\n0,0,0,0.9\n1,0,1,1.1\n")
+    with pytest.raises(InputError, match=r"normalised sensor give --scale, the factor to nT \(50000 would"):
+        read_readings(path, columns=Columns(field="b"))
+    with pytest.raises(InputError, match=r"mean of b is 3 nT with scale 3, .*; --scale 50000 would make"):
+        read_readings(path, columns=Columns(field="b", scale=3.0))
+    with pytest.raises(InputError, match="the unit of the field or its scale"):
+        Columns(scale=3.0, unit="uT")
+    with pytest.raises(InputError, match="scale, the factor to nT, must be above 0, got 0"):
+        Columns(scale=0.0)
+    save_readings(read_readings(file(tmp_path, ROWS, "b.csv")), tmp_path / "b.parquet")
+    with pytest.raises(InputError, match="in nT already; leave out --scale"):
+        read_readings(tmp_path / "b.parquet", columns=Columns(scale=2.0))
+
+
+def test_a_pattern_stands_for_the_files_that_match_it_in_the_order_of_their_names(tmp_path, monkeypatch):
+    files = [file(tmp_path, ROWS.replace("0,0,0.5", f"{k},0,0.5"), f"drive_{k}.csv") for k in (2, 0, 1)]
+    want = read_readings(*sorted(files))
+    assert want.runs == ("drive_0", "drive_1", "drive_2")
+    assert same(read_readings(tmp_path / "drive_*.csv"), want)
+    monkeypatch.chdir(tmp_path)
+    assert same(read_readings("drive_?.csv"), want)
+    with pytest.raises(InputError, match=r"^no file or folder matches 'nowhere/\*\.csv'; check the pattern$"):
+        read_readings("nowhere/*.csv")
+
+
+def test_a_file_whose_name_looks_like_a_pattern_is_that_file(tmp_path):
+    file(tmp_path, ROWS, "a1.csv")
+    own = file(tmp_path, ROWS.replace("41000", "42000"), "a[1].csv")
+    assert read_readings(own).b_nt[0] == 42_000
+
+
+def test_a_folder_of_parquet_files_is_several_runs(tmp_path):
+    for name in ("b", "a"):
+        readings = read_readings(file(tmp_path, ROWS, f"{name}.csv"))
+        (tmp_path / "runs").mkdir(exist_ok=True)
+        save_readings(readings, tmp_path / "runs" / f"{name}.parquet")
+    assert read_readings(tmp_path / "runs").runs == ("a", "b")

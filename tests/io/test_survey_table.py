@@ -1,0 +1,148 @@
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from numpy.testing import assert_array_equal
+
+from magtwin.errors import InputError
+from magtwin.io.surveys.table import LONGEST_LINE, read_csv, read_parquet_table
+
+
+def written(tmp_path, content, name="a.csv"):
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x,y\n1,2\n3,4\n",
+        "# x, y\n1,2\n3,4\n",
+        "\ufeffx;y\r\n1;2\r\n\r\n3;4\r\n",
+        "x\ty\n1\t2\n# a remark\n3\t4",
+        "x y\n 1  2 \n3 4\n",
+        '"x","y"\n"1","2"\n3,4\n',
+    ],
+    ids=["commas", "hash", "semicolons", "tabs and a remark", "blanks", "quotes"],
+)
+def test_a_table_is_the_same_whatever_stands_between_its_values(tmp_path, text):
+    table = read_csv(written(tmp_path, text))
+    assert table.names == ["x", "y"]
+    assert_array_equal(table.numbers("x"), [1, 3])
+    assert_array_equal(table.numbers("2"), [2, 4])
+
+
+def test_columns_without_a_header_are_numbered_from_1(tmp_path):
+    table = read_csv(written(tmp_path, "1,2\n3,nan\n"))
+    assert table.names == ["1", "2"]
+    assert_array_equal(table.numbers("2"), [2, np.nan])
+    with pytest.raises(InputError, match="no header: name columns by number, 1 to 2"):
+        table.numbers("x")
+
+
+def test_a_missing_column_is_refused_by_the_near_name(tmp_path):
+    table = read_csv(written(tmp_path, "x,y,heading\n1,2,3\n"))
+    with pytest.raises(InputError, match=r"a\.csv: no column 'headin'; did you mean 'heading'"):
+        table.numbers("headin")
+
+
+def test_two_columns_of_one_name_are_told_apart_by_number(tmp_path):
+    table = read_csv(written(tmp_path, "x,x\n1,2\n"))
+    with pytest.raises(InputError, match="2 columns are called 'x'; name it by its number"):
+        table.numbers("x")
+    assert_array_equal(table.numbers("2"), [2])
+
+
+@pytest.mark.parametrize(
+    ("cell", "said"),
+    [
+        ("east", "'east'"),
+        ("inf", "'inf'"),
+        ("1e999", "'1e999'"),
+        ("1_000", "'1_000'"),
+        ("0x10", "'0x10'"),
+        ("=cmd|'/C calc'!A0", r"\"=cmd\|'/C calc'!A0\""),
+        ("__import__('os').system('touch x')", '"__import__'),
+        ("1" * 60_000 + "x", "'1{60}'$"),
+    ],
+)
+def test_a_cell_that_is_no_finite_number_is_refused_with_its_line(tmp_path, cell, said):
+    table = read_csv(written(tmp_path, f"x,y\n1,2\n\n{cell},3\n"))
+    with pytest.raises(InputError, match=rf"a\.csv:4: x must be a finite number, got {said}"):
+        table.numbers("x")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv"]
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        ("", r"a\.csv: empty"),
+        ("\n # only a remark\n", r"a\.csv: empty"),
+        ("x,y\n", r"a\.csv: no rows below the header"),
+        ("x,y\n1,2\n3\n", r"a\.csv:3: 2 values expected, got 1"),
+        ('x,y\n1,"2\n', r"a\.csv:2: not CSV"),
+        (b"x,y\n1,\xff\xfe\n", r"a\.csv: not a text file"),
+        (b"\x89PNG\r\n\x1a\n\x00\x00", r"a\.csv: not a text file"),
+        ("x,y\n1,2\n" + "7" * (LONGEST_LINE + 1), r"a\.csv:3: longer than 65,536 characters"),
+    ],
+)
+def test_a_broken_table_is_refused_with_its_line(tmp_path, content, what):
+    with pytest.raises(InputError, match=what) as refusal:
+        read_csv(written(tmp_path, content))
+    assert len(str(refusal.value)) < 500
+    assert "\n" not in str(refusal.value)
+
+
+def test_tables_side_by_side_number_their_columns_on_and_know_their_own_files(tmp_path):
+    left = read_csv(written(tmp_path, "1\n2\n"))
+    right = read_csv(written(tmp_path, "a,b\n3,4\nfive,6\n", "b.csv"))
+    both = left.beside(right)
+    assert_array_equal(both.numbers("b"), [4, 6])
+    assert_array_equal(both.numbers("3"), [4, 6])
+    with pytest.raises(InputError, match=r"b\.csv:3: a must be a finite number, got 'five'"):
+        both.numbers("a")
+    with pytest.raises(InputError, match=r"c\.csv: 1 rows, but .*a\.csv has 2"):
+        left.beside(read_csv(written(tmp_path, "3,4\n", "c.csv")))
+
+
+def test_a_parquet_table_has_nan_for_nulls_and_keeps_words(tmp_path):
+    table = pa.table({"x": pa.array([1, None], pa.int32()), "run": ["a", "b"], "list": [[1], [2]]})
+    pq.write_table(table, tmp_path / "a.parquet")
+    table = read_parquet_table(tmp_path / "a.parquet")
+    assert table.names == ["x", "run"]
+    assert_array_equal(table.numbers("x"), [1, np.nan])
+    assert table.texts("run") == ["a", "b"]
+    with pytest.raises(InputError, match="column 'run' must hold numbers, got texts"):
+        table.numbers("run")
+
+
+def test_an_infinite_number_in_parquet_is_refused_with_its_row(tmp_path):
+    pq.write_table(pa.table({"x": [1.0, np.inf]}), tmp_path / "a.parquet")
+    with pytest.raises(InputError, match=r"a\.parquet, row 1: x must be a finite number, got inf"):
+        read_parquet_table(tmp_path / "a.parquet").numbers("x")
+
+
+@pytest.mark.parametrize("keep", [0, 3, 40, -5])
+def test_parquet_that_was_cut_short_is_refused(tmp_path, keep):
+    path = tmp_path / "a.parquet"
+    pq.write_table(pa.table({"x": np.arange(1_000.0)}), path)
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(InputError, match=r"a\.parquet: (not a Parquet file|Parquet cut short)"):
+        read_parquet_table(path)
+
+
+def test_parquet_whose_middle_is_damaged_is_refused(tmp_path):
+    path = tmp_path / "a.parquet"
+    pq.write_table(pa.table({"x": np.random.default_rng(0).random(10_000)}), path)
+    whole = bytearray(path.read_bytes())
+    whole[-200:-8] = bytes(192)
+    path.write_bytes(whole)
+    with pytest.raises(InputError, match="damaged Parquet"):
+        read_parquet_table(path)
+
+
+def test_the_header_may_stand_above_remarks(tmp_path):
+    file = tmp_path / "a.csv"
+    file.write_text('# x,y,field\n# said "so" by, a friend\n# units: ["m", "m", "nT"]\n1,2,3\n4,5,6\n')
+    assert read_csv(file).names == ["x", "y", "field"]
