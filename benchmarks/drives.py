@@ -33,8 +33,8 @@ def drive(folder, minutes, seed):
     """A drive's Parquet file."""
     file = folder / f"drive_{seed}.parquet"
     command = [sys.executable, "-m", "magtwin", "run", str(SCENE), "--path", "random", "--rate-hz", "17"]
-    command += ["--duration", str(60 * minutes), "--seed", str(seed), "--magnetometer", "physical"]
-    subprocess.run([*command, "--parquet", str(file)], check=True, capture_output=True)
+    command += ["--duration-s", str(60 * minutes), "--seed", str(seed), "--magnetometer", "physical"]
+    subprocess.run([*command, "--out", str(file)], check=True, capture_output=True)
     return file
 
 

@@ -29,7 +29,7 @@ from magtwin.field.survey.stuck import mask_stuck
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 EARTH_NT = (-2_700.0, 24_000.0, -38_400.0)  # IGRF-14, Gainesville, Florida
 NINETY = 1.6448536269514722
-BRIDGED = {"trilinear": {"fill": True}, "cubic": {"fill": True}}  # as `magtwin map check` does
+BRIDGED = {"trilinear": {"fill": True}, "cubic": {"fill": True}}  # as `magtwin map validate` does
 NEAR_M = 0.1
 AHEAD = 15  # readings, 0.3 s, over which a direction of travel is taken
 

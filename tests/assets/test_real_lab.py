@@ -30,11 +30,11 @@ def real_run(tmp_path_factory):
     )
     magtwin(
         *("scene", "aprilab", "--out", out / "scene"),
-        *("--map", out / "aprilab.usdc", "--net", out / "released.safetensors"),
+        *("--map", out / "aprilab.usdc", "--network", out / "released.safetensors"),
     )
     magtwin(
         *("run", out / "scene" / "aprilab.usda", "--path", real / "paths" / "figure8_path.csv"),
-        *("--parquet", out / "run.parquet"),
+        *("--out", out / "run.parquet"),
     )
     return read_parquet(out / "run.parquet"), real
 
@@ -113,7 +113,7 @@ def test_the_command_line_gives_the_same_bytes_for_one_seed_and_others_for_anoth
                 str(lab_scene),
                 "--seed",
                 str(seed),
-                "--parquet",
+                "--out",
                 str(tmp_path / f"{name}.parquet"),
                 "--json",
             ]

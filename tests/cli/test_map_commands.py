@@ -207,14 +207,14 @@ def test_what_is_no_series_is_refused_and_nothing_is_written(tmp_path, layer, se
 
 
 def test_continue_writes_the_map_of_another_height(tmp_path, layer, capsys):
-    said = told(capsys, "map", "continue", layer, "--height", "1.0", "--out", tmp_path / "up.usdc")
+    said = told(capsys, "map", "upward", layer, "--height-m", "1.0", "--out", tmp_path / "up.usdc")
     assert said["figures"]["height"]["value"] == 1.0
     up = load_map(tmp_path / "up.usdc")
     exact = a_field().magnitude_nt(*up.grid.poses(), height_m=1.0)
     assert np.abs(up.values_nt - exact).max() < 0.004
     assert up.method.endswith("continued from 0.35 to 1 m by its harmonic field")
     assert "height_m is a height above the floor, 0 m or more, got -1.0" in refused(
-        capsys, "map", "continue", layer, "--height", "-1", "--out", tmp_path / "down.usdc"
+        capsys, "map", "upward", layer, "--height-m", "-1", "--out", tmp_path / "down.usdc"
     )
     assert not (tmp_path / "down.usdc").exists()
 
@@ -245,7 +245,7 @@ def test_diff_tells_and_draws_what_changed(tmp_path, layer, capsys):
 def test_plot_draws_each_quantity_as_png_and_svg(tmp_path, layer, capsys, what):
     for suffix, head in (("png", b"\x89PNG"), ("svg", b"<?xml")):
         out = tmp_path / f"a.{suffix}"
-        main(["map", "plot", str(layer), "--out", str(out), "--what", what])
+        main(["map", "plot", str(layer), "--out", str(out), "--quantity", what])
         assert out.read_bytes().startswith(head)
 
 
@@ -257,7 +257,7 @@ def test_plot_shows_the_headings_and_the_day_that_are_asked_for(tmp_path, series
             str(series),
             "--out",
             str(tmp_path / "a.svg"),
-            "--headings",
+            "--headings-deg",
             "45",
             "--date",
             "2026-01-06",
@@ -270,7 +270,7 @@ def test_plot_shows_the_headings_and_the_day_that_are_asked_for(tmp_path, series
 
 
 def test_a_map_in_many_headings_is_drawn_in_four_unless_asked(tmp_path):
-    from magtwin.figures.plots import plot_map
+    from magtwin.figures.maps import plot_map
 
     headings = np.radians(np.arange(0, 360, 15.0))
     values = np.repeat(a_map().values_nt[:1], 24, axis=0)

@@ -208,7 +208,7 @@ def read_survey(
     if not (keep_stuck or masked.good.any()):
         raise InputError(
             f"{folder}: all {len(readings)} readings are those of a sensor that was stuck; "
-            "survey it again, or import them as they are with keep_stuck (--keep-latched)"
+            "survey it again, or import them as they are with `keep_stuck=True`"
         )
     field = node_map(readings if keep_stuck else masked)
     field = replace(field, parameters=_common(layers, "parameters") or {})

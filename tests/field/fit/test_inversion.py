@@ -291,9 +291,9 @@ def test_a_drive_with_headings_all_around_has_no_gaps_between_them():
 
 @pytest.mark.slow
 def test_in_the_default_lab_it_is_four_times_nearer_to_the_exact_field_than_trilinear(lab_scene):
-    from magtwin.author.scene import read_scene
     from magtwin.field.survey.stuck import mask_stuck
     from magtwin.sim.survey import field_at_rest_nt, survey_readings
+    from magtwin.usd.scene import read_scene
 
     scene = read_scene(lab_scene)
     readings, _ = mask_stuck(survey_readings(scene, rng=np.random.default_rng(0)))

@@ -165,7 +165,7 @@ def test_surveys_on_other_grids_meet_on_the_coarser_one_in_the_fewer_headings():
         ({"valid": np.zeros((4, 15, 25), bool)}, "no valid node in common"),
         ({"frame": "map"}, "map 'a' has the frame 'world' and 'a' 'map', so that one x and y are two places"),
         ({"datum": "the door"}, "has the datum 'the wall' and 'a' 'the door', .* with one --datum"),
-        ({"height_m": 0.5}, r"'a' is of 0\.35 m above the floor and 'a' of 0\.5 m; .*magtwin map continue"),
+        ({"height_m": 0.5}, r"'a' is of 0\.35 m above the floor and 'a' of 0\.5 m; .*magtwin map upward"),
     ],
 )
 def test_surveys_that_cannot_be_compared_are_refused(change, said):
