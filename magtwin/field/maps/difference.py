@@ -220,7 +220,7 @@ def _compared(a: AnomalyMap, b: AnomalyMap) -> tuple[str, ...]:
     if a.height_m is not None and b.height_m is not None and abs(a.height_m - b.height_m) > GRAIN_M:
         raise InputError(
             f"map {a.name!r} is of {a.height_m:g} m above the floor and {b.name!r} of {b.height_m:g} m; take "
-            "one to the other's height first (magtwin map continue)"
+            "one to the other's height first (magtwin map upward)"
         )
     cautions = []
     unknown = {
