@@ -31,7 +31,7 @@ from magtwin.spec.scene import Scene
 from magtwin.twin import Kind, Twin, open_twin, room_of, without_model_error
 
 if TYPE_CHECKING:
-    from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 
 Array = NDArray[np.float64]
 
@@ -336,12 +336,7 @@ def _predictions(network: "NeuralMagnetometer") -> Predict:
 
 
 def _check_network(network: "NeuralMagnetometer") -> None:
-    """Refuse a network whose inputs are not simulated here."""
-    if network.net.context:
-        raise InputError(
-            f"{network.name}: a {network.net.kind} reads {network.net.context} earlier readings, which "
-            "MagNav does not keep; give a network that reads one row at a time"
-        )
+    """Refuse a network that reads columns that MagNav does not simulate."""
     if missing := sorted(network.columns - SENSED):
         raise InputError(
             f"{network.name}: reads {', '.join(missing)}, which MagNav does not simulate; give a network of "

@@ -29,7 +29,7 @@ from magtwin.twin.twin import (
 from magtwin.version import __version__
 
 if TYPE_CHECKING:
-    from magtwin.learn.magnetometer import NeuralMagnetometer, Read
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer, Read
     from magtwin.sim.motion.commands import Commands
     from magtwin.sim.motion.controllers import Controller
     from magtwin.sim.motion.engine import Engine

@@ -7,7 +7,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.path import Path, resolve_path
-from magtwin.placement import Room, fitted, path_in
+from magtwin.path.room import Room, fit_path, path_in
 from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands
 
@@ -21,7 +21,7 @@ def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> Dr
     Args:
         path: The name of a path, a CSV file, or points (N, 2) [m], which become a `Path`. "random", a `Path`,
             `Commands` and a `Run` stay as they are.
-        room: Where it is driven: named paths are scaled to its floor, see `magtwin.placement.path_in`.
+        room: Where it is driven: named paths are scaled to its floor, see `magtwin.path.path_in`.
             Default: the floor for which they were designed.
         fit: Whether a path that does not fit into the room is moved and shrunk until it does.
 
@@ -31,11 +31,11 @@ def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> Dr
     if isinstance(path, Commands | Run) or (isinstance(path, str) and path == "random"):
         return path
     if isinstance(path, Path):
-        return fitted(path, room) if fit and room is not None else path
+        return fit_path(path, room) if fit and room is not None else path
     if isinstance(path, str | FilePath | list | tuple | np.ndarray):
         named = isinstance(path, str | FilePath) and room is not None
         resolved = path_in(room, path) if named else resolve_path(path)  # type: ignore[arg-type]
-        return fitted(resolved, room) if fit and room is not None else resolved
+        return fit_path(resolved, room) if fit and room is not None else resolved
     raise InputError(
         "path must be a name, a CSV file, points (N, 2) [m], a Path, Commands or a Run, got "
         f"{type(path).__name__}",

@@ -17,8 +17,7 @@ def drawn(sessions, recordings, *, seconds=60.0, offset=OFFSET, within=WITHIN, t
     for k in range(sessions):
         constant = offset * rng.standard_normal()
         for _ in range(recordings):
-            first, *white = rng.standard_normal(len(t))
-            process, _ = gauss_markov([*white, 0.0], first, time_s, RATE_HZ)
+            process = gauss_markov(rng.standard_normal(len(t)), time_s, RATE_HZ)
             held.append(Held(str(k), t, constant + within * process))
     return held
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magtwin.author.scene import author_scene, read_scene
+from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.io.formats import read_run, write_run
@@ -16,6 +16,7 @@ from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.drive_input import drive_input, drive_inputs
 from magtwin.twin import open_twin, scan, scene_from_toml, simulate, simulate_robots, sweep
+from magtwin.usd.scene import read_scene
 
 POINTS = [[-1.0, -0.5], [0.25, 0.5], [1.0, 0.125], [0.5, -0.75]]
 SHORT = {"duration_s": 3.0, "rate_hz": 20.0}

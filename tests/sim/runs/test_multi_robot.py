@@ -12,7 +12,7 @@ from magtwin.author.scene import author_scene
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.files import shipped
 from magtwin.io.provenance import repeat
 from magtwin.io.tables import read_parquet
@@ -258,11 +258,11 @@ def two(tmp_path_factory):
 
 
 def test_run_writes_a_file_for_each_robot_and_robot_the_one_to_the_same_bits(two, tmp_path, capsys):
-    main(["run", str(two), "--parquet", str(tmp_path / "r.parquet"), "--rate-hz", "20", "--json"])
+    main(["run", str(two), "--out", str(tmp_path / "r.parquet"), "--rate-hz", "20", "--json"])
     report = json.loads(capsys.readouterr().out)
     assert {"ann: duration", "bob: duration"} <= report["figures"].keys()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["r.ann.parquet", "r.bob.parquet"]
-    main(["run", str(two), "--robot", "bob", "--parquet", str(tmp_path / "one.parquet"), "--rate-hz", "20"])
+    main(["run", str(two), "--robot", "bob", "--out", str(tmp_path / "one.parquet"), "--rate-hz", "20"])
     whole, one = read_parquet(tmp_path / "r.bob.parquet"), read_parquet(tmp_path / "one.parquet")
     for name, values in whole.items():
         assert_array_equal(values, one[name], err_msg=name)
@@ -275,7 +275,7 @@ def test_run_writes_a_file_for_each_robot_and_robot_the_one_to_the_same_bits(two
 def test_meet_flag_lets_robots_drive_through_each_other(two, tmp_path, capsys):
     (tmp_path / "through.csv").write_text("-0.4,0.5\n0.4,0.5\n")
     options = ["run", str(two), "--robot", "ann", "--path", str(tmp_path / "through.csv"), "--rate-hz", "20"]
-    out = ["--parquet", str(tmp_path / "r.parquet")]
+    out = ["--out", str(tmp_path / "r.parquet")]
     with pytest.raises(SystemExit):
         main([*options, *out])
     assert "'ann' and 'bob' would run into each other after" in capsys.readouterr().err
@@ -287,7 +287,7 @@ def test_meet_flag_lets_robots_drive_through_each_other(two, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--path", "sine"], "which of ann, bob is to drive sine? say it with --robot NAME"),
+        (["--path", "sine"], "which of ann, bob is to drive sine? name it with --robot NAME"),
         (["--robot", "bo"], "no robot 'bo'; did you mean 'bob'"),
         (["--engine", "newton"], "--engine newton drives one robot by itself"),
         (["--live"], "--live and --viewer show one robot"),

@@ -147,7 +147,7 @@ def test_without_sources_or_iron_the_truth_is_the_earths_field_seen_from_the_rob
 
 
 def test_the_field_is_that_at_the_magnetometer_not_at_base_link():
-    from magtwin.field.sources.point_dipoles import dipole_field_nt
+    from magtwin.field.sources.dipoles import dipole_field_nt
 
     lever = np.array([0.1, -0.05, 0.36])
     parts = {"p_base_magnetometer": tuple(lever.tolist()), "base_height_m": -0.02}
