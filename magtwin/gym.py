@@ -336,7 +336,7 @@ def _predictions(network: "NeuralMagnetometer") -> Predict:
 
 
 def _check_network(network: "NeuralMagnetometer") -> None:
-    """Refuse a network that reads columns that MagNav does not simulate."""
+    """Refuse a network whose inputs are not simulated here."""
     if missing := sorted(network.columns - SENSED):
         raise InputError(
             f"{network.name}: reads {', '.join(missing)}, which MagNav does not simulate; give a network of "
