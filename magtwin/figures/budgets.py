@@ -10,7 +10,7 @@ from magtwin.figures.evaluations import MOST_PANELS, Drawing, ink, of_weights, p
 from magtwin.figures.pages import Section, Table
 from magtwin.figures.plots import INK, new_figure
 from magtwin.learn.evaluation.budget import CLOSED, TERMS, Budget, TrueError
-from magtwin.learn.evaluation.evaluate import Evaluation
+from magtwin.learn.evaluation.evaluation import Evaluation
 
 SAVED, LOST = "#40916c", "#c92a2a"
 """Colours of what a step takes from an error, and of what it adds to it."""
@@ -44,7 +44,7 @@ def _steps_table(found: Evaluation, order: Sequence[int]) -> Table:
     for k, m in enumerate(order):
         score, before = scores[m], scores[order[max(k - 1, 0)]]
         bought = (before.mae_nt - score.mae_nt, before.ratio - score.ratio) if k else ("", "")
-        rows.append((found.names[m], found.contenders[m].chart.name, score.mae_nt, score.ratio, *bought))
+        rows.append((found.names[m], found.candidates[m].map.name, score.mae_nt, score.ratio, *bought))
     head = ("model", "map", "MAE [nT]", "ratio to naive", "gain [nT]", "gain in ratio")
     note = "gain: improvement over the row above; negative where the row above was better."
     return Table("Steps", head, tuple(rows), note)
@@ -71,7 +71,7 @@ def _rms_table(made: Sequence[Budget]) -> Table:
 
 
 def _true_table(missed: Sequence[TrueError]) -> Table:
-    rows = tuple((one.chart, one.mae_nt, one.rms_nt, one.bias_nt) for one in missed)
+    rows = tuple((one.map, one.mae_nt, one.rms_nt, one.bias_nt) for one in missed)
     note = "Map minus the exact field of the surveying robot at rest, along the recorded paths."
     return Table("Errors of the maps", ("map", "MAE [nT]", "RMS [nT]", "mean [nT]"), rows, note)
 

@@ -20,7 +20,7 @@ from magtwin.figures.plots import INK, drawn, new_figure
 from magtwin.files import output
 from magtwin.learn.data.correlation import correlations
 from magtwin.learn.data.features import FEATURES, FULL, features
-from magtwin.learn.evaluation.evaluate import PAPER, Case, Evaluation, Judged
+from magtwin.learn.evaluation.evaluation import PAPER, Case, Evaluation, Judged
 from magtwin.learn.evaluation.scores import COVERED, DRAWS, LEVEL
 from magtwin.verdict import Z_90
 
@@ -231,22 +231,22 @@ def _intervals(found: Evaluation) -> Table:
 
 def _models(found: Evaluation) -> Table:
     rows = []
-    for one in found.contenders:
+    for one in found.candidates:
         arm = ", ".join(f"{1000 * part:.1f}" for part in one.alignment.lever_arm_m)
         inputs = len(one.model.features)
         checksum = str(one.metadata.get("sha256", ""))[:12]
-        rows.append((one.name, one.chart.name, inputs, arm, 1000 * one.alignment.latency_s, checksum))
+        rows.append((one.name, one.map.name, inputs, arm, 1000 * one.alignment.latency_s, checksum))
     head = ("model", "map", "inputs", "lever arm [mm]", "latency [ms]", "SHA-256")
     return Table("Models", head, tuple(rows))
 
 
 def _maps(found: Evaluation) -> Table:
     rows = []
-    for chart in found.charts:
-        mae, rms = found.floor(chart)
-        alone, centred = _alone(found, chart.field)
+    for named in found.maps:
+        mae, rms = found.floor(named)
+        alone, centred = _alone(found, named.field)
         own = ("unknown", "unknown") if np.isnan(mae) else (mae, rms)
-        rows.append((chart.name, chart.field.method, *own, alone, centred))
+        rows.append((named.name, named.field.method, *own, alone, centred))
     head = (
         "map",
         "method",
@@ -264,7 +264,7 @@ def _maps(found: Evaluation) -> Table:
 
 def _alone(found: Evaluation, field_: AnomalyMap) -> tuple[float, float]:
     """MAE of a map without a model, as it is and less the mean error of these very readings [nT]."""
-    m = next(i for i, one in enumerate(found.contenders) if one.chart.field is field_)
+    m = next(i for i, one in enumerate(found.candidates) if one.map.field is field_)
     error = np.concatenate([one.map_nt[m, one.kept] - one.measured_nt[one.kept] for one in found.judged])
     return float(np.mean(np.abs(error))), float(np.mean(np.abs(error - error.mean())))
 
@@ -309,8 +309,8 @@ def _every(one: Judged, rate_hz: float) -> int:
 
 def of_weights(found: Evaluation) -> list[int]:
     """Models that came from weights files, or all but the naive one; `MOST_PANELS` of them at most."""
-    own = [i for i, one in enumerate(found.contenders) if "sha256" in one.metadata]
-    own = own or list(range(1, len(found.contenders))) or [0]
+    own = [i for i, one in enumerate(found.candidates) if "sha256" in one.metadata]
+    own = own or list(range(1, len(found.candidates))) or [0]
     return own if len(own) <= MOST_PANELS else [own[0], *own[1 - MOST_PANELS :]]
 
 
@@ -372,7 +372,7 @@ def _floor_plan(found: Evaluation) -> Drawing | None:
     cases = list(dict.fromkeys(one.case for one in found.judged))[:MOST_PANELS]
     shown = [next(one for one in found.judged if one.case == case) for case in cases]
     best = _best(found)
-    chart = found.contenders[best].chart.field
+    chart = found.candidates[best].map.field
     known = np.where(chart.valid.all(axis=0), chart.values_nt.mean(axis=0), np.nan) / 1000
     x0, x1, y0, y1 = chart.extent
     height = np.clip(2.2 * (y1 - y0) / (x1 - x0), 0.9, 5.0)
@@ -416,14 +416,14 @@ def _floor_plan(found: Evaluation) -> Drawing | None:
         ax.set_xlabel("x [m]", fontsize=9)
     for ax in axes[:, 0]:
         ax.set_ylabel("y [m]", fontsize=9)
-    title = f"Figure 7: paths over the map {found.contenders[best].chart.name} (grey, mean over headings)"
+    title = f"Figure 7: paths over the map {found.candidates[best].map.name} (grey, mean over headings)"
     return Drawing("figure_7", title, title, figure, "png")
 
 
 def _bars(found: Evaluation) -> Drawing:
     """The paper's Figure 6 a and b: errors by path, with their intervals."""
     cases = [case for case in found.cases if case.name != "all"]
-    count = len(found.contenders)
+    count = len(found.candidates)
     figure = new_figure(WIDTH_IN, 2.9 + 0.13 * count)
     ax = figure.subplots()
     width = 0.84 / count

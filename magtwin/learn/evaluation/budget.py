@@ -33,7 +33,9 @@ from magtwin.frames import into_base
 from magtwin.learn.data.dataset import Dataset
 from magtwin.learn.data.features import CARRIED, CIRCULAR, FEATURES, GRADIENT, features
 from magtwin.learn.data.labels import Alignment, labelled, placed
-from magtwin.learn.evaluation.evaluate import Contender, Evaluation, Mean, aligned_runs
+from magtwin.learn.evaluation.candidates import Candidate, Mean
+from magtwin.learn.evaluation.evaluation import Evaluation
+from magtwin.learn.evaluation.training_rows import aligned_runs
 from magtwin.run.run import Run
 from magtwin.sim.interference import level_field_nt, platform_field_nt, sensor_places
 from magtwin.spec.scene import Scene
@@ -138,7 +140,7 @@ class Budget(Summarized):
 class TrueError:
     """What a map misses of the field of the robot that surveyed, on the readings of an evaluation."""
 
-    chart: str
+    map: str
     mae_nt: float
     rms_nt: float
     bias_nt: float
@@ -265,7 +267,7 @@ def budgets(
 
 
 def _budget(found: Evaluation, m: int, truth: Truth, train: Dataset, names: Sequence[str] | None) -> Budget:
-    one = found.contenders[m]
+    one = found.candidates[m]
     inputs = _inputs(one, found, train)
     learned = _learned(one, inputs, truth, train, names)
     errors, parts, naive = [], [], []
@@ -277,7 +279,7 @@ def _budget(found: Evaluation, m: int, truth: Truth, train: Dataset, names: Sequ
         )
         run = judged.run.take(rows)
         if any(set(FEATURES[name].columns) & {"b_map_gradient_nt_m"} for name in inputs):
-            run = labelled(judged.run, one.chart.field, one.alignment).take(rows)
+            run = labelled(judged.run, one.map.field, one.alignment).take(rows)
         expected = learned(features(run, inputs)).T
         part = dict(zip(TERMS, exact, strict=True))
         for term, expectation in zip(_OTHERS, expected, strict=True):
@@ -297,11 +299,11 @@ def _budget(found: Evaluation, m: int, truth: Truth, train: Dataset, names: Sequ
 
 
 def _learned(
-    one: Contender, inputs: Sequence[str], truth: Truth, train: Dataset, names: Sequence[str] | None
+    one: Candidate, inputs: Sequence[str], truth: Truth, train: Dataset, names: Sequence[str] | None
 ) -> "_Expectation":
     """What the inputs tell of each term but the platform's, from training recordings."""
     xs, ys = [], []
-    for name, run in aligned_runs(train, names, one.chart, one.alignment):
+    for name, run in aligned_runs(train, names, one.map.field, one.alignment):
         x, rows = features(run, inputs), np.arange(run.rows)
         called, measured = f"training {name}", run["b_measured_nt"]
         exact = truth.parts(called, run, rows, run["b_map_nt"], one.alignment, measured)
@@ -327,7 +329,7 @@ class _Expectation:
         return np.asarray(self.offset + (x - self.mean) / self.scale @ self.weights)
 
 
-def _inputs(one: Contender, found: Evaluation, train: Dataset) -> tuple[str, ...]:
+def _inputs(one: Candidate, found: Evaluation, train: Dataset) -> tuple[str, ...]:
     """Inputs by which a model can have learned of a term: none of the naive one's."""
     if isinstance(one.model, Mean):
         return ()
@@ -341,17 +343,17 @@ def _inputs(one: Contender, found: Evaluation, train: Dataset) -> tuple[str, ...
 def true_errors(found: Evaluation, truth: Truth) -> list[TrueError]:
     """What each map misses of the robot that surveyed, at rest, on the readings judged on."""
     told = []
-    for chart in found.charts:
-        m = next(i for i, one in enumerate(found.contenders) if one.chart is chart)
+    for named in found.maps:
+        m = next(i for i, one in enumerate(found.candidates) if one.map is named)
         missed = []
         for judged in found.judged:
             rows = _thinned(judged.run, judged.kept)
-            place, yaw, _ = placed(judged.run, found.contenders[m].alignment)
+            place, yaw, _ = placed(judged.run, found.candidates[m].alignment)
             exact = truth.at_rest(place[rows], yaw[rows])
             missed.append(judged.map_nt[m, rows] - exact)
         error = np.concatenate(missed)
         told.append(
-            TrueError(chart.name, _mae(error), float(np.sqrt(np.mean(error**2))), float(np.mean(error)))
+            TrueError(named.name, _mae(error), float(np.sqrt(np.mean(error**2))), float(np.mean(error)))
         )
     return told
 
@@ -362,14 +364,14 @@ def steps(found: Evaluation) -> list[int]:
     """
 
     def rank(m: int) -> tuple[int, ...]:
-        one = found.contenders[m]
-        chart = found.charts.index(one.chart)
+        one = found.candidates[m]
+        place = found.maps.index(one.map)
         own = "sha256" in one.metadata
         gradient = bool(set(one.model.features) & set(GRADIENT))
         aligned = one.alignment != Alignment()
-        return (chart, int(own) if chart else int(not own), int(gradient), int(aligned), m)
+        return (place, int(own) if place else int(not own), int(gradient), int(aligned), m)
 
-    return [0, *sorted(range(1, len(found.contenders)), key=rank)]
+    return [0, *sorted(range(1, len(found.candidates)), key=rank)]
 
 
 def _thinned(run: Run, kept: NDArray[np.bool_]) -> NDArray[np.intp]:
