@@ -71,7 +71,7 @@ def build(
     """
     from magtwin.cli.file import _named
     from magtwin.files import check_free
-    from magtwin.learn.data.labels import Alignment
+    from magtwin.learn.data.alignment import Alignment
     from magtwin.learning import build_dataset
 
     check_free(out, force=force)

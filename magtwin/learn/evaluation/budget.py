@@ -32,7 +32,8 @@ from magtwin.errors import InputError
 from magtwin.frames import into_base
 from magtwin.learn.data.dataset import Dataset
 from magtwin.learn.data.features import CARRIED, CIRCULAR, FEATURES, GRADIENT, features
-from magtwin.learn.data.labels import Alignment, labelled, placed
+from magtwin.learn.data.alignment import Alignment, placed
+from magtwin.learn.data.labels import labelled
 from magtwin.learn.evaluation.candidates import Candidate, Mean
 from magtwin.learn.evaluation.evaluation import Evaluation
 from magtwin.learn.evaluation.training_rows import aligned_runs

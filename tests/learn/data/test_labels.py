@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_from_yaw
-from magtwin.learn.data.labels import Alignment, fit_alignment, labelled, labels
+from magtwin.learn.data.alignment import Alignment, fit_alignment
+from magtwin.learn.data.labels import labelled, labels
 from magtwin.run.run import Run
 
 

@@ -8,7 +8,8 @@ from numpy.testing import assert_allclose
 
 from magtwin.errors import InputError
 from magtwin.learn.data.dataset import build_dataset
-from magtwin.learn.data.labels import Alignment, labels
+from magtwin.learn.data.alignment import Alignment
+from magtwin.learn.data.labels import labels
 from magtwin.learn.evaluation.budget import TERMS, Truth, budgets, steps, true_errors
 from magtwin.learn.evaluation.candidates import NAIVE, Candidate, Mean, naive, named_map, tolles_lawson
 from magtwin.learn.evaluation.evaluate import evaluate
