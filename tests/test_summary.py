@@ -15,8 +15,8 @@ from magtwin.field.fit.fit import fit
 from magtwin.field.maps.difference import difference
 from magtwin.field.survey.readings import Readings
 from magtwin.files import shipped
-from magtwin.learn.data.dataset import build_dataset
 from magtwin.learn.data.alignment import Alignment
+from magtwin.learn.data.dataset import build_dataset
 from magtwin.learn.data.split import split
 from magtwin.learn.evaluation.candidates import Candidate, Mean, named_map
 from magtwin.learn.evaluation.evaluate import evaluate

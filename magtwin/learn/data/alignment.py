@@ -325,15 +325,19 @@ def _platform(run: Run, rows: NDArray[np.intp], yaw: Array, rates: Array) -> Arr
     speed = run["odom_v"][:, 0] if "odom_v" in run else np.interp(t, t[rows], ahead)
     turning = run["odom_w"][:, 2] if "odom_w" in run else np.interp(t, t[rows], rates[:, 2])
     currents = [np.ones(len(rows)), speed[rows], turning[rows]]
-    for values in (speed, turning):
-        early, late = (np.interp(t[rows] + way * SLOPE_S / 2, t, values) for way in (-1, 1))
-        currents.append((late - early) / SLOPE_S)
+    currents += [_slope(values, t, t[rows]) for values in (speed, turning)]
     currents += [run["lidar_on"][rows].astype(float)] if "lidar_on" in run else []
     currents += [run["battery_a"][rows]] if "battery_a" in run else []
     ways = (np.ones(len(rows)), np.cos(yaw), np.sin(yaw))
     return np.column_stack(
         [*(current * way for current in currents for way in ways), np.cos(2 * yaw), np.sin(2 * yaw)]
     )
+
+
+def _slope(values: Array, t: Array, at: Array) -> Array:
+    """Rate of a signal, over `SLOPE_S` around each instant."""
+    early, late = (np.interp(at + way * SLOPE_S / 2, t, values) for way in (-1, 1))
+    return (late - early) / SLOPE_S
 
 
 def _residual(platform: Array, values: Array) -> Array:

@@ -10,9 +10,9 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import Dataset, values_sha256
 from magtwin.learn.data.features import CARRIED, CIRCULAR, FEATURES, GRADIENT
-from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.evaluation.training_rows import alignment_on, training_rows
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer, Read
 from magtwin.learn.models.linear import fit_linear

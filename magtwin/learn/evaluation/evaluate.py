@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from magtwin.errors import InputError
-from magtwin.learn.data.dataset import KEPT
 from magtwin.learn.data.alignment import Alignment
+from magtwin.learn.data.dataset import KEPT
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.evaluation.candidates import Candidate
 from magtwin.learn.evaluation.evaluation import TOTALS, Case, Evaluation, Judged

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import Dataset
 from magtwin.learn.data.features import features
-from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.recording import thinned
 from magtwin.run.run import Run

@@ -8,9 +8,9 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.io.tables import read_parquet
 from magtwin.learn.data import dataset as rooms
+from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset, open_dataset
 from magtwin.learn.data.features import SETS, features
-from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.labels import labels
 from magtwin.learn.data.recording import Source
 from magtwin.learn.data.split import split

@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from magtwin.errors import InputError
-from magtwin.learn.data.dataset import build_dataset
 from magtwin.learn.data.alignment import Alignment
+from magtwin.learn.data.dataset import build_dataset
 from magtwin.learn.data.labels import labels
 from magtwin.learn.evaluation.budget import TERMS, Truth, budgets, steps, true_errors
 from magtwin.learn.evaluation.candidates import NAIVE, Candidate, Mean, naive, named_map, tolles_lawson
@@ -40,12 +40,12 @@ def drives(twin):
 
 @pytest.fixture(scope="module")
 def truth(twin):
-    def day_of(name, run):
+    def scene_of(name, run):
         scene = in_session_of(twin, run.metadata).scene
         check_scene(scene, run.metadata, name)
         return scene
 
-    return Truth(twin.scene, day_of)
+    return Truth(twin.scene, scene_of)
 
 
 @pytest.fixture(scope="module")
@@ -165,5 +165,5 @@ def test_a_run_of_no_known_session_is_refused(twin):
 def test_a_run_without_the_truth_is_refused(drives, truth, found, train):
     bare = Run({k: v for k, v in drives["d2"].items() if k != "b_truth_nt"}, drives["d2"].metadata)
     other = replace(found, judged=(replace(found.judged[0], name="d8", run=bare),))
-    with pytest.raises(InputError, match="d8: tells no b_truth_nt, and an error budget needs the truth"):
+    with pytest.raises(InputError, match="d8: has no b_truth_nt, and an error budget needs the truth"):
         budgets(other, [0], truth, train)

@@ -7,8 +7,8 @@ import pytest
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.learn.data.dataset import build_dataset
 from magtwin.learn.data.alignment import Alignment
+from magtwin.learn.data.dataset import build_dataset
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.split import split
 from magtwin.learn.evaluation.candidates import (
