@@ -13,7 +13,7 @@ app.command(net_app)
 
 @net_app.command(name="convert")
 def net_convert(pth: Path, *, out: Path, licence: str = "", force: Force = False) -> None:
-    """Convert a released checkpoint (.pth) to safetensors, executing nothing of what it holds.
+    """Convert a released checkpoint (.pth) to safetensors, without executing its content.
 
     Parameters
     ----------
@@ -22,9 +22,9 @@ def net_convert(pth: Path, *, out: Path, licence: str = "", force: Force = False
     out
         File to write, .safetensors.
     licence
-        Licence of the weights, an SPDX identifier such as MIT; an export says it.
+        Licence of the weights, an SPDX identifier such as MIT, kept in their metadata.
     force
-        Replace the file if it exists.
+        Replace an existing file.
     """
     from magtwin.learn.models.network import convert
 
@@ -39,9 +39,9 @@ def net_convert(pth: Path, *, out: Path, licence: str = "", force: Force = False
 def net_export(weights: Path, *, onnx: Path, force: Force = False, json: Json = False) -> None:
     """Export a network as ONNX, which runs in onnxruntime without torch and without magtwin.
 
-    Its input is float64 features in their units, as magtwin info lists them; its outputs are the disturbance
-    and the standard deviation of its error [nT]. Scalers are inside. What onnxruntime gives is held against
-    torch before the file is written. Needs the extra onnx.
+    The input is float64 features in their units, as magtwin info lists them; the outputs are the disturbance
+    and the standard deviation of its error [nT]. Scalers are inside. onnxruntime is compared with torch
+    before the file is written. Needs the extra onnx.
 
     Parameters
     ----------
@@ -50,9 +50,9 @@ def net_export(weights: Path, *, onnx: Path, force: Force = False, json: Json = 
     onnx
         File to write, .onnx.
     force
-        Replace the file if it exists.
+        Replace an existing file.
     json
-        Print what it holds as JSON.
+        Print its content as JSON.
     """
     from magtwin.learn.inference.onnx import export_onnx
 
