@@ -19,9 +19,9 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.gridded import import_survey
 from magtwin.files import existing, sha256
 from magtwin.io.formats import read_run
+from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
 from magtwin.learn.data.dataset import build_dataset as build
-from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.recording import Source, sources_of
 from magtwin.learn.evaluation.budget import Budget, TrueError, Truth, budgets, steps, true_errors
 from magtwin.learn.evaluation.candidates import (

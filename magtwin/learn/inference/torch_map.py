@@ -100,8 +100,8 @@ class TorchMap(torch.nn.Module):
                 across = sides(holes, wx, wy, wh, 1.0)
                 unknown = [~known | ((r != 0) & (s > EDGE)) for r, s in zip(rates, across, strict=True)]
         moved = (*p.unbind(-1), yaw)
-        found = zip(moved, (wx, wy, wh), rates, unknown, strict=True)
-        wx, wy, wh = (_Weight.apply(*of) for of in found)
+        weights = zip(moved, (wx, wy, wh), rates, unknown, strict=True)
+        wx, wy, wh = (_Weight.apply(*each) for each in weights)
         b = blend(self._corners(self.values, node), wx, wy, wh)
         return torch.where(known, b, torch.nan).to(p_xy.dtype)
 

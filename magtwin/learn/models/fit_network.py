@@ -212,7 +212,8 @@ def _continue_from(net: FieldNet, init: FieldNet, x: Array) -> None:
     if init.features != net.features or init.hidden != net.hidden:
         raise InputError(
             f"the network to continue from has inputs {', '.join(init.features)} and layers of "
-            f"{init.hidden}, this training {', '.join(net.features)} and {net.hidden}; give it the same features and layers"
+            f"{init.hidden}, this training {', '.join(net.features)} and {net.hidden}; give it the same "
+            "features and layers"
         )
     net.load_state_dict(init.state_dict())
     net.x_min.copy_(torch.from_numpy(np.minimum(net.x_min.numpy(), x.min(axis=0))))
