@@ -13,12 +13,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from magtwin.author.scene import read_scene
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.survey.gridded import import_survey
 from magtwin.files import existing, sha256
 from magtwin.io.formats import read_run
+from magtwin.io.surveys.maps import open_map
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
 from magtwin.learn.data.dataset import build_dataset as build
@@ -42,10 +41,10 @@ from magtwin.learn.models.predictor import Predictor
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
 from magtwin.twin import Twin, check_scene, in_session_of, open_twin
-from magtwin.usd.maps import load_map
+from magtwin.usd.scene import read_scene
 
 File = str | os.PathLike[str]
-By = Literal["fact", "file", "folder"]
+By = Literal["metadata", "file", "folder"]
 Progress = Callable[[int, int, str], Any]
 
 
@@ -55,8 +54,8 @@ def build_dataset(
     out: File,
     anomaly_map: AnomalyMap | File,
     alignment: Literal["fit"] | Alignment | None = None,
-    session_by: By = "fact",
-    path_by: By = "fact",
+    session_by: By = "metadata",
+    path_by: By = "metadata",
     rate_hz: float | None = None,
     force: bool = False,
     progress: Progress | None = None,
@@ -65,13 +64,13 @@ def build_dataset(
     """Label recordings on a map and write them as a data set: measured total field minus the map.
 
     Args:
-        runs: Runs by name, or files of any kind that `magtwin.load_run` reads. A folder of `magtwin runs`
+        runs: Runs by name, or files of any kind that `magtwin.load_run` reads. A folder of `magtwin sweep`
             stands for its runs.
         out: Folder to make.
         anomaly_map: The map, a map layer or stage, or a folder of survey CSVs.
         alignment: Lever arm and latency of the sensor; "fit" fits them to all recordings. None uses pose and
             reading as they are.
-        session_by: Where the session of a file comes from: "fact" (its metadata, else its name), "file" (its
+        session_by: Where the session of a file comes from: "metadata" (else its name), "file" (its
             name) or "folder".
         path_by: Where the driven path comes from, likewise.
         rate_hz: Highest rate of readings to keep [Hz]. Default: all.
@@ -90,7 +89,7 @@ def build_dataset(
     checksum = ""
     if not isinstance(anomaly_map, AnomalyMap):
         path = Path(anomaly_map)
-        anomaly_map, checksum = _open_map(path), sha256(path) if path.is_file() else ""
+        anomaly_map, checksum = open_map(path), sha256(path) if path.is_file() else ""
     return build(
         sources,
         anomaly_map,
@@ -104,7 +103,7 @@ def build_dataset(
 
 
 def sources_of_files(
-    files: Sequence[File] | File, *, session_by: By = "fact", path_by: By = "fact", **reading: Any
+    files: Sequence[File] | File, *, session_by: By = "metadata", path_by: By = "metadata", **reading: Any
 ) -> list[Source]:
     """Files of recordings as sources of a data set; the arguments are those of `build_dataset`.
 
@@ -126,7 +125,7 @@ def sources_of_files(
     long = [named(f"{path.resolve().parent.name}_{path.resolve().stem}") for path in paths]
     names = [name if short.count(name) == 1 else other for name, other in zip(short, long, strict=True)]
     by: dict[str, Callable[[Path, str], str]] = {
-        "fact": lambda path, name: "",
+        "metadata": lambda path, name: "",
         "file": lambda path, name: name,
         "folder": lambda path, name: path.resolve().parent.name or name,
     }
@@ -300,10 +299,6 @@ def _dataset(dataset: Dataset | File) -> Dataset:
     return dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
 
 
-def _open_map(path: Path) -> AnomalyMap:
-    return import_survey(path) if path.is_dir() else load_map(path)
-
-
 def _named_maps(maps: Sequence[AnomalyMap | File]) -> list[NamedMap]:
     files = iter(short_names([Path(each) for each in maps if not isinstance(each, AnomalyMap)]))
     named = []
@@ -313,7 +308,7 @@ def _named_maps(maps: Sequence[AnomalyMap | File]) -> list[NamedMap]:
         else:
             path = existing(each, "map")
             checksum = [sha256(path)] if path.is_file() else []
-            named.append(named_map(next(files), _open_map(path), *checksum))
+            named.append(named_map(next(files), open_map(path), *checksum))
     if not named:
         raise InputError(
             "no map: name those that the weights were trained on (--map), or the scene (--scene)"

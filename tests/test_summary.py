@@ -228,16 +228,11 @@ def test_a_run_is_drawn_with_units_on_every_axis(run, twin):
     figure = run.plot(twin.field)
     x, y = labels_of(figure)
     words = {text.replace("\n", " ") for text in (*x, *y) if text}
-    assert {"x [m]", "y [m]", "field [µT]", "disturbance [nT]", "speed [m/s]", "battery [V]"} <= words
+    assert {"x [m]", "y [m]", "field [µT]", "disturbance, error [nT]", "speed [m/s]", "battery [V]"} <= words
     assert {"total field along the path [µT]", "map, mean over headings [µT]"} <= words
     assert "time [s]; shaded while the LiDAR is on" in words
     assert figure._repr_png_().startswith(b"\x89PNG")
     pickle.dumps(figure)
-
-
-def test_the_same_run_gives_the_same_picture(run):
-    few = run.take(slice(0, 500))
-    assert few.plot()._repr_png_() == few.plot()._repr_png_()
 
 
 def test_a_run_is_drawn_by_the_columns_that_it_has(run):
@@ -252,13 +247,9 @@ def test_a_run_is_drawn_by_the_columns_that_it_has(run):
         Run({"t": np.arange(3.0)}).plot()
 
 
-@pytest.mark.parametrize(
-    ("quantity", "label"), [("field", "total field [µT]"), ("variance", "standard deviation [nT]")]
-)
-def test_a_map_is_drawn_a_panel_a_heading(twin, quantity, label):
-    figure = twin.field.plot(quantity)
-    x, y = labels_of(figure)
-    assert (x.count("x [m]"), y.count("y [m]"), label in y) == (2, 2, True)
+def test_a_map_is_drawn_with_one_panel_per_heading(twin):
+    x, y = labels_of(figure := twin.field.plot("variance"))
+    assert (x.count("x [m]"), y.count("y [m]"), "standard deviation [nT]" in y) == (2, 2, True)
     assert [ax.get_title() for ax in figure.axes[:4]] == [f"heading {h}°" for h in (0, 90, 180, 270)]
     assert len(twin.field.plot(headings=[0.5]).axes) == 2
 

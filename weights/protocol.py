@@ -23,21 +23,21 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from magtwin.author.robot import read_robot
 from magtwin.author.scene import author_scene
 from magtwin.cli import main as magtwin
 from magtwin.field.fit.fit import fit, raster
-from magtwin.field.survey.gridded import read_survey
+from magtwin.field.survey.folder import read_survey
 from magtwin.files import from_table, read_toml, shipped
 from magtwin.io.surveys.readings import read_readings
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.spec.scene import Scene
 from magtwin.usd.maps import save_map
+from magtwin.usd.robot import load_robot
 
 CONSOLE = Console()
 
-SURVEY = ("--heading-error", "7", "--position-error", "0.015", "--readings", "135")
+SURVEY = ("--heading-error-deg", "7", "--position-error-m", "0.015", "--readings", "135")
 """Errors of the robot's pose at a node: headings in the published survey are 5 to 11 deg off, and the
 residual of its four headings at a node, 79 nT, equals 1.5 cm of the lab's gradient."""
 
@@ -74,7 +74,7 @@ def aprilab(surveys: Path, out: Path) -> Path:
     Its field is that of the dipoles and the uniform field of a harmonic fit, and of `SCRAPS` cuboids of iron,
     up to 8 cm long and 5 to 15 cm deep, which the survey cannot resolve.
     """
-    robot = read_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
+    robot = load_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
     height = robot.base_height_m + robot.p_base_magnetometer[2]
     about = read_toml(shipped("maps", "lab", "map.toml"))
     where = from_table(EarthFieldSpec, about["earth"], shipped("maps", "lab", "map.toml"), "earth")
@@ -149,12 +149,12 @@ def protocol(
         harmonic = out / "harmonic.usdc"
         do("map", "fit", survey, "--method", "harmonic", "--out", harmonic)
     do(
-        *("runs", stage, "--out", out / "train", "--count", RUNS // shorter, "--sessions", SESSIONS),
-        *("--duration", SECONDS, "--seed", 1000, *by_physics, "--path", *TRAINING),
+        *("sweep", stage, "--out", out / "train", "--count", RUNS // shorter, "--sessions", SESSIONS),
+        *("--duration-s", SECONDS, "--seed", 1000, *by_physics, "--path", *TRAINING),
     )
     do(
         *(
-            "runs",
+            "sweep",
             stage,
             "--out",
             out / "test",
@@ -165,9 +165,19 @@ def protocol(
         ),
         *("--seed", 2000, *by_physics, "--path", *"ABCDE"),
     )
-    by_session = ("--session-by", "fact")
+    by_session = ("--session-by", "metadata")
     do("dataset", "build", out / "train", "--map", trilinear, "--out", out / "paper_set", *by_session)
-    do("dataset", "build", out / "train", "--map", harmonic, "--align", "fit", "--out", out / "hybrid_set")
+    do(
+        "dataset",
+        "build",
+        out / "train",
+        "--map",
+        harmonic,
+        "--alignment",
+        "fit",
+        "--out",
+        out / "hybrid_set",
+    )
     weights = [out / f"{name}.safetensors" for name in SHIPPED]
     leak = out / "leak.safetensors"
     licence = ("--licence", "Apache-2.0")

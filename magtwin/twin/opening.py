@@ -50,10 +50,10 @@ def open_twin(
     options: Any = {"network": network, "magnetometer": magnetometer, "model_error": model_error}
     if isinstance(scene, Scene):
         return _open_in_memory(scene, **options)
-    from magtwin.author.scene import read_scene
     from magtwin.usd.layers import stage_sha256
     from magtwin.usd.maps import load_map
     from magtwin.usd.obstacles import read_obstacles
+    from magtwin.usd.scene import read_scene
 
     file = FilePath(scene)
     read = read_scene(file, check_network=network is None and magnetometer in (None, "neural"))

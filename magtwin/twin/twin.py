@@ -11,7 +11,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.placement import Room
+from magtwin.path.room import Room
 from magtwin.spec.base import spelled
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import RobotSpec

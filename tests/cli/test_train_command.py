@@ -137,7 +137,19 @@ def test_the_learning_curve_is_a_recording_on_a_timeline_of_epochs(data, tmp_pat
 
 def test_a_simulation_runs_the_trained_network(trained, lab_scene, tmp_path, capsys):
     out = tmp_path / "a.parquet"
-    main(["run", str(lab_scene), "--net", str(trained), "--duration", "1", "--parquet", str(out), "--json"])
+    main(
+        [
+            "run",
+            str(lab_scene),
+            "--network",
+            str(trained),
+            "--duration-s",
+            "1",
+            "--out",
+            str(out),
+            "--json",
+        ]
+    )
     run = read_run(out)
     assert run.metadata["network_sha256"] == sha256(trained)
     assert run["b_sd_nt"][0] == pytest.approx(load_net(trained).residual_sd_nt)

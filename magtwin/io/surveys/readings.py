@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
-from magtwin.field.survey.gridded import read_grid
+from magtwin.field.survey.folder import read_grid
 from magtwin.field.survey.readings import FARTHEST_M, SHAPES, TAKEN, Readings
 from magtwin.field.units import check_unit, nt_per, unit_by_size
 from magtwin.files import existing, output, sha256
@@ -65,7 +65,7 @@ def read_readings(
 ) -> Readings:
     """The readings of a survey, whatever form it is in.
 
-    A source is a folder of one CSV a heading (`magtwin.field.survey.gridded`); a table of readings, CSV or
+    A source is a folder of one CSV a heading (`magtwin.field.survey.folder`); a table of readings, CSV or
     Parquet; several files whose rows belong together, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`;
     those after the first are looked for beside it); a Run's Parquet; Readings' own Parquet; or a
     rosbag2, its folder or its storage file. Several sources are several runs of one survey; so are the

@@ -390,7 +390,7 @@ def test_what_cannot_be_fitted_is_refused(change, says):
 def test_compensate_says_which_vectors_it_took(calibration, tmp_path, capsys):
     write_parquet(calibration("figure8", 1), tmp_path / "run.parquet")
     told = {}
-    for name, options in (("measured", []), ("exact", ["--exact"])):
+    for name, options in (("measured", []), ("exact", ["--truth"])):
         model = str(tmp_path / f"{name}.json")
         main(
             [

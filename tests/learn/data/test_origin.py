@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from magtwin import simulate
-from magtwin.author.robot import read_robot
 from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
@@ -20,8 +19,9 @@ from magtwin.spec.sensors import MocapSpec
 from magtwin.twin import in_session, open_twin, sweep
 from magtwin.twin.opening import _platform_sha256
 from magtwin.usd.maps import save_map
+from magtwin.usd.robot import load_robot
 
-ROBOT = read_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
+ROBOT = load_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
 SLOPE = 4000.0
 
 
@@ -198,7 +198,7 @@ def test_the_shipped_scene_s_network_belongs_to_its_map_and_robot(lab_scene):
 
 def test_a_command_says_each_mismatch_once_on_stderr_and_info_shows_it(lab_scene, strange, tmp_path, capsys):
     out = tmp_path / "run"
-    main(["run", str(lab_scene), "--net", str(strange), "--duration", "1", "--out", str(out)])
+    main(["run", str(lab_scene), "--network", str(strange), "--duration-s", "1", "--out", str(out)])
     shown = capsys.readouterr()
     lines = [line for line in shown.err.splitlines() if "warning" in line]
     assert len(lines) == 2

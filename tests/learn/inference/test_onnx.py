@@ -99,12 +99,12 @@ def test_info_tells_what_a_file_holds_and_runs_nothing_of_it(exported, capsys):
 
 def test_the_command_says_what_it_wrote_and_replaces_nothing_unasked(weights, tmp_path, capsys):
     out = tmp_path / "n.onnx"
-    main(["net", "export", str(weights), "--onnx", str(out)])
+    main(["network", "export", str(weights), "--out", str(out)])
     assert f"Wrote {out}" in capsys.readouterr().out
     with pytest.raises(InputError, match="exists already"):
         export_onnx(weights, out)
     with pytest.raises(SystemExit):
-        main(["net", "export", str(weights), "--onnx", str(tmp_path / "n.txt")])
+        main(["network", "export", str(weights), "--out", str(tmp_path / "n.txt")])
     assert "an ONNX file ends in .onnx" in capsys.readouterr().err
 
 

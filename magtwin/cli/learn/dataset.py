@@ -1,0 +1,158 @@
+"""`magtwin dataset`: recordings with labels on a map, to train a magnetometer on."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import App, Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.options import Force, Remap, Unit
+from magtwin.cli.terminal import Done, progress, step
+from magtwin.errors import InputError
+
+dataset_app = App(name="dataset", help="Data sets: recordings with labels on a map, to train on.")
+app.command(dataset_app)
+
+By = Literal["metadata", "file", "folder"]
+
+
+@dataset_app.command
+def build(
+    run: Annotated[list[Path], Parameter(negative="")],
+    *,
+    map: Path,  # noqa: A002
+    out: Path,
+    alignment: Literal["fit", "none"] = "none",
+    lever_arm_m: tuple[float, float] | None = None,
+    latency_s: float | None = None,
+    session_by: By = "metadata",
+    path_by: By = "metadata",
+    rate_hz: float | None = None,
+    remap: Remap = None,
+    unit: Unit = None,
+    column: Annotated[list[str] | None, Parameter(negative="")] = None,
+    force: Force = False,
+) -> Done:
+    """Label recordings on a map and write them as a data set: measured total field minus the map.
+
+    Parameters
+    ----------
+    run
+        Recordings of any kind: Parquet, CSV, npz, Rerun, rosbag2, USD, the released node's own .json; a
+        folder that `magtwin sweep` made stands for all of its runs.
+    map
+        Map that the labels are made on: a layer or stage, or a folder of survey CSVs.
+    out
+        Folder to make.
+    alignment
+        fit: fit the sensor's lever arm and latency to all recordings; none: use pose and reading as they are.
+    lever_arm_m
+        Place of the sensor, forward and left of the map's reference [m], if known.
+    latency_s
+        Age of a reading at its stamp [s], if known.
+    session_by
+        Source of the session: the recording's metadata "session" (else its name), its file, or its folder.
+    path_by
+        Source of the driven path: the recording's metadata "path" (else its name), its file, or its folder.
+    rate_hz
+        Highest rate of readings to keep [Hz]. Default: all.
+    column
+        Name of a column in a CSV or Parquet of another program, as NAME=THEIRS, of a vector by its parts:
+        b_measured_nt=field, p_world_base_x=east. Repeatable. A p_world_base without z is on the floor.
+    """
+    from magtwin.cli.runs.file import pairs
+    from magtwin.files import check_free
+    from magtwin.learn.data.alignment import Alignment
+    from magtwin.learning import build_dataset
+
+    check_free(out, force=force)
+    given = lever_arm_m is not None or latency_s is not None
+    if given and alignment == "fit":
+        raise InputError("--alignment fit finds both; drop it, or --lever-arm-m and --latency-s")
+    known: Any = Alignment(lever_arm_m or (0.0, 0.0), latency_s or 0.0) if given else None
+    reading: dict[str, Any] = {"topics": pairs("remap", remap) if remap else None, "unit": unit}
+    reading["columns"] = _columns(column) if column else None
+    with progress("Labelling", "recordings") as advance:
+        made = build_dataset(
+            run,
+            out=out,
+            anomaly_map=map,
+            alignment="fit" if alignment == "fit" else known,
+            session_by=session_by,
+            path_by=path_by,
+            rate_hz=rate_hz,
+            force=force,
+            progress=advance,
+            **{name: value for name, value in reading.items() if value is not None},
+        )
+    return Done(made.report(), out)
+
+
+@dataset_app.command
+def info(dataset: Path) -> Done:
+    """Show what a data set holds, and check each shard against its checksum.
+
+    Parameters
+    ----------
+    dataset
+        Folder that `magtwin dataset build` made.
+    """
+    from dataclasses import replace
+
+    from magtwin.learn.data.dataset import open_dataset
+
+    step("Checking the shards")
+    opened = open_dataset(dataset)
+    opened.check()
+    report = opened.report()
+    recordings = {
+        each.name: f"session {each.session}, path {each.path}, {each.rows:,} readings, {each.labelled:,} "
+        f"labels, {each.label_mean_nt:.0f} ± {each.label_sd_nt:.0f} nT"
+        for each in opened.recordings
+    }
+    return Done(replace(report, metadata={**report.metadata, "recordings": recordings}))
+
+
+@dataset_app.command
+def correlate(
+    dataset: Path,
+    *,
+    features: str = "full",
+    out: Path | None = None,
+    force: Force = False,
+) -> Done:
+    """Correlate each input with the disturbance: Spearman's rank correlation, as in the paper's Figure 2.
+
+    Parameters
+    ----------
+    dataset
+        Folder that `magtwin dataset build` made.
+    features
+        Set of inputs, or names separated by commas.
+    out
+        Picture to write, .png or .svg.
+    """
+    from magtwin.files import check_free
+    from magtwin.learn.data.correlation import correlations_of
+
+    if out is not None:
+        check_free(out, force=force)
+    step("Ranking the inputs")
+    result = correlations_of(dataset, features)
+    if out is not None:
+        from magtwin.figures.training import plot_correlations
+
+        plot_correlations(result, out, title=f"{dataset}", force=force)
+    return Done(result.report(f"Correlation with the disturbance in {dataset}"), out or ())
+
+
+def _columns(given: Sequence[str]) -> dict[str, str]:
+    """Names of a table's columns by those of a Run."""
+    columns: dict[str, str] = {}
+    for word in given:
+        name, _, theirs = word.partition("=")
+        if not (name and theirs) or name in columns or theirs in columns.values():
+            raise InputError(f"--column takes NAME=THEIRS, each once, such as yaw=heading, got {word!r}")
+        columns[name] = theirs
+    return columns
