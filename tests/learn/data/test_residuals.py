@@ -17,7 +17,8 @@ def drawn(sessions, recordings, *, seconds=60.0, offset=OFFSET, within=WITHIN, t
     for k in range(sessions):
         constant = offset * rng.standard_normal()
         for _ in range(recordings):
-            process = gauss_markov(rng.standard_normal(len(t)), time_s, RATE_HZ)
+            white = rng.standard_normal(len(t))
+            process = np.append(*gauss_markov(white[1:], white[0], time_s, RATE_HZ))
             held.append(HeldOut(str(k), t, constant + within * process))
     return held
 
