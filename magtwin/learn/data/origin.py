@@ -155,6 +155,28 @@ def displacement_nt(field: AnomalyMap, forward_m: float, left_m: float, late_s: 
     return float(np.sqrt(np.mean(change[known] ** 2))) if known.any() else math.nan
 
 
+def same_map(metadata: Metadata, field: AnomalyMap, name: str = "") -> bool:
+    """Whether a map has the values that a network keeps of its own map, within `SAME_NT`."""
+    rms = _map_difference_nt(metadata, field, name)
+    return rms is not None and rms < SAME_NT
+
+
+def _map_difference_nt(metadata: Metadata, field: AnomalyMap, name: str) -> float | None:
+    """RMS difference of a map from the values that a network keeps [nT]; None if unknown, inf if too few
+    overlap.
+    """
+    known, extent = (
+        _numbers(metadata, name, "map_samples_nt", SAMPLES),
+        _numbers(metadata, name, "map_extent_m", 4),
+    )
+    if known is None or extent is None:
+        return None
+    low_x, high_x, low_y, high_y = extent
+    difference = field.lookup(*_poses((low_x, high_x, low_y, high_y))) - np.array(known)
+    both = np.isfinite(difference)
+    return math.inf if both.sum() < LEAST_SAMPLES else float(np.sqrt(np.mean(difference[both] ** 2)))
+
+
 def _map_mismatch(metadata: Metadata, name: str, field: AnomalyMap, map_sha256: str) -> Mismatch | None:
     if "map_sha256" not in metadata:
         return Mismatch(
@@ -167,21 +189,13 @@ def _map_mismatch(metadata: Metadata, name: str, field: AnomalyMap, map_sha256: 
     if "map_method" in metadata:
         learned += f" ({metadata['map_method']})"
     here = f"{field.name!r}" + (f" ({field.method})" if field.method else "")
-    effect, known = "the expected effect is unknown", _numbers(metadata, name, "map_samples_nt", SAMPLES)
-    extent = _numbers(metadata, name, "map_extent_m", 4)
-    if known is not None and extent is not None:
-        low_x, high_x, low_y, high_y = extent
-        difference = field.lookup(*_poses((low_x, high_x, low_y, high_y))) - np.array(known)
-        both = np.isfinite(difference)
-        if both.sum() < LEAST_SAMPLES:
-            effect = "the two cover different floors, and the field is meaningless"
-        else:
-            rms = float(np.sqrt(np.mean(difference[both] ** 2)))
-            if rms < SAME_NT:
-                return None
-            effect = (
-                f"the two differ by {rms:.0f} nT RMS over the floor, so its predictions may not fit this map"
-            )
+    effect, rms = "the expected effect is unknown", _map_difference_nt(metadata, field, name)
+    if rms is not None and rms < SAME_NT:
+        return None
+    if rms == math.inf:
+        effect = "the two cover different floors, and the field is meaningless"
+    elif rms is not None:
+        effect = f"the two differ by {rms:.0f} nT RMS over the floor, so its predictions may not fit this map"
     return Mismatch(
         f"{name} learned on the map {learned}, and the scene's map is {here}: {effect}; use that map, or "
         "train on this one"

@@ -13,6 +13,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import Dataset, values_sha256
 from magtwin.learn.data.features import CARRIED, CIRCULAR, FEATURES, GRADIENT
+from magtwin.learn.data.origin import same_map
 from magtwin.learn.evaluation.training_rows import alignment_on, training_rows
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer, Read
 from magtwin.learn.models.linear import fit_linear
@@ -124,6 +125,7 @@ def candidate_of(
     metadata = dict(magnetometer.net.metadata)
     wanted = str(metadata.get("map_sha256", ""))
     fits = [known for known in maps if wanted in known.checksums]
+    fits = fits or [known for known in maps if wanted and same_map(metadata, known.field)]
     if wanted and not fits and not any_map:
         held = "; ".join(f"{known.name} has {', '.join(sorted(known.checksums))}" for known in maps)
         raise InputError(
@@ -179,7 +181,10 @@ def naive(
         return Candidate(NAIVE, model, named, alignment, {"fitted to": dataset.folder.name})
     for candidate in weights:
         mean = candidate.metadata.get("label_mean_nt")
-        if candidate.metadata.get("map_sha256") in named.checksums and isinstance(mean, int | float):
+        fits = candidate.metadata.get("map_sha256") in named.checksums or same_map(
+            candidate.metadata, named.field
+        )
+        if fits and isinstance(mean, int | float):
             sd = candidate.metadata.get("label_sd_nt", math.nan)
             about = {"mean label of": candidate.name}
             return Candidate(NAIVE, Mean(float(mean), float(sd)), named, candidate.alignment, about)
