@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_cli import refused
 from test_gp import survey
-from test_stuck import gridded
 from test_rosbag import at_middle, drive, write_bag
+from test_stuck import gridded
 
 from magtwin.author.earth import earth_of
 from magtwin.cli import main

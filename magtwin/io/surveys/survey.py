@@ -4,6 +4,7 @@ import warnings
 from typing import Any
 
 from magtwin.field.survey.readings import Readings
+from magtwin.field.units import Unit
 from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.maps import Source
 from magtwin.io.surveys.maps import read_survey as read_with_report
@@ -11,7 +12,7 @@ from magtwin.io.surveys.maps import read_survey as read_with_report
 
 def read_survey(
     *sources: Source,
-    unit: str | None = None,
+    unit: Unit | None = None,
     scale: float | None = None,
     columns: Columns | None = None,
     **options: Any,
