@@ -1,7 +1,7 @@
 """Action Graphs for Isaac Sim: each robot's ROS 2 topics.
 
 The graph of a robot publishes clock, odometry, IMU, pose, battery, joints and scan, and drives the robot by
-commands, on the topics and in the frames of `magtwin.io.bags.messages`. Isaac Sim has no magnetometer; these
+commands, on the topics and in the frames of `magtwin.io.bags.topics`. Isaac Sim has no magnetometer; these
 topics are the inputs of the network. The graph was not run in Isaac Sim, but is checked against the
 definitions of its nodes, see `magtwin.export.ogn`.
 """
@@ -108,7 +108,7 @@ def _author(graph: Graph, robot: RobotSpec, parts: _Parts, namespace: str, *, cl
 
 
 def _qos(graph: Graph) -> None:
-    """QoS as in `magtwin.io.bags.messages`."""
+    """QoS as in `magtwin.io.bags.topics`."""
     kind = f"{BRIDGE}ROS2QoSProfile"
     reliable, best = {"reliability": "reliable"}, {"reliability": "bestEffort"}
     graph.node(DEFAULT_QOS, kind, createProfile="Default for publishers/subscribers", depth=10, **reliable)

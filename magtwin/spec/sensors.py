@@ -257,7 +257,7 @@ class LidarSpec(MountSpec):
 
 @dataclass(frozen=True, kw_only=True)
 class BatterySpec(Spec):
-    """A battery and its loads, see `magtwin.sim.sensors.battery.discharge`."""
+    """A battery and its loads; see `magtwin.sim.sensors.battery.Battery`."""
 
     model: Literal["power", "linear"] = "power"
     """"power": electronics, LiDAR and motors discharge it, and its voltage sags; "linear": the voltage falls

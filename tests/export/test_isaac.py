@@ -13,7 +13,9 @@ from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
 from magtwin.export.isaac import GRAPHS, author_graph
 from magtwin.export.ogn import Graph, faults, fits, message_fields, node_types
-from magtwin.io.bags.messages import SCAN, TOPICS, TYPES, sender_of
+from magtwin.io.bags.sender import sender_of
+from magtwin.io.bags.topics import SCAN, TOPICS
+from magtwin.io.bags.types import layout
 from magtwin.ros.magnetometer import INPUTS
 from magtwin.spec.robot import PlacedRobot
 from magtwin.usd.layers import open_stage
@@ -153,18 +155,17 @@ def test_a_message_has_every_field_that_its_publisher_makes_so_that_isaac_keeps_
 
 @pytest.mark.parametrize("message", ["geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/BatteryState"])
 def test_fields_of_messages_are_the_leaves_that_magtwin_itself_writes(message):
-    basic = {"text": "token", "f8": "double", "f4": "float", "u1": "uint", "f4[]": "float[]"}
-    parts = {"f8[3]": "xyz", "f8[4]": "xyzw"}
+    basic = {"text": "token", "f8": "double", "f4": "float", "u1": "uint"}
+    parts = {3: "xyz", 4: "xyzw"}
     want = {}
-    for leaf in TYPES[message].split(", "):
-        kind, name = leaf.split()
-        name = name.replace(".", ":")
-        if kind == "time":
+    for leaf in layout(message):
+        name = leaf.name.replace(".", ":")
+        if leaf.kind == "time":
             want |= {f"{name}:sec": "int", f"{name}:nanosec": "uint"}
-        elif kind in parts:
-            want |= {f"{name}:{part}": "double" for part in parts[kind]}
+        elif leaf.count in parts:
+            want |= {f"{name}:{part}": "double" for part in parts[leaf.count]}
         else:
-            want[name] = "bool" if name == "present" else basic[kind]
+            want[name] = "bool" if name == "present" else basic[leaf.kind] + ("" if leaf.count else "[]")
     assert message_fields(message) == want
 
 

@@ -240,7 +240,7 @@ def test_a_date_of_a_map_of_one_day_is_that_day_or_refused(tmp_path):
     with pytest.raises(InputError, match="is of 2026-01-02 only"):
         load_map(tmp_path / "m.usdc", "2026-01-03")
     save_map(a_map(created=""), tmp_path / "m.usdc", force=True)
-    with pytest.raises(InputError, match=r"map 'small' does not say its day; .*--created"):
+    with pytest.raises(InputError, match=r"map 'small' has no day; .*--created"):
         load_map(tmp_path / "m.usdc", "2026-01-02")
 
 
@@ -254,7 +254,7 @@ def test_a_date_that_is_no_day_is_refused(tmp_path, date):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"created": ""}, "map 'small' does not say its day"),
+        ({"created": ""}, "map 'small' has no day"),
         ({"created": "2026-01-02"}, "are both of 2026-01-02"),
         ({"origin_m": (0.0, 0.0)}, r"origin_m is \(-3.0, -1.75\) on 2026-01-02 and \(0.0, 0.0\)"),
         ({"height_m": 0.5}, "height_m is None on 2026-01-02 and 0.5 on"),
@@ -294,7 +294,7 @@ def test_an_epoch_that_was_tampered_with_is_refused_when_it_is_asked_for(tmp_pat
             "its epoch at time 9506 must be of the day that many days after 2000-01-01, got .*11;",
         ),
         ("soon", "created of AnomalyMap must be a day YYYY-MM-DD, got 'soon'"),
-        ("", "at time 9506, map 'survey 1' does not say its day"),
+        ("", "at time 9506, map 'survey 1' has no day"),
     ],
 )
 def test_an_epoch_whose_day_is_not_that_of_its_time_is_refused_with_its_prim(tmp_path, day, said):
