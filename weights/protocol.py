@@ -37,7 +37,7 @@ from magtwin.usd.robot import load_robot
 
 CONSOLE = Console()
 
-SURVEY = ("--heading-error", "7", "--position-error", "0.015", "--readings", "135")
+SURVEY = ("--heading-error-deg", "7", "--position-error-m", "0.015", "--readings", "135")
 """How the robot stands about a node: the published survey's recorded headings are 5 to 11 deg off its
 nominal ones, and what its four headings leave at a node, 79 nT, is 1.5 cm of the lab's gradient."""
 
