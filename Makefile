@@ -74,8 +74,8 @@ pictures: $(VENV)/.installed  ## Draw the README's pictures again
 	$(BIN)/magtwin picture robots/turtlebot4/turtlebot4.usda --size 1100x900 --out docs/robot.png --force
 	$(BIN)/magtwin map plot maps/lab/lab.usdc --out docs/map.png --force
 	$(BIN)/magtwin run scenes/lab/lab.usda --seed 1 --out build/pictures --force
-	$(BIN)/magtwin picture build/pictures/run.rrd --time 35 --size 1600x900 --out docs/recording.png --force
-	$(BIN)/magtwin film build/pictures/run.parquet --camera 0.4,-1.6,6.1:0.4,-0.2,0 --size 560x350 --speed 10 --fps 8 --out docs/run.gif --force
+	$(BIN)/magtwin picture build/pictures/run.rrd --time-s 35 --size 1600x900 --out docs/recording.png --force
+	$(BIN)/magtwin film build/pictures/run.parquet --camera 0.4,-1.6,6.1:0.4,-0.2,0 --size 560x350 --pace 10 --fps 8 --out docs/run.gif --force
 
 clean:  ## Remove the environment and what was built
 	rm -rf $(VENV) build demo

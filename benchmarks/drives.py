@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from magtwin.field.fit.fit import fit
-from magtwin.field.survey.stuck import mask_latched
+from magtwin.field.survey.stuck import mask_stuck
 from magtwin.io.surveys.readings import read_readings
 
 SCENE = Path(__file__).resolve().parents[1] / "scenes" / "lab" / "lab.usda"
@@ -33,8 +33,8 @@ def drive(folder, minutes, seed):
     """A drive's Parquet file."""
     file = folder / f"drive_{seed}.parquet"
     command = [sys.executable, "-m", "magtwin", "run", str(SCENE), "--path", "random", "--rate-hz", "17"]
-    command += ["--duration", str(60 * minutes), "--seed", str(seed), "--magnetometer", "physical"]
-    subprocess.run([*command, "--parquet", str(file)], check=True, capture_output=True)
+    command += ["--duration-s", str(60 * minutes), "--seed", str(seed), "--magnetometer", "physical"]
+    subprocess.run([*command, "--out", str(file)], check=True, capture_output=True)
     return file
 
 
@@ -101,7 +101,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(options.drives):
             file = drive(Path(folder), options.minutes, seed)
-            readings, _ = mask_latched(read_readings(file))
+            readings, _ = mask_stuck(read_readings(file))
             first = None
             for method in options.method:
                 seconds, memory = whole(file, method)

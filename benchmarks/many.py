@@ -28,9 +28,9 @@ from magtwin.author.scene import author_scene
 from magtwin.files import shipped
 from magtwin.learn.models.network import FieldNet
 from magtwin.path import path_named
-from magtwin.sim.motion.course import run_courses, warm_up
+from magtwin.sim.motion.closed_loop import run_loops, warm_up
 from magtwin.sim.motion.drive import draw_wheel_errors
-from magtwin.sim.motion.follow import course_along
+from magtwin.sim.motion.follow import loop_along
 from magtwin.sim.session import draw_session
 from magtwin.twin import Twin, open_twin, scene_from_toml, sweep
 
@@ -96,7 +96,7 @@ def beside_the_network(twin: Twin, robots: int, repetitions: int, exact: bool) -
 
 def loop_alone(twin: Twin, most: int) -> None:
     drive = twin.scene.robot.drive
-    course = course_along(path_named("figure8"), drive, speed=0.2, duration_s=DURATION_S)
+    course = loop_along(path_named("figure8"), drive, speed=0.2, duration_s=DURATION_S)
     rng = np.random.default_rng(0)
     print(f"the closed loop alone, {course.steps:,} steps a robot:")
     count = 10
@@ -105,7 +105,7 @@ def loop_alone(twin: Twin, most: int) -> None:
 
         def work(courses: list = courses) -> None:
             for first in range(0, len(courses), 500):  # what they did is not kept
-                run_courses(courses[first : first + 500])
+                run_loops(courses[first : first + 500])
 
         took, cpu = min(seconds(work) for _ in range(3 if count < 10_000 else 1))
         print(

@@ -20,22 +20,23 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from magtwin.field.fit.fit import METHODS, fit
-from magtwin.field.survey.gridded import read_grid
+from magtwin.field.fit.fit import fit
+from magtwin.field.fit.methods import METHODS
+from magtwin.field.survey.folder import read_grid
 from magtwin.field.survey.readings import Readings
-from magtwin.field.survey.stuck import mask_latched
+from magtwin.field.survey.stuck import mask_stuck
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 EARTH_NT = (-2_700.0, 24_000.0, -38_400.0)  # IGRF-14, Gainesville, Florida
 NINETY = 1.6448536269514722
-BRIDGED = {"trilinear": {"fill": True}, "cubic": {"fill": True}}  # as `magtwin map check` does
+BRIDGED = {"trilinear": {"fill": True}, "cubic": {"fill": True}}  # as `magtwin map validate` does
 NEAR_M = 0.1
 AHEAD = 15  # readings, 0.3 s, over which a direction of travel is taken
 
 
 def aprilab(folder):
     """Readings to fit and to predict, a pair a turn."""
-    readings, _ = mask_latched(read_grid(folder / "aprilab" / "maps"))
+    readings, _ = mask_stuck(read_grid(folder / "aprilab" / "maps"))
     parity = (readings.node[:, 1] + readings.node[:, 2]) % 2
     return [
         tuple(readings.take(readings.good & (parity == side)) for side in (kept, 1 - kept)) for kept in (0, 1)

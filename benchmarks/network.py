@@ -12,7 +12,7 @@ most. Without --net a network of the paper's shape whose units are as often 0 as
 
 One: pose and signals to the total field. The release's way, written anew: scipy's RegularGridInterpolator
 over four headings and the first once more, a list of twenty numbers through StandardScaler.transform, the
-network in eager torch, StandardScaler.inverse_transform. magtwin's is `magtwin.learn.reading.Reader`. They
+network in eager torch, StandardScaler.inverse_transform. magtwin's is `magtwin.learn.inference.reader.Reader`. They
 take turns in rounds of readings, as a robot's node has the processor's caches for itself, and then reading by
 reading, where each finds the caches full of the other's weights.
 """
@@ -31,10 +31,10 @@ from sklearn.preprocessing import StandardScaler
 
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.features import FULL
+from magtwin.learn.inference.reader import Reader
 from magtwin.learn.models.network import FieldNet, load_net
 from magtwin.learn.models.perceptron import in_threads
 from magtwin.learn.models.sparse import Skipping, warm_up
-from magtwin.learn.reading import Reader
 
 WANTED_MANY, GOAL_MANY = 0.90, 1.45
 WANTED_ONE, GOAL_ONE = 25, 50

@@ -54,7 +54,7 @@ def main() -> None:
         [*magtwin, "magnetometer", scene, "use_sim_time:=true"], stderr=subprocess.DEVNULL
     )
     sim = subprocess.Popen(
-        [*magtwin, "sim", scene, "--no-magnetometer", "--lidar", "on"], stderr=subprocess.DEVNULL
+        [*magtwin, "sim", scene, "--magnetometer", "none", "--lidar", "on"], stderr=subprocess.DEVNULL
     )
     bus = open_bus("benchmark", backend="cyclonedds")
     heard: dict[str, list[Message]] = defaultdict(list)

@@ -53,15 +53,15 @@ def magtwins() -> dict[str, Callable[[], int]]:
     import numpy as np
 
     from magtwin.path import path_named
-    from magtwin.sim.motion import course, loop
-    from magtwin.sim.motion.follow import course_along
+    from magtwin.sim.motion import closed_loop, loop
+    from magtwin.sim.motion.follow import loop_along
     from magtwin.spec.drive import DriveSpec
 
-    course.warm_up()
+    closed_loop.warm_up()
     room = walls()
 
-    def planned() -> course.Course:
-        return course_along(
+    def planned() -> closed_loop.ClosedLoop:
+        return loop_along(
             path_named("figure8"),
             DriveSpec(),
             speed=SPEED,
@@ -71,13 +71,13 @@ def magtwins() -> dict[str, Callable[[], int]]:
         )
 
     once = planned()
-    guide, figures, fence = once.guide, np.array([once.figures()]), course.fence_of(room)
+    guide, figures, fence = once.guide, np.array([once.figures()]), closed_loop.fence_of(room)
     record, made = np.zeros((1, loop.RECORD, COUNT)), np.zeros(1, np.int64)
     laws, begin, end = np.array([guide.law]), np.array([0]), np.array([guide.table.shape[1]])
 
     def steps() -> int:
         state = np.array([once.state()])
-        course.compiled_robots()(
+        closed_loop.LOOPS.open().robots(
             laws, figures, guide.table, begin, end, *fence, state, 0, COUNT, record, made
         )
         if made[0] != COUNT or record[0, -1].any():
@@ -85,7 +85,7 @@ def magtwins() -> dict[str, Callable[[], int]]:
         return COUNT
 
     def whole() -> int:
-        return len(course.run_courses([planned()], room)[0].v)
+        return len(closed_loop.run_loops([planned()], room)[0].v)
 
     return {OURS: steps, "magtwin, planned and told": whole}
 

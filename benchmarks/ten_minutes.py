@@ -30,7 +30,7 @@ from magtwin.learn.data.features import features
 from magtwin.learn.models.network import FieldNet
 from magtwin.learn.models.perceptron import in_threads
 from magtwin.path import path_named
-from magtwin.sim.motion.course import warm_up
+from magtwin.sim.motion.closed_loop import warm_up
 from magtwin.twin import Twin, open_twin, scene_from_toml, simulate
 
 HIDDEN = (512, 512, 512, 512)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from magtwin.author.scene import SceneFile
+from magtwin.author.scene_file import SceneFile
 from magtwin.spec.furniture import GENERIC, KINDS, MATERIALS, STEEL, parts_of
 
 HERE = Path(__file__).resolve().parent

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from magtwin.errors import MismatchWarning as MismatchWarning
     from magtwin.field.fit.fit import fit as fit_map
     from magtwin.field.maps.map import AnomalyMap as AnomalyMap
-    from magtwin.figures.plotting import plot as plot
+    from magtwin.figures.plot import plot as plot
     from magtwin.io.formats import read_run as load_run
     from magtwin.io.formats import write_run as save_run
     from magtwin.io.surveys.readings import load_readings as read_survey
@@ -54,7 +54,7 @@ _NAMES = {
     "load_map": "usd.maps",
     "load_run": "io.formats:read_run",
     "open_twin": "twin",
-    "plot": "figures.plotting",
+    "plot": "figures.plot",
     "read_survey": "io.surveys.readings:load_readings",
     "save_map": "usd.maps",
     "save_run": "io.formats:write_run",

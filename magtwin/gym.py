@@ -23,15 +23,15 @@ from magtwin.errors import InputError, find
 from magtwin.path import Path, check_clear, check_on_floor
 from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.exact import check_field
-from magtwin.sim.motion.way import way_of
-from magtwin.sim.runs.fleet import SENSED, Fleet
+from magtwin.sim.motion.drive_input import drive_input
 from magtwin.sim.runs.simulate import Predict
+from magtwin.sim.runs.stepped import SENSED, SteppedRobots
 from magtwin.sim.session import draw_session
 from magtwin.spec.scene import Scene
 from magtwin.twin import Kind, Twin, open_twin, room_of, without_model_error
 
 if TYPE_CHECKING:
-    from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 
 Array = NDArray[np.float64]
 
@@ -79,7 +79,7 @@ class Transition:
     """What a reward is given for: a step of robots, arrays with a robot a row."""
 
     before: dict[str, NDArray[Any]]
-    """Columns before the step, as `magtwin.sim.runs.fleet.Fleet.columns`."""
+    """Columns before the step, as `magtwin.sim.runs.stepped.SteppedRobots.columns`."""
 
     after: dict[str, NDArray[Any]]
     """Columns after it."""
@@ -171,7 +171,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         if twin.magnetometer:
             _check_network(twin.magnetometer)
         robot = twin.scene.robot
-        way = way_of(path, room_of(twin))
+        way = drive_input(path, room_of(twin))
         if not isinstance(way, Path):
             raise InputError(f"path must be one to drive along, got {way!r}")
         self.path = way
@@ -186,7 +186,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         if not bounds:
             raise InputError("signals are empty; name at least one")
         widths = [COLUMNS[name].width for name in self.signals]
-        self.fleet = Fleet(
+        self.stepped = SteppedRobots(
             twin.scene,
             num_envs,
             anomaly_map=twin.field,
@@ -252,11 +252,11 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         if not self._begun:
             raise gymnasium.error.ResetNeeded("call reset before step")
         again, action = self._over.copy(), np.asarray(actions, float)
-        before, s = self.fleet.columns, self._s
-        self.fleet.step(action, np.flatnonzero(~again))
-        after = self.fleet.columns
+        before, s = self.stepped.columns, self._s
+        self.stepped.step(action, np.flatnonzero(~again))
+        after = self.stepped.columns
         self._s, off = _on_path(self.path, s, after["p_world_base"][:, :2])
-        step = Transition(before, after, action, self._s - s, off, self.fleet.step_s)
+        step = Transition(before, after, action, self._s - s, off, self.stepped.step_s)
         rewards = np.asarray(self.reward(step), float)
         if rewards.shape != (self.num_envs,):
             raise InputError(f"reward must give shape {(self.num_envs,)}, got {rewards.shape}")
@@ -275,13 +275,13 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             self._s[i] = rng.uniform(0.0, self.path.length) if self.random_start else 0.0
         xy, heading = self.path.at(self._s[which]), self.path.heading(self._s[which])
         poses = [(float(x), float(y), float(yaw)) for (x, y), yaw in zip(xy, heading, strict=True)]
-        robot = self.fleet.scene.robot
+        robot = self.stepped.scene.robot
         drawn = [draw_session(robot, rng) for rng in rngs] if self._draws else None
-        self.fleet.begin(which.tolist(), poses, rngs, drawn)
+        self.stepped.begin(which.tolist(), poses, rngs, drawn)
         self._made[which], self._over[which] = 0, False
 
     def _observations(self) -> NDArray[np.float32]:
-        columns = self.fleet.columns
+        columns = self.stepped.columns
         parts = [np.reshape(columns[name], (self.num_envs, -1)) for name in self.signals]
         box = self.single_observation_space
         assert isinstance(box, spaces.Box)
@@ -289,7 +289,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _infos(self) -> dict[str, Any]:
         """The truth, in the arrays of Gymnasium's vector infos."""
-        columns, known = self.fleet.columns, np.ones(self.num_envs, bool)
+        columns, known = self.stepped.columns, np.ones(self.num_envs, bool)
         infos: dict[str, Any] = {
             "p_world_base": columns["p_world_base"].copy(),
             "yaw": columns["yaw"].copy(),
@@ -338,12 +338,7 @@ def _predictions(network: "NeuralMagnetometer") -> Predict:
 
 
 def _check_network(network: "NeuralMagnetometer") -> None:
-    """Refuse a network that reads what robots that step together do not have."""
-    if network.net.context:
-        raise InputError(
-            f"{network.name}: a {network.net.kind} looks at {network.net.context} earlier readings, which "
-            "MagNav does not keep; give a network that reads one row at a time"
-        )
+    """Refuse a network that reads columns that MagNav does not simulate."""
     if missing := sorted(network.columns - SENSED):
         raise InputError(
             f"{network.name}: reads {', '.join(missing)}, which MagNav does not simulate; give a network of "

@@ -1,4 +1,4 @@
-"""Summary: what an object shows of itself, in five lines at a prompt and as a table in a notebook."""
+"""Summary: the display of an object, in five lines at a prompt and as a table in a notebook."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -7,30 +7,30 @@ from html import escape
 from typing import Any
 
 WIDTH = 98
-"""Characters of a line at most; five lines are then at most 500 characters."""
+"""Most characters of a line. Five lines then have at most 500."""
 
 LINES = 5
-"""Lines of a repr at most, the title among them."""
+"""Most lines of a repr, with the title."""
 
 MOST_CELLS = 200
-"""Rows of a notebook's table at most."""
+"""Most rows of a notebook's table."""
 
 _QUOTED = 40
-"""Characters of a text that stands among other fields."""
+"""Most characters of a text among other fields."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """A title, and what matters by name."""
+    """A title with labelled lines of text."""
 
     title: str
-    """The class and what the object is called, in a line."""
+    """The class and the name of the object, in one line."""
 
     rows: tuple[tuple[str, str], ...] = ()
     """Labels and texts. A prompt shows the first four, a notebook all of them."""
 
     heads: tuple[str, ...] = ()
-    """Column heads of a table that a notebook shows folded below; () for none."""
+    """Column heads of a table that a notebook shows folded; () for no table."""
 
     cells: Sequence[tuple[str, ...]] = ()
     """Rows of that table."""
@@ -60,19 +60,18 @@ class Summary:
 
 
 class Summarized:
-    """Gives a class a repr of at most five lines and an HTML view, both made of its `_summary`.
+    """Gives a class a repr of at most five lines and an HTML view, both from its `_summary`.
 
-    A dataclass needs `repr=False` for it. Without a `_summary` of its own its fields are listed, arrays by
-    their shapes.
+    A dataclass needs `repr=False`. By default, its fields are listed, arrays by their shapes.
     """
 
     def _summary(self) -> Summary:
         kind = type(self).__name__
         if not is_dataclass(self):
             return Summary(kind)
-        told = [f"{f.name}={_short(getattr(self, f.name, None))}" for f in fields(self) if f.repr]
+        texts = [f"{f.name}={_short(getattr(self, f.name, None))}" for f in fields(self) if f.repr]
         lines = [""]
-        for text in told:
+        for text in texts:
             joined = f"{lines[-1]}, {text}" if lines[-1] else text
             if len(joined) > WIDTH - 4 and lines[-1]:
                 lines[-1] += ","
@@ -89,17 +88,17 @@ class Summarized:
 
 
 def printable(text: object) -> str:
-    """A text in one line, with whatever would move a cursor escaped."""
+    """A text in one line, with control characters escaped."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(text))
 
 
 def clipped(text: str, most: int) -> str:
-    """A text of at most so many characters; "..." stands for what is left out."""
+    """A text of at most `most` characters; a longer one ends in "..."."""
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def listed(names: Collection[str], most: int = 60) -> str:
-    """Names in a line of about so many characters, and how many are left out."""
+    """Names in a line of about `most` characters, and the number of names left out."""
     shown: list[str] = []
     length = 0
     for name in names:
@@ -111,7 +110,7 @@ def listed(names: Collection[str], most: int = 60) -> str:
 
 
 def span(low: float, high: float, unit: str = "", *, form: str = ",.0f") -> str:
-    """Two bounds with their unit, as "47,301 to 53,020 nT"; "unknown" where they are not numbers."""
+    """Two bounds with their unit, as "47,301 to 53,020 nT"; "unknown" if they are not finite."""
     if not (math.isfinite(low) and math.isfinite(high)):
         return "unknown"
     return f"{low:{form}} to {high:{form}} {unit}".rstrip()
@@ -123,7 +122,7 @@ def rectangle(x0: float, x1: float, y0: float, y1: float) -> str:
 
 
 def _short(value: Any) -> str:
-    """A field's value in a few words."""
+    """The value of a field as a short text."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{value.dtype} {tuple(value.shape)}"
     if isinstance(value, Summarized):

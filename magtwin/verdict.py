@@ -9,24 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 EVEN = 0.03
-"""Relative difference of errors below which two models are called equal, where no interval is known."""
+"""Relative difference of errors below which two models count as equal, if no interval is known."""
 
 HOLDS = (0.8, 0.97)
-"""Share of readings that 90 % intervals may hold before they are called too narrow or too wide."""
+"""Bounds of the share of readings within 90 % intervals. Beyond them, they are too narrow or too wide."""
 
 Z_90 = 1.6448536269514722
-"""Half the width of the interval that holds 90 % of a normal distribution, in standard deviations."""
+"""Half the width of the 90 % interval of a normal distribution, in standard deviations."""
 
 HOLDS_ONE = (0.5, 1.0)
-"""The same for readings of one session, whose errors have an offset in common: a session that is two standard
-deviations off its mean holds 70 %."""
+"""The same bounds for readings of one session, whose errors share an offset: with an offset of two standard
+deviations, the share is 70 %."""
 
 SEPARATOR = ", "
 """Between the names of sessions and paths in the metadata of weights."""
 
 
 def coverage(error_nt: NDArray[Any], sd_nt: NDArray[Any]) -> float:
-    """Share of readings whose error lies in its 90 % interval; nan where no standard deviation is known."""
+    """Share of readings whose error is within its 90 % interval; nan if no standard deviation is known."""
     known = np.isfinite(sd_nt) & np.isfinite(error_nt)
     return float(np.mean(np.abs(error_nt[known]) <= Z_90 * sd_nt[known])) if known.any() else math.nan
 
@@ -41,17 +41,17 @@ def verdict(
     holds: tuple[float, float] = HOLDS,
     judged_on: str = "",
 ) -> str:
-    """Whether a model is better than a naive one, by how much, and whether its intervals hold.
+    """Judge in one line whether a model is better than a naive one, and whether its intervals hold.
 
     Args:
         mae_nt: Mean absolute error of the model [nT].
-        naive_mae_nt: That of the naive model on the same readings [nT].
-        than: What to call the naive model.
-        interval: Confidence interval of the ratio of the two errors. The models are called equal if it holds
+        naive_mae_nt: Mean absolute error of the naive model on the same readings [nT].
+        than: Name of the naive model.
+        interval: Confidence interval of the ratio of the two errors. The models count as equal if it contains
             1; without an interval, if the ratio is within `EVEN` of 1.
-        coverage: Share of readings within the model's 90 % intervals, 0 to 1; nan where none are predicted.
-        holds: Bounds of `coverage` that are called right: `HOLDS`, or `HOLDS_ONE` for one session.
-        judged_on: What the figures are of, such as "3 sessions that it never saw".
+        coverage: Share of readings within the model's 90 % intervals, 0 to 1; nan if it predicts none.
+        holds: Right bounds of `coverage`: `HOLDS`, or `HOLDS_ONE` for one session.
+        judged_on: The evaluated recordings, such as "3 new sessions".
 
     Returns:
         One line.
@@ -81,10 +81,10 @@ def verdict(
 
 @dataclass
 class Tally:
-    """Errors of a model and of the naive one, summed over runs."""
+    """Sums of the errors of a model and of the naive one over runs."""
 
     than: str = "the naive mean"
-    """What to call the naive model."""
+    """Name of the naive model."""
 
     readings: int = 0
     error_nt: float = 0.0
@@ -93,7 +93,7 @@ class Tally:
     with_sd: int = 0
 
     def add(self, error_nt: NDArray[Any], naive_error_nt: NDArray[Any], sd_nt: NDArray[Any]) -> None:
-        """Add the readings of a run, each an array of shape (N,); readings without an error are left out."""
+        """Add the readings of a run, arrays of shape (N,); readings without a known error are left out."""
         known = np.isfinite(error_nt) & np.isfinite(naive_error_nt)
         error, sd = np.abs(error_nt[known]), sd_nt[known]
         self.readings += len(error)
@@ -103,7 +103,7 @@ class Tally:
         self.within += int(np.count_nonzero(error <= Z_90 * sd))
 
     def verdict(self, judged_on: str, *, holds: tuple[float, float] = HOLDS) -> str:
-        """As `verdict`; "" if no reading was added."""
+        """The verdict; "" if no reading was added."""
         if not self.readings:
             return ""
         held = self.within / self.with_sd if self.with_sd else math.nan
@@ -118,14 +118,14 @@ def recordings_text(
     learned_sessions: Collection[str] | None,
     learned_paths: Collection[str] | None,
 ) -> str:
-    """What a model was judged on, and how much of it was not in its training.
+    """The evaluated recordings, and how many of their sessions and paths were not in the training.
 
     Args:
-        recordings: Number of recordings that it was judged on.
+        recordings: Number of recordings.
         sessions: Their sessions.
         paths: Their paths.
-        learned_sessions: Sessions of its training; None where unknown.
-        learned_paths: Paths of its training; None where unknown.
+        learned_sessions: Sessions of the training; None if unknown.
+        learned_paths: Paths of the training; None if unknown.
     """
     sessions, paths = set(sessions), set(paths)
     text = f"{recordings} recordings"

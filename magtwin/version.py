@@ -1,3 +1,3 @@
-"""Version: the one place where it stands, below every room that writes it into what it makes."""
+"""Version of magtwin."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -35,9 +35,9 @@ LEFT_OUT = {
 """Commands that are not run, and why."""
 
 CHANGES = (
-    (r"^(magtwin drive .*)$", r"printf wwwaq | \1 --no-view"),
-    (r"^(magtwin ros sim .*)$", r"\1 --duration 40 > sim.txt 2>&1 & sleep 5"),
-    (r"^(magtwin ros (?:magnetometer|record) .*)$", r"\1 --duration 4"),
+    (r"^(magtwin drive .*)$", r"printf wwwaq | \1 --no-live"),
+    (r"^(magtwin ros sim .*)$", r"\1 --duration-s 40 > sim.txt 2>&1 & sleep 5"),
+    (r"^(magtwin ros (?:magnetometer|record) .*)$", r"\1 --duration-s 4"),
     (r"^(magtwin ros follow .*)$", r"timeout -s INT 6 \1; test $? = 124"),  # it drives until it is stopped
 )
 """Live commands: what is run in their place."""

@@ -23,17 +23,17 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from magtwin.author.robot import read_robot
 from magtwin.author.scene import author_scene
 from magtwin.cli import main as magtwin
 from magtwin.field.fit.fit import fit, raster
-from magtwin.field.survey.gridded import read_survey
+from magtwin.field.survey.folder import read_survey
 from magtwin.files import from_table, read_toml, shipped
 from magtwin.io.surveys.readings import read_readings
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.spec.scene import Scene
 from magtwin.usd.maps import save_map
+from magtwin.usd.robot import load_robot
 
 CONSOLE = Console()
 
@@ -74,7 +74,7 @@ def aprilab(surveys: Path, out: Path) -> Path:
     Its field is that of the dipoles that a harmonic fit puts below the floor, the Earth's as the fit finds
     it, and of `SCRAPS` cuboids of iron, up to 8 cm long, 5 to 15 cm deep: finer than a survey can tell.
     """
-    robot = read_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
+    robot = load_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
     height = robot.base_height_m + robot.p_base_magnetometer[2]
     about = read_toml(shipped("maps", "lab", "map.toml"))
     where = from_table(EarthFieldSpec, about["earth"], shipped("maps", "lab", "map.toml"), "earth")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from magtwin.author.robot import RobotSettings, build_robot, read_robot, read_settings
+from magtwin.author.robot import RobotSettings, build_robot, read_settings
 from magtwin.files import existing, output
 from magtwin.spec.robot import RobotSpec
 from magtwin.urdf.convert import convert_with_report
@@ -15,6 +15,7 @@ from magtwin.urdf.description.kinematics import link_poses
 from magtwin.urdf.options import DEFAULTS, DriveRule, Options
 from magtwin.urdf.report import ConversionReport
 from magtwin.urdf.write import write_urdf
+from magtwin.usd.robot import load_robot
 
 __all__ = ["DriveRule", "Options", "Robot", "RobotSettings", "from_urdf", "link_poses", "write_urdf"]
 
@@ -73,4 +74,4 @@ def from_urdf(
         else:
             report = build_robot(urdf, settings, folder / name, options=options, thumbnail=thumbnail)
     asset = Path(out) / name
-    return Robot(asset, read_robot(asset) if settings else None, report)
+    return Robot(asset, load_robot(asset) if settings else None, report)

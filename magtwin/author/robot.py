@@ -10,7 +10,7 @@ from pxr import Sdf, Usd, UsdPhysics
 
 from magtwin.author.shape import drive_of, footprint_of, stand_on_floor
 from magtwin.errors import InputError, hint
-from magtwin.files import existing, from_table, read_toml, sha256
+from magtwin.files import from_table, read_toml
 from magtwin.spec.base import Spec
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import PlatformFieldSpec
@@ -21,7 +21,7 @@ from magtwin.urdf.options import DEFAULTS, Options
 from magtwin.urdf.report import ConversionReport
 from magtwin.urdf.reroot import reroot
 from magtwin.usd.geometry import BASE_LINK
-from magtwin.usd.layers import open_stage
+from magtwin.usd.robot import urdf_of
 from magtwin.usd.schema import NOUNS, prims_with
 from magtwin.usd.sensors import (
     define_battery,
@@ -33,7 +33,6 @@ from magtwin.usd.sensors import (
     define_mocap,
     define_platform,
     read_drive,
-    read_robot_prim,
 )
 
 _DEFAULTS = RobotSpec(name="", asset=Path())
@@ -126,27 +125,13 @@ def read_settings(settings: str | os.PathLike[str]) -> RobotSettings:
     return from_table(RobotSettings, read_toml(settings), settings)
 
 
-def read_robot(asset: str | os.PathLike[str]) -> RobotSpec:
-    """The spec of a robot's asset.
-
-    Raises:
-        InputError: The file is missing, is not USD, or is not an asset that `build_robot` made. Whether
-            a network that it names is there is for its user to see.
-    """
-    path = existing(asset, "robot asset").resolve()
-    stage = open_stage(path)
-    if not stage.GetDefaultPrim():
-        raise InputError(f"{path}: has no default prim, so no robot; make the asset with `magtwin robot`")
-    return read_robot_prim(stage.GetDefaultPrim(), path)
-
-
 def read_description(asset: str | os.PathLike[str]) -> str:
-    """The URDF that an asset was converted from, its root base_link, if `description_of` finds it; else "".
+    """The URDF that an asset was converted from, its root base_link, if `urdf_of` finds it; else "".
 
     Raises:
         InputError: It is none that can be read.
     """
-    source = description_of(asset)
+    source = urdf_of(asset)
     if source is None:
         return ""
     try:
@@ -156,35 +141,6 @@ def read_description(asset: str | os.PathLike[str]) -> str:
             f"{source}: is not UTF-8, which ROS says descriptions in; save it as that"
         ) from error
     return reroot(text, BASE_LINK, source)
-
-
-def notes_of(asset: str | os.PathLike[str]) -> list[str]:
-    """What was repaired, guessed or left out when an asset was converted."""
-    stage = open_stage(existing(asset, "robot asset"))
-    return [str(note) for note in stage.GetRootLayer().customLayerData.get("magtwin", {}).get("notes", [])]
-
-
-def description_of(asset: str | os.PathLike[str]) -> Path | None:
-    """The URDF that an asset was converted from, if it still lies beside it, unchanged."""
-    stage = open_stage(
-        existing(asset, "robot asset")
-    )  # held in a name: a layer does not keep its stage alive
-    said = stage.GetRootLayer().customLayerData.get("magtwin", {})
-    source = Path(asset).parent / Path(str(said.get("source", ""))).name
-    if source.suffix != ".urdf" or not source.is_file() or sha256(source) != said.get("sourceSha256"):
-        return None
-    return source
-
-
-def robot_of(prim: Usd.Prim) -> RobotSpec:
-    """The spec of the robot at `prim` in a composed scene, its asset the file that the prim refers to.
-
-    Raises:
-        InputError: It is not the prim of a robot that `build_robot` made; the text names it.
-    """
-    arcs = Usd.PrimCompositionQuery.GetDirectReferences(prim).GetCompositionArcs()
-    layer = arcs[0].GetTargetLayer() if arcs else prim.GetStage().GetRootLayer()
-    return read_robot_prim(prim, Path(layer.realPath).resolve())
 
 
 def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:

@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 from pxr import Usd
 
-from magtwin.author.furniture import FURNITURE, define_furniture
-from magtwin.author.lab import define_lab
 from magtwin.errors import InputError
 from magtwin.field.sources.bodies import mesh_moments
 from magtwin.files import existing, refused_at, shipped
@@ -24,6 +22,8 @@ from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import PlacedRobot
 from magtwin.urdf.meshes.mesh import read_mesh
 from magtwin.usd.attributes import check_prim_name
+from magtwin.usd.furniture import FURNITURE, define_furniture
+from magtwin.usd.lab import define_lab
 from magtwin.usd.maps import load_map
 from magtwin.usd.obstacles import read_obstacles
 

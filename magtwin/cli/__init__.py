@@ -1,27 +1,12 @@
-"""The command line: one typed function a subcommand, a module a noun, nothing else."""
+"""The command line: one typed function for each command. Commands parse, call a public function and print."""
 
-from magtwin.cli import (  # noqa: F401 - each registers its commands
-    compare,
-    compensate,
-    dataset,
-    drive,
-    evaluate,
-    export,
-    file,
-    map,  # noqa: A004
-    net,
-    new,
-    picture,
-    report,
-    rerun_of,
-    robot,
-    ros,
-    run,
-    runs,
-    scene,
-    train,
-    validate,
-)
-from magtwin.cli.app import main
+from magtwin.cli import completion, doctor, ros  # noqa: F401 - each registers its commands
+from magtwin.cli.app import main, share_options
+from magtwin.cli.learn import compensate, dataset, evaluate, network, train  # noqa: F401
+from magtwin.cli.maps import fit, look  # noqa: F401
+from magtwin.cli.runs import drive, file, picture, report, reproduce, run, sweep  # noqa: F401
+from magtwin.cli.scenes import export, robot, scene, validate  # noqa: F401
+
+share_options()
 
 __all__ = ["main"]

@@ -1,54 +1,70 @@
-"""The application: its name, where options come from, and how it ends."""
+"""The application: configuration, options that every command has, warnings, errors and exit status."""
 
+import functools
+import inspect
 import signal
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from cyclopts import App
+from cyclopts import App, Parameter
 from cyclopts.config import Env, Toml
 from cyclopts.exceptions import CycloptsError
 
+from magtwin.cli.options import Json, Quiet
 from magtwin.cli.progress import watched
+from magtwin.cli.renamed import renamed
+from magtwin.cli.terminal import Done, output_mode, print_error
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.version import __version__
 
 app = App(
     name="magtwin",
-    help="Magnetic digital twins of robots: author labs and robots as USD, drive them, log what a "
-    "neural-network magnetometer reads.",
+    help="Author magnetic digital twins of labs and robots in USD, simulate what a robot's magnetometer "
+    "reads, fit field maps and train neural magnetometers.",
     version=__version__,
     config=[Env("MAGTWIN_", show=False), Toml("magtwin.toml", search_parents=False)],
-    help_epilogue="Options also come from the environment (MAGTWIN_RUN_SEED=1) and from magtwin.toml. "
+    default_parameter=Parameter(negative_iterable="", negative_none=""),
+    help_epilogue="Options can also be set in the environment (MAGTWIN_RUN_SEED=1) and in magtwin.toml. "
     "Exit status: 0 done, 1 an input was refused, 2 wrong usage. --debug shows the traceback of a refusal.",
 )
 
-
 HELP = {"--help", "-h"}
-"""Options that ask for help."""
+
+ALIASES = {
+    "anomaly_map": "map",
+    "duration": "duration_s",
+    "map_layer": "map",
+    "net": "network",
+    "offsets_s": "offset_s",
+}
+"""Options of the command line whose parameter has another name in Python."""
+
+_flags: dict[str, str] = {}
+"""Flag of each parameter of the command that is running."""
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point of the `magtwin` command; `arguments` are those of the command line unless given."""
+    """Run the `magtwin` command; `arguments` default to those of the command line."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what is half-written goes
-    plain = not sys.stderr.isatty()
+    signal.signal(
+        signal.SIGTERM, lambda *_: sys.exit(143)
+    )  # an exception, so that partial outputs are removed
+    _flags.clear()
     try:
         with watched(), _warnings_in_lines():
             app(
                 [a for a in arguments if a != "--debug"],
                 exit_on_error=False,
-                print_error=not plain,
+                print_error=False,
                 result_action="return_value",
-                **_help_of(arguments),
+                **_help_options(arguments),
             )
     except CycloptsError as error:
-        if plain:
-            print("magtwin: " + " ".join(str(error).split()), file=sys.stderr)  # noqa: T201
-        sys.exit(2)
+        _fail(renamed(error, arguments) or str(error), status=2)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # `magtwin info ... | head`
@@ -58,15 +74,52 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             raise
         if isinstance(error, InputError):
-            _fail(str(error))
+            _fail(error.in_flags(_flags))
         if isinstance(error, OSError | MemoryError):
             _fail(f"{error} ({type(error).__name__})")
-        _fail(f"a fault of magtwin's own, {type(error).__name__}: {error}; --debug shows where, do report it")
+        _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
 
 
-def _help_of(arguments: list[str]) -> dict[str, Any]:
-    """Options that print help for a file or another program: without boxes, no line broken."""
-    asked = HELP & set(arguments) or len(arguments) < 2  # `magtwin map` is answered by its help too
+def share_options(group: App = app) -> None:
+    """Give every command of a group --json and --quiet."""
+    for name in group:
+        if not name.startswith("-"):
+            share_options(group[name])
+    if group.default_command is not None and group is not app:
+        group.default_command = _with_output_options(group, group.default_command)
+
+
+def _with_output_options(command: App, function: Callable[..., Any]) -> Callable[..., Any]:
+    """A command's function that takes --json and --quiet too, and shows the `Done` that it returns."""
+    signature = inspect.signature(function)
+    own = [name for name in ("json", "quiet") if name in signature.parameters]
+
+    @functools.wraps(function)
+    def wrapped(*args: Any, json: bool = False, quiet: bool = False, **options: Any) -> None:
+        for argument in command.assemble_argument_collection(parse_docstring=False):
+            if argument.name.startswith("--"):
+                _flags[argument.name.removeprefix("--").replace("-", "_")] = argument.name
+        _flags.update({name: _flags[key] for name, key in ALIASES.items() if key in _flags})
+        given = {"json": json, "quiet": quiet}
+        with output_mode(json=json, quiet=quiet):
+            done = function(*args, **options, **{name: given[name] for name in own})
+            if isinstance(done, Done):
+                done.show()
+
+    parameters = [p for p in signature.parameters.values() if p.name not in ("json", "quiet")]
+    added = {"json": Json, "quiet": Quiet}
+    for name, annotation in added.items():
+        parameters.append(
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=annotation)
+        )
+    wrapped.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    wrapped.__annotations__ = {**function.__annotations__, **added}
+    return wrapped
+
+
+def _help_options(arguments: list[str]) -> dict[str, Any]:
+    """Options that print help for a file or another program: no boxes, no broken lines."""
+    asked = HELP & set(arguments) or len(arguments) < 2  # `magtwin map` prints its help too
     if sys.stdout.isatty() or not asked:
         return {}
     from cyclopts.help import PlainFormatter
@@ -79,8 +132,8 @@ def _help_of(arguments: list[str]) -> dict[str, Any]:
 
 @contextmanager
 def _warnings_in_lines() -> Iterator[None]:
-    """Show a MismatchWarning as one line on stderr, each text once in a command; other warnings as ever."""
-    told: set[str] = set()
+    """Print each MismatchWarning once, as a line on stderr; other warnings as usual."""
+    printed: set[str] = set()
     with warnings.catch_warnings():
         warnings.simplefilter("always", MismatchWarning)
         show = warnings.showwarning
@@ -88,16 +141,14 @@ def _warnings_in_lines() -> Iterator[None]:
         def line(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
             if not issubclass(category, MismatchWarning):
                 show(message, category, *where, **more)
-            elif str(message) not in told:
-                told.add(str(message))
-                text = f"magtwin: warning: {' '.join(str(message).split())}"
-                loud = sys.stderr.isatty()  # yellow and bold
-                print(f"\033[1;33m{text}\033[0m" if loud else text, file=sys.stderr)  # noqa: T201
+            elif str(message) not in printed:
+                printed.add(str(message))
+                print_error(f"warning: {message}", style="1;33")
 
         warnings.showwarning = line
         yield
 
 
-def _fail(text: str) -> None:
-    print("magtwin: " + " ".join(text.split()), file=sys.stderr)  # noqa: T201
-    sys.exit(1)
+def _fail(text: str, status: int = 1) -> None:
+    print_error(text, style="1;31" if status == 2 else "")
+    sys.exit(status)

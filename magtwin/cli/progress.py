@@ -1,8 +1,7 @@
-"""Progress of commands on stderr: a bar on a terminal, a plain line now and then elsewhere.
+"""Progress of commands on stderr: a bar on a terminal, else a line now and then.
 
-A thread watches each command. Where nothing has been printed for `FIRST_S`, it prints what is being done,
-with counts, rate and time left as far as they are known, and again every `EVERY_S`. So a command reports
-progress even while it waits for a library that does not.
+A thread watches each command. After `FIRST_S` of silence, and then every `EVERY_S`, it prints the current
+step with counts, rate and time left. So progress appears even while a library reports none.
 """
 
 import sys
@@ -152,6 +151,7 @@ class Watch:
         self._steps: list[Step] = []
         self._bar: Any = None
         self._silent = 0
+        self._announces, self._mute = True, False
         self._lock = Lock()
         self._end = Event()
         self._thread: Thread | None = None
@@ -167,12 +167,22 @@ class Watch:
         if self._thread is not None:
             self._thread.join()
 
-    def step(self, text: str, *, quiet: bool = False) -> None:
-        """Say what is done next, whose length is unknown; `quiet` prints it only where it takes long."""
+    @contextmanager
+    def reduced(self, *, steps: bool, all: bool) -> Iterator[None]:  # noqa: A002
+        """Announce no steps, or print nothing at all, until the end of the block."""
+        before = self._announces, self._mute
+        self._announces, self._mute = not steps, all
+        try:
+            yield
+        finally:
+            self._announces, self._mute = before
+
+    def step(self, text: str, *, announced: bool = True) -> None:
+        """Name what is done next, whose length is unknown; printed at once if `announced`."""
         now = self._clock()
         with self._lock:
             self._base = Step(text, "", now)
-            if not quiet:
+            if announced and self._announces:
                 self._print(f"  {text} ...")
                 self._printed = now
 
@@ -192,7 +202,7 @@ class Watch:
         step = Step(title, unit, self._clock())
         self._steps.append(step)
         try:
-            with self._drawn(step) if self._terminal else nullcontext() as draw:
+            with self._drawn(step) if self._terminal and not self._mute else nullcontext() as draw:
 
                 def advance(done: float, total: float | None, what: str = "") -> None:
                     step.advance(self._clock(), done, total, what)
@@ -209,7 +219,7 @@ class Watch:
         """Print a line if one is due."""
         with self._lock:
             now = self._clock()
-            if self._silent or self._bar is not None or self._end.is_set():
+            if self._silent or self._mute or self._bar is not None or self._end.is_set():
                 return
             if now - self._printed < FIRST_S or now - self._reported < EVERY_S:
                 return
@@ -285,15 +295,14 @@ def current() -> Watch:
     return _watches[-1] if _watches else Watch()
 
 
-def announcer(*, quiet: bool) -> Callable[[str], None]:
-    """A function that says what is being done, on stderr; `quiet` says it only where it takes long."""
-    watch = current()
-    return lambda text: watch.step(text, quiet=quiet)
+def announce(text: str) -> None:
+    """Print what is done next, on stderr; with --json only if it takes long."""
+    current().step(text)
 
 
 def step(text: str) -> None:
-    """Name what is done next; it is printed where it takes long."""
-    current().step(text, quiet=True)
+    """Name what is done next; it is printed only if it takes long."""
+    current().step(text, announced=False)
 
 
 def progress(title: str, unit: str = "") -> Any:

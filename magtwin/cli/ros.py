@@ -1,65 +1,74 @@
-"""`magtwin ros`: the twin and its sensors as nodes of ROS 2."""
+"""`magtwin ros`: the twin and its sensors as ROS 2 nodes."""
 
 import signal
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.terminal import Force, Seed, Session, Whole, announcer, progress, say, silence, step
+from magtwin.cli.options import (
+    Flag,
+    Force,
+    Gamepad,
+    Lidar,
+    ModelError,
+    Network,
+    OutUnit,
+    RateHz,
+    Seed,
+    Session,
+    Whole,
+)
+from magtwin.cli.terminal import Done, announce, progress, silence, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
     from magtwin.ros.bus import Bus
+    from magtwin.spec.drive import DriveSpec
 
-ros_app = App(name="ros", help="The twin and its sensors as nodes of ROS 2.")
+ros_app = App(name="ros", help="Run the twin and its sensors as ROS 2 nodes.")
 app.command(ros_app)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Node:
-    """Where a node stands."""
+    """A node's place in the ROS network."""
 
     namespace: str = "robot"
-    """Namespace of its topics; "" is the root."""
+    """Namespace of the topics; "" is the root."""
 
-    name: str | None = None
-    """Its name, magtwin_sim and so on unless given; two of one name cannot be told apart."""
+    node_name: str | None = None
+    """Name of the node. Default: magtwin_sim and so on. Two nodes need different names."""
 
     remap: tuple[str, ...] = ()
-    """A name that it has on the network instead, as odom:=/wheel/odom; may be given several times."""
+    """Name of a topic on the network, as OURS:=THEIRS: odom:=/wheel/odom. May be repeated."""
 
     domain: Whole | None = None
-    """ROS domain, 0 to 232; ROS_DOMAIN_ID unless given."""
+    """ROS domain, 0 to 232. Default: ROS_DOMAIN_ID."""
 
     backend: Literal["auto", "rclpy", "cyclonedds"] = "auto"
-    """What carries it: rclpy where it can be imported, else cyclonedds."""
+    """ROS client library. auto: rclpy if it can be imported, else cyclonedds."""
 
     @contextmanager
-    def bus(self, name: str, *, sim_time: bool = False, duration: float | None = None) -> "Iterator[Bus]":
-        """The node, until the end or Ctrl-C.
-
-        Raises:
-            InputError: It cannot be there, or not for a `duration` [s].
-        """
-        if duration is not None and not duration > 0:
-            raise InputError(f"duration must be above 0 s, got {duration!r}")
+    def bus(self, name: str, *, sim_time: bool = False, duration_s: float | None = None) -> "Iterator[Bus]":
+        """The node, until the end of the block or Ctrl-C."""
+        if duration_s is not None and not duration_s > 0:
+            raise InputError(f"--duration-s must be above 0 s, got {duration_s!r}")
         from magtwin.ros.bus import names_of, open_bus
 
         bus = open_bus(
-            self.name or name,
+            self.node_name or name,
             names=names_of(self.namespace, self.remap),
             sim_time=sim_time,
             backend=self.backend,
             domain=self.domain,
         )
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # which a script's jobs begin without
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a script ignore it
         try:
             with suppress(KeyboardInterrupt):
                 yield bus
@@ -69,11 +78,13 @@ class Node:
 
 Where = Annotated[Node, Parameter(name="*")]
 HERE = Node()
-Profile = Literal["ros", "aprilab"]
-
-UNITS: Mapping[Profile, Literal["T", "nT"]] = MappingProxyType({"ros": "T", "aprilab": "nT"})
-"""Unit of fields by profile: tesla as ROS has it, or what programs expect that were written against APRILab's
-release."""
+WallS = Annotated[float | None, Parameter(help="Duration in real time [s]. Default: until Ctrl-C.")]
+SimTime = Annotated[bool, Parameter(negative="", help="Use the time of /clock, for a simulated robot.")]
+Stamped = Annotated[bool, Parameter(negative="", help="cmd_vel is a TwistStamped in place of a Twist.")]
+Asset = Annotated[
+    Path | None,
+    Parameter(help="USD asset of the robot, whose limits are kept. Default: the TurtleBot 4."),
+]
 
 
 @ros_app.command(name="sim")
@@ -81,106 +92,86 @@ def sim(
     scene: Path,
     *,
     where: Where = HERE,
-    speed: float = 1.0,
-    duration: float | None = None,
+    pace: float = 1.0,
+    duration_s: float | None = None,
     seed: Seed = 0,
     session: Session = None,
-    net: Path | None = None,
-    model_error: bool = True,
-    rate_hz: float | None = None,
-    profile: Profile = "ros",
-    units: Literal["T", "nT"] | None = None,
-    lidar: Literal["schedule", "on", "off"] = "schedule",
+    network: Network = None,
+    magnetometer: Literal["physical", "neural", "map-only", "none"] | None = None,
+    model_error: ModelError = True,
+    rate_hz: RateHz = None,
+    out_unit: OutUnit = None,
+    lidar: Lidar = "schedule",
     stamps: Literal["sim", "wall"] = "sim",
-    stamped_commands: bool = False,
-    magnetometer: bool = True,
-) -> None:
-    """Simulate a scene's robot in real time: the topics of the real one, and /clock.
+    stamped_commands: Stamped = False,
+) -> Done:
+    """Simulate a scene's robot in real time: the topics of the real robot, and /clock.
 
-    It is driven by cmd_vel, and stops where none has come for half a second. A message on reset
-    (std_msgs/Empty) puts it back to its start. Ctrl-C ends.
+    cmd_vel drives it; it stops after half a second without one. A message on reset (std_msgs/Empty) puts it
+    back to its start. Ctrl-C ends it.
 
     Parameters
     ----------
     scene
         USD stage to simulate.
-    where
-        Where the node stands.
-    speed
-        Sim time for each wall time.
-    duration
-        How long, in sim time [s]; without an end unless given.
-    seed
-        Seed of all noise.
-    session
-        As for `magtwin run`.
-    net
-        Weights to use in place of the scene's; "none" for a physical magnetometer.
-    model_error
-        As for `magtwin run`.
-    rate_hz
-        Readings of the magnetometer a second [Hz]; the scene's unless given.
-    profile
-        Conventions: ros, fields in tesla; aprilab, in nT, for programs written against APRILab's release.
-    units
-        Unit of fields, T or nT; the profile's unless given.
-    lidar
-        Whether the LiDAR follows its schedule, or stays on or off.
-    stamps
-        Whether messages are stamped by sim time, from 0 on, or by the wall's.
-    stamped_commands
-        Take cmd_vel as TwistStamped, and not as Twist.
+    pace
+        Simulated seconds per second.
+    duration_s
+        Duration in simulated time [s]. Default: until Ctrl-C.
     magnetometer
-        Say what its magnetometer reads, or leave that to magtwin ros magnetometer.
+        What the magnetometer reads: physical, neural or map-only, as for `magtwin run`; or none, which leaves
+        its topics to `magtwin ros magnetometer`. Default: the scene's.
+    stamps
+        Time of the messages: sim, from 0, or wall.
     """
     from magtwin.ros.simulate import Simulator
     from magtwin.twin import open_twin
 
-    tell = announcer(quiet=False)
-    tell(f"opening {scene}")
-    twin = open_twin(scene, network=net, model_error=model_error)
-    with where.bus("magtwin_sim", duration=duration) as bus:
+    announce(f"opening {scene}")
+    kind = None if magnetometer == "none" else magnetometer
+    twin = open_twin(scene, network=network, magnetometer=kind, model_error=model_error)
+    with where.bus("magtwin_sim", duration_s=duration_s) as bus:
         node = Simulator(
             twin,
             bus,
             seed=seed,
             session=session,
-            speed=speed,
+            speed=pace,
             rate_hz=rate_hz,
-            units=units or UNITS[profile],
+            units=out_unit or "T",
             lidar=lidar,
             stamps=stamps,
             stamped_commands=stamped_commands,
-            magnetometer=magnetometer,
-            say=tell,
+            magnetometer=magnetometer != "none",
+            say=announce,
         )
-        tell(f"simulating by {bus.backend} at {speed:g} x real time; Ctrl-C ends")
-        with progress("Simulating", "s") if duration else silence() as advance:
+        announce(f"simulating by {bus.backend} at {pace:g} x real time; Ctrl-C ends")
+        with progress("Simulating", "s") if duration_s else silence() as advance:
 
-            def told() -> bool:
+            def reported() -> bool:
                 if advance is not None:
-                    advance(node.online.t, duration)
+                    advance(node.online.t, duration_s)
                 return False
 
-            node.run(told, duration_s=duration)
+            node.run(reported, duration_s=duration_s)
+    return Done()
 
 
-@ros_app.command(name="magnetometer")
+@ros_app.command(name="magnetometer", usage="Usage: magtwin ros magnetometer [OPTIONS] SCENE [SETTING...]")
 def magnetometer(
     scene: Path,
     *settings: str,
     where: Where = HERE,
-    net: Path | None = None,
-    profile: Profile = "ros",
-    duration: float | None = None,
-) -> None:
-    """Read a robot's sensors through map and network: the magnetometer alone, for any robot or simulator.
+    network: Network = None,
+    duration_s: WallS = None,
+) -> Done:
+    """Run the magnetometer alone: read a robot's sensors through map and network, and publish the field.
 
-    It takes pose (/robot/enu/pose), odometry, IMU, battery and scans, as far as the network reads them, and
+    It reads pose (/robot/enu/pose), odometry, IMU, battery and scans, as far as the network needs them. It
     publishes qtfm/magnitude and qtfm/total_field_nt while its inputs are fresh, and its state in
-    /diagnostics.
-    Inputs may come and go. Settings are those of ROS, name:=value: rate_hz (135), units (T or nT),
-    use_sim_time, max_age_s (0.5), battery_max_age_s (30), lidar (scan, on or off), outside (silent or clamp).
+    /diagnostics. Inputs may come and go. Settings have the form of ROS, name:=value: rate_hz (135), units
+    (T or nT), use_sim_time, max_age_s (0.5), battery_max_age_s (30), lidar (scan, on, off), outside
+    (silent, clamp).
 
     Parameters
     ----------
@@ -188,29 +179,19 @@ def magnetometer(
         USD stage that names the map, the network and the robot.
     settings
         Settings, such as units:=nT use_sim_time:=true.
-    where
-        Where the node stands.
-    net
-        Weights to use in place of the scene's.
-    profile
-        Conventions, unless settings say otherwise: ros, fields in tesla; aprilab, in nT, for programs written
-        against APRILab's release.
-    duration
-        How long, by the wall [s]; without an end unless given.
     """
     from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
     from magtwin.ros.parameters import settings as settings_of
     from magtwin.twin import open_twin
 
-    values = settings_of(PARAMETERS, (f"units:={UNITS[profile]}", *settings))
-    tell = announcer(quiet=False)
-    tell(f"opening {scene}")
-    twin = open_twin(scene, network=net, model_error=False)  # it predicts, for a robot that reads
-    sim_time = values["use_sim_time"]
-    with where.bus("magtwin_magnetometer", sim_time=sim_time, duration=duration) as bus:
-        Magnetometer(twin, bus, values, say=tell)
-        tell(f"reading by {bus.backend}; Ctrl-C ends")
-        spin(bus, duration)
+    values = settings_of(PARAMETERS, settings)
+    announce(f"opening {scene}")
+    twin = open_twin(scene, network=network, model_error=False)  # it predicts for a robot that reads
+    with where.bus("magtwin_magnetometer", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
+        Magnetometer(twin, bus, values, say=announce)
+        announce(f"reading by {bus.backend}; Ctrl-C ends")
+        spin(bus, duration_s)
+    return Done()
 
 
 @ros_app.command(name="follow")
@@ -218,51 +199,40 @@ def follow(
     path: str,
     *,
     where: Where = HERE,
-    robot: Path | None = None,
+    asset: Asset = None,
     speed: float = 0.2,
     controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
     source: Literal["truth", "estimate", "odometry"] = "truth",
     laps: Whole = 1,
-    continuous: bool = False,
-    flip: bool = False,
-    sim_time: bool = False,
-    stamped_commands: bool = False,
-) -> None:
+    continuous: Flag = False,
+    flip: Flag = False,
+    sim_time: SimTime = False,
+    stamped_commands: Stamped = False,
+) -> Done:
     """Drive a robot along a path by its reported pose; it stops at the end, and while the pose is lost.
 
     Parameters
     ----------
     path
         Name of a path, or a CSV file of x, y [m].
-    where
-        Where the node stands.
-    robot
-        Asset of the robot, whose limits are kept; the TurtleBot 4 unless given.
     speed
-        Forward speed where the path is straight [m/s].
+        Forward speed on straight parts [m/s].
     controller
-        What steers: magtwin's, the released package's with its gain, Stanley's or pure pursuit.
+        What steers: magtwin's follower, the released package's controller, Stanley's, or pure pursuit.
     source
-        What tells the pose: truth (enu/pose), estimate (estimate/pose) or odometry.
+        Source of the pose: truth (enu/pose), estimate (estimate/pose) or odometry.
     laps
-        How often to drive it; an open path is driven back and forth.
+        Number of times to drive the path; an open path is driven back and forth.
     continuous
-        Drive on without an end.
+        Drive until Ctrl-C.
     flip
-        Drive it from its end to its beginning.
-    sim_time
-        Go by /clock, as when the robot is simulated.
-    stamped_commands
-        Send cmd_vel as TwistStamped, and not as Twist.
+        Drive the path backwards, from its end to its start.
     """
-    from magtwin.author.robot import read_robot
-    from magtwin.files import shipped
     from magtwin.path import resolve_path
     from magtwin.ros.follow import Follower
 
-    tell = announcer(quiet=False)
     way = resolve_path(path)
-    drive = read_robot(robot or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
+    drive = _drive_of(asset)
     with where.bus("magtwin_follow", sim_time=sim_time) as bus:
         node = Follower(
             way,
@@ -275,71 +245,55 @@ def follow(
             continuous=continuous,
             flip=flip,
             stamped_commands=stamped_commands,
-            say=tell,
+            say=announce,
         )
-        tell(f"driving {way.name}, {way.length:.1f} m, by {bus.backend}; Ctrl-C ends")
+        announce(f"driving {way.name}, {way.length:.1f} m, by {bus.backend}; Ctrl-C ends")
         try:
             with progress(f"Driving {way.name}") as advance:
                 while not node.done:
                     bus.spin_once(0.1)
-                    advance(
-                        node.progress.laps,
-                        None if continuous else laps,
-                        f"{node.progress.rms_m:.3f} m RMS off it",
-                    )
+                    total = None if continuous else laps
+                    advance(node.progress.laps, total, f"{node.progress.rms_m:.3f} m RMS off it")
         finally:
             node.stop()
-            say(f"{node.progress.laps} times along {way.name}, {node.progress.rms_m:.3f} m RMS off it")
+    done = node.progress
+    text = f"{done.laps} times along {way.name}, {done.rms_m:.3f} m RMS off it"
+    return Done(text=text, data={"path": way.name, "laps": done.laps, "rms_m": done.rms_m})
 
 
 @ros_app.command(name="teleop")
 def teleop(
     *,
     where: Where = HERE,
-    robot: Path | None = None,
-    gamepad: Path | None = None,
+    asset: Asset = None,
+    gamepad: Gamepad = None,
     out: Path | None = None,
-    stamped_commands: bool = False,
-    sim_time: bool = False,
+    stamped_commands: Stamped = False,
+    sim_time: SimTime = False,
     force: Force = False,
-) -> None:
-    """Drive a robot by hand, and record it on the way.
+) -> Done:
+    """Drive a robot by hand, and record its topics.
 
     Keys: w/s or up/down for speed, a/d or left/right for turning, x to go straight on, space to stop, q to
     end.
 
     Parameters
     ----------
-    where
-        Where the node stands.
-    robot
-        Asset of the robot, whose limits are kept; the TurtleBot 4 unless given.
-    gamepad
-        A gamepad of Linux to drive with, such as /dev/input/js0, in place of the keyboard: the left stick
-        drives, Start ends.
     out
-        Bag to record the robot's topics into, as magtwin ros record does.
-    stamped_commands
-        Send cmd_vel as TwistStamped, and not as Twist.
-    sim_time
-        Date messages by /clock, as when the robot is simulated.
-    force
-        Replace what exists.
+        Bag to record the robot's topics to, as `magtwin ros record` does. Default: none.
     """
-    from contextlib import ExitStack
-
-    from magtwin.author.robot import read_robot
-    from magtwin.cli.drive import device
-    from magtwin.files import existing, shipped
+    from magtwin.cli.runs.drive import device
+    from magtwin.files import existing
     from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder
     from magtwin.ros.teleop import Teleop
-    from magtwin.sim.motion.manual import HELP, Gamepad, Hand, Keyboard
+    from magtwin.sim.motion.manual import HELP, Hand, Keyboard
+    from magtwin.sim.motion.manual import Gamepad as Pad
 
     if gamepad is not None:
         existing(gamepad, "gamepad")
-    drive = read_robot(robot or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
-    hand: Hand = Keyboard(drive) if gamepad is None else Gamepad(drive)
+    drive = _drive_of(asset)
+    hand: Hand = Keyboard(drive) if gamepad is None else Pad(drive)
     with ExitStack() as stack:
         writer = None
         if out is not None:
@@ -348,12 +302,13 @@ def teleop(
         bus = stack.enter_context(where.bus("magtwin_teleop", sim_time=sim_time))
         recorder = None if writer is None else Recorder(bus, writer, say=_warn, sim_time=sim_time)
         source = stack.enter_context(device(gamepad))
-        announcer(quiet=False)(HELP if gamepad is None else "left stick drives, Start ends")
+        announce(HELP if gamepad is None else "left stick drives, Start ends")
         node = Teleop(bus, hand, source, stamped_commands=stamped_commands)
         with silence(), suppress(KeyboardInterrupt):
             node.run(recorder.step if recorder else lambda: None)
         node.stop()
-    say(f"{node.sent} commands" + ("" if out is None else f"; wrote {out}"))
+    text = f"{node.sent} commands" + ("" if out is None else f"; wrote {out}")
+    return Done(text=text, data={"commands": node.sent}, wrote=out or ())
 
 
 @ros_app.command(name="record")
@@ -362,47 +317,39 @@ def record(
     *,
     topic: tuple[str, ...] = (),
     where: Where = HERE,
-    duration: float | None = None,
-    sim_time: bool = False,
+    duration_s: WallS = None,
+    sim_time: SimTime = False,
     force: Force = False,
-) -> None:
-    """Record a robot's topics as a rosbag2, which is a run: magtwin convert, info, report and train take it.
+) -> Done:
+    """Record a robot's topics as a rosbag2, which magtwin convert, info, report and dataset read as a run.
 
-    Topics may come and go; Ctrl-C ends.
+    Topics may come and go. Ctrl-C ends it.
 
     Parameters
     ----------
     out
-        Folder to make, or a file that ends in .mcap or .db3.
+        Folder to make, or a file (.mcap or .db3).
     topic
-        A topic to record; may be given several times. All of the robot's unless given.
-    where
-        Where the node stands.
-    duration
-        How long, by the wall [s]; without an end unless given.
-    sim_time
-        Date messages by /clock, as when the robot is simulated.
-    force
-        Replace what exists.
+        Topic to record. May be repeated. Default: all of the robot's.
     """
     from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder
 
     writer = RawBagWriter(out, force=force)
     try:
-        with where.bus("magtwin_record", sim_time=sim_time, duration=duration) as bus:
-            announcer(quiet=False)(f"recording by {bus.backend}; Ctrl-C ends")
+        with where.bus("magtwin_record", sim_time=sim_time, duration_s=duration_s) as bus:
+            announce(f"recording by {bus.backend}; Ctrl-C ends")
             recorder = Recorder(bus, writer, topic, sim_time=sim_time, say=_warn)
             with progress("Recording", "messages") as advance:
-                recorder.run(lambda: advance(sum(writer.counts.values()), None), duration_s=duration)
+                recorder.run(lambda: advance(sum(writer.counts.values()), None), duration_s=duration_s)
     finally:
         counts = dict(writer.counts)
         writer.close()
     if not sum(counts.values()):
-        raise InputError("nothing was recorded: nobody offered a topic; look at --domain and --namespace")
-    for name, count in counts.items():
-        say(f"{count:8d}  {name}")
-    say(f"Wrote {out}; magtwin info {out}")
+        raise InputError("nothing was recorded: no node offers these topics; check --domain and --namespace")
+    lines = [f"{count:8d}  {name}" for name, count in counts.items()]
+    text = "\n".join([*lines, f"Wrote {out}; magtwin info {out}"])
+    return Done(text=text, data={"messages": counts}, wrote=out)
 
 
 @ros_app.command(name="replay")
@@ -412,46 +359,40 @@ def replay(
     topic: tuple[str, ...] = (),
     scene: Path | None = None,
     where: Where = HERE,
-    speed: float = 1.0,
-    units: Literal["T", "nT"] = "T",
-) -> None:
+    pace: float = 1.0,
+    out_unit: OutUnit = None,
+) -> Done:
     """Publish a recorded run on its robot's ROS topics, in real time.
 
     Parameters
     ----------
     run
-        A run of any format.
+        A run in any format that magtwin reads.
     topic
-        A topic to say; may be given several times. All unless given.
+        Topic to publish. May be repeated. Default: all.
     scene
-        Scene that the run came from: gives frames, covariances, /tf_static and the robot's description.
-    where
-        Where the node stands.
-    speed
-        Sim time for each wall time.
-    units
-        Unit of fields: T, as ROS has them, or nT, as APRILab's robot publishes them.
+        Scene of the run, for frames, covariances, /tf_static and the robot's description. Default: none.
+    pace
+        Simulated seconds per second.
     """
     from magtwin.io.formats import read_run
     from magtwin.ros.record import Player
     from magtwin.twin import open_twin
 
-    if not speed > 0:
-        raise InputError(f"speed must be above 0, got {speed!r}")
+    if not pace > 0:
+        raise InputError(f"--pace must be above 0, got {pace!r}")
     whole = read_run(run)
     twin = None if scene is None else open_twin(scene, model_error=False)
     with where.bus("magtwin_replay") as bus:
-        player = Player(whole, bus, twin, units=units, topics=topic)
-        announcer(quiet=False)(
-            f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends"
-        )
+        player = Player(whole, bus, twin, units=out_unit or "T", topics=topic)
+        announce(f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends")
         step("Replaying")
-        count = player.run(speed=speed)
-    say(f"{count} messages")
+        count = player.run(speed=pace)
+    return Done(text=f"{count} messages", data={"messages": count})
 
 
 def spin(bus: "Bus", duration_s: float | None) -> None:
-    """Have a node do what it does, without an end or for a time by the wall [s]."""
+    """Run a node until it ends, or for a time [s]."""
     begin = time.monotonic()
     with progress("Reading", "s") if duration_s else silence() as advance:
         while duration_s is None or (gone := time.monotonic() - begin) < duration_s:
@@ -460,5 +401,13 @@ def spin(bus: "Bus", duration_s: float | None) -> None:
                 advance(gone, duration_s)
 
 
+def _drive_of(asset: Path | None) -> "DriveSpec":
+    """Limits of a robot's drive."""
+    from magtwin.files import shipped
+    from magtwin.usd.robot import load_robot
+
+    return load_robot(asset or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
+
+
 def _warn(text: str) -> None:
-    announcer(quiet=False)(f"warning: {text}")
+    announce(f"warning: {text}")

@@ -1,59 +1,106 @@
-"""What commands say, and how: reports, steps, progress, refusals; options that many of them share."""
+"""Output of commands: reports on stdout, one JSON document with --json, nothing with --quiet."""
 
 import io
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TextIO, cast
+from typing import Any, TextIO, cast
 
-from cyclopts import Parameter
-
-from magtwin.cli.progress import announcer, progress, silence, step
+from magtwin.cli.progress import announce, current, progress, silence, step
 from magtwin.errors import InputError
 from magtwin.summary import printable
 
-__all__ = [
-    "announcer",
-    "printable",
-    "progress",
-    "silence",
-    "step",
-]  # beside what is made here: commands have all from one place
+__all__ = ["announce", "printable", "progress", "silence", "step"]  # commands import these from here too
 
 WIDE = 100_000
 """Columns of output that goes to a file or another program: no line is broken."""
 
 
-def _whole(kind: type, tokens: Any) -> int:
-    """A whole number; cyclopts itself would round 1.5 to 2."""
+@dataclass(frozen=True)
+class Done:
+    """Result of a command, printed at its end: `Done(report, file)`."""
+
+    report: Any = None
+    """A report: `print_report` shows it, and its `to_json` is the JSON."""
+    wrote: Path | str | tuple[Path | str, ...] = ()
+    """Files and folders that the command wrote."""
+    text: str = ""
+    """Last lines for people, in place of "Wrote ..."."""
+    table: Callable[[], None] | None = None
+    """Prints the report for people, in place of `print_report`."""
+    data: Any = None
+    """Content of the JSON, in place of the report's."""
+    status: int = 0
+    """Exit status."""
+
+    def show(self) -> None:
+        """Print it, as JSON if --json was given, and exit if the status is not 0."""
+        wrote = self.wrote if isinstance(self.wrote, tuple) else (self.wrote,)
+        if _mode.json:
+            self._show_json([str(path) for path in wrote])
+        else:
+            if self.table is not None:
+                self.table()
+            elif self.report is not None:
+                print_report(self.report)
+            if self.text or wrote:
+                say(self.text or f"Wrote {', '.join(map(str, wrote))}")
+        if self.status:
+            sys.exit(self.status)
+
+    def _show_json(self, wrote: list[str]) -> None:
+        import json
+
+        data = self.data
+        if data is None and self.report is not None:
+            data = json.loads(self.report.to_json())
+        if wrote and (data is None or isinstance(data, dict)):
+            data = {**(data or {}), "wrote": wrote}
+        print(json.dumps({} if data is None else data, indent=2, ensure_ascii=False))  # noqa: T201
+
+
+@dataclass
+class _Mode:
+    """What --json and --quiet of the command said."""
+
+    json: bool = False
+    quiet: bool = False
+
+
+_mode = _Mode()
+
+
+@contextmanager
+def output_mode(*, json: bool, quiet: bool) -> Iterator[None]:
+    """Print JSON, or nothing, until the end of the block."""
+    before = _mode.json, _mode.quiet
+    _mode.json, _mode.quiet = json, quiet
     try:
-        return int(tokens[0].value)
-    except ValueError:
-        raise ValueError(f"a whole number is wanted, got {tokens[0].value!r}") from None
-
-
-Whole = Annotated[int, Parameter(converter=_whole)]
-Seed = Whole
-
-
-def _session(kind: Any, tokens: Any) -> int | str:
-    """A session: its number, or "survey"."""
-    text = tokens[0].value
-    if text == "survey":
-        return "survey"
-    try:
-        return int(text)
-    except ValueError:
-        raise ValueError(f"a session is a whole number, or survey; got {text!r}") from None
-
-
-Session = Annotated[int | Literal["survey"] | None, Parameter(converter=_session)]
-Force = Annotated[bool, Parameter(name="--force", negative="")]
-Json = Annotated[bool, Parameter(name="--json", negative="")]
+        with current().reduced(steps=json or quiet, all=quiet):
+            yield
+    finally:
+        _mode.json, _mode.quiet = before
 
 
 def say(text: str) -> None:
-    """Say a line on stdout."""
-    print(text)  # noqa: T201
+    """Print a line on stdout; nothing with --json or --quiet."""
+    if not (_mode.json or _mode.quiet):
+        print(text)  # noqa: T201
+
+
+def note(text: str) -> None:
+    """Print an indented line on stderr; nothing with --quiet."""
+    if not _mode.quiet:
+        print(f"  {text}", file=sys.stderr)  # noqa: T201
+
+
+def print_error(text: str, style: str = "") -> None:
+    """Print one line on stderr, in colour on a terminal; --quiet prints it too."""
+    text = f"magtwin: {' '.join(text.split())}"
+    coloured = style and sys.stderr.isatty()
+    print(f"\033[{style}m{text}\033[0m" if coloured else text, file=sys.stderr)  # noqa: T201
 
 
 class _Trimmed(io.TextIOBase):
@@ -64,16 +111,18 @@ class _Trimmed(io.TextIOBase):
         return sys.stdout.write("\n".join(line.rstrip(" ") for line in text.split("\n")))
 
     def flush(self) -> None:
-        """Hand on what was written."""
+        """Flush stdout."""
         sys.stdout.flush()
 
 
 def stdout_console() -> Any:
-    """A console on stdout: as wide as the terminal, or as wide as its text needs where there is none."""
+    """A console on stdout: as wide as the terminal, or as its text if stdout is no terminal."""
     import os
 
     from rich.console import Console
 
+    if _mode.json or _mode.quiet:
+        return Console(file=io.StringIO(), highlight=False)
     if sys.stdout.isatty():
         return Console(highlight=False)
     width = None if os.environ.get("COLUMNS") else WIDE
@@ -81,15 +130,24 @@ def stdout_console() -> Any:
 
 
 def check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:
-    """Refuse a file to write whose name ends otherwise."""
+    """Refuse an output whose name has another suffix."""
     if path.suffix not in suffixes:
         raise InputError(f"{path}: {what} ends in {' or '.join(suffixes)}")
 
 
-def print_report(report: Any, as_json: bool) -> None:
-    """A report as a table for people, or as JSON for scripts."""
-    if as_json:
-        say(report.to_json())
+def check_output(path: Path | None, suffixes: tuple[str, ...], what: str, *, force: bool) -> None:
+    """Refuse an output whose name has another suffix, or that exists without --force."""
+    from magtwin.files import check_free
+
+    if path is not None:
+        check_suffix(path, suffixes, what)
+        check_free(path, force=force)
+
+
+def print_report(report: Any, as_json: bool = False) -> None:
+    """Print a report: a table for people, its JSON for scripts."""
+    if as_json or _mode.json:
+        print(report.to_json())  # noqa: T201
         return
     from rich.table import Table
     from rich.text import Text
@@ -111,38 +169,36 @@ def print_report(report: Any, as_json: bool) -> None:
             spread = f"± {_rounded(figure.spread)}" if figure.spread is not None else ""
             cells = (figure.name, value, f"{spread} {figure.unit}".strip())
             numbers.add_row(*map(Text, cells), Text(figure.note, style="dim"))
-    for name, fact in report.metadata.items():
-        if isinstance(fact, (dict, list)):
-            lists.append((name, fact))
-        elif fact != "":
-            words.add_row(Text(name), Text(printable(str(fact))))
+    for name, entry in report.metadata.items():
+        if isinstance(entry, (dict, list)):
+            lists.append((name, entry))
+        elif entry != "":
+            words.add_row(Text(name), Text(printable(str(entry))))
     console.print(Text(printable(report.title), style="bold"))
     for table in (numbers, words):
         if table.row_count:
             console.print(table)
     if report.verdict:
         console.print(Text(printable(report.verdict), style="bold"), soft_wrap=True)
-    for name, fact in lists:
+    for name, entry in lists:
         console.print(Text(name))
-        entries = fact.items() if isinstance(fact, dict) else (("", entry) for entry in fact)
-        for key, entry in entries:
-            _print_entry(console, printable(str(key)), printable(str(entry)))
+        entries = entry.items() if isinstance(entry, dict) else (("", item) for item in entry)
+        for key, item in entries:
+            _print_entry(console, printable(str(key)), printable(str(item)))
 
 
 def _rounded(spread: float) -> str:
-    """A spread to three digits, without an exponent where it is a usual number."""
+    """A spread to three digits, without an exponent below 1e9."""
     text = f"{spread:,.3g}"
     return f"{round(spread, 3 - len(str(int(spread)))):,.0f}" if "e+" in text and spread < 1e9 else text
 
 
 def _print_entry(console: Any, key: str, text: str) -> None:
-    """An entry of a list, below its title: on one line, or its text on lines of its own below its key."""
+    """Print an entry of a list below its title: on one line if it fits, else the text below its key."""
     from rich.padding import Padding
     from rich.text import Text
 
-    whole = f"{key}  {text}" if key else text
-    if not key or len(whole) + 2 <= console.width:
-        console.print(Padding(Text(whole, overflow="fold"), (0, 0, 0, 2), expand=False))
-        return
-    console.print(Padding(Text(key), (0, 0, 0, 2), expand=False))
-    console.print(Padding(Text(text, overflow="fold"), (0, 0, 0, 4), expand=False))
+    line = f"{key}  {text}" if key else text
+    fits = not key or len(line) + 2 <= console.width
+    for part, indent in ((line, 2),) if fits else ((key, 2), (text, 4)):
+        console.print(Padding(Text(part, overflow="fold"), (0, 0, 0, indent), expand=False))

@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdUtils, Vt
 
 from magtwin.errors import InputError
-from magtwin.export.contents import assets_of, kind_of
+from magtwin.export.contents import kind_of, named_files
 from magtwin.files import sha256
 from magtwin.usd.layers import open_stage, relative_asset
 from magtwin.usd.schema import place as said
@@ -56,7 +56,7 @@ def attach(root: Path, *more: Path) -> None:
         raise InputError(f"{root} <{scope}>: is where files are attached; rename that prim")
     layers = [layer for layer in stage.GetUsedLayers() if layer.realPath]
     for layer in layers:
-        if any(kind_of(asset) in KINDS for _, asset in assets_of(layer)):
+        if any(kind_of(file.path) in KINDS for file in named_files(layer)):
             UsdUtils.ModifyAssetPaths(layer, lambda asset: "" if kind_of(asset) in KINDS else asset)
             layer.Save()
     names = ("files.usdc", *(f"files_{i}.usdc" for i in range(2, 99)))

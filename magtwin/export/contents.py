@@ -3,11 +3,13 @@
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
 from pxr import Sdf, UsdUtils
+from safetensors import SafetensorError, safe_open
 
 from magtwin.errors import InputError
 from magtwin.usd.layers import SUFFIXES, open_stage
@@ -71,7 +73,7 @@ def bring_together(root: Path, folder: Path, *, within: Path | None = None) -> P
     for file, layer in files.items():
         _copy_layer(file, layer, folder, places)
     for file in others:
-        _copied(file, folder / places[file])
+        copied(file, folder / places[file])
     return folder / places[root]
 
 
@@ -85,21 +87,45 @@ def dependencies(root: Path) -> tuple[list[Sdf.Layer], list[str], list[str]]:
     return layers, assets, lost
 
 
-def assets_of(layer: Sdf.Layer) -> Iterator[tuple[Sdf.Path, str]]:
-    """Every asset that a layer's properties name, in any variant, with the path of the property."""
-    found: list[tuple[Sdf.Path, str]] = []
+@dataclass(frozen=True)
+class NamedFile:
+    """A file that a layer names."""
+
+    path: str
+    """The asset path, as it is written."""
+
+    where: str
+    """Path of the prim or property that names it; "" for the layer itself."""
+
+
+def named_files(layer: Sdf.Layer) -> list[NamedFile]:
+    """Every asset path that a layer authors, in any variant, in order of the layer."""
+    files = [NamedFile(path, "") for path in layer.subLayerPaths]
 
     def visit(path: Sdf.Path) -> None:
-        spec = layer.GetObjectAtPath(path) if path.IsPropertyPath() else None
-        if not isinstance(spec, Sdf.AttributeSpec) or spec.typeName not in _ASSETS:
-            return
-        values = [spec.default, *(layer.QueryTimeSample(path, t) for t in layer.ListTimeSamplesForPath(path))]
-        for value in values:
-            named = [value] if isinstance(value, Sdf.AssetPath) else list(value or ())
-            found.extend((path, asset.path) for asset in named if asset.path)
+        spec = layer.GetObjectAtPath(path)
+        if isinstance(spec, Sdf.PrimSpec):
+            for arcs in (spec.referenceList, spec.payloadList):
+                named = [arc.assetPath for arc in arcs.GetAddedOrExplicitItems() if arc.assetPath]
+                files.extend(NamedFile(name, str(path)) for name in named)
+        elif isinstance(spec, Sdf.AttributeSpec) and spec.typeName in _ASSETS:
+            times = layer.ListTimeSamplesForPath(path)
+            for value in [spec.default, *(layer.QueryTimeSample(path, time) for time in times)]:
+                assets = [value] if isinstance(value, Sdf.AssetPath) else value or ()
+                files.extend(NamedFile(asset.path, str(path)) for asset in assets if asset.path)
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
-    return iter(found)
+    seen = {file.path for file in files}
+    copy = Sdf.Layer.CreateAnonymous(".usda")
+    copy.TransferContent(layer)
+
+    def keep(path: str) -> str:  # paths in metadata, such as clips
+        if path and path not in seen:
+            files.append(NamedFile(path, ""))
+        return path
+
+    UsdUtils.ModifyAssetPaths(copy, keep)
+    return files
 
 
 _ASSETS = (Sdf.ValueTypeNames.Asset, Sdf.ValueTypeNames.AssetArray)
@@ -129,16 +155,12 @@ def _check_carried(file: Path, layers: Iterable[Sdf.Layer], within: Path | None)
 
 
 def _namer(layers: Iterable[Sdf.Layer], name: str) -> str:
-    """Which layer, and which property of it, names a file."""
+    """Which layer, and which prim or property of it, names a file."""
     layers = list(layers)
     for layer in layers:
-        for path, asset in assets_of(layer):
-            if name in (asset, layer.ComputeAbsolutePath(asset), str(_resolved(layer, asset))):
-                return f"{layer.realPath} <{path}>"
-    for layer in layers:
-        for asset in layer.GetExternalReferences():
-            if name in (asset, layer.ComputeAbsolutePath(asset), str(_resolved(layer, asset))):
-                return str(layer.realPath)
+        for file in named_files(layer):
+            if name in (file.path, layer.ComputeAbsolutePath(file.path), str(_resolved(layer, file.path))):
+                return f"{layer.realPath} <{file.where}>" if file.where else str(layer.realPath)
     return str(layers[0].realPath)
 
 
@@ -188,10 +210,10 @@ def _copy_layer(file: Path, layer: Sdf.Layer, folder: Path, places: Mapping[Path
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
         copy.Export(str(folder / place))
     else:
-        _copied(file, folder / place)
+        copied(file, folder / place)
     picture = THUMBNAIL / f"{file.name}.png"
     if (file.parent / picture).is_file():
-        _copied(file.parent / picture, folder / place.parent / picture)
+        copied(file.parent / picture, folder / place.parent / picture)
 
 
 def _udim(pattern: Path, places: Mapping[Path, Path]) -> Path | None:
@@ -203,6 +225,16 @@ def _udim(pattern: Path, places: Mapping[Path, Path]) -> Path | None:
     return None
 
 
-def _copied(file: Path, place: Path) -> None:
+def copied(file: Path, place: Path) -> None:
+    """Copy a file, and make its folder."""
     place.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(file, place)
+
+
+def weights_metadata(file: Path) -> dict[str, str]:
+    """Metadata in the header of a safetensors file; empty if it has none or cannot be read."""
+    try:
+        with safe_open(file, framework="numpy") as weights:
+            return weights.metadata() or {}
+    except (OSError, SafetensorError):
+        return {}

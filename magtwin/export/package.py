@@ -3,26 +3,24 @@
 import json
 import os
 import shutil
-import struct
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from tempfile import TemporaryDirectory
 from typing import Literal
 
+from jinja2 import Template
 from pxr import Sdf, Usd, UsdGeom
 
-from magtwin.author.scene import read_scene
 from magtwin.errors import InputError, find
 from magtwin.export.attached import attach, detach
-from magtwin.export.contents import THUMBNAIL, bring_together
+from magtwin.export.contents import THUMBNAIL, bring_together, copied, weights_metadata
 from magtwin.export.flatten import flatten
 from magtwin.export.glb import write_glb
-from magtwin.export.howto import howto
 from magtwin.export.isaac import GRAPHS, author_graph
 from magtwin.export.structure import structure
-from magtwin.export.units import to_metres_z_up
 from magtwin.export.usdz import pack, unpack
 from magtwin.export.validation.inspection import inspect
 from magtwin.files import check_free, existing, output, sha256
@@ -32,9 +30,9 @@ from magtwin.urdf.simready import UNKNOWN
 from magtwin.usd.animation import write_animation
 from magtwin.usd.layers import open_stage, stage_sha256
 from magtwin.usd.maps import read_map
+from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import FOLDER as SCHEMA
 from magtwin.usd.schema import attribute_name, place, prims_with
-from magtwin.usd.sensors import MAP_CHECKSUM
 from magtwin.version import __version__
 
 Profile = Literal["omniverse", "isaac", "newton", "viewer"]
@@ -54,13 +52,10 @@ PLUGIN = Path("plugin", "magtwin")
 GENERATED = ("plugInfo.json", "generatedSchema.usda")
 """What a program needs to know magtwin's schemas, and where it lies."""
 
-HOWTO = "HOWTO.md"
+README = "README.md"
 
 SCRIPTS = Path(__file__).resolve().parent / "scripts"
 """Examples of what to do with an export, which need no magtwin; those called as a profile go with it."""
-
-HEADER_MAX = 10_000_000
-"""Bytes of the header of a safetensors file that are read for a licence."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +96,6 @@ def export_scene(
     animation: Run | None = None,
     to_onnx: Callable[[Path, Path], object] | None = None,
     thumbnail: Callable[[Path, Path], object] | None = None,
-    convert_units: bool = False,
     trusted: bool = False,
     force: bool = False,
     progress: Callable[[str], object] = lambda step: None,
@@ -111,7 +105,7 @@ def export_scene(
     Args:
         scene_file: Root layer of a scene or of any other stage, or a .usdz.
         out: What to make: a folder (no suffix), a package .usdz, one layer .usd or .usdc, or a .glb. Beside
-            a package lies a folder `<name>_magtwin` with the schema plugin, the how-to and the network.
+            a package lies a folder `<name>_magtwin` with the schema plugin, README.md and the network.
         profile: For whom, see `PROFILES`; omniverse for folders and packages, viewer for the others, unless
             given.
         animation: A run that plays over the stage; in a folder as a layer of its own, `<name>_run.usdc`.
@@ -119,7 +113,6 @@ def export_scene(
             file to make. What it refuses becomes a note.
         thumbnail: Draws a folder's stage: called with its root layer and the PNG to make, 256 pixels square.
             What it refuses becomes a note.
-        convert_units: Whether a stage that is not in metres with Z up is converted, see `to_metres_z_up`.
         trusted: Whether the stage was made here. Otherwise it is first read in a process of its own, as a
             damaged layer can end its reader; that takes a second.
         force: Whether what exists is replaced.
@@ -127,7 +120,7 @@ def export_scene(
 
     Raises:
         InputError: The stage cannot be opened, names what is not there, is not what its checksums say, or
-            is not in metres with Z up and `convert_units` was not given; or `out` exists, or cannot hold what
+            is not in metres with Z up; or `out` exists, or cannot hold what
             the stage has. Nothing is written.
     """
     scene_file, out = Path(scene_file), Path(out)
@@ -149,7 +142,7 @@ def export_scene(
             raise InputError(f"{target}: is or holds the stage that is exported; name another place")
     with TemporaryDirectory() as scratch, _told_of(Path(scratch, "stage"), scene_file):
         work = _Work(Path(scratch, "stage"), scene_file, name, progress)
-        work.gather(convert_units=convert_units, trusted=trusted)
+        work.gather(trusted=trusted)
         work.check()
         if to_onnx is not None and name != "viewer":
             work.onnx_of(to_onnx)
@@ -208,8 +201,8 @@ class _Work:
         self.scripts = sorted(SCRIPTS.glob(f"{profile}_*.py"))
         self.checksum = ""
 
-    def gather(self, *, convert_units: bool, trusted: bool) -> None:
-        """Bring the stage together, in metres with Z up."""
+    def gather(self, *, trusted: bool) -> None:
+        """Copy the stage and all that it names into the folder."""
         self.progress("Gathering what the stage names")
         self.folder.mkdir()
         if self.source.suffix == ".usdz":
@@ -222,7 +215,7 @@ class _Work:
             self.checksum = sha256(self.source)
             self.root = bring_together(root, self.folder, within=package)
             for file in unnamed:
-                _copied(file, self.folder / file.relative_to(root.parent))
+                copied(file, self.folder / file.relative_to(root.parent))
         else:
             if not trusted:
                 inspect(self.source, ())
@@ -233,36 +226,11 @@ class _Work:
         metres, up = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)
         if UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters) and up == UsdGeom.Tokens.z:
             return
-        if not convert_units:
-            said = stage.HasAuthoredMetadata("metersPerUnit") and stage.HasAuthoredMetadata("upAxis")
-            raise InputError(
-                f"{self.source}: has {metres:g} m a unit and {up} up{'' if said else ', as it says none'}; "
-                "magtwin hands on metres with Z up: give --convert-units to convert its points and transforms"
-            )
-        self.progress("Converting to metres with Z up")
-        stale = self._map_stamps(stage)
-        del stage
-        self.notes += to_metres_z_up(self.root)
-        self._stamp(stale)
-
-    def _map_stamps(self, stage: Usd.Stage) -> list[tuple[Sdf.Path, Path]]:
-        """The attributes that hold the checksum of a map's file, where it fits."""
-        fits = []
-        maps = prims_with(stage.GetPseudoRoot(), "anomalyMap")
-        for prim in prims_with(stage.GetPseudoRoot(), "magnetometer"):
-            stamp = prim.GetAttribute(MAP_CHECKSUM)
-            fits += [
-                (stamp.GetPath(), file) for file in map(_values_layer, maps) if stamp.Get() == sha256(file)
-            ]
-        return fits
-
-    def _stamp(self, stamps: list[tuple[Sdf.Path, Path]]) -> None:
-        if not stamps:
-            return
-        stage = open_stage(self.root)
-        for path, layer in stamps:
-            stage.GetAttributeAtPath(path).Set(sha256(layer))
-        stage.GetRootLayer().Save()
+        authored = stage.HasAuthoredMetadata("metersPerUnit") and stage.HasAuthoredMetadata("upAxis")
+        raise InputError(
+            f"{self.source}: has {metres:g} m a unit and {up} up{'' if authored else ', the defaults of USD'}"
+            "; an export is in metres with Z up: convert the stage first, in Blender or Omniverse"
+        )
 
     def check(self) -> None:
         """Refuse a scene, map or network that is not what its checksums say."""
@@ -274,7 +242,7 @@ class _Work:
             read_map(prim)
             self.map = self.map or str(prim.GetPath())
             licence = prim.GetAttribute(attribute_name("anomalyMap", "licence")).Get()
-            self.licences[self._said(_values_layer(prim))] = licence or UNKNOWN
+            self.licences[self._relative(_values_layer(prim))] = licence or UNKNOWN
         magnetometers = prims_with(world, "magnetometer")
         self.magnetometer = str(magnetometers[0].GetPath()) if magnetometers else ""
         self.networks: list[Path] = []
@@ -291,16 +259,16 @@ class _Work:
                 )
             if file not in self.networks:
                 self.networks.append(file)
-                self.licences[self._said(file)] = licence_of(file) or UNKNOWN
+                self.licences[self._relative(file)] = licence_of(file) or UNKNOWN
         for layer in stage.GetUsedLayers():
             metadata = layer.customLayerData.get("SimReady_Metadata", {})
             if layer.realPath and metadata.get("asset_license"):
-                self.licences[self._said(Path(layer.realPath))] = metadata["asset_license"]
+                self.licences[self._relative(Path(layer.realPath))] = metadata["asset_license"]
         self.licences = dict(sorted(self.licences.items()))
         is_scene = all(prims_with(world, noun) for noun in ("lab", "robot", "magnetometer"))
         self.scene = read_scene(self.root) if is_scene else None
 
-    def _said(self, file: Path) -> str:
+    def _relative(self, file: Path) -> str:
         return file.resolve().relative_to(self.folder.resolve()).as_posix()
 
     def onnx_of(self, write: Callable[[Path, Path], object]) -> None:
@@ -313,7 +281,7 @@ class _Work:
                     write(weights, out)
                 self.onnx.append(out)
             except InputError as error:
-                self.notes.append(f"{self._said(weights)} has no ONNX beside it: {error}")
+                self.notes.append(f"{self._relative(weights)} has no ONNX beside it: {error}")
 
     def for_isaac(self) -> None:
         """Give robots Isaac Sim's asset structure, and the scene its Action Graphs."""
@@ -371,7 +339,7 @@ class _Work:
         for file in self.folder.rglob("*"):
             if file.is_file() and file != self.root:
                 raise InputError(
-                    f"{self.source}: {self._said(file)} cannot lie in a layer; give a folder or a .usdz"
+                    f"{self.source}: {self._relative(file)} cannot lie in a layer; give a folder or a .usdz"
                 )
         if out.suffix == ".usd":
             self.root = self.root.rename(self.root.with_suffix(".usd"))
@@ -382,7 +350,7 @@ class _Work:
         if beside is not None:
             beside.mkdir()
             for file in [*self.networks, *self.onnx]:
-                _copied(file, beside / "weights" / file.name)
+                copied(file, beside / "weights" / file.name)
             self._explain(beside, out.name, attached=True)
         attach(self.root, *self.onnx)
         if self.profile == "viewer":
@@ -408,20 +376,23 @@ class _Work:
                     shutil.rmtree(picture.parents[1])
 
     def _explain(self, folder: Path, root: str, *, attached: bool) -> None:
-        """Lay the how-to into a folder, and the schema plugin where programs can use it."""
+        """Write the README page and the schema plugin to a folder."""
         viewer = self.profile == "viewer"
         run = root if attached or self.run is None else self.run.name  # what plays it
         if not viewer:
             for name in GENERATED:
-                _copied(SCHEMA / name, folder / PLUGIN / name)
-        page = howto(
+                copied(SCHEMA / name, folder / PLUGIN / name)
+        template = Template(
+            (Path(__file__).with_name("readme.md.jinja")).read_text(encoding="utf-8"), trim_blocks=True
+        )
+        page = template.render(
             name=self.source.stem,
             version=__version__,
             root=root,
             run=run if self.plays else "",
             flat=viewer,
             plugin=not viewer,
-            map_prim=self.map,
+            map=self.map,
             magnetometer=self.magnetometer if self.networks else "",
             attached=attached,
             graphs=str(GRAPHS) if self.profile == "isaac" else "",
@@ -429,12 +400,13 @@ class _Work:
             checksum=self.checksum,
             licences=self.licences,
             scripts=[script.name for script in self.scripts],
-            onnx=self._said(self.onnx[0]) if self.onnx else "",
+            stage=quote(f"../{root}" if attached else root),
+            onnx=quote(self._relative(self.onnx[0]) if self.onnx else "NETWORK.onnx"),
             notes=self.notes,
         )
-        (folder / HOWTO).write_text(page, encoding="utf-8")
+        (folder / README).write_text(page, encoding="utf-8")
         for script in self.scripts:
-            _copied(script, folder / script.name)
+            copied(script, folder / script.name)
 
 
 def _values_layer(prim: Usd.Prim) -> Path:
@@ -444,22 +416,8 @@ def _values_layer(prim: Usd.Prim) -> Path:
 
 
 def licence_of(network: Path) -> str:
-    """The licence that the metadata of a network's weights say, "" where they say none."""
-    if network.suffix != ".safetensors":
-        return ""
-    with open(network, "rb") as file:
-        head = file.read(8)
-        size = struct.unpack("<Q", head)[0] if len(head) == 8 else 0
-        if not 0 < size <= HEADER_MAX:
-            return ""
-        text = file.read(size)
+    """The licence in the metadata of a network's weights; "" if there is none."""
     try:
-        metadata = json.loads(json.loads(text)["__metadata__"]["magtwin"])["facts"]
-        return str(metadata.get("licence", ""))
+        return str(json.loads(weights_metadata(network)["magtwin"])["facts"].get("licence", ""))
     except (ValueError, KeyError, TypeError, AttributeError):
         return ""
-
-
-def _copied(file: Path, place: Path) -> None:
-    place.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(file, place)

@@ -1,4 +1,4 @@
-"""Days: the dates of surveys, of epochs and of the Earth's field."""
+"""Calendar days: dates of surveys, of epochs and of the Earth's field."""
 
 import datetime
 from collections.abc import Sequence
@@ -10,10 +10,10 @@ ORIGIN = datetime.date(2000, 1, 1)
 
 
 def parse_day(day: str | datetime.date, what: str = "date") -> datetime.date:
-    """A day, from its name YYYY-MM-DD.
+    """Parse a day, YYYY-MM-DD.
 
     Raises:
-        InputError: It is none; the text begins with `what`.
+        InputError: It is not a day; the text begins with `what`.
     """
     if isinstance(day, datetime.datetime):
         return day.date()
@@ -29,20 +29,16 @@ def parse_day(day: str | datetime.date, what: str = "date") -> datetime.date:
 
 
 def check_day(day: str, what: str) -> None:
-    """Refuse the text of a day that is neither YYYY-MM-DD nor empty.
-
-    Raises:
-        InputError: It is none; the text begins with `what`.
-    """
+    """Raise InputError unless a text is a day YYYY-MM-DD or empty; the error begins with `what`."""
     if day != "":
         parse_day(day, what)
 
 
 def check_texts(survey: object, names: Sequence[str]) -> None:
-    """Refuse what a survey or a map says of itself where it is no text, or its day none.
+    """Refuse metadata of a survey or a map that is not text, and a `created` that is not a day.
 
     Raises:
-        InputError: An attribute of `survey`, one of `names`, is no text, or `created` is no day.
+        InputError: The text names the attribute.
     """
     kind = type(survey).__name__
     for name in names:
@@ -53,5 +49,5 @@ def check_texts(survey: object, names: Sequence[str]) -> None:
 
 
 def day_number(day: datetime.date) -> int:
-    """Days from 2000-01-01 to `day`, UTC; below 0 before it."""
+    """Days from 2000-01-01 to `day`, UTC; negative before it."""
     return (day - ORIGIN).days

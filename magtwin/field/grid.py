@@ -1,4 +1,4 @@
-"""Grid: nodes over x, y and heading, as surveys stand on and maps are kept on."""
+"""Grid: the nodes over x, y and heading of gridded surveys and of maps."""
 
 from dataclasses import dataclass
 
@@ -13,15 +13,15 @@ Array = NDArray[np.float64]
 TURN = 2 * np.pi
 
 MOST_NODES = 50_000_000
-"""A larger grid is taken for a slip in its spacing: 0.4 GB of values."""
+"""Larger grids (0.4 GB of values) are refused: the spacing is probably a typo."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Grid(Summarized):
-    """Evenly spaced nodes over a floor, in one or more headings.
+    """Evenly spaced nodes over a floor, at one or more headings.
 
-    Node (h, j, i) lies at x = origin_m[0] + i cell_m[0], y = origin_m[1] + j cell_m[1] in world, with
-    the robot's heading at headings_rad[h].
+    Node (h, j, i) is at x = origin_m[0] + i cell_m[0], y = origin_m[1] + j cell_m[1] in world, at heading
+    headings_rad[h].
     """
 
     origin_m: tuple[float, float]
@@ -66,11 +66,11 @@ class Grid(Summarized):
 
     @classmethod
     def over(cls, extent: ArrayLike, spacing_m: float, headings_rad: ArrayLike) -> "Grid":
-        """The grid of a spacing over a rectangle, centred in it, its nodes none outside.
+        """A grid of a given spacing, centred in a rectangle and within it.
 
         Args:
             extent: Least x, greatest x, least y, greatest y [m].
-            spacing_m: Distance between nodes both ways [m].
+            spacing_m: Distance between nodes in x and y [m].
             headings_rad: Headings [rad], ascending in [0, 2 pi).
 
         Raises:

@@ -12,28 +12,28 @@ Array = NDArray[np.float64]
 Unit = Literal["nT", "uT", "T", "mG", "G"]
 
 LEAST_MEAN_NT, GREATEST_MEAN_NT = 10_000.0, 100_000.0
-"""Bounds of a survey's mean [nT]; the Earth's field lies in 22,000..67,000 nT, a building bends it."""
+"""Bounds of a survey's mean [nT]. The Earth's field is 22,000 to 67,000 nT; a building bends it."""
 
 INDOORS_NT = 18_000.0, 75_000.0
-"""Median of readings from which their unit follows [nT]: the Earth's 22,000 to 67,000, and some steel."""
+"""Range of the median of readings from which their unit is deduced [nT]: the Earth's field and some steel."""
 
 USUAL_NT = 50_000.0
-"""Magnitude that a refusal suggests a scale for [nT]."""
+"""Magnitude that a suggested scale would give [nT]."""
 
 NT_PER: dict[str, float] = {"nT": 1.0, "uT": 1e3, "T": 1e9, "mG": 1e2, "G": 1e5}
-"""Units that a field may be in, and the nT that each is."""
+"""nT per unit."""
 
 MIXED = 0.01
-"""Share of readings that are a unit's factor off the others, above which they are no outliers."""
+"""Share of readings in another unit from which they count as mixed units, not as outliers."""
 
 
 def _four(value: float) -> str:
-    """A number to four digits, without an exponent where it is usual."""
+    """Four significant digits, without an exponent for usual sizes."""
     return f"{float(f'{value:.4g}'):g}"
 
 
 def nt_per(unit: str | None, scale: float | None) -> float:
-    """Factor from a file's values to nT: `scale` if it is given, else that of the unit, nT if None."""
+    """Factor from a file's values to nT: `scale` if given, else that of the unit; None is nT."""
     return NT_PER[unit or "nT"] if scale is None else scale
 
 
@@ -45,19 +45,19 @@ def check_unit(
     row: Callable[[int], str] | None = None,
     scale: float | None = None,
 ) -> None:
-    """Refuse readings whose mean cannot be the Earth's field in nT, and those of two units.
+    """Refuse readings whose mean cannot be the Earth's field, and readings in two units.
 
     Args:
-        b_nt: Magnitudes of the field as taken for nT, shape (N,).
-        where: File, for the refusal.
-        column: Its column.
-        unit: Unit that the file was said to be in.
-        row: Says where a reading stands, by its index; the file itself unless given.
-        scale: Factor that took the file's values to nT, in place of a unit.
+        b_nt: Field magnitudes [nT], shape (N,).
+        where: File, for the error.
+        column: Column, for the error.
+        unit: Unit that the file was read in.
+        row: Gives the place of a reading from its index. Default: the file.
+        scale: Factor from the file's values to nT, in place of a unit.
 
     Raises:
-        InputError: The mean lies outside 10,000..100,000 nT; the text names the unit that would fit. Or
-            more readings than outliers would be are another unit's factor off the others.
+        InputError: The mean is outside 10,000..100,000 nT (the text names the unit that would fit), or more
+            than 1 % of the readings are off by the factor of another unit.
     """
     usual = float(np.sort(b_nt)[len(b_nt) // 2])
     for other, factor in NT_PER.items():
@@ -99,10 +99,10 @@ def check_unit(
 
 
 def unit_by_size(b: Array) -> Unit | None:
-    """The unit in which magnitudes have the size of the Earth's field indoors; None where none has.
+    """Deduce the unit in which magnitudes have the size of the Earth's field indoors; None if none fits.
 
     Args:
-        b: Magnitudes as they stand in the file, shape (N,); nan counts for nothing.
+        b: Magnitudes as the file has them, shape (N,); nan is ignored.
     """
     b = np.abs(b[np.isfinite(b)])
     if not len(b):

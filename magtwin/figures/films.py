@@ -1,4 +1,4 @@
-"""Films: a run in its lab, or a stage on a turntable, as an MP4 or a GIF, frame by frame off screen."""
+"""Films: a run in its lab as an MP4 or a GIF, drawn off screen."""
 
 import math
 import os
@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.figures.pictures import turntable
 from magtwin.figures.scenery import Scenery, View
 from magtwin.files import check_free, output
 from magtwin.run.run import Run
@@ -23,21 +22,16 @@ Image = NDArray[np.uint8]
 
 SUFFIXES = (".mp4", ".gif")
 SIZES = {".mp4": (1280, 720), ".gif": (640, 360)}
-"""Width and height unless told otherwise [pixel]."""
+"""Default width and height [pixel]."""
 
 LONGEST_S = 30.0
-"""A run longer than this is shown faster, so that the film is no longer, unless a speed is given [s]."""
+"""Length of a film by default: a longer run is shown faster [s]."""
 
-TURN_S = 10.0
-"""Time that a turntable takes to go round once [s]."""
+MOST_FRAMES = {".mp4": 100_000, ".gif": 2_000}
+"""Frames of a film. Those of a GIF are held in memory until it is written."""
 
-MOST_FRAMES = 100_000
-MOST_GIF_FRAMES = 2_000
-"""Frames of a GIF, all of which are held until it is written."""
-
-MOST_FPS = 120.0
-MOST_GIF_FPS = 50.0
-"""GIF counts in hundredths of a second, and viewers slow down what is shorter than two."""
+MOST_FPS = {".mp4": 120.0, ".gif": 50.0}
+"""Frame rates. GIF counts in hundredths of a second, and viewers slow down frames shorter than two."""
 
 
 def film_of_run(
@@ -55,72 +49,21 @@ def film_of_run(
     """Draw a run as a film.
 
     Args:
-        run: What happened.
-        scene_file: The stage that it happened in.
+        run: The run.
+        scene_file: Stage of its lab.
         out: MP4 (H.264) or GIF to write.
-        fps: Frames a second.
-        speed: How many times faster it is shown than it happened; as it happened unless given, and what lasts
-            longer than 30 s in 30 s.
+        fps: Frames per second.
+        speed: Playback speed relative to the run. Default: 1, or more for a film of at most 30 s.
         camera: "orbit", "top", "chase" or "x,y,z:x,y,z", as for `magtwin.figures.scenery.View.of`.
-        size: Width and height [pixel]; 1280 x 720, of a GIF 640 x 360, unless given.
-        force: Whether a file that is there is replaced.
-        advance: Called after each frame with how many are done, and of how many.
+        size: Width and height [pixel]. Default: 1280 x 720, or 640 x 360 for a GIF.
+        force: Whether to replace an existing file.
+        advance: Called after each frame with the number of frames drawn, and their total.
 
     Raises:
-        InputError: As for `magtwin.figures.scenery.Scenery`; an option is out of range; `out` is no film, is
-            there already or cannot be written.
+        InputError: As for `magtwin.figures.scenery.Scenery`; an option is out of range; `out` is not a film,
+            exists, or cannot be written.
     """
     out, view = Path(out), View.of(camera)
-    size = _checked(out, size, fps, force=force)
-    times, speed = frame_times(run, fps, speed, _most_frames(out))
-
-    with Scenery(run, scene_file, times, view=view, size=size, speed=speed) as scenery:
-
-        def frames() -> Generator[Image, None, None]:
-            for k in range(len(times)):
-                yield scenery.frame(k)
-                advance(k + 1, len(times))
-
-        return _write(frames(), out, size, fps, force=force)
-
-
-def film_of_stage(
-    stage_file: str | os.PathLike[str],
-    out: str | os.PathLike[str],
-    *,
-    fps: float = 25.0,
-    size: tuple[int, int] | None = None,
-    force: bool = False,
-    advance: Callable[[int, int], None] = lambda done, total: None,
-) -> Path:
-    """Draw a stage as it stands, on a turntable: once round in `TURN_S`, so that the film can be repeated.
-
-    Args:
-        stage_file: The stage.
-        out: MP4 (H.264) or GIF to write.
-        fps: Frames a second.
-        size: Width and height [pixel]; as for `film_of_run` unless given.
-        force: Whether a file that is there is replaced.
-        advance: Called after each frame with how many are done, and of how many.
-
-    Raises:
-        InputError: As for `magtwin.figures.pictures.picture_of_stage`; an option is out of range; `out` is no
-            film, is there already or cannot be written.
-    """
-    out = Path(out)
-    size = _checked(out, size, fps, force=force)
-    count = max(1, round(TURN_S * fps))
-
-    def frames() -> Generator[Image, None, None]:
-        for k, image in enumerate(turntable(stage_file, count, size=size)):
-            yield image
-            advance(k + 1, count)
-
-    return _write(frames(), out, size, fps, force=force)
-
-
-def _checked(out: Path, size: tuple[int, int] | None, fps: float, *, force: bool) -> tuple[int, int]:
-    """The size of a film, once it, its rate and its name are not refused."""
     suffix = out.suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(f"{out}: films end in {' or '.join(SUFFIXES)}")
@@ -128,37 +71,32 @@ def _checked(out: Path, size: tuple[int, int] | None, fps: float, *, force: bool
     size = size or SIZES[suffix]
     if suffix == ".mp4" and (size[0] % 2 or size[1] % 2):
         raise InputError(f"an MP4's width and height must be even, got {size[0]} x {size[1]}")
-    most = MOST_GIF_FPS if suffix == ".gif" else MOST_FPS
-    if not 0 < fps < math.inf:
-        raise InputError(f"fps must be above 0 and finite, got {fps:g}")
-    if fps > most:
-        raise InputError(f"fps must be at most {most:g} in a {suffix[1:].upper()}, got {fps:g}")
-    return size
+    if fps > MOST_FPS[suffix]:
+        kind = suffix[1:].upper()
+        raise InputError(f"fps must be at most {MOST_FPS[suffix]:g} in a {kind}, got {fps:g}")
+    times, speed = frame_times(run, fps, speed, MOST_FRAMES[suffix])
+    with Scenery(run, scene_file, times, view=view, size=size, speed=speed) as scenery:
 
+        def frames() -> Generator[Image, None, None]:
+            for k in range(len(times)):
+                yield scenery.frame(k)
+                advance(k + 1, len(times))
 
-def _most_frames(out: Path) -> int:
-    return MOST_GIF_FRAMES if out.suffix.lower() == ".gif" else MOST_FRAMES
-
-
-def _write(
-    frames: Generator[Image, None, None], out: Path, size: tuple[int, int], fps: float, *, force: bool
-) -> Path:
-    """Frames as what the film's name ends in."""
-    with output(out, force=force) as aside, closing(frames):
-        if out.suffix.lower() == ".gif":
-            _write_gif(frames, aside, fps, out)
-        else:
-            _write_mp4(frames, aside, size, fps, out)
+        with output(out, force=force) as aside, closing(frames()) as images:
+            if suffix == ".gif":
+                _write_gif(images, aside, fps, out)
+            else:
+                _write_mp4(images, aside, size, fps, out)
     return out
 
 
 def frame_times(
-    run: Run, fps: float, speed: float | None, most: int = MOST_FRAMES
+    run: Run, fps: float, speed: float | None, most: int = MOST_FRAMES[".mp4"]
 ) -> tuple[NDArray[np.float64], float]:
-    """When the frames of a film are, on the run's clock [s], and how many times faster it is shown.
+    """Times of a film's frames on the run's clock [s], and the playback speed.
 
     Raises:
-        InputError: The run has too few readings, or an option is out of range.
+        InputError: The run has fewer than two readings, or an option is out of range.
     """
     if run.rows < 2 or "t" not in run:
         raise InputError(f"the run has {run.rows} readings; two or more are needed to show it")
@@ -175,51 +113,33 @@ def frame_times(
 
 
 def _write_mp4(frames: Iterator[Image], aside: Path, size: tuple[int, int], fps: float, out: Path) -> None:
-    """Frames as H.264 that every browser plays, without a word of when and by what it was made."""
-    with tempfile.TemporaryFile() as said, _ffmpeg(aside, size, fps, said) as process:
+    """Frames as H.264 that every browser plays, without date and encoder version."""
+    with tempfile.TemporaryFile() as log, _ffmpeg(aside, size, fps, log) as process:
         assert process.stdin is not None
         try:
             for image in frames:
                 process.stdin.write(image.tobytes())
             process.stdin.close()
-        except OSError as error:  # it ended before the frames did
+        except OSError as error:  # the encoder ended before the frames did
             process.wait()
-            raise InputError(f"{out}: cannot be written: {_last_line(said) or error.strerror}") from error
+            raise InputError(f"{out}: cannot be written: {_last_line(log) or error.strerror}") from error
         if process.wait():
-            raise InputError(f"{out}: cannot be written: {_last_line(said)}")
+            raise InputError(f"{out}: cannot be written: {_last_line(log)}")
 
 
 @contextmanager
 def _ffmpeg(
-    aside: Path, size: tuple[int, int], fps: float, said: IO[bytes]
+    aside: Path, size: tuple[int, int], fps: float, log: IO[bytes]
 ) -> "Iterator[subprocess.Popen[bytes]]":
-    """The encoder that comes with imageio-ffmpeg, fed by its stdin; ended with the block."""
+    """The encoder of imageio-ffmpeg, which reads frames from its stdin; ended with the block."""
     import imageio_ffmpeg
 
-    options: dict[str, Any] = {
-        "-f": "rawvideo",
-        "-pix_fmt": "rgb24",
-        "-s": f"{size[0]}x{size[1]}",
-        "-r": f"{fps:g}",
-    }
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "error", "-y"]
-    command += [word for option in options.items() for word in option]
-    command += [
-        "-i",
-        "-",
-        "-an",
-        "-c:v",
-        "libx264",
-        "-preset",
-        "veryfast",
-        "-crf",
-        "21",
-        "-pix_fmt",
-        "yuv420p",
-    ]
-    command += ["-map_metadata", "-1", "-fflags", "+bitexact", "-flags:v", "+bitexact"]
-    command += ["-movflags", "+faststart", str(aside)]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said)
+    source = f"-f rawvideo -pix_fmt rgb24 -s {size[0]}x{size[1]} -r {fps:g} -i -"
+    video = "-an -c:v libx264 -preset veryfast -crf 21 -pix_fmt yuv420p -movflags +faststart"
+    exact = "-map_metadata -1 -fflags +bitexact -flags:v +bitexact"
+    options = f"-nostdin -v error -y {source} {video} {exact}".split()
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), *options, str(aside)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log)
     try:
         yield process
     finally:
@@ -231,34 +151,26 @@ def _ffmpeg(
                 process.stdin.close()
 
 
-def _last_line(said: IO[bytes]) -> str:
-    said.seek(0)
-    lines = [line.strip() for line in said.read().decode(errors="replace").splitlines() if line.strip()]
-    return re.sub(r"^\[[^]]*] ", "", lines[-1]) if lines else ""  # the part of ffmpeg that speaks
+def _last_line(log: IO[bytes]) -> str:
+    log.seek(0)
+    lines = [line.strip() for line in log.read().decode(errors="replace").splitlines() if line.strip()]
+    return re.sub(r"^\[[^]]*] ", "", lines[-1]) if lines else ""  # without the component's name
 
 
 def _write_gif(frames: Iterator[Image], aside: Path, fps: float, out: Path) -> None:
-    """Frames in the colours of the first, each shown for hundredths of a second that add up."""
+    """Frames in the palette of the first one, with durations rounded so that errors do not add up."""
     from PIL import Image as Pillow
 
     palette: Any = None
-    made, ends = [], []
+    pictures, ends = [], []
     for k, image in enumerate(frames):
         picture = Pillow.fromarray(np.ascontiguousarray(image))
         if palette is None:
             palette = picture.quantize(256, method=Pillow.Quantize.MEDIANCUT)
-        made.append(picture.quantize(palette=palette, dither=Pillow.Dither.NONE))
+        pictures.append(picture.quantize(palette=palette, dither=Pillow.Dither.NONE))
         ends.append(10 * round(100 * (k + 1) / fps))
-    durations = np.diff([0, *ends]).tolist()
+    options: dict[str, Any] = {"append_images": pictures[1:], "duration": np.diff([0, *ends]).tolist()}
     try:
-        made[0].save(
-            aside,
-            format="gif",
-            save_all=True,
-            append_images=made[1:],
-            duration=durations,
-            loop=0,
-            optimize=False,
-        )
+        pictures[0].save(aside, format="gif", save_all=True, loop=0, optimize=False, **options)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror or error})") from error

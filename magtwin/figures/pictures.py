@@ -1,11 +1,10 @@
-"""Pictures: a stage as a PNG, drawn off screen, with or without a graphics card."""
+"""Pictures: a stage as a PNG or in a window, drawn with or without a graphics card."""
 
 import ctypes
 import itertools
 import os
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,25 +26,26 @@ from magtwin.usd.geometry import (
 )
 from magtwin.usd.layers import open_stage
 
+Array = NDArray[np.float64]
+
 MARGIN = 1.08
-"""How much farther away the camera stands than what is seen would need."""
+"""Distance of the camera, relative to the least distance from which everything is visible."""
 
 AROUND_M = 0.7
-"""How far around and above a heat-map, or a run's path, a camera over the lab sees at least [m]."""
+"""Margin around and above a heat-map or a path that a camera over the lab keeps in view [m]."""
 
 LAB_ELEVATION_DEG = 36.0
-"""Height of a camera over a lab above its target's horizon [deg]."""
+"""Elevation of a camera over a lab above its target's horizon [deg]."""
 
 BAR_SHARE = 0.12
 """Share of a picture's width, at its right, that the colour bar takes."""
 
 GL_PACKAGES = "libegl1 libgl1-mesa-dri libx11-6"
-"""Debian's packages that draw without a screen: EGL, Mesa's drivers for it, and what VTK loads first."""
+"""Debian packages for drawing without a screen: EGL, Mesa's drivers, and the library that VTK loads first."""
 
 BACKGROUND = "#e9edf1"
 
 INK = "#20262d"
-
 
 LIGHTS = (
     ((0.6, 0.9, 1.4), 0.75),
@@ -53,27 +53,27 @@ LIGHTS = (
     ((-0.9, 0.2, 0.6), 0.4),
     ((0.1, 0.0, -1.0), 0.3),
 )
-"""Direction that light comes from, in world, and its strength."""
+"""Direction towards each light in world, and its strength."""
 
 AMBIENT, DIFFUSE = 0.22, 0.8
-"""Shares of a thing's colour that it shows in no light, and in light that meets it upright."""
+"""Share of an object's colour visible without light, and share added by light at normal incidence."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Where a picture is taken from."""
+    """A camera."""
 
     azimuth_deg: float = 40.0
     """Direction from the target to the camera about world z, from x towards y [deg]."""
 
     elevation_deg: float = 22.0
-    """Height of the camera above the target's horizon [deg]."""
+    """Elevation of the camera above the target's horizon [deg]."""
 
     distance_m: float | None = None
-    """Distance from the target [m]; none means that everything just fits."""
+    """Distance from the target [m]. None: everything just fits."""
 
     target: Vec3 | None = None
-    """Point in the middle of the picture, in world [m]; none means the middle of everything."""
+    """Point in the middle of the picture, in world [m]. None: the middle of everything."""
 
     view_angle_deg: float = 30.0
     """Angle between the upper and the lower edge [deg]."""
@@ -85,6 +85,13 @@ class Camera:
             raise InputError(f"view_angle_deg of Camera must lie in 1..120, got {self.view_angle_deg!r}")
         if self.distance_m is not None and not self.distance_m > 0:
             raise InputError(f"distance_m of Camera must be above 0, got {self.distance_m!r}")
+
+    def axes(self) -> Array:
+        """Right, up and back axes in world, as rows, shape (3, 3)."""
+        a, e = np.radians([self.azimuth_deg, self.elevation_deg])
+        back = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        right = np.array([-np.sin(a), np.cos(a), 0.0])
+        return np.array([right, np.cross(back, right), back])
 
 
 def picture_of_stage(
@@ -98,45 +105,43 @@ def picture_of_stage(
     ground: bool | None = None,
     force: bool = False,
 ) -> Path:
-    """Draw a stage as it stands and write a PNG.
+    """Draw a stage and write a PNG. Objects in front of a heat-map or a robot are drawn as a veil.
 
     Args:
         path: USD file.
         out: PNG to write.
         size: Width and height [pixel].
-        camera: Where from; by default three quarters from the front, with everything in view, or, in a lab,
-            its heat-map. What stands between the camera and a heat-map or robot is drawn as a veil.
+        camera: The camera. Default: from the front left and above, with everything in view; of a lab, its
+            heat-map.
         title: A line at the top.
         legend: Whether a stage with an anomaly map gets the colour bar of its heat-map.
-        ground: Whether to draw a floor below everything; by default where the stage has nothing but
-            moving bodies, a robot alone, and the camera looks down on them.
-        force: Whether a file that is there is replaced.
+        ground: Whether to draw a floor below everything. Default: if the stage has only moving bodies (a
+            robot alone) and the camera looks down on them.
+        force: Whether to replace an existing file.
 
     Returns:
         `out`.
 
     Raises:
-        InputError: The stage is missing, is not USD or shows nothing; `out` is no PNG or is there
-            already; or this machine has nothing to draw with (the packages are named).
+        InputError: The stage is missing, is not USD or shows nothing; `out` is not a PNG or exists; or the
+            machine has no OpenGL (the packages are named).
     """
     out = check_png(out)
     check_size(size)
     with output(out, force=force) as aside:
         plotter = plotter_of(size)
         try:
-            drawn = _draw(plotter, path, size, camera, legend=legend, ground=ground)
+            screens = _draw(plotter, path, size, camera, legend=legend, ground=ground)
             if title:
-                plotter.add_text(
-                    title, position=(0.02, 0.93), viewport=True, font_size=round(size[1] / 80), color=INK
-                )
-            write_png(Cutaway(plotter, size, drawn.screens).image(), aside)
+                add_text(plotter, title, round(size[1] / 80))
+            write_png(Cutaway(plotter, size, screens).image(), aside)
         finally:
             plotter.close()
     return out
 
 
 def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1000)) -> None:
-    """Show a stage as it stands in a window, to be turned by the mouse; returns when it is closed.
+    """Show a stage in a window, where the mouse turns it; returns when the window is closed.
 
     Args:
         path: USD file.
@@ -155,27 +160,13 @@ def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1
         plotter.close()
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """What `_draw` put before the camera."""
-
-    around: NDArray[np.float64]
-    """Points that a camera without a distance of its own keeps in view [m], shape (N, 3)."""
-
-    screens: list[Any]
-    """Actors that may hide the subject of the picture."""
-
-    bar: bool
-    """Whether there is a colour bar."""
-
-
 def is_subject(shape: Shape, scale: ColourScale | None) -> bool:
     """Whether a shape must not be hidden: a heat-map, or a part of a robot."""
     return bool(shape.link) or (scale is not None and shape.prim == scale.prim)
 
 
-def room_above(points: ArrayLike) -> NDArray[np.float64]:
-    """Corners of the box around points, `AROUND_M` more on all sides and above [m], shape (8, 3)."""
+def room_above(points: ArrayLike) -> Array:
+    """Corners of the box around points [m], with `AROUND_M` more on all sides and above, shape (8, 3)."""
     points = np.asarray(points, float)
     low, high = points.min(axis=0), points.max(axis=0)
     low[:2] -= AROUND_M
@@ -192,9 +183,8 @@ def _draw(
     *,
     legend: bool = True,
     ground: bool | None = None,
-    soft: bool = True,
-) -> "_Drawn":
-    """Draw a stage as it stands, lit, before a camera; arguments as for `picture_of_stage`."""
+) -> list[Any]:
+    """Draw a stage, with lights and camera; returns the actors that may hide the subject."""
     stage = open_stage(path)
     shapes = read_shapes(stage)
     if not shapes:
@@ -207,58 +197,26 @@ def _draw(
         for s in shapes
     ]
     everything, scale = np.vstack(worlds), read_colour_scale(stage)
-    subject = [is_subject(s, scale) for s in shapes]
+    subject = [is_subject(shape, scale) for shape in shapes]
     around = everything
     if scale is not None and any(s.prim == scale.prim for s in shapes):
         camera = camera or Camera(elevation_deg=LAB_ELEVATION_DEG)
         around = room_above(np.vstack([v for v, chosen in zip(worlds, subject, strict=True) if chosen]))
     camera, screens = camera or Camera(), []
     for shape, vertices, chosen in zip(shapes, worlds, subject, strict=True):
-        actor = _add(plotter, shape, vertices)
+        flat = shape.vertex_colours is not None
+        actor = plotter.add_mesh(mesh_of(shape, vertices), opacity=shape.colour[3], **style_of(flat))
         if not chosen and any(subject):
             screens.append(actor)
     if ground is None:
         ground = camera.elevation_deg > 0 and all(s.link for s in shapes)
     if ground:
         _add_ground(plotter, everything)
-    light(plotter, everything, soft=soft)
-    bar = scale is not None and legend
-    aim(plotter, camera, around, size, bar=bar)
+    light(plotter, everything)
+    aim(plotter, camera, around, size, bar=scale is not None and legend)
     if scale is not None and legend:
         add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
-    return _Drawn(around, screens, bar)
-
-
-def turntable(
-    path: str | os.PathLike[str], count: int, *, size: tuple[int, int], camera: Camera | None = None
-) -> Iterator[NDArray[np.uint8]]:
-    """Pictures of a stage as it stands, from once round it, the last one step before the first.
-
-    Args:
-        path: USD file.
-        count: Number of pictures.
-        size: Width and height [pixel].
-        camera: Where from at first; all are taken from one distance, where everything is always in view.
-
-    Yields:
-        Arrays of shape (height, width, 3).
-
-    Raises:
-        InputError: As for `picture_of_stage`.
-    """
-    check_size(size)
-    first = camera or Camera()
-    cameras = [replace(first, azimuth_deg=first.azimuth_deg + 360 * k / count) for k in range(count)]
-    plotter = plotter_of(size)
-    try:
-        drawn = _draw(plotter, path, size, first, soft=False)
-        farthest = max(distance_of(camera, drawn.around, size, bar=drawn.bar) for camera in cameras)
-        cutaway = Cutaway(plotter, size, drawn.screens)
-        for camera in cameras:
-            aim(plotter, replace(camera, distance_m=farthest), drawn.around, size)
-            yield cutaway.image()
-    finally:
-        plotter.close()
+    return screens
 
 
 def view_distance(
@@ -266,13 +224,13 @@ def view_distance(
 ) -> float:
     """Least distance at which a camera sees all points.
 
-    A point at (r, u, b) along the camera's right, up and back axes stands D - b before it, and is seen
-    where |r| <= (D - b) tan(h), |u| <= (D - b) tan(v).
+    A point at (r, u, b) along the camera's right, up and back axes is D - b in front of it, and is visible
+    if |r| <= (D - b) tan(h) and |u| <= (D - b) tan(v).
 
     Args:
         points: Points in world [m], shape (N, 3).
-        target: Point that the camera looks at [m], shape (3,).
-        axes: Right, up and back axes of the camera in world, rows, shape (3, 3).
+        target: Point in the middle of the view [m], shape (3,).
+        axes: Right, up and back axes of the camera in world, as rows, shape (3, 3).
         half_angles: Half the horizontal and vertical angle of view [rad].
 
     Returns:
@@ -287,7 +245,7 @@ def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
     """A plotter, off screen or in a window.
 
     Raises:
-        InputError: There is nothing to draw with. VTK itself would end the process.
+        InputError: The machine has no OpenGL. VTK itself would end the process.
     """
     import vtkmodules.vtkRenderingOpenGL2
     from vtkmodules.vtkCommonCore import vtkLogger
@@ -296,10 +254,10 @@ def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
     refusal = InputError(
         f"no OpenGL here, so no picture can be drawn; install it: apt-get install {GL_PACKAGES}"
     )
-    if sys.platform == "linux" and not _loads("libX11.so", "libX11.so.6"):  # screen or none
+    if sys.platform == "linux" and not _loads("libX11.so", "libX11.so.6"):  # needed without a screen too
         raise refusal
-    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it tells of each way to draw that is not there
-    drawn_by = vtkRenderWindow()  # VTK picks the first that works: a screen, EGL, at last OSMesa, untried
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it reports each missing way to draw
+    drawn_by = vtkRenderWindow()  # the first that works of a screen and EGL; else OSMesa, untested
     software = isinstance(drawn_by, vtkmodules.vtkRenderingOpenGL2.vtkOSOpenGLRenderWindow)
     if software and not _loads("libOSMesa.so", "libOSMesa.so.8", "libOSMesa.so.6"):
         raise refusal
@@ -312,7 +270,7 @@ def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
 
 
 def _loads(*names: str) -> bool:
-    """Whether one of the shared libraries is there."""
+    """Whether one of the shared libraries can be loaded."""
     for name in names:
         try:
             ctypes.CDLL(name)
@@ -323,7 +281,7 @@ def _loads(*names: str) -> bool:
 
 
 def check_png(out: str | os.PathLike[str]) -> Path:
-    """`out` if it is named as a PNG."""
+    """`out` if its name ends in .png."""
     out = Path(out)
     if out.suffix.lower() != ".png":
         raise InputError(f"{out}: pictures are PNG; give it the suffix .png")
@@ -344,19 +302,15 @@ def write_png(image: NDArray[np.uint8], path: Path) -> None:
 
 
 def style_of(flat: bool) -> dict[str, Any]:
-    """How a mesh of `mesh_of` is shaded; a map's colours mean numbers, so light must not change them."""
-    lit = {
-        "ambient": AMBIENT,
-        "diffuse": DIFFUSE,
-        "specular": 0.25,
-        "specular_power": 25,
-        "smooth_shading": True,
-    }
-    return {"scalars": "rgb", "rgb": True, **({"lighting": False} if flat else lit)}
+    """Shading of a mesh of `mesh_of`. Colours of a map are numbers, so light must not change them."""
+    if flat:
+        return {"scalars": "rgb", "rgb": True, "lighting": False}
+    shading = {"ambient": AMBIENT, "diffuse": DIFFUSE, "specular": 0.25, "specular_power": 25}
+    return {"scalars": "rgb", "rgb": True, "smooth_shading": True, **shading}
 
 
 def mesh_of(shape: Shape, vertices: NDArray) -> Any:
-    """A shape as a mesh with its colours at its points, and normals for shading unless a map's."""
+    """A shape as a mesh with colours at its points; with normals for shading unless it is a map."""
     import pyvista
 
     mesh = pyvista.PolyData.from_regular_faces(np.asarray(vertices, np.float32), shape.faces)
@@ -372,7 +326,7 @@ def mesh_of(shape: Shape, vertices: NDArray) -> Any:
 
 
 def bake(mesh: Any) -> None:
-    """Put the light of `LIGHTS` into the colours of what does not move, which is then drawn without any."""
+    """Put the light of `LIGHTS` into the colours of a still mesh, to draw it without lighting."""
     normals = np.asarray(mesh.point_data.active_normals, float)
     shade = np.full(len(normals), AMBIENT)
     for direction, strength in LIGHTS:
@@ -381,14 +335,8 @@ def bake(mesh: Any) -> None:
     mesh["rgb"] = np.minimum(mesh["rgb"] * shade[:, None], 255).round().astype(np.uint8)
 
 
-def _add(plotter: Any, shape: Shape, vertices: NDArray) -> Any:
-    """One shape in its colours, shaded smooth but for its creases; returns its actor."""
-    flat = shape.vertex_colours is not None
-    return plotter.add_mesh(mesh_of(shape, vertices), opacity=shape.colour[3], **style_of(flat))
-
-
 def _add_ground(plotter: Any, everything: NDArray) -> None:
-    """A floor just below everything, of the background's colour: it shows by what stands on it only."""
+    """A floor just below everything, in the colour of the background: only shadows on it are visible."""
     import pyvista
 
     low, high = everything.min(axis=0), everything.max(axis=0)
@@ -399,17 +347,16 @@ def _add_ground(plotter: Any, everything: NDArray) -> None:
 
 
 def light(plotter: Any, everything: NDArray, *, soft: bool = True) -> None:
-    """Light from four sides, the strongest from the upper left, and soft shadow in corners if wanted."""
+    """Light from four sides, the strongest from the upper left, with soft shadows in corners if `soft`."""
     import pyvista
 
     middle = everything.mean(axis=0)
     reach = float(np.linalg.norm(np.ptp(everything, axis=0)))
     for direction, strength in LIGHTS:
-        light = pyvista.Light(
-            position=middle + 3 * reach * np.array(direction), focal_point=middle, intensity=strength
-        )
-        light.positional = False
-        plotter.add_light(light)
+        place = middle + 3 * reach * np.array(direction)
+        lamp = pyvista.Light(position=place, focal_point=middle, intensity=strength)
+        lamp.positional = False
+        plotter.add_light(lamp)
     if soft:
         plotter.enable_ssao(radius=0.08 * reach, bias=0.002 * reach, kernel_size=64, blur=True)
 
@@ -417,18 +364,23 @@ def light(plotter: Any, everything: NDArray, *, soft: bool = True) -> None:
 def aim(
     plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int], *, bar: bool = False
 ) -> None:
-    """Set the camera, at the distance from which everything is seen unless it gives its own.
+    """Set the camera; without a distance, it sees everything.
 
     Args:
-        plotter: Plotter whose camera is set.
-        camera: Where it stands.
+        plotter: The plotter.
+        camera: The camera.
         everything: Points to keep in view [m], shape (N, 3).
         size: Width and height [pixel].
-        bar: Whether to keep the points to the left of a colour bar; a camera that gives its distance has
-            its target in the middle all the same.
+        bar: Whether to keep the points to the left of a colour bar. A camera with a distance has its target
+            in the middle all the same.
     """
-    target, axes = _target(camera, everything), _axes(camera)
-    plotter.camera.position = target + distance_of(camera, everything, size, bar=bar) * axes[2]
+    axes, target = camera.axes(), np.array(camera.target, float)
+    if camera.target is None:
+        target = (everything.min(axis=0) + everything.max(axis=0)) / 2
+    v = np.radians(camera.view_angle_deg) / 2
+    h = np.arctan(np.tan(v) * size[0] / size[1] * (1 - BAR_SHARE * bar))
+    distance = camera.distance_m or MARGIN * view_distance(everything, target, axes, (h, v))
+    plotter.camera.position = target + distance * axes[2]
     plotter.camera.SetWindowCenter(BAR_SHARE if bar and camera.distance_m is None else 0.0, 0.0)
     plotter.camera.focal_point = target
     plotter.camera.up = axes[1]
@@ -436,29 +388,13 @@ def aim(
     plotter.renderer.ResetCameraClippingRange()
 
 
-def distance_of(camera: Camera, everything: NDArray, size: tuple[int, int], *, bar: bool = False) -> float:
-    """Distance of a camera from its target [m]; where it gives none, everything is just seen."""
-    v = np.radians(camera.view_angle_deg) / 2
-    h = np.arctan(np.tan(v) * size[0] / size[1] * (1 - BAR_SHARE * bar))
-    target, axes = _target(camera, everything), _axes(camera)
-    return camera.distance_m or MARGIN * view_distance(everything, target, axes, (h, v))
-
-
-def _target(camera: Camera, everything: NDArray) -> NDArray[np.float64]:
-    middle: NDArray[np.float64] = (everything.min(axis=0) + everything.max(axis=0)) / 2
-    return middle if camera.target is None else np.array(camera.target, float)
-
-
-def _axes(camera: Camera) -> NDArray[np.float64]:
-    """Right, up and back axes of a camera in world, rows, shape (3, 3)."""
-    a, e = np.radians([camera.azimuth_deg, camera.elevation_deg])
-    back = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    right = np.array([-np.sin(a), np.cos(a), 0.0])
-    return np.array([right, np.cross(back, right), back])
+def add_text(plotter: Any, text: str, letters: int) -> Any:
+    """A line of text at the upper left."""
+    return plotter.add_text(text, position=(0.02, 0.93), viewport=True, font_size=letters, color=INK)
 
 
 def add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: str) -> None:
-    """A colour bar, in µT where the map is in nT."""
+    """A colour bar; a map in nT gets one in µT."""
     import pyvista
 
     unit, factor = ("µT", 1e-3) if unit == "nT" else (unit, 1.0)
@@ -467,22 +403,13 @@ def add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: 
     points["field"] = np.array([least, greatest]) * factor
     actor = plotter.add_mesh(points, scalars="field", cmap=table, opacity=0, show_scalar_bar=False)
     letters = max(8, round(min(plotter.window_size[1], plotter.window_size[0] / 1.6) / 42))
-    bar = plotter.add_scalar_bar(
-        title=f"total field [{unit}]",
-        mapper=actor.mapper,
-        vertical=True,
-        position_x=0.92,
-        position_y=0.2,
-        height=0.6,
-        width=0.05,
-        fmt="%.1f",
-        color=INK,
-        title_font_size=letters,
-        label_font_size=letters,
-    )
-    bar.DrawBackgroundOn()  # so that it can be read before anything
-    bar.GetBackgroundProperty().SetColor(pyvista.Color(BACKGROUND).float_rgb)
+    place = {"vertical": True, "position_x": 0.92, "position_y": 0.2, "height": 0.6, "width": 0.05}
+    font = {"fmt": "%.1f", "color": INK, "title_font_size": letters, "label_font_size": letters}
+    bar = plotter.add_scalar_bar(title=f"total field [{unit}]", mapper=actor.mapper, **place, **font)
+    background = pyvista.Color(BACKGROUND).float_rgb
+    bar.DrawBackgroundOn()  # keeps it readable in front of anything
+    bar.GetBackgroundProperty().SetColor(background)
     bar.GetBackgroundProperty().SetOpacity(0.7)
-    bar.GetTitleTextProperty().SetBackgroundColor(pyvista.Color(BACKGROUND).float_rgb)
+    bar.GetTitleTextProperty().SetBackgroundColor(background)
     bar.GetTitleTextProperty().SetBackgroundOpacity(0.7)
-    bar.SetVerticalTitleSeparation(round(plotter.window_size[1] / 60))  # else it touches the top number
+    bar.SetVerticalTitleSeparation(round(plotter.window_size[1] / 60))  # keeps it off the top number

@@ -1,4 +1,4 @@
-"""Scenery: a run set up to be drawn: the lab that stands still, the robot that moves in it, and its trail."""
+"""Scenery: a run ready to be drawn: the lab, the robot that moves in it, and its trail."""
 
 import math
 import os
@@ -12,16 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.author.scene import read_scene
 from magtwin.errors import InputError
-from magtwin.field.maps.colours import COLOUR_MAP, colour_limits
+from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.figures.cutaway import Cutaway
 from magtwin.figures.pictures import (
     BACKGROUND,
-    INK,
     LAB_ELEVATION_DEG,
     Camera,
     add_bar,
+    add_text,
     aim,
     bake,
     check_png,
@@ -41,59 +40,61 @@ from magtwin.run.run import Run
 from magtwin.spec.base import Vec3
 from magtwin.usd.geometry import ColourScale, Link, Shape, read_colour_scale, read_links, read_shapes
 from magtwin.usd.layers import open_stage
+from magtwin.usd.scene import read_scene
 
 Array = NDArray[np.float64]
 
 ORBIT_DEG_S = 5.0
-"""How fast the camera that circles the lab goes round [deg/s of what is seen]."""
+"""Angular speed of the orbit camera in the film [deg/s]."""
 
 CHASE_BACK_M, CHASE_UP_M, CHASE_AHEAD_M = 1.3, 0.75, 0.3
-"""Where the camera that follows is, behind and above the robot, and how far ahead of it it looks [m]."""
+"""Position of the chase camera behind and above the robot, and of its target ahead of the robot [m]."""
 
 CHASE_ANGLE_DEG = 50.0
 
 CHASE_S = 0.7
-"""Time over which the camera that follows evens out turns, before and after [s]."""
+"""Time before and after a frame over which the chase camera averages the heading [s]."""
 
 WALL_M, WALL_LENGTH_M = 0.1, 1.0
-"""How near the camera that follows comes to the ends of the lab and to what is as high as itself and at least
-so long [m]; narrower things are seen through."""
+"""Clearance of the chase camera to the ends of the lab and to objects as high as itself, and least length of
+these objects [m]. Narrower objects become a veil."""
 
 TRAIL_STEP_M = 0.01
 """Step of the trail [m]."""
 
 TRAIL = ((0.065, 0.008, (32, 38, 45)), (0.05, 0.011, (255, 255, 255)), (0.026, 0.014, None))
-"""Half the width of the trail's dark edge, of its white edge and of its middle [m], their heights above the
-floor [m], and their colours; the middle has the field's. The map below has the field's colours too, and one
-of the two edges differs from each of them."""
+"""Half width [m], height above the floor [m] and colour of the trail's dark edge, white edge and middle. The
+middle has the colours of the field, as has the map below; one of the two edges differs from any of them."""
 
 TRAIL_SPAN_M = 6.0
-"""Length of a path from which on its trail is drawn wider, so that it stays visible from farther away [m]."""
+"""Extent of a path above which its trail is wider, to stay visible from farther away [m]."""
 
 UNKNOWN = (150, 150, 150)
-"""Colour of the trail where the field is not known."""
+"""Colour of the trail where the field is unknown."""
 
 SAMPLES = 4
-"""Samples a pixel of a film's frames."""
+"""Samples per pixel in frames of a film."""
 
 
 @dataclass(frozen=True)
 class View:
-    """Where a run is seen from."""
+    """A camera for a run."""
 
     kind: str
-    """"top", "orbit", "chase", or "fixed" for a place of its own."""
+    """"top", "orbit", "chase", or "fixed"."""
+
     place: Vec3 = (0.0, 0.0, 0.0)
-    """Where a fixed camera is [m]."""
+    """Position of a fixed camera [m]."""
+
     target: Vec3 = (0.0, 0.0, 0.0)
-    """What it looks at [m]."""
+    """Target of a fixed camera [m]."""
 
     @classmethod
     def of(cls, text: str) -> "View":
-        """What a text names: top, orbit, chase, or `x,y,z:x,y,z`, place and target in world [m].
+        """The view that a text names: top, orbit, chase, or `x,y,z:x,y,z`, place and target in world [m].
 
         Raises:
-            InputError: It names none.
+            InputError: The text names no view.
         """
         if text in KINDS:
             return cls(text)
@@ -107,11 +108,11 @@ class View:
                 f"no camera {text!r}; known: {', '.join(KINDS)}; or x,y,z:x,y,z, from where to where"
             )
         if (x, y, z) == (tx, ty, tz):
-            raise InputError(f"the camera {text!r} looks at the place where it is; give another target")
+            raise InputError(f"the camera {text!r} looks at its own place; give another target")
         return cls("fixed", (x, y, z), (tx, ty, tz))
 
     def camera(self, seen_s: float = 0.0) -> Camera:
-        """The camera over a lab, after some time of looking [s]; that which follows begins as orbit does."""
+        """The camera over a lab, `seen_s` [s] into the film. The chase view starts like orbit."""
         if self.kind == "top":
             return Camera(azimuth_deg=-90.0, elevation_deg=90.0)
         if self.kind == "fixed":
@@ -134,14 +135,14 @@ KINDS: Mapping[str, str] = MappingProxyType(
         "chase": "from behind the robot",
     }
 )
-"""Cameras by name, and what they see."""
+"""Cameras by name, with a description."""
 
 
 class Scenery:
-    """A run in its lab, before a camera.
+    """A run in its lab in front of a camera.
 
-    The lab is put up once, as one body of each kind; between frames only the robot's bodies are moved, the
-    trail grows and the camera goes on.
+    The lab is built once, as one body per look. Between frames, only the robot's bodies and the camera move,
+    and the trail grows.
     """
 
     def __init__(
@@ -155,20 +156,20 @@ class Scenery:
         speed: float = 1.0,
         fine: bool = False,
     ) -> None:
-        """Put it up.
+        """Build the scenery.
 
         Args:
-            run: What happened; it needs t and a position, of the truth, motion capture or odometry.
-            scene_file: The stage that it happened in.
-            times: When it will be looked at, in order, on the run's clock [s].
-            view: Where from.
+            run: The run, with t and a position: the truth, motion capture or odometry.
+            scene_file: Stage of its lab.
+            times: Ascending times of the frames on the run's clock [s].
+            view: The camera.
             size: Width and height [pixel].
-            speed: How many times faster it is shown than it happened.
-            fine: Whether frames may take seconds each: smoother edges, and shadow in corners.
+            speed: Playback speed relative to the run.
+            fine: Whether to draw smoother edges and shadows in corners, which takes seconds per frame.
 
         Raises:
             InputError: A column is missing, a time lies outside the run, the stage shows nothing or has no
-                robot, or there is nothing to draw with.
+                robot, or the machine has no OpenGL.
         """
         check_size(size)
         self._times, self._speed, self._view, self._size = np.asarray(times, float), speed, view, size
@@ -185,15 +186,13 @@ class Scenery:
         self.plotter = plotter_of(size)
         try:
             scale = read_colour_scale(stage)
-            self._put_up(still, links, [s for s in shapes if s.link in moving], moving, fine, scale)
-            self._put_up_trail(run, (scale.least, scale.greatest) if scale else None)
+            self._build(still, links, [s for s in shapes if s.link in moving], moving, fine, scale)
+            self._build_trail(run, (scale.least, scale.greatest) if scale else None)
             light(self.plotter, self._everything, soft=fine)
             if not fine:
                 self.plotter.disable_anti_aliasing()
                 self.plotter.enable_anti_aliasing("msaa", multi_samples=SAMPLES)
-            self._label = self.plotter.add_text(
-                " ", position=(0.02, 0.93), viewport=True, font_size=max(8, round(size[1] / 60)), color=INK
-            )
+            self._label = add_text(self.plotter, " ", max(8, round(size[1] / 60)))
             self._label.prop.background_color, self._label.prop.background_opacity = BACKGROUND, 0.7
             self._cutaway = Cutaway(self.plotter, size, self._screens)
         except BaseException:
@@ -207,18 +206,18 @@ class Scenery:
         self.close()
 
     def close(self) -> None:
-        """Take it down."""
+        """Release the plotter."""
         self.plotter.close()
 
     def __len__(self) -> int:
-        """Number of frames, one a time."""
+        """Number of frames."""
         return len(self._times)
 
     def frame(self, k: int, *, whole: bool = False) -> NDArray[np.uint8]:
-        """Draw the k-th time.
+        """Draw frame k.
 
         Args:
-            k: Number of the frame.
+            k: Index of the frame.
             whole: Whether objects may hide the floor and the robot.
 
         Returns:
@@ -236,7 +235,7 @@ class Scenery:
         return self._cutaway.image(whole=whole)
 
     def poses(self, k: int) -> dict[str, Array]:
-        """Where the robot's visible bodies are at the k-th time: T_world_link (4, 4) by the link's name."""
+        """Poses of the robot's visible links in frame k: T_world_link, shape (4, 4), by link name."""
         base = _matrix(self._p[k], self._q[k])
         poses = {}
         for name, link in self._links.items():
@@ -251,23 +250,23 @@ class Scenery:
         return poses
 
     def _pose(self, run: Run) -> None:
-        """Where the robot is at each time, how far its wheels have turned, and what is said of it."""
+        """Pose, wheel angles and caption of each frame."""
         position, orientation = self._position, HEADINGS[self._position]
         facing = (orientation,) if orientation in run else ("yaw",) if "yaw" in run else ()
         names = [n for n in ("wheel_angle", "v_base") if n in run]
         field = next((n for n in FIELDS if n in run and np.isfinite(run[n]).any()), None)
         self._field = field
         if not facing:
-            raise InputError(f"the run says where the robot was and not where it faced: no {orientation}")
+            raise InputError(f"the run has positions but no headings: no {orientation}")
         if run.rows < 2:
             raise InputError(f"the run has {run.rows} readings; two or more are needed to show it")
-        wanted = run.select("t", position, *facing, *names, *([field] if field else []))
-        seen = wanted.resample(self._times)
+        columns = run.select("t", position, *facing, *names, *([field] if field else []))
+        seen = columns.resample(self._times)
         self._p = seen[position]
         self._q = seen[orientation] if orientation in seen else quat_from_yaw(seen["yaw"])
         for name, values in ((position, self._p), (facing[0], self._q)):
             if not np.isfinite(values).all():
-                raise InputError(f"the run does not know {name} all the time that is to be shown")
+                raise InputError(f"{name} of the run is unknown for a part of the time to show")
         self._wheels = seen["wheel_angle"] if "wheel_angle" in seen else np.zeros((len(self._times), 2))
         fast = f"   x{self._speed:.3g}" if self._speed != 1 else ""
         words = [f"{t - run['t'][0]:.1f} s" for t in self._times]
@@ -278,7 +277,7 @@ class Scenery:
             words = [f"{w}   {v:.2f} m/s" for w, v in zip(words, speeds, strict=True)]
         self._words = [w + fast for w in words]
 
-    def _put_up(
+    def _build(
         self,
         still: Sequence[Shape],
         links: Mapping[str, Link],
@@ -287,20 +286,19 @@ class Scenery:
         fine: bool,
         scale: ColourScale | None,
     ) -> None:
-        """What stands still, one body a look; and each of the robot's links."""
+        """Build the lab, one body per look, and each link of the robot."""
         bodies: dict[tuple[bool, bool, float], list[Any]] = {}
         placed = [_placed(shape, links[shape.link]) if shape.link else shape.vertices for shape in still]
         self._subjects = [v for s, v in zip(still, placed, strict=True) if is_subject(s, scale)]
         for shape, vertices in zip(still, placed, strict=True):
             mesh, flat = mesh_of(shape, vertices), shape.vertex_colours is not None
-            if not flat and not fine:  # half the work of a frame would be to light what does not change
+            if not flat and not fine:  # lighting it in each frame would double the work
                 bake(mesh)
                 flat = True
             bodies.setdefault((is_subject(shape, scale), flat, shape.colour[3]), []).append(mesh)
         self._screens = []
         for (subject, flat, opacity), meshes in bodies.items():
-            whole = meshes[0] if len(meshes) == 1 else meshes[0].append_polydata(*meshes[1:])
-            actor = self.plotter.add_mesh(whole, opacity=opacity, **style_of(flat))
+            actor = self.plotter.add_mesh(_joined(meshes), opacity=opacity, **style_of(flat))
             if not subject:
                 self._screens.append(actor)
         self._actors: dict[str, Any] = {}
@@ -309,15 +307,14 @@ class Scenery:
             meshes = [mesh_of(s, s.vertices) for s in carried if s.link == name and s.vertex_colours is None]
             if not meshes:
                 continue
-            whole = meshes[0] if len(meshes) == 1 else meshes[0].append_polydata(*meshes[1:])
-            self._actors[name] = self.plotter.add_mesh(whole, **style_of(False))
+            self._actors[name] = self.plotter.add_mesh(_joined(meshes), **style_of(False))
             self._links[name] = link
         self._everything = np.vstack([*placed, self._p]).astype(float)
         boxes = np.array([(v.min(axis=0), v.max(axis=0)) for v in placed]).reshape(-1, 2, 3)
         self._walls = boxes[np.ptp(boxes[..., :2], axis=1).max(axis=1) >= WALL_LENGTH_M]
 
-    def _put_up_trail(self, run: Run, limits: tuple[float, float] | None) -> None:
-        """The whole trail, edged and coloured by the field; a frame shows the part driven until then."""
+    def _build_trail(self, run: Run, limits: tuple[float, float] | None) -> None:
+        """Build the whole trail, coloured by the field; a frame shows the part driven so far."""
         import pyvista
         from matplotlib import colormaps
 
@@ -356,7 +353,7 @@ class Scenery:
         if self._view.kind != "chase":
             seen_s = (self._times[k] - self._times[0]) / self._speed
             camera, around = self._view.camera(seen_s), self._around
-            if self._view.kind == "top":  # the whole map, as a picture of the stage shows it
+            if self._view.kind == "top":  # with the whole map, like a picture of the stage
                 around = np.vstack([around, *self._subjects])
             aim(self.plotter, camera, around, self._size, bar=self._bar)
             return
@@ -384,19 +381,19 @@ def picture_of_run(
     size: tuple[int, int] = (1600, 1000),
     force: bool = False,
 ) -> Path:
-    """Draw a moment of a run in its lab, with the trail until then, and write a PNG.
+    """Draw a moment of a run in its lab, with the trail so far, and write a PNG.
 
     Args:
-        run: What happened.
-        scene_file: The stage that it happened in.
+        run: The run.
+        scene_file: Stage of its lab.
         out: PNG to write.
-        time_s: Which moment, on the run's clock [s]; its end unless given.
+        time_s: Time on the run's clock [s]. Default: the end of the run.
         camera: "top", "orbit", "chase" or "x,y,z:x,y,z", as for `View.of`.
         size: Width and height [pixel].
-        force: Whether a file that is there is replaced.
+        force: Whether to replace an existing file.
 
     Raises:
-        InputError: As for `Scenery`; or `out` is no PNG or is there already.
+        InputError: As for `Scenery`; or `out` is not a PNG or exists.
     """
     out, view = check_png(out), View.of(camera)
     if not run.rows or "t" not in run:
@@ -415,36 +412,36 @@ def picture_of_run(
 
 
 def _position(run: Run) -> str:
-    """The best column of position that a run has."""
+    """The best position column of a run."""
     for name in POSITIONS:
         if name in run and np.isfinite(run[name]).all(axis=1).any():
             return name
-    raise InputError(f"the run does not say where the robot was: it has none of {', '.join(POSITIONS)}")
+    raise InputError(f"the run has no positions: it has none of {', '.join(POSITIONS)}")
 
 
 def _links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dict[str, Link]:
-    """The links of the robot that a run is of; other robots of a scene stand where it has them.
+    """Links of the robot of a run; other robots of the scene stand still.
 
     Raises:
-        InputError: There is none, or the run does not say which of several it is of.
+        InputError: There is no robot, or several and the run does not name one of them.
     """
     bases = list(dict.fromkeys(link.base for link in links.values() if link.joint))
     if not bases:
-        raise InputError("the scene has no robot that could move")
+        raise InputError("the scene has no robot with joints")
     name = str(run.metadata.get("robot", robots[0] if len(robots) == 1 else ""))
     if len(robots) > 1 and name not in robots:
-        raise InputError(f"the run does not say of which robot it is; the scene has {', '.join(robots)}")
+        raise InputError(f"the metadata of the run name no robot of the scene, which has {', '.join(robots)}")
     base = bases[robots.index(name)] if len(robots) == len(bases) and name in robots else bases[0]
     return {name: link for name, link in links.items() if link.base == base}
 
 
 def _free_share(p: Array, d: Array, boxes: Array) -> float:
-    """Share of a segment before it comes within `WALL_M` of the first box.
+    """Share of a segment that is farther than `WALL_M` from all boxes, from its start on.
 
     Args:
         p: Start in world [m], shape (3,).
-        d: Way to the end [m], shape (3,).
-        boxes: Least and greatest corners of boxes along the world's axes [m], shape (N, 2, 3).
+        d: Vector from the start to the end [m], shape (3,).
+        boxes: Least and greatest corners of axis-aligned boxes [m], shape (N, 2, 3).
     """
     low, high = boxes[:, 0] - WALL_M, boxes[:, 1] + WALL_M
     d = np.where(np.abs(d) < 1e-12, 1e-12, d)
@@ -455,7 +452,7 @@ def _free_share(p: Array, d: Array, boxes: Array) -> float:
 
 
 def _steps(p_xy: Array) -> NDArray[np.intp]:
-    """Rows at which a trail has gone a step further."""
+    """Rows at which the path has moved a step further."""
     rows: list[int] = []
     x0 = y0 = math.inf
     for i, (x, y) in enumerate(p_xy.tolist()):
@@ -466,13 +463,17 @@ def _steps(p_xy: Array) -> NDArray[np.intp]:
 
 
 def _placed(shape: Shape, link: Link) -> Array:
-    """Vertices of a body that nothing moves, in world [m]."""
+    """Vertices of a body that stands still, in world [m]."""
     T = _matrix(link.p_world_link, link.q_world_link_xyzw)
     return shape.vertices @ T[:3, :3].T + T[:3, 3]
 
 
+def _joined(meshes: Sequence[Any]) -> Any:
+    return meshes[0] if len(meshes) == 1 else meshes[0].append_polydata(*meshes[1:])
+
+
 def _matrix(p: ArrayLike, q_xyzw: ArrayLike) -> Array:
-    """The transform (4, 4) of a pose."""
+    """Transform of a pose, shape (4, 4)."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = matrix_from_quat(q_xyzw), p
     return T

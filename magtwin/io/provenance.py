@@ -211,9 +211,9 @@ def map_of(
     Raises:
         InputError: The scene is missing, or its map changed.
     """
-    from magtwin.author.scene import read_scene
     from magtwin.files import sha256
     from magtwin.usd.maps import load_map
+    from magtwin.usd.scene import read_scene
 
     layer = read_scene(scene_of(run, scene, near=near), check_network=False).map_layer
     if "map_sha256" in run.metadata and run.metadata["map_sha256"] != sha256(layer):

@@ -38,7 +38,7 @@ from magtwin.run.run import Run
 from magtwin.twin import Twin
 
 if TYPE_CHECKING:
-    from magtwin.learn.reading import Reader, Reading
+    from magtwin.learn.inference.reader import Reader, Reading
 
 PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
     {
@@ -162,11 +162,11 @@ class Magnetometer:
             self._timer = self._bus.timer(1 / self._rate, self._read)
         self._noise_nt = float(robot.magnetometer.noise_density_nt * np.sqrt(self._rate / 2))
         network = self._twin.magnetometer
-        alone = network is not None and not network.net.context and settings["outside"] == "silent"
+        alone = network is not None and settings["outside"] == "silent"
         if not alone:
             self._reader = None
         elif self._reader is None and network is not None:
-            from magtwin.learn.reading import Reader
+            from magtwin.learn.inference.reader import Reader
 
             self._reader = Reader(network.net, self._twin.field)
         if settings["units"] != self._units:
@@ -218,7 +218,7 @@ class Magnetometer:
 
     def _reading(self, now: int, columns: dict[str, Any]) -> "Reading":
         """Map and prediction at this step; the sd includes the sensor's noise, and is 0 if unknown."""
-        from magtwin.learn.reading import Reading
+        from magtwin.learn.inference.reader import Reading
 
         lidar = self._settings["lidar"]
         spins = lidar == "on" or (lidar == "scan" and self._scans is not None and self._scans.on(now))

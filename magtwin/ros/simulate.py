@@ -31,8 +31,8 @@ from magtwin.ros.network import Following
 from magtwin.ros.topics import READ, SAMPLED, TICKS
 from magtwin.run.run import Run
 from magtwin.sim.exact import check_field
-from magtwin.sim.runs.online import Online
-from magtwin.sim.sensors.online_sensors import Samples
+from magtwin.sim.runs.live import LiveRobot
+from magtwin.sim.sensors.clock import Samples
 from magtwin.twin import Session, Twin, in_session, model_error_of
 
 RESET = "/robot/reset"
@@ -184,10 +184,10 @@ class Simulator:
                 self._report(factor)
         self._publish_until(pace, pace.due_s(self.online.t))
 
-    def _online(self) -> Online:
+    def _online(self) -> LiveRobot:
         twin = self._twin
         check_field(twin.scene, twin.field)
-        return Online(
+        return LiveRobot(
             twin.scene,
             anomaly_map=twin.field,
             rng=np.random.default_rng(self._seed),

@@ -191,7 +191,7 @@ class ExactField:
         if harmonic is None:
             way = self.scene.earth.b_world_nt if self.scene.earth else (0.0, np.cos(DIP), -np.sin(DIP))
             return np.broadcast_to(np.asarray(way, float), (len(cos), 3))
-        from magtwin.field.sources.dipole_sums import dipole_field_nt  # compiled, as simulations are
+        from magtwin.field.sources.compiled_dipoles import dipole_field_nt  # compiled, as simulations are
 
         if self.holds_robot:
             x, y, z = harmonic.p_base_sensor

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.field.maps.plane import Plane
 from magtwin.field.sources.bodies import Bodies
+from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.field.sources.magnets import body_of
-from magtwin.field.sources.point_dipoles import dipole_field_nt
 from magtwin.sim.motion.drive import Moment, wheel_rates
 from magtwin.sim.motion.sampling import Moving, moment_at
 from magtwin.sim.sensors.battery import current_a

@@ -13,7 +13,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.readings import Readings
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.sim.interference import ambient_field_nt, ambient_gradient_nt_m, platform_field_nt
-from magtwin.sim.sensors.magnetometer import latched_nt, lost_in, rounded
+from magtwin.sim.sensors.magnetometer import lost_in, rounded, stuck_nt
 from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
@@ -173,7 +173,7 @@ def _visit(
     for _ in range(readings):
         total += _read(exact, sensor.noise_std_nt, sensor.resolution_nt, rng)
     if lost.any():
-        value = rounded(latched_nt(sensor, lost.ravel(), latch), sensor.resolution_nt).reshape(grid.shape)
+        value = rounded(stuck_nt(sensor, lost.ravel(), latch), sensor.resolution_nt).reshape(grid.shape)
         total[lost] = value[lost] * readings
     read = Readings(
         good=stood.ravel(),

@@ -52,7 +52,7 @@ def scene_from_toml(
         InputError: A key is misspelt or missing, a file is missing or invalid, there is neither a map nor an
             Earth field, or the map contradicts the sources; the text gives the difference.
     """
-    from magtwin.author.scene import scene_from_toml as read_toml_scene
+    from magtwin.author.scene_file import scene_from_toml as read_toml_scene
     from magtwin.sim.contradiction import check_agrees
     from magtwin.usd.maps import load_map
 
@@ -96,7 +96,7 @@ def scene_from_toml(
 def _file_of(path: str | FilePath) -> FilePath:
     """The TOML that a path or the name of a shipped scene leads to."""
     file = FilePath(path)
-    if file.suffix or file.exists():
+    if file.suffix or file.is_file():
         return file
     return find("scene", str(path), {toml.stem: toml for toml in sorted(shipped("scenes").glob("*.toml"))})
 

@@ -18,7 +18,7 @@ from magtwin.spec.scene import Scene
 from magtwin.twin.twin import Kind, Metadata, Twin, scene_sha256, without_model_error
 
 if TYPE_CHECKING:
-    from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 
 _CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_sha256": "the scene"}
 
@@ -50,10 +50,10 @@ def open_twin(
     options: Any = {"network": network, "magnetometer": magnetometer, "model_error": model_error}
     if isinstance(scene, Scene):
         return _open_in_memory(scene, **options)
-    from magtwin.author.scene import read_scene
     from magtwin.usd.layers import stage_sha256
     from magtwin.usd.maps import load_map
     from magtwin.usd.obstacles import read_obstacles
+    from magtwin.usd.scene import read_scene
 
     file = FilePath(scene)
     read = read_scene(file, check_network=network is None and magnetometer in (None, "neural"))
@@ -195,7 +195,7 @@ def _magnetometer(scene: Scene) -> "NeuralMagnetometer | None":
             f"scene {scene.name!r} has a neural magnetometer without a network; name one with `network`, or "
             'take the kind "physical" or "map-only"'
         )
-    from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 
     magnetometer = NeuralMagnetometer.load(spec.network, sha256=spec.network_sha256)
     if spec.inputs and spec.inputs != magnetometer.features:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError, find
 from magtwin.path import Path
 from magtwin.run.run import Run
-from magtwin.sim.motion.way import way_of
+from magtwin.sim.motion.drive_input import drive_input
 from magtwin.spec.scene import Scene
 from magtwin.twin.opening import led_by, open_twin, opened
 from magtwin.twin.twin import (
@@ -29,7 +29,7 @@ from magtwin.twin.twin import (
 from magtwin.version import __version__
 
 if TYPE_CHECKING:
-    from magtwin.learn.magnetometer import NeuralMagnetometer, Read
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer, Read
     from magtwin.sim.motion.commands import Commands
     from magtwin.sim.motion.controllers import Controller
     from magtwin.sim.motion.engine import Engine
@@ -93,7 +93,7 @@ def simulate(
     twin = opened(twin, network, magnetometer, model_error, "simulate")
     twin = in_session(twin, session, seed=seed)
     check_field(twin.scene, twin.field)
-    path = way_of(path, room_of(twin))
+    path = drive_input(path, room_of(twin))
     check_commands(path, twin.magnetometer)
     reads: list[Read] = []
     run = run_scene(
@@ -166,7 +166,7 @@ def simulate_robots(
         InputError: A name is not that of a robot, robots would meet, or `simulate` would refuse one of them.
     """
     from magtwin.sim.exact import check_field, check_read
-    from magtwin.sim.runs.together import simulate_together
+    from magtwin.sim.runs.multi_robot import simulate_robots as run_robots
 
     seed = checked_seed(seed)
     twin = opened(twin, network, magnetometer, model_error, "simulate_robots")
@@ -177,13 +177,13 @@ def simulate_robots(
         find("robot", name, placed)
     twins = {name: led_by(twin, name) for name in placed}
     driven = {
-        name: way_of((paths or {}).get(name, robot.path or "figure8"), room_of(twins[name]))
+        name: drive_input((paths or {}).get(name, robot.path or "figure8"), room_of(twins[name]))
         for name, robot in placed.items()
     }
     for name, path in driven.items():
         check_commands(path, twins[name].magnetometer)
     reads: dict[str, list[Read]] = {name: [] for name in placed}
-    runs = simulate_together(
+    runs = run_robots(
         twin.scene,
         driven,
         anomaly_map=twin.field,
@@ -215,7 +215,7 @@ def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Sc
         run: A run with t, p_world_base, yaw and lidar_on.
         seed: Seed of the noise.
     """
-    from magtwin.sim.runs.simulate import streams
+    from magtwin.sim.runs.sensing import streams
     from magtwin.sim.sensors.lidar import scans_of
 
     if not isinstance(twin, Twin):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from magtwin.errors import InputError
 from magtwin.path import Path
 from magtwin.run.run import Run
-from magtwin.sim.motion.way import ways_of
+from magtwin.sim.motion.drive_input import drive_inputs
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.opening import opened
@@ -29,7 +29,7 @@ from magtwin.twin.twin import (
 
 if TYPE_CHECKING:
     from magtwin.sim.motion.commands import Commands
-    from magtwin.sim.runs.many import Runs
+    from magtwin.sim.runs.batch import Runs
     from magtwin.sim.runs.simulate import Sensed
 
 MIXTURE = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
@@ -94,7 +94,7 @@ def sweep(
             magnetometer is not the twin's, or `simulate` would refuse a run.
     """
     from magtwin.sim.exact import check_field, check_read
-    from magtwin.sim.runs.many import BLOCK, Conditions, Job, Runs
+    from magtwin.sim.runs.batch import BLOCK, Conditions, Job, Runs
 
     twin = opened(twin, network, magnetometer, model_error, "sweep")
     check_field(twin.scene, twin.field)
@@ -110,7 +110,7 @@ def sweep(
         seeds = range(first, first + int(seeds))
     numbers = [checked_seed(number) for number in seeds]
     count = len(numbers)
-    ways = ways_of(MIXTURE if paths is None else paths, room_of(twin))
+    ways = drive_inputs(MIXTURE if paths is None else paths, room_of(twin))
     if robots is not None and sessions is not None:
         raise InputError("robots are used as they are; give robots or sessions, not both")
     twins = _twins(twin, robots, sessions, numbers, first, model_error)

@@ -11,7 +11,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.placement import Room
+from magtwin.path.room import Room
 from magtwin.spec.base import spelled
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import RobotSpec
@@ -20,7 +20,7 @@ from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.summary import Summarized, Summary
 
 if TYPE_CHECKING:
-    from magtwin.learn.magnetometer import NeuralMagnetometer
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
     from magtwin.sim.sensors.model_error import ModelError
 
 Kind = Literal["physical", "neural", "map-only"]

@@ -1,14 +1,14 @@
-"""Lint: what is doubtful in a description, though it can be converted."""
+"""Lint: doubtful values in a description that can still be converted."""
 
 from collections.abc import Callable, Iterable, Iterator
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description, origin_of
-from magtwin.urdf.description.model import Geometry, Mesh, Shape
+from magtwin.urdf.description.model import Mesh, Shape
 from magtwin.urdf.meshes.mesh import bounds
 
 Array = NDArray[np.float64]
@@ -17,7 +17,7 @@ Vertices = Callable[[Mesh], Array]
 """Vertices of a URDF `<mesh>`, scaled [m], shape (V, 3)."""
 
 OUTSIDE = 0.1
-"""How far outside of the body's box a frame is doubtful, as part of the box's diagonal."""
+"""Doubtful distance of a frame from the body's box, relative to the box's diagonal."""
 
 ASIDE = 0.01
 """Distance from the middle plane from which a frame counts as left or right [m]."""
@@ -26,10 +26,12 @@ DENSEST = 9_000.0
 """Density above which a body is doubtful [kg/m3]; copper has 8,960."""
 
 LIGHT = 10.0
-"""How many times less than an evenly filled box of its size a body may resist turning."""
+"""Factor by which an inertia may be below that of an evenly filled box of its size."""
 
 MASS_OFF = 0.05
-"""Part of a data sheet's mass by which the links' sum may be off."""
+"""Relative error of the total mass against the data sheet that is doubtful."""
+
+SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"))
 
 
 def lint(
@@ -38,12 +40,12 @@ def lint(
     """Doubts about a description, one line each, in the order of the checks below.
 
     Args:
-        description: What was read.
+        description: The description.
         mass: Mass on the robot's data sheet [kg].
-        vertices: Reads a mesh; without it, or where it refuses, meshes count for nothing.
+        vertices: Reads a mesh; without it, or if it fails, meshes are ignored.
     """
     shapes = {
-        name: [points for part in (*link.visuals, *link.collisions) for points in _box_of(part, vertices)]
+        name: [points for part in (*link.visuals, *link.collisions) for points in _box(part, vertices)]
         for name, link in description.links.items()
     }
     return (
@@ -59,7 +61,7 @@ def lint(
 
 
 def _dummies(description: Description) -> Iterator[str]:
-    """Frames that were given a mass, though nothing is there."""
+    """Frames with a mass but no shape."""
     dummies: dict[float, list[str]] = {}
     for name, link in description.links.items():
         fixed = name in description.joints and description.joints[name].type == "fixed"
@@ -73,7 +75,7 @@ def _dummies(description: Description) -> Iterator[str]:
 
 
 def _weightless(description: Description) -> Iterator[str]:
-    """Bodies without mass, or without a tensor."""
+    """Bodies without mass or inertia."""
     links = description.links.values()
     bare = [link.name for link in links if (link.visuals or link.collisions) and link.inertial is None]
     if bare:
@@ -84,9 +86,9 @@ def _weightless(description: Description) -> Iterator[str]:
 
 
 def _frames_outside(description: Description, shapes: dict[str, list[Array]]) -> Iterator[str]:
-    """Frames without a shape that stand far off all shapes."""
+    """Frames without a shape that are far from all shapes."""
     poses = description.poses()
-    placed = [_moved(poses[name], points) for name, boxes in shapes.items() for points in boxes]
+    placed = [_transformed(poses[name], points) for name, boxes in shapes.items() for points in boxes]
     if not placed:
         return
     low, high = np.vstack(placed).min(0), np.vstack(placed).max(0)
@@ -95,15 +97,16 @@ def _frames_outside(description: Description, shapes: dict[str, list[Array]]) ->
         p = poses[name][:3, 3]
         off = float(np.linalg.norm(p - np.clip(p, low, high)))
         if not shapes[name] and off > margin:
-            yield f"link {name!r} at ({_say(p)}) m lies {off:.3g} m outside of the body"
+            at = ", ".join(f"{round(float(v), 4) + 0.0:g}" for v in p)
+            yield f"link {name!r} at ({at}) m lies {off:.3g} m outside of the body"
 
 
 def _swapped_sides(description: Description) -> Iterator[str]:
-    """Pairs called left and right that stand the other way round: left is +y (REP-103)."""
+    """Pairs called left and right that are swapped: left is +y (REP-103)."""
     poses = description.poses()
     for name in description.links:
-        twin = _twin(name)
-        if twin is None or twin not in description.links or not _is_rigid(description, name, twin):
+        twin = next((name.replace(left, right) for left, right in SIDES if left in name), None)
+        if twin not in description.links or not _is_rigid(description, name, twin):
             continue
         left, right = float(poses[name][1, 3]), float(poses[twin][1, 3])
         if left < -ASIDE and right > ASIDE:
@@ -113,16 +116,8 @@ def _swapped_sides(description: Description) -> Iterator[str]:
             )
 
 
-def _twin(name: str) -> str | None:
-    """What the link opposite of a left one would be called."""
-    for left, right in (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT")):
-        if left in name:
-            return name.replace(left, right)
-    return None
-
-
 def _is_rigid(description: Description, *names: str) -> bool:
-    """Whether links hang from the root by fixed joints, save their own."""
+    """Whether fixed joints connect links to the root, apart from the links' own joints."""
     for name in names:
         while name in description.joints:
             name = description.joints[name].parent
@@ -132,21 +127,20 @@ def _is_rigid(description: Description, *names: str) -> bool:
 
 
 def _stuck_joints(description: Description) -> Iterator[str]:
-    """Joints that move by their type and not by their limits."""
+    """Joints whose type allows a motion that their limits forbid."""
     for joint in description.joints.values():
         limit = joint.limit
         if limit is None or joint.type == "fixed":
             continue
-        zeros = [f"{what} of 0" for what in ("effort", "velocity") if getattr(limit, what) == 0]
+        zeros = " and ".join(f"{what} of 0" for what in ("effort", "velocity") if getattr(limit, what) == 0)
         if zeros:
-            limits = " and ".join(zeros)
-            yield f"joint {joint.name!r} ({joint.type}) has an {limits}: it cannot be driven"
+            yield f"joint {joint.name!r} ({joint.type}) has an {zeros}: it cannot be driven"
         if joint.type != "continuous" and limit.lower is not None and limit.lower == limit.upper:
             yield f"joint {joint.name!r} ({joint.type}) has both limits at {limit.lower:g}: it cannot move"
 
 
 def _inertias(description: Description, shapes: dict[str, list[Array]]) -> Iterator[str]:
-    """Tensors that no body of that mass and size can have, or none that is filled evenly.
+    """Inertias that are impossible or implausible for a body of that mass and size.
 
     A moment of inertia is the mass times a mean of squared distances from its axis, so none exceeds
     m R^2, with R the distance from the centre of mass to the shape's farthest corner.
@@ -179,7 +173,7 @@ def _inertias(description: Description, shapes: dict[str, list[Array]]) -> Itera
 
 
 def _densities(description: Description, vertices: Vertices | None) -> Iterator[str]:
-    """Bodies that weigh more than their shapes can hold."""
+    """Bodies that are too heavy for their shapes."""
     for name, link in description.links.items():
         volume = max(_volume(link.collisions, vertices), _volume(link.visuals, vertices))
         mass = 0.0 if link.inertial is None else float(link.inertial.mass or 0.0)
@@ -191,7 +185,7 @@ def _densities(description: Description, vertices: Vertices | None) -> Iterator[
 
 
 def _mass(description: Description, mass: float | None) -> Iterator[str]:
-    """The sum of the links against the data sheet."""
+    """Total mass against the data sheet."""
     if mass is None:
         return
     links = description.links.values()
@@ -201,71 +195,39 @@ def _mass(description: Description, mass: float | None) -> Iterator[str]:
         yield f"the links weigh {total:.6g} kg in all, the data sheet says {mass:g} kg ({more:+.0%})"
 
 
-def _box_of(part: Shape, vertices: Vertices | None) -> list[Array]:
-    """Corners of a box around a visual or collision in its link's frame, shape (8, 3); [] for none."""
-    geometry = part.geometry
-    if geometry.mesh is not None:
-        points = _read(geometry.mesh, vertices)
-        if points is None:
-            return []
+def _box(part: Shape, vertices: Vertices | None) -> list[Array]:
+    """Corners of a box around a visual or collision in its link's frame, shape (8, 3); [] if unknown."""
+    if part.geometry.mesh is None:
+        high = part.geometry.half_extents(np.eye(3))
+        low = -high
+    elif (points := _read(part.geometry.mesh, vertices)) is not None:
         low, high = bounds(points)
     else:
-        high = _half(geometry)
-        low = -high
-    corners = np.array(list(product(*zip(low, high, strict=True))))
-    return [_moved(origin_of(part), corners)]
-
-
-def _half(geometry: Geometry) -> Array:
-    """Half the edges of the box around a primitive at its origin [m], shape (3,)."""
-    if geometry.box is not None:
-        return np.asarray(geometry.box.size, float) / 2
-    if geometry.sphere is not None:
-        return np.full(3, float(geometry.sphere.radius))
-    round_one = geometry.cylinder or geometry.capsule
-    assert round_one is not None  # a geometry is one of these
-    radius, half = float(round_one.radius), float(round_one.length) / 2
-    return np.array([radius, radius, half + (radius if geometry.capsule else 0.0)])
+        return []
+    return [_transformed(origin_of(part), np.array(list(product(*zip(low, high, strict=True)))))]
 
 
 def _volume(parts: Iterable[Shape], vertices: Vertices | None) -> float:
-    """What shapes hold at most [m3]: primitives exactly, meshes by their boxes; inf where one is unknown."""
+    """Upper limit of the volume of shapes [m3], with boxes for meshes; inf if one is unknown."""
     total = 0.0
     for part in parts:
-        geometry = part.geometry
-        if geometry.mesh is not None:
-            points = _read(geometry.mesh, vertices)
-            if points is None:
-                return np.inf
-            low, high = bounds(points)
-            total += float(np.prod(high - low))
-        elif geometry.box is not None:
-            total += float(np.prod(geometry.box.size))
-        elif geometry.sphere is not None:
-            total += 4 / 3 * np.pi * float(geometry.sphere.radius) ** 3
+        if part.geometry.mesh is None:
+            total += part.geometry.volume
+        elif (points := _read(part.geometry.mesh, vertices)) is not None:
+            total += float(np.prod(np.subtract(*bounds(points)[::-1])))
         else:
-            round_one = geometry.cylinder or geometry.capsule
-            assert round_one is not None
-            radius, length = float(round_one.radius), float(round_one.length)
-            total += np.pi * radius**2 * (length + (4 / 3 * radius if geometry.capsule else 0.0))
+            return np.inf
     return total
 
 
 def _read(mesh: Mesh, vertices: Vertices | None) -> Array | None:
-    """Vertices of a mesh, none where it cannot be read."""
-    if vertices is None:
-        return None
+    """Vertices of a mesh; None if it cannot be read."""
     try:
-        return vertices(mesh)
+        return None if vertices is None else vertices(mesh)
     except (InputError, KeyError):
-        return None  # the conversion says so itself
+        return None  # the conversion reports it
 
 
-def _moved(T: ArrayLike, points: Array) -> Array:
+def _transformed(T: Array, points: Array) -> Array:
     """Points (N, 3) after a transform (4, 4)."""
-    T = np.asarray(T, float)
     return points @ T[:3, :3].T + T[:3, 3]
-
-
-def _say(p: Array) -> str:
-    return ", ".join(f"{round(float(v), 4) + 0.0:g}" for v in p)

@@ -6,13 +6,9 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 
-from magtwin.urdf.description.gazebo import Surface
+from magtwin.urdf.meshes.mesh import GREY, Rgba
+from magtwin.urdf.physics.gazebo import Surface
 from magtwin.usd.geometry import linear_from_srgb
-
-Rgba = tuple[float, float, float, float]
-
-GREY: Rgba = (0.5, 0.5, 0.5, 1.0)
-"""Look of what has none."""
 
 PHYSX_API = "PhysxMaterialAPI"
 """PhysX's applied schema, by name: its plugin lives elsewhere."""

@@ -1,4 +1,4 @@
-"""Report of a conversion: every link, joint and geometry, in the description and on the stage."""
+"""Report: every link, joint and geometry of a conversion, in the description and on the stage."""
 
 import dataclasses
 import json
@@ -12,73 +12,73 @@ from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 from magtwin.errors import InputError
 from magtwin.report import Figure, Report
 from magtwin.urdf.description.description import Description, origin_of
-from magtwin.urdf.description.model import Geometry, Joint, Link, Shape
+from magtwin.urdf.description.model import Joint, Link, Shape
 from magtwin.urdf.meshes.mesh import bounds
 from magtwin.urdf.meshes.mesh_layer import MeshLayer
 from magtwin.usd.geometry import read_vertices
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
-"""Least and greatest corner of what bounds a shape, axis-aligned in the robot's frame [m]."""
+"""Lower and upper corner of an axis-aligned box in the robot's frame [m]."""
 
 BOX_TOLERANCE = 1e-5
-"""How far a box may be off, as part of its diagonal, before it counts as changed: 32-bit vertices."""
+"""Allowed error of a box relative to its diagonal, for vertices in single precision."""
 
 ROUND_TOLERANCE = 0.01
-"""The same for a sphere, cylinder or capsule, which comes from the stage as a polygon of 32 sides:
+"""The same for a sphere, cylinder or capsule, which the stage shows as a polygon of 32 sides:
 1 - cos(pi / 32) is 0.5 % of its radius."""
 
 
 @dataclass(frozen=True)
 class LinkLine:
-    """A link, in and out."""
+    """A link before and after."""
 
     name: str
     became: str
     """"body", "frame" (a site on another body), "merged" or "nothing"."""
     prim: str
-    """Path of its prim; "" for none."""
+    """Path of its prim, or ""."""
     mass_in_kg: float | None
     mass_out_kg: float | None
 
 
 @dataclass(frozen=True)
 class JointLine:
-    """A joint, in and out."""
+    """A joint before and after."""
 
     name: str
     type_in: str
     type_out: str
-    """Type of its prim; "" where none holds its link, as with frames and merged links."""
+    """Type of its prim; "" if it has none, as for frames and merged links."""
     prim: str
 
 
 @dataclass(frozen=True)
 class GeometryLine:
-    """A visual or collider, in and out."""
+    """A visual or collider before and after."""
 
     link: str
     role: str
     """"visual" or "collision"."""
     index: int
-    """Which of its link's it is, from 0."""
+    """Index within its link and role, from 0."""
     shape: str
     """"box", "sphere", "cylinder", "capsule", or the name of the mesh's file."""
     prims: tuple[str, ...]
     box_in: Box | None
-    """None where the mesh could not be read."""
+    """None if the mesh could not be read."""
     box_out: Box | None
-    """None where nothing of it is on the stage."""
+    """None if it is not on the stage."""
 
     @property
     def error_m(self) -> float:
-        """Greatest distance between the coordinates of both boxes [m]; infinite where one is missing."""
+        """Largest difference between coordinates of the two boxes [m]; infinite if one is missing."""
         if self.box_in is None or self.box_out is None:
             return np.inf
         return float(np.abs(np.subtract(self.box_in, self.box_out)).max())
 
     @property
     def kept(self) -> bool:
-        """Whether what arrived fills the box that was sent."""
+        """Whether the box is unchanged."""
         if self.box_in is None or self.box_out is None:
             return False
         diagonal = float(np.linalg.norm(np.subtract(*self.box_in)))
@@ -88,7 +88,7 @@ class GeometryLine:
 
 @dataclass(frozen=True)
 class ConversionReport:
-    """What a conversion read, what it wrote, and what it changed on the way."""
+    """What a conversion read, wrote and changed."""
 
     robot: str
     source: str
@@ -102,17 +102,17 @@ class ConversionReport:
     mass_in_kg: float
     mass_out_kg: float
     box_in: Box | None
-    """What bounds every visual, in the description."""
+    """Box of all visuals in the description."""
     box_out: Box | None
-    """What bounds every visual, on the stage."""
+    """Box of all visuals on the stage."""
     notes: tuple[str, ...]
-    """What was repaired, guessed or left out, one line each."""
+    """Repairs, guesses and omissions, one line each."""
     losses: tuple[str, ...]
-    """What the stage has less of than the description, one line each."""
+    """Contents of the description that the stage lacks, one line each."""
     lint: tuple[str, ...]
-    """What is doubtful in the description itself, one line each."""
+    """Doubtful values in the description, one line each."""
     unknown_tags: Mapping[str, int] = field(default_factory=dict)
-    """How often each tag was met that has no meaning here and is kept as text."""
+    """Number of occurrences of each tag that is kept as text."""
 
     def to_json(self) -> str:
         """The report as one JSON object."""
@@ -148,10 +148,10 @@ class ConversionReport:
         return Report(f"{self.robot}: {self.source} -> {self.stage}", tuple(figures), metadata)
 
     def refuse_losses(self) -> None:
-        """Go on only if nothing was lost.
+        """Refuse a conversion that lost anything.
 
         Raises:
-            InputError: Something was; the text has the first loss and says how many there are.
+            InputError: Something was lost; the message gives the first loss and their number.
         """
         if self.losses:
             more = len(self.losses) - 1
@@ -163,30 +163,30 @@ class ConversionReport:
 
 @dataclass
 class Ledger:
-    """What is authored for what, put down while a robot is authored."""
+    """The prims authored for each part of a description."""
 
     bodies: dict[str, tuple[str, Sdf.Path]] = field(default_factory=dict)
-    """What each link became, see LinkLine, and its prim, by name of the link."""
+    """Kind (see LinkLine) and prim by link name."""
 
     joints: dict[str, Sdf.Path] = field(default_factory=dict)
-    """Prim of each joint that has one, by its name."""
+    """Prim by joint name; floating joints have none."""
 
     shapes: dict[tuple[str, str, int], list[Sdf.Path]] = field(default_factory=dict)
     """Prims of each geometry, by link, role and index."""
 
     unknown_tags: dict[str, int] = field(default_factory=dict)
-    """How often each tag was met that has no meaning here."""
+    """Number of occurrences of each tag without a meaning here."""
 
     def link(self, name: str, became: str, prim: Usd.Prim) -> None:
-        """Put down a link's prim."""
+        """Record the prim of a link."""
         self.bodies[name] = (became, prim.GetPath())
 
     def joint(self, name: str, prim: Usd.Prim) -> None:
-        """Put down a joint's prim."""
+        """Record the prim of a joint."""
         self.joints[name] = prim.GetPath()
 
     def shape(self, link: str, role: str, index: int, prims: Sequence[Usd.Prim]) -> None:
-        """Put down the prims of a visual or collider."""
+        """Record the prims of a visual or collider."""
         self.shapes[link, role, index] = [prim.GetPath() for prim in prims]
 
 
@@ -201,19 +201,19 @@ def make_report(
     poses: Mapping[str, NDArray[np.float64]] | None = None,
     lint: tuple[str, ...] = (),
 ) -> ConversionReport:
-    """Compare a description with the stage that was made of it.
+    """Compare a description with its stage.
 
-    Boxes on the stage are those of its vertices, read back as a viewer reads them; boxes of the
-    description are those of its mesh files' vertices and of its primitives, placed by its own joints.
+    Boxes on the stage bound its vertices, as a viewer reads them. Boxes of the description bound the vertices
+    of its mesh files and its primitives, placed by its joints.
 
     Args:
-        description: What was read; its notes are taken over.
+        description: The description, with its notes.
         meshes: Its mesh files.
-        stage: What was authored.
-        ledger: Which prim stands for what.
+        stage: The authored stage.
+        ledger: Prims of each part.
         name: Name of the root layer.
         sha256: Checksum of the description's file.
-        poses: T_root_link of each link as the robot is authored, (4, 4); each joint at 0 unless given.
+        poses: T_root_link of each link as authored, (4, 4). Default: all joints at 0.
         lint: Lines of `lint.lint`.
     """
     lines = _geometries(description, meshes, stage, ledger, poses or description.poses())
@@ -255,26 +255,18 @@ def make_report(
 
 def _link(name: str, link: Link, stage: Usd.Stage, ledger: Ledger) -> LinkLine:
     became, path = ledger.bodies.get(name, ("nothing", Sdf.Path.emptyPath))
-    mass_in = None if link.inertial is None else link.inertial.mass
-    mass_out = None
+    mass_in, mass_out = None if link.inertial is None else link.inertial.mass, None
     if became == "body":
-        api = UsdPhysics.MassAPI(stage.GetPrimAtPath(path))
-        mass_out = float(api.GetMassAttr().Get()) if api and api.GetMassAttr().HasAuthoredValue() else None
-    return LinkLine(
-        name=name,
-        became=became,
-        prim=str(path),
-        mass_in_kg=None if mass_in is None else float(mass_in),
-        mass_out_kg=None if mass_out is None else round(mass_out, 9),
-    )
+        mass = UsdPhysics.MassAPI(stage.GetPrimAtPath(path)).GetMassAttr()
+        mass_out = round(float(mass.Get()), 9) if mass and mass.HasAuthoredValue() else None
+    return LinkLine(name, became, str(path), None if mass_in is None else float(mass_in), mass_out)
 
 
 def _joint(joint: Joint, stage: Usd.Stage, ledger: Ledger) -> JointLine:
     path = ledger.joints.get(joint.name)
     if path is None:
-        return JointLine(name=joint.name, type_in=joint.type, type_out="", prim="")
-    kind = str(stage.GetPrimAtPath(path).GetTypeName())
-    return JointLine(name=joint.name, type_in=joint.type, type_out=kind, prim=str(path))
+        return JointLine(joint.name, joint.type, "", "")
+    return JointLine(joint.name, joint.type, str(stage.GetPrimAtPath(path).GetTypeName()), str(path))
 
 
 def _geometries(
@@ -284,64 +276,33 @@ def _geometries(
     ledger: Ledger,
     poses: Mapping[str, NDArray],
 ) -> tuple[GeometryLine, ...]:
-    """A line for each visual and collider."""
     boxes, lines = _boxes(stage), []
     for name, link in description.links.items():
         for role, shapes in (("visual", link.visuals), ("collision", link.collisions)):
             for index, shape in enumerate(shapes):
-                prims = ledger.shapes.get((name, role, index), [])
-                lines.append(
-                    GeometryLine(
-                        link=name,
-                        role=role,
-                        index=index,
-                        shape=_kind(shape.geometry),
-                        prims=tuple(map(str, prims)),
-                        box_in=_box_of(shape, poses[name] @ origin_of(shape), meshes),
-                        box_out=_union(
-                            [box for prim in prims for path, box in boxes.items() if path.HasPrefix(prim)]
-                        ),
-                    )
-                )
+                prims, mesh = ledger.shapes.get((name, role, index), []), shape.geometry.mesh
+                box_in = _box_of(shape, poses[name] @ origin_of(shape), meshes)
+                box_out = [box for prim in prims for path, box in boxes.items() if path.HasPrefix(prim)]
+                kind = shape.geometry.kind if mesh is None else str(mesh.filename).rpartition("/")[2]
+                paths = tuple(map(str, prims))
+                lines.append(GeometryLine(name, role, index, kind, paths, box_in, _union(box_out)))
     return tuple(lines)
 
 
-def _kind(geometry: Geometry) -> str:
-    """What a URDF `<geometry>` is, in a word."""
-    if geometry.mesh is not None:
-        return str(geometry.mesh.filename).rpartition("/")[2]
-    return geometry.kind
-
-
 def _box_of(shape: Shape, T: NDArray[np.float64], meshes: MeshLayer) -> Box | None:
-    """What bounds a URDF visual or collision at a pose (4, 4) in the robot's frame."""
-    geometry = shape.geometry
-    if geometry.mesh is not None:
-        try:
-            points = meshes.vertices(geometry.mesh)
-        except (InputError, KeyError):
-            return None  # missing, and noted as that
-        placed = points @ T[:3, :3].T + T[:3, 3]
-        return _corners(*bounds(placed))
-    R, p = T[:3, :3], T[:3, 3]
-    if geometry.box is not None:
-        half = np.abs(R) @ (np.asarray(geometry.box.size, float) / 2)
-    elif geometry.sphere is not None:
-        half = np.full(3, float(geometry.sphere.radius))
-    elif geometry.cylinder is not None:
-        # a disc of radius r with normal n reaches r sqrt(1 - n_i^2) along axis i
-        n, r = R[:, 2], float(geometry.cylinder.radius)
-        half = r * np.sqrt(np.clip(1 - n**2, 0, 1)) + np.abs(n) * float(geometry.cylinder.length) / 2
-    else:
-        capsule = getattr(geometry, "capsule", None)
-        if capsule is None:
-            return None
-        half = float(capsule.radius) + np.abs(R[:, 2]) * float(capsule.length) / 2
-    return _corners(p - half, p + half)
+    """The box around a URDF visual or collision at a pose (4, 4) in the robot's frame."""
+    if shape.geometry.mesh is None:
+        half = shape.geometry.half_extents(T[:3, :3])
+        return _corners(T[:3, 3] - half, T[:3, 3] + half)
+    try:
+        points = meshes.vertices(shape.geometry.mesh)
+    except (InputError, KeyError):
+        return None  # missing, with a note
+    return _corners(*bounds(points @ T[:3, :3].T + T[:3, 3]))
 
 
 def _boxes(stage: Usd.Stage) -> dict[Sdf.Path, Box]:
-    """What bounds each gprim of a stage, colliders included, in the frame of its default prim."""
+    """The box around each gprim of a stage, including colliders, in the frame of its default prim."""
     to_robot = UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetDefaultPrim()).GetInverse()
     bodies = {str(p.GetPath()): p for p in stage.Traverse() if p.HasAPI(UsdPhysics.RigidBodyAPI)}
     by_name = {p.GetName(): p for p in bodies.values()} | bodies
@@ -358,7 +319,7 @@ def _boxes(stage: Usd.Stage) -> dict[Sdf.Path, Box]:
 
 
 def _union(boxes: Sequence[Box | None]) -> Box | None:
-    """What bounds all boxes; None where there is none."""
+    """The box around all boxes; None if there is none."""
     there = np.array([box for box in boxes if box is not None])
     return _corners(there[:, 0].min(0), there[:, 1].max(0)) if len(there) else None
 

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
 from magtwin.urdf.description.description import Description, origin_of
-from magtwin.urdf.description.gazebo import Surface
 from magtwin.urdf.description.model import Material, Shape
-from magtwin.urdf.inertia import quaternion
 from magtwin.urdf.material import Look, define_grip, define_look, wear
 from magtwin.urdf.meshes.mesh import Paint
 from magtwin.urdf.meshes.mesh_layer import MESH, Entry, MeshLayer, free_name
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.urdf.meshes.texture import Image, read_image
+from magtwin.urdf.physics.gazebo import Surface
+from magtwin.urdf.physics.inertia import quaternion
 from magtwin.urdf.source.source import MissingFileError
 from magtwin.usd.sensors import write_pose
 

@@ -17,9 +17,9 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from magtwin.errors import InputError
 from magtwin.field.days import ORIGIN, day_number
-from magtwin.field.maps.colours import COLOUR_MAP, colour_limits
 from magtwin.field.maps.epochs import at_date, day_of, in_order
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.field.sources.harmonic import SHAPES as HARMONIC
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.geometry import linear_from_srgb

@@ -10,17 +10,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, Vt
+from pxr import Sdf, Usd, UsdGeom, UsdPhysics, Vt
 
 from magtwin.errors import InputError, hint
-from magtwin.frames import IDENTITY_XYZW, canonical, xyzw_from_wxyz
-from magtwin.spec.base import Quat, Vec3
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import PlatformFieldSpec
-from magtwin.spec.robot import RobotSpec
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
 from magtwin.usd.attributes import read_figures, read_pose, target, write_figures, write_pose
-from magtwin.usd.schema import NOUNS, apply_api, attribute_name, only_prim_with, place, require_api
+from magtwin.usd.schema import NOUNS, apply_api, attribute_name, place, require_api
 
 S = TypeVar("S")
 
@@ -36,9 +33,6 @@ BASE = "base_link"
 MAP_RELATIONSHIP = "magtwin:magnetometer:map"
 MAP_CHECKSUM = "magtwin:magnetometer:mapSha256"
 """What a scene adds to its robot's magnetometer: the map that it reads, and the checksum of its file."""
-
-PARALLEL = 1e-12
-"""Sine of half the angle between axes that count as parallel."""
 
 IMU_TYPE = "IsaacImuSensor"
 LIDAR_TYPE = "OmniLidar"
@@ -198,13 +192,13 @@ def read_footprint(prim: Usd.Prim) -> float:
     return float(require_api(prim, "robot").GetAttribute(FOOTPRINT).Get())
 
 
-def define_way(prim: Usd.Prim, path: str | Path) -> Usd.Prim:
+def define_path(prim: Usd.Prim, path: str | Path) -> Usd.Prim:
     """Say what the robot rooted at `prim` drives unless told otherwise: a name, a CSV file, or ""."""
     way = _Way(path_file=path) if isinstance(path, Path) else _Way(path=path)
     return write_figures(apply_api(prim, "robot"), "robot", way)
 
 
-def read_way(prim: Usd.Prim) -> str | Path:
+def read_path(prim: Usd.Prim) -> str | Path:
     """What the robot rooted at `prim` drives unless told otherwise; a file is named before a name is."""
     way = read_figures(_Way, prim, "robot")
     return way.path_file or way.path
@@ -260,72 +254,6 @@ def read_mocap(prim: Usd.Prim) -> MocapSpec:
     if not prim.HasAPI(NOUNS["mocap"]):
         return MocapSpec()
     return read_figures(MocapSpec, prim, "mocap")
-
-
-def read_robot_prim(prim: Usd.Prim, asset: Path) -> RobotSpec:
-    """The spec of the robot rooted at `prim`, in its own asset or in a scene that refers to it.
-
-    Args:
-        prim: Has the robot, drive and platform schemas; one magnetometer, IMU, LiDAR and battery below it.
-        asset: USD file that the robot comes from.
-
-    Raises:
-        InputError: A part is missing or there twice, or a figure is out of range; names the prim.
-    """
-    magnetometer, imu, lidar = (only_prim_with(prim, noun) for noun in ("magnetometer", "imu", "lidar"))
-    parts: dict[str, Any] = {
-        "drive": read_drive(prim),
-        "battery": read_battery(only_prim_with(prim, "battery")),
-        "platform": read_platform(prim),
-        "magnetometer": read_magnetometer(magnetometer),
-        "imu": read_imu(imu),
-        "lidar": read_lidar(lidar),
-        "mocap": read_mocap(prim),
-    }
-    try:
-        return RobotSpec(
-            name=prim.GetName(),
-            asset=asset,
-            footprint_radius_m=read_footprint(prim),
-            base_height_m=_p_root(prim, _base(prim))[2],
-            p_base_magnetometer=_p_base(prim, magnetometer),
-            q_base_magnetometer_link_xyzw=_q_base(prim, magnetometer.GetParent()),
-            q_base_imu_link_xyzw=_q_base(prim, imu.GetParent()),
-            p_base_lidar=_p_base(prim, lidar),
-            q_base_lidar_link_xyzw=_q_base(prim, lidar.GetParent()),
-            **parts,
-        )
-    except InputError as error:
-        raise InputError(f"{place(prim)}: {error}") from error
-
-
-def _base(root: Usd.Prim) -> Usd.Prim:
-    """The body of a robot called base_link, or the root where there is none of that name."""
-    return next((p for p in Usd.PrimRange(root) if p.GetName() == BASE), root)
-
-
-def _p_root(root: Usd.Prim, prim: Usd.Prim) -> Vec3:
-    """A prim's origin in the axes of its robot's root [m], wherever in the world the robot stands."""
-    return tuple(UsdGeom.XformCache().ComputeRelativeTransform(prim, root)[0].ExtractTranslation())
-
-
-def _p_base(root: Usd.Prim, sensor: Usd.Prim) -> Vec3:
-    """A sensor's origin in the axes of its robot's base [m], wherever in the world the robot stands."""
-    to_root = UsdGeom.XformCache().ComputeRelativeTransform(_base(root), root)[0]
-    return tuple(to_root.GetInverse().Transform(_p_root(root, sensor)))
-
-
-def _q_base(root: Usd.Prim, link: Usd.Prim) -> Quat:
-    """A link's axes in those of its robot's base (xyzw, w >= 0), wherever in the world the robot stands."""
-    cache = UsdGeom.XformCache()
-    link_to_root, base_to_root = (
-        cache.ComputeRelativeTransform(prim, root)[0].RemoveScaleShear() for prim in (link, _base(root))
-    )
-    q: Gf.Quatd = (link_to_root * base_to_root.GetInverse()).ExtractRotationQuat().GetNormalized()
-    if q.GetImaginary().GetLength() <= PARALLEL:
-        return IDENTITY_XYZW
-    x, y, z, w = canonical(xyzw_from_wxyz((q.GetReal(), *q.GetImaginary()))).tolist()
-    return (x, y, z, w)
 
 
 def _define_xform(stage: Usd.Stage, path: str | Sdf.Path) -> Usd.Prim:

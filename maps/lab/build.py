@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.author.robot import read_robot
 from magtwin.field.fit.fit import fit, raster
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.readings import Readings
@@ -33,6 +32,7 @@ from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.usd.earth import derived
 from magtwin.usd.maps import save_map
+from magtwin.usd.robot import load_robot
 
 HERE = Path(__file__).resolve().parent
 SEED = 398
@@ -200,7 +200,7 @@ def _rounded(v: NDArray[np.float64], digits: int = 3) -> tuple[float, float, flo
 
 def robot() -> RobotSpec:
     """The robot that surveys the lab."""
-    return read_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
+    return load_robot(shipped("robots", "turtlebot4", "turtlebot4.usda"))
 
 
 def scene(robot: RobotSpec) -> Scene:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from magtwin.author.scene import read_sources
+from magtwin.author.scene_file import read_sources
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.magnets import body_of
 from magtwin.files import from_table, read_toml, shipped
@@ -179,7 +179,7 @@ def test_the_protocol_surveys_as_the_shipped_map_was_surveyed(script):
     spec.loader.exec_module(protocol)
     options = dict(zip(protocol.SURVEY[::2], map(float, protocol.SURVEY[1::2]), strict=True))
     assert options == {
-        "--heading-error": script.HEADING_ERROR_DEG,
-        "--position-error": script.POSITION_ERROR_M,
+        "--heading-error-deg": script.HEADING_ERROR_DEG,
+        "--position-error-m": script.POSITION_ERROR_M,
         "--readings": script.READINGS,
     }

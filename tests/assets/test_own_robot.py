@@ -46,14 +46,14 @@ def test_a_scene_that_names_a_urdf_is_driven_in_two_commands(tmp_path, capsys):
     main(["scene", str(scene(tmp_path)), "--out", str(tmp_path / "mine")])
     main(
         [
-            *("run", str(tmp_path / "mine" / "mine.usda"), "--duration", "3", "--json"),
-            *("--parquet", str(tmp_path / "run.parquet"), "--rrd", str(tmp_path / "run.rrd")),
+            *("run", str(tmp_path / "mine" / "mine.usda"), "--duration-s", "3", "--json"),
+            *("--out", str(tmp_path / "run.parquet"), "--out", str(tmp_path / "run.rrd")),
         ]
     )
     out = capsys.readouterr().out
     metadata = json.loads(out[out.rindex('{\n  "title"') :])["metadata"]
     assert metadata["scene"] == "mine"
-    from magtwin.author.scene import read_scene
+    from magtwin.usd.scene import read_scene
 
     robot = read_scene(tmp_path / "mine" / "mine.usda").robot
     assert robot.name == "cart"
@@ -85,7 +85,7 @@ def test_a_scene_that_does_not_fit_its_urdf_is_refused_and_nothing_is_written(
 
 
 def test_keys_of_a_urdf_are_refused_beside_an_asset(tmp_path):
-    from magtwin.author.scene import scene_from_toml
+    from magtwin.author.scene_file import scene_from_toml
 
     asset = shipped("robots", "turtlebot4", "turtlebot4.usda")
     file = scene(tmp_path, SCENE.replace(f'urdf = "{CART}"', f'asset = "{asset}"'))
@@ -155,7 +155,7 @@ def test_options_of_the_command_reach_the_conversion(tmp_path, capsys):
         [
             *("robot", str(CART), "--out", str(tmp_path / "cart"), "--fix-base", "--report", str(report)),
             "--thumbnail",
-            *("--drive", "left:position:stiffness=7:damping=2:max_force=4", "--mass", "9"),
+            *("--drive", "left:position:stiffness=7:damping=2:max_force=4", "--mass-kg", "9"),
         ]
     )
     stage = Usd.Stage.Open(str(tmp_path / "cart" / "cart.usda"))
@@ -179,8 +179,8 @@ def test_options_of_the_command_reach_the_conversion(tmp_path, capsys):
         (["--drive", "left:velocity:dampening=3"], "PATTERN:TYPE"),
         (["--drive", "left:velocity:damping=much"], "PATTERN:TYPE"),
         (["--package", "mine"], "NAME=VALUE is wanted"),
-        (["--density", "-1"], "density must be above 0"),
-        (["--density", "inf"], "density must be above 0, got inf"),
+        (["--density-kg-m3", "-1"], "density must be above 0"),
+        (["--density-kg-m3", "inf"], "density must be above 0, got inf"),
         (["--report", "report.txt"], "a report ends in .json"),
     ],
 )

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from places import DOCS
 
-from magtwin.author.scene import read_scene
 from magtwin.cli import main
 from magtwin.io.tables import read_parquet
+from magtwin.usd.scene import read_scene
 
 PAGE = DOCS / "own.md"
 EARTH_NT = np.array([-1_800.0, 21_500.0, -43_000.0])

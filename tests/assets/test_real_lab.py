@@ -30,11 +30,11 @@ def real_run(tmp_path_factory):
     )
     magtwin(
         *("scene", "aprilab", "--out", out / "scene"),
-        *("--map", out / "aprilab.usdc", "--net", out / "released.safetensors"),
+        *("--map", out / "aprilab.usdc", "--network", out / "released.safetensors"),
     )
     magtwin(
         *("run", out / "scene" / "aprilab.usda", "--path", real / "paths" / "figure8_path.csv"),
-        *("--parquet", out / "run.parquet"),
+        *("--out", out / "run.parquet"),
     )
     return read_parquet(out / "run.parquet"), real
 
@@ -42,12 +42,12 @@ def real_run(tmp_path_factory):
 def test_the_map_column_is_what_scipy_interpolates_and_unknown_beside_latched_nodes(real_run):
     from scipy.interpolate import RegularGridInterpolator
 
-    from magtwin.field.survey.gridded import import_survey
+    from magtwin.field.survey.folder import read_survey
 
     run, real = real_run
     tables = [np.loadtxt(real / "maps" / f"{h}_map.csv", delimiter=",") for h in (0, 90, 180, 270)]
     grids = [t[:, 3].reshape(15, 25) for t in tables]
-    masked = (~import_survey(real / "maps").valid).astype(float)
+    masked = (~read_survey(real / "maps")[0].valid).astype(float)
     x, y = np.linspace(-3, 3, 25), np.linspace(-1.75, 1.75, 15)
     p = run["p_world_base"]
     poses = np.column_stack([run["yaw"] % (2 * np.pi), p[:, 1], p[:, 0]])
@@ -113,7 +113,7 @@ def test_the_command_line_gives_the_same_bytes_for_one_seed_and_others_for_anoth
                 str(lab_scene),
                 "--seed",
                 str(seed),
-                "--parquet",
+                "--out",
                 str(tmp_path / f"{name}.parquet"),
                 "--json",
             ]

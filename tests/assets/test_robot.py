@@ -6,12 +6,13 @@ from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
 from validators import assert_valid
 
-from magtwin.author.robot import build_robot, read_robot, read_settings, robot_of
+from magtwin.author.robot import build_robot, read_settings
 from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.frames import rotate
 from magtwin.urdf import read_notes
 from magtwin.usd.geometry import read_links, read_shapes
+from magtwin.usd.robot import load_robot, read_robot
 
 HOME = shipped("robots", "turtlebot4")
 ASSET = HOME / "turtlebot4.usda"
@@ -60,7 +61,7 @@ def test_the_meshes_and_the_urdf_are_what_the_script_draws(tmp_path):
 
 def test_the_asset_gives_the_settings_back(links):
     settings = read_settings(HOME / "robot.toml")
-    robot = read_robot(ASSET)
+    robot = load_robot(ASSET)
     assert robot.asset == ASSET
     for name in (
         "name",
@@ -90,8 +91,8 @@ def test_a_robot_placed_in_a_scene_reads_the_same_wherever_it_stands(stage):
         prim.AddTranslateOp().Set((1.7, -0.3, 0))
         prim.AddRotateZOp().Set(yaw)
         prim.GetPrim().GetReferences().AddReference(str(ASSET))
-    first, second = (robot_of(scene.GetPrimAtPath(f"/World/{n}")) for n in ("first", "second"))
-    assert first.p_base_magnetometer == second.p_base_magnetometer == read_robot(ASSET).p_base_magnetometer
+    first, second = (read_robot(scene.GetPrimAtPath(f"/World/{n}")) for n in ("first", "second"))
+    assert first.p_base_magnetometer == second.p_base_magnetometer == load_robot(ASSET).p_base_magnetometer
     assert first.asset == second.asset == ASSET
     assert (first.name, second.name) == ("first", "second")
 
@@ -221,9 +222,9 @@ def test_an_asset_without_sensors_is_no_robot(tmp_path):
     empty = Usd.Stage.CreateNew(str(tmp_path / "empty.usda"))
     empty.Save()
     with pytest.raises(InputError, match=r"empty\.usda: has no default prim, so no robot"):
-        read_robot(tmp_path / "empty.usda")
+        load_robot(tmp_path / "empty.usda")
     with pytest.raises(InputError, match=r"no such robot asset"):
-        read_robot(tmp_path / "none.usda")
+        load_robot(tmp_path / "none.usda")
 
 
 def test_a_network_named_in_the_settings_is_found_from_the_asset(tmp_path):
@@ -236,4 +237,4 @@ def test_a_network_named_in_the_settings_is_found_from_the_asset(tmp_path):
     out = tmp_path / "robots" / "turtlebot4.usda"
     build_robot(HOME / "turtlebot4.urdf", settings, out)
     assert "@../weights/net.safetensors@" in out.read_text()
-    assert read_robot(out).magnetometer.network == network
+    assert load_robot(out).magnetometer.network == network

@@ -11,8 +11,6 @@ from pxr import Usd
 from validators import assert_valid
 
 import magtwin
-from magtwin.author.furniture import define_furniture, read_magnets
-from magtwin.author.scene import read_scene
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.holes import filled
@@ -32,7 +30,9 @@ from magtwin.spec.furniture import (
     parts_of,
 )
 from magtwin.twin import author_scene, new_scene, open_twin, scene_from_toml, simulate
+from magtwin.usd.furniture import define_furniture, read_magnets
 from magtwin.usd.maps import save_map
+from magtwin.usd.scene import read_scene
 
 ROOM = """
 name = "den"

@@ -15,8 +15,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade
 from validators import assert_valid
 
 import magtwin
-from magtwin.author.lab import LAB, define_lab, read_lab
-from magtwin.author.scene import author_scene, open_alone, read_scene, robots_in, scene_from_toml
+from magtwin.author.scene import author_scene
+from magtwin.author.scene_file import scene_from_toml
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.earth import earth_field_nt
@@ -30,8 +30,10 @@ from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSp
 from magtwin.twin import open_twin, simulate
 from magtwin.usd import sensors
 from magtwin.usd.attributes import write_pose
+from magtwin.usd.lab import LAB, define_lab, read_lab
 from magtwin.usd.layers import new_stage
 from magtwin.usd.maps import MAP, save_map
+from magtwin.usd.scene import open_alone, read_scene, robots_in
 
 EARTH = EarthFieldSpec(
     b_world_nt=(-2_000.5, 23_000.25, -39_000.125),

@@ -4,11 +4,12 @@ from dataclasses import fields, is_dataclass, replace
 
 import pytest
 
-from magtwin.author.scene import author_scene, read_scene
+from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.spec.robot import PlacedRobot
 from magtwin.twin import scene_from_toml
+from magtwin.usd.scene import read_scene
 
 DERIVED = (
     "base_height_m",

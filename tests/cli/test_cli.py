@@ -32,7 +32,7 @@ def test_help_loads_nothing_heavy():
 
 
 def test_every_command_of_the_readme_is_a_command(capsys):
-    for command in ("demo", "robot", "map import", "map plot", "map info", "scene", "run", "net convert"):
+    for command in ("demo", "robot", "map import", "map plot", "map info", "scene", "run", "network convert"):
         main([*command.split(), "--help"])
         assert f"Usage: magtwin {command}" in capsys.readouterr().out
     for command in ("info", "view", "fetch"):
@@ -167,7 +167,7 @@ def test_a_checkpoint_with_foreign_types_is_refused_by_name_and_not_run(tmp_path
     with zipfile.ZipFile(tmp_path / "evil.pth", "w") as archive:
         archive.writestr("evil/data.pkl", pickle.dumps(Evil(), protocol=2))
         archive.writestr("evil/version", "3\n")
-    line = refused(capsys, "net", "convert", tmp_path / "evil.pth", "--out", tmp_path / "out.safetensors")
+    line = refused(capsys, "network", "convert", tmp_path / "evil.pth", "--out", tmp_path / "out.safetensors")
     assert "evil.pth" in line
     assert "open" in line
     assert sorted(p.name for p in tmp_path.iterdir()) == ["evil.pth"]
@@ -175,7 +175,7 @@ def test_a_checkpoint_with_foreign_types_is_refused_by_name_and_not_run(tmp_path
 
 def test_an_output_that_exists_is_refused_before_the_run(tmp_path, capsys, lab_scene):
     (tmp_path / "run.rrd").write_text("mine")
-    line = refused(capsys, "run", lab_scene, "--rrd", tmp_path / "run.rrd")
+    line = refused(capsys, "run", lab_scene, "--out", tmp_path / "run.rrd")
     assert "run.rrd: exists already; give --force" in line
     assert (tmp_path / "run.rrd").read_text() == "mine"
 
@@ -195,7 +195,7 @@ def test_a_scene_whose_map_was_changed_is_refused(tmp_path, capsys, lab_scene):
     changed[0] += 1
     values.default = type(values.default).FromNumpy(changed)
     opened.Save()
-    line = refused(capsys, "run", folder / lab_scene.name, "--parquet", tmp_path / "run.parquet")
+    line = refused(capsys, "run", folder / lab_scene.name, "--out", tmp_path / "run.parquet")
     assert "</World/AnomalyMap>" in line
     assert "checksum" in line
 
@@ -217,14 +217,16 @@ def test_debug_lets_the_traceback_through(tmp_path):
 def test_run_takes_the_kind_of_magnetometer(lab_scene, tmp_path, capsys):
     from magtwin.io.tables import read_parquet
 
-    for options, kind in ((["--magnetometer", "map-only"], "map-only"), (["--net", "none"], "physical")):
+    for options, kind in ((["--magnetometer", "map-only"], "map-only"), (["--network", "none"], "physical")):
         out = tmp_path / f"{kind}.parquet"
-        main(["run", str(lab_scene), "--duration", "1", "--parquet", str(out), "--json", *options])
+        main(["run", str(lab_scene), "--duration-s", "1", "--out", str(out), "--json", *options])
         run = read_parquet(out)
         assert run.metadata["magnetometer"] == kind
         assert (run["b_disturbance_nt"] == 0).all() == (kind == "map-only")
     capsys.readouterr()
-    line = refused(capsys, "run", lab_scene, "--net", "none", "--magnetometer", "neural", "--duration", "1")
+    line = refused(
+        capsys, "run", lab_scene, "--network", "none", "--magnetometer", "neural", "--duration-s", "1"
+    )
     assert "a neural magnetometer without a network" in line
 
 
@@ -232,32 +234,32 @@ def test_options_come_from_the_environment_and_from_magtwin_toml(tmp_path, monke
     monkeypatch.chdir(tmp_path)
     (tmp_path / "magtwin.toml").write_text("[run]\nspeed = 0.15\nseed = 5\n")
     monkeypatch.setenv("MAGTWIN_RUN_SEED", "9")
-    main(["run", str(lab_scene), "--duration", "2", "--parquet", "a.parquet", "--json"])
+    main(["run", str(lab_scene), "--duration-s", "2", "--out", "a.parquet", "--json"])
     metadata = json.loads(capsys.readouterr().out)["metadata"]
     assert metadata["seed"] == 9
     assert metadata["speed_m_s"] == 0.15
     (tmp_path / "magtwin.toml").write_text("[run]\nspeeed = 0.15\n")
     with pytest.raises(SystemExit) as stop:
-        main(["run", str(lab_scene), "--duration", "2", "--parquet", "b.parquet"])
+        main(["run", str(lab_scene), "--duration-s", "2", "--out", "b.parquet"])
     assert stop.value.code == 2
     assert "speeed" in capsys.readouterr().err
 
 
 def test_info_tells_of_stages_runs_and_networks(lab_scene, tmp_path, capsys):
-    main(["run", str(lab_scene), "--duration", "2", "--parquet", str(tmp_path / "a.parquet")])
+    main(["run", str(lab_scene), "--duration-s", "2", "--out", str(tmp_path / "a.parquet")])
     capsys.readouterr()
     main(["info", str(lab_scene)])
     assert "MagtwinMagnetometerAPI" in capsys.readouterr().out
     main(["info", str(tmp_path / "a.parquet"), "--json"])
     assert json.loads(capsys.readouterr().out)["figures"]["duration"]["unit"] == "s"
     (tmp_path / "a.txt").touch()
-    assert "no kind of file '.txt'" in refused(capsys, "info", tmp_path / "a.txt")
+    assert "unknown kind of file '.txt'" in refused(capsys, "info", tmp_path / "a.txt")
 
 
 @pytest.mark.parametrize("seed", ["-1", "1.5"])
 def test_a_seed_that_is_no_whole_number_from_0_up_is_refused(lab_scene, tmp_path, capsys, seed):
     with pytest.raises(SystemExit) as stop:
-        main(["run", str(lab_scene), "--seed", seed, "--parquet", str(tmp_path / "a.parquet")])
+        main(["run", str(lab_scene), "--seed", seed, "--out", str(tmp_path / "a.parquet")])
     assert stop.value.code in (1, 2)
     assert "a whole number" in capsys.readouterr().err.replace("seed must be ", "")
     assert not list(tmp_path.iterdir())
@@ -268,16 +270,25 @@ def test_a_seed_that_is_no_whole_number_from_0_up_is_refused(lab_scene, tmp_path
 )
 def test_weights_that_are_no_file_are_refused(lab_scene, tmp_path, capsys, net, said):
     with pytest.raises(SystemExit):
-        main(["run", str(lab_scene), "--net", str(tmp_path / net), "--parquet", str(tmp_path / "a.parquet")])
+        main(
+            [
+                "run",
+                str(lab_scene),
+                "--network",
+                str(tmp_path / net),
+                "--out",
+                str(tmp_path / "a.parquet"),
+            ]
+        )
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
 def test_of_several_outputs_all_are_written_or_none(lab_scene, tmp_path, capsys):
     (tmp_path / "file").touch()
-    arguments = ("run", lab_scene, "--duration", "1", "--parquet", tmp_path / "a.parquet")
-    assert "cannot be written" in refused(capsys, *arguments, "--rrd", tmp_path / "file" / "a.rrd")
-    assert "two outputs have one name" in refused(capsys, *arguments, "--rrd", tmp_path / "a.parquet")
+    arguments = ("run", lab_scene, "--duration-s", "1", "--out", tmp_path / "a.parquet")
+    assert "cannot be written" in refused(capsys, *arguments, "--out", tmp_path / "file" / "a.rrd")
+    assert "two outputs have one name" in refused(capsys, *arguments, "--out", tmp_path / "a.parquet")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
@@ -287,7 +298,7 @@ def test_a_run_that_is_told_to_end_leaves_nothing(lab_scene, tmp_path):
 
     command = [sys.executable, "-c", "from magtwin.cli import main; main()", "run", str(lab_scene)]
     process = subprocess.Popen(
-        [*command, "--duration", "20000", "--out", str(tmp_path / "run")], stderr=subprocess.DEVNULL
+        [*command, "--duration-s", "20000", "--out", str(tmp_path / "run")], stderr=subprocess.DEVNULL
     )
     deadline = time.monotonic() + 30
     while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
@@ -325,6 +336,6 @@ def test_the_working_folder_and_devices_are_not_replaced(tmp_path, monkeypatch, 
     assert "working folder" in refused(capsys, "scene", "lab", "--out", ".", "--force")
     assert "working folder" in refused(capsys, "scene", "lab", "--out", "../here", "--force")
     os.mkfifo("pipe.parquet")
-    line = refused(capsys, "run", lab_scene, "--duration", "1", "--parquet", "pipe.parquet", "--force")
+    line = refused(capsys, "run", lab_scene, "--duration-s", "1", "--out", "pipe.parquet", "--force")
     assert "a device or pipe" in line
     assert (tmp_path / "here").is_dir()

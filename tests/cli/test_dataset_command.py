@@ -151,10 +151,13 @@ def test_correlate_tells_and_draws(made, tmp_path, capsys):
         (["build", "DAYS/monday/x.json"], "no such recording"),
         (["build", "DAYS/monday/a.json", "DAYS/monday/a.json"], "two recordings are called 'monday_a'"),
         (
-            ["build", "DAYS/c.parquet", "--align", "fit", "--latency", "0.1"],
-            "drop it, or --lever-arm and --latency",
+            ["build", "DAYS/c.parquet", "--alignment", "fit", "--latency-s", "0.1"],
+            "drop it, or --lever-arm-m and --latency-s",
         ),
-        (["build", "DAYS/c.parquet", "--align", "fit"], "80 readings have a label on the map 'lab', too few"),
+        (
+            ["build", "DAYS/c.parquet", "--alignment", "fit"],
+            "80 readings have a label on the map 'lab', too few",
+        ),
         (
             ["correlate", "SET", "--features", "gradiant"],
             "no feature set 'gradiant'; did you mean 'gradient'?",

@@ -93,7 +93,7 @@ def test_a_drive_at_a_terminal_is_recorded_and_leaves_the_terminal_as_it_was(tmp
     before = termios.tcgetattr(theirs)
     command = [sys.executable, "-m", "magtwin", "drive", str(lab_scene), "--out", str(tmp_path / "d")]
     process = subprocess.Popen(
-        [*command, "--net", "none", "--no-view", "--json"],
+        [*command, "--network", "none", "--no-live", "--json"],
         stdin=theirs,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -115,7 +115,7 @@ def test_a_drive_at_a_terminal_is_recorded_and_leaves_the_terminal_as_it_was(tmp
     assert run["p_world_base"][-1, 0] > 0.01
     assert np.abs(run["w_cmd"]).max() == 0.25
     commands, parquet = tmp_path / "d" / "commands.csv", tmp_path / "again.parquet"
-    options = ["--net", "none", "--json", "--commands", str(commands), "--parquet", str(parquet)]
+    options = ["--network", "none", "--json", "--commands", str(commands), "--out", str(parquet)]
     main(["run", str(lab_scene), *options])
     again = read_parquet(tmp_path / "again.parquet")
     for name in run:
@@ -132,7 +132,7 @@ def test_a_gamepad_that_is_not_there_is_refused(tmp_path, lab_scene, capsys):
 
 def test_a_folder_is_no_gamepad(tmp_path, lab_scene, capsys):
     with pytest.raises(SystemExit):
-        main(["drive", str(lab_scene), "--gamepad", str(tmp_path), "--out", str(tmp_path / "d"), "--no-view"])
+        main(["drive", str(lab_scene), "--gamepad", str(tmp_path), "--out", str(tmp_path / "d"), "--no-live"])
     assert f"{tmp_path}: a folder; name a gamepad in it" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 

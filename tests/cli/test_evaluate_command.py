@@ -70,7 +70,7 @@ def report(room):
     drives = [str(room / f"drive{k}.parquet") for k in range(3)]
     maps = [str(room / name) for name in ("hills.usdc", "higher.usdc")]
     words = ["evaluate", str(room / "net.safetensors"), "--runs", *drives, "--map", *maps]
-    main([*words, "--train", str(room / "set"), "--against", str(room / "drive2.parquet"), "--out", str(out)])
+    main([*words, "--train", str(room / "set"), "--overlay", str(room / "drive2.parquet"), "--out", str(out)])
     return out
 
 
@@ -119,7 +119,7 @@ def test_the_same_evaluation_gives_the_same_bytes(room, report):
     maps = [str(room / name) for name in ("hills.usdc", "higher.usdc")]
     words = ["evaluate", str(room / "net.safetensors"), "--runs", *drives, "--map", *maps, "--force"]
     out = room / "again"
-    main([*words, "--train", str(room / "set"), "--against", str(room / "drive2.parquet"), "--out", str(out)])
+    main([*words, "--train", str(room / "set"), "--overlay", str(room / "drive2.parquet"), "--out", str(out)])
     for path in (path for path in report.rglob("*") if path.is_file()):
         assert path.read_bytes() == (out / path.relative_to(report)).read_bytes(), path.name
 
@@ -213,7 +213,7 @@ def test_a_budget_is_made_where_the_scene_is_at_hand(room, lab_scene, tmp_path, 
     for one in told["budget"]["models"]:
         assert sum(term["bought_nt"] for term in one["terms"]) == pytest.approx(one["mae_nt"])
     pictures = {path.stem for path in (tmp_path / "out" / "figures").iterdir()}
-    assert {"budget", "steps", "figure_8"} <= pictures
+    assert {"budget", "figure_8"} <= pictures
 
 
 def test_the_example_of_the_docs_runs(room, tmp_path, monkeypatch, capsys):

@@ -9,15 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Sdf, Usd
 
-from magtwin.author.scene import read_scene
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.export.package import export_scene
 from magtwin.export.structure import structure
-from magtwin.export.units import to_metres_z_up
 from magtwin.export.usdz import pack, unpack
 from magtwin.files import sha256, shipped
 from magtwin.io.tables import write_parquet
@@ -310,232 +307,15 @@ def test_a_prim_in_the_place_of_attached_files_is_refused(lab, tmp_path):
 # Units
 
 
-YARD = """#usda 1.0
-(
-    defaultPrim = "World"
-    metersPerUnit = 0.01
-    upAxis = "Y"
+@pytest.mark.parametrize(
+    ("metadata", "text"),
+    [
+        ('(metersPerUnit = 0.01; upAxis = "Y")\n', r"stage\.usda: has 0\.01 m a unit and Y up; .*convert"),
+        ("", "0.01 m a unit and Y up, the defaults of USD"),
+    ],
 )
-
-def Xform "World"
-{
-    def PhysicsScene "Scene"
-    {
-        vector3f physics:gravityDirection = (0, -1, 0)
-        float physics:gravityMagnitude = 981
-    }
-
-    def Xform "cart" (
-        prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"]
-    )
-    {
-        double3 xformOp:translate = (100, 20, -300)
-        double xformOp:rotateY = 90
-        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateY"]
-        point3f physics:centerOfMass = (10, 0, 0)
-        float physics:density = 0.001
-        float3 physics:diagonalInertia = (10000, 20000, 30000)
-        float physics:mass = 5
-
-        def Mesh "plate"
-        {
-            float3[] extent = [(0, 0, 0), (200, 50, 0)]
-            int[] faceVertexCounts = [3]
-            int[] faceVertexIndices = [0, 1, 2]
-            point3f[] points = [(0, 0, 0), (200, 0, 0), (0, 50, 0)]
-            point3f[] points.timeSamples = {
-                0: [(0, 0, 0), (200, 0, 0), (0, 50, 0)],
-                1: [(0, 0, 0), (400, 0, 0), (0, 50, 0)],
-            }
-        }
-
-        def Xform "free"
-        {
-            double3 xformOp:translate = (0, 100, 0)
-            uniform token[] xformOpOrder = ["!resetXformStack!", "xformOp:translate"]
-        }
-
-        def Camera "eye"
-        {
-            float2 clippingRange = (1, 1000)
-            float focalLength = 50
-            float horizontalAperture = 20
-            matrix4d xformOp:transform = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 30, 0, 1))
-            uniform token[] xformOpOrder = ["xformOp:transform"]
-        }
-    }
-
-    def PhysicsPrismaticJoint "slide" (
-        prepend apiSchemas = ["PhysicsDriveAPI:linear"]
-    )
-    {
-        float drive:linear:physics:maxForce = 500
-        float drive:linear:physics:stiffness = 7
-        float drive:linear:physics:targetPosition = 25
-        point3f physics:localPos0 = (0, 10, 0)
-        point3f physics:localPos1 = (0, 20, 0)
-        rel physics:body1 = </World/cart>
-        float physics:lowerLimit = -50
-        float physics:upperLimit = inf
-    }
-
-    def PhysicsRevoluteJoint "turn" (
-        prepend apiSchemas = ["PhysicsDriveAPI:angular"]
-    )
-    {
-        float drive:angular:physics:damping = 10000
-        float physics:lowerLimit = -90
-        rel physics:body0 = </World/cart>
-        rel physics:body1 = </World/cart>
-    }
-}
-"""
-
-
-def world_points(stage: Usd.Stage, path: str, time: float) -> np.ndarray:
-    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
-    to_world = np.array(UsdGeom.Xformable(mesh).ComputeLocalToWorldTransform(time))
-    points = np.array(mesh.GetPointsAttr().Get(time))
-    return np.column_stack([points, np.ones(len(points))]) @ to_world[:, :3]
-
-
-def test_a_stage_in_centimetres_with_y_up_is_refused_unless_it_is_to_be_converted(tmp_path):
-    stage = write(tmp_path, YARD)
-    refuse(r"stage\.usda: has 0\.01 m a unit and Y up; .*give --convert-units", stage, tmp_path)
-
-
-def test_a_stage_that_says_no_unit_is_refused_as_what_usd_takes_it_for(tmp_path):
-    refuse("0.01 m a unit and Y up, as it says none", write(tmp_path, "#usda 1.0\n" + CUBE), tmp_path)
-
-
-def test_points_and_transforms_are_converted_to_metres_with_z_up(tmp_path):
-    made = export_scene(write(tmp_path, YARD), tmp_path / "out", convert_units=True, trusted=True)
-    stage = Usd.Stage.Open(str(made.root))
-    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
-    assert UsdGeom.GetStageUpAxis(stage) == "Z"
-    # cart's x axis is the yard's -z, which is y of the world with Z up; its y is up
-    assert_allclose(
-        world_points(stage, "/World/cart/plate", 0), [[1, 3, 0.2], [1, 5, 0.2], [1, 3, 0.7]], atol=1e-6
-    )
-    assert_allclose(world_points(stage, "/World/cart/plate", 1)[1], [1, 7, 0.2], atol=1e-6)
-    cache = UsdGeom.XformCache()
-    free, eye = (
-        cache.GetLocalToWorldTransform(stage.GetPrimAtPath(f"/World/cart/{n}")) for n in ("free", "eye")
-    )
-    assert_allclose(free.ExtractTranslation(), [0, 0, 1], atol=1e-9)
-    assert_allclose(eye.ExtractTranslation(), [1, 3, 0.5], atol=1e-9)
-    assert_allclose(free.TransformDir(Gf.Vec3d(0, 1, 0)), [0, 0, 1], atol=1e-9)
-    world = stage.GetPrimAtPath("/World")
-    assert cache.GetLocalToWorldTransform(world) == Gf.Matrix4d(1)
-    assert_allclose(
-        UsdGeom.Mesh(stage.GetPrimAtPath("/World/cart/plate")).GetExtentAttr().Get()[1], [2, 0.5, 0]
-    )
-
-
-def test_every_conversion_agrees_with_the_rule_for_points_of_the_world(tmp_path):
-    before = Usd.Stage.Open(str(write(tmp_path, YARD)))
-    made = export_scene(tmp_path / "stage.usda", tmp_path / "out", convert_units=True, trusted=True)
-    after = Usd.Stage.Open(str(made.root))
-    for time in (0, 1):
-        x, y, z = world_points(before, "/World/cart/plate", time).T / 100
-        assert_allclose(
-            world_points(after, "/World/cart/plate", time), np.column_stack([x, -z, y]), atol=1e-6
-        )
-
-
-def test_figures_of_physics_are_converted_by_their_units(tmp_path):
-    made = export_scene(write(tmp_path, YARD), tmp_path / "out", convert_units=True, trusted=True)
-    stage = Usd.Stage.Open(str(made.root))
-    scene = UsdPhysics.Scene(stage.GetPrimAtPath("/World/Scene"))
-    assert scene.GetGravityMagnitudeAttr().Get() == pytest.approx(9.81)
-    assert_allclose(scene.GetGravityDirectionAttr().Get(), [0, 0, -1])
-    expected = {
-        "/World/cart.physics:mass": 5,
-        "/World/cart.physics:density": 1000,  # kg/cm3 to kg/m3
-        "/World/cart.physics:diagonalInertia": (1, 2, 3),  # kg cm2 to kg m2
-        "/World/cart.physics:centerOfMass": (0.1, 0, 0),
-        "/World/slide.physics:lowerLimit": -0.5,
-        "/World/slide.physics:upperLimit": np.inf,
-        "/World/slide.physics:localPos0": (0, 0, 0.1),  # its first end is the world
-        "/World/slide.physics:localPos1": (0, 0.2, 0),
-        "/World/slide.drive:linear:physics:maxForce": 5,  # kg cm/s2 to N
-        "/World/slide.drive:linear:physics:stiffness": 7,  # N/m, of force and length
-        "/World/slide.drive:linear:physics:targetPosition": 0.25,
-        "/World/turn.physics:lowerLimit": -90,
-        "/World/turn.drive:angular:physics:damping": 1,
-        "/World/cart/eye.focalLength": 0.5,
-        "/World/cart/eye.horizontalAperture": 0.2,
-        "/World/cart/eye.clippingRange": (0.01, 10),
-    }
-    for path, value in expected.items():
-        assert_allclose(stage.GetAttributeAtPath(path).Get(), value, rtol=1e-6, err_msg=path)
-
-
-def test_a_variant_that_is_not_chosen_is_converted_too(tmp_path):
-    (tmp_path / "tall.usda").write_text(
-        '#usda 1.0\n(\n    defaultPrim = "box"\n)\ndef Cube "box"\n{\n    double size = 300\n}\n'
-    )
-    text = (
-        '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 0.01\n    upAxis = "Y"\n)\n'
-        'def Xform "World" (variants = {string v = "low"}\nprepend variantSets = "v")\n{\n'
-        'variantSet "v" = {\n"low" {\ndef Cube "box"\n{\ndouble size = 100\n}\n}\n'
-        '"tall" {\ndef "box" (references = @./tall.usda@)\n{\n}\n}\n}\n}\n'
-    )
-    made = export_scene(write(tmp_path, text), tmp_path / "out", convert_units=True, trusted=True)
-    stage = Usd.Stage.Open(str(made.root))
-    world = stage.GetPrimAtPath("/World")
-    for variant, size in (("low", 1), ("tall", 3)):
-        world.GetVariantSet("v").SetVariantSelection(variant)
-        box = stage.GetPrimAtPath("/World/box")
-        assert box.GetAttribute("size").Get() == pytest.approx(size)
-        up = UsdGeom.XformCache().GetLocalToWorldTransform(box).TransformDir(Gf.Vec3d(0, 1, 0))
-        assert_allclose(up, [0, 0, 1], atol=1e-9)
-
-
-def test_lengths_of_physics_engines_that_are_not_known_are_noted(tmp_path):
-    text = YARD.replace(
-        "        float physics:mass = 5",
-        "        float physxVehicle:wheelBase = 5\n        float physics:mass = 5",
-    )
-    made = export_scene(write(tmp_path, text), tmp_path / "out", convert_units=True, trusted=True)
-    assert "physxVehicle:wheelBase" in made.notes[0]
-
-
-def test_a_scene_that_went_to_centimetres_comes_back_to_the_bit_of_single_precision(lab, tmp_path):
-    own = shutil.copytree(lab, tmp_path / "lab")
-    _to_centimetres(own / "lab.usda")
-    refuse("0.01 m a unit and Z up", own / "lab.usda", tmp_path)
-    made = export_scene(own / "lab.usda", tmp_path / "back", convert_units=True, trusted=True)
-    there, here = (read_scene(file) for file in (lab / "lab.usda", made.root))
-    assert here.lab == there.lab
-    assert here.robot.drive == there.robot.drive
-    assert_allclose(here.robot.magnetometer.p_link_sensor, there.robot.magnetometer.p_link_sensor, rtol=1e-12)
-    before, after = (Usd.Stage.Open(str(file)) for file in (lab / "lab.usda", made.root))
-    caches = UsdGeom.XformCache(), UsdGeom.XformCache()
-    for prim in before.Traverse():
-        places = [
-            c.GetLocalToWorldTransform(s.GetPrimAtPath(prim.GetPath()))
-            for c, s in zip(caches, (before, after), strict=True)
-        ]
-        assert_allclose(np.array(places[1]), np.array(places[0]), atol=1e-7)
-
-
-def _to_centimetres(root: Path) -> None:
-    """The lab in centimetres, as another program's conversion leaves it, its map's checksum taken anew."""
-    stage = Usd.Stage.Open(str(root))
-    UsdGeom.SetStageMetersPerUnit(stage, 1)
-    layers = [Sdf.Layer.FindOrOpen(layer.identifier) for layer in stage.GetUsedLayers() if layer.realPath]
-    # metres a unit 100, as if one unit were a hundred metres, multiplies all lengths by 100
-    for layer in layers:
-        layer.pseudoRoot.SetInfo("metersPerUnit", 100.0)
-        layer.Save()
-    to_metres_z_up(root)
-    for layer in layers:
-        layer.pseudoRoot.SetInfo("metersPerUnit", 0.01)
-        layer.Save()
-    prim = stage.GetPrimAtPath("/World/turtlebot4/magnetometer_link/magnetometer")
-    prim.GetAttribute("magtwin:magnetometer:mapSha256").Set(sha256(root.parent / "lab" / "lab.usdc"))
-    stage.GetRootLayer().Save()
+def test_a_stage_that_is_not_in_metres_with_z_up_is_refused(tmp_path, metadata, text):
+    refuse(text, write(tmp_path, f"#usda 1.0\n{metadata}{CUBE}"), tmp_path)
 
 
 # Structure

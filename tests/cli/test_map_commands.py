@@ -9,9 +9,9 @@ import pytest
 
 from magtwin.cli import main
 from magtwin.field.grid import Grid
-from magtwin.field.maps.card import map_card, source_files
 from magtwin.field.maps.epochs import drift
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.statistics import map_metadata, source_files
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
 
@@ -122,13 +122,13 @@ def test_info_says_what_is_unknown():
         headings_rad=[0.0],
         source="by hand",
     )
-    card = map_card(bare)
+    card = map_metadata(bare)
     figures = {f.name: f.value for f in card.figures}
     assert figures["standard deviation"] == figures["height"] == "unknown"
     assert [card.metadata[n] for n in ("method", "frame", "datum", "created", "licence")] == ["unknown"] * 5
     assert card.metadata["source"] == "by hand"
     assert "dipoles" not in figures
-    assert map_card(replace(bare, source="")).metadata["source"] == "unknown"
+    assert map_metadata(replace(bare, source="")).metadata["source"] == "unknown"
 
 
 def test_info_works_on_a_stage_that_holds_a_map(lab_scene, capsys):
@@ -207,14 +207,14 @@ def test_what_is_no_series_is_refused_and_nothing_is_written(tmp_path, layer, se
 
 
 def test_continue_writes_the_map_of_another_height(tmp_path, layer, capsys):
-    said = told(capsys, "map", "continue", layer, "--height", "1.0", "--out", tmp_path / "up.usdc")
+    said = told(capsys, "map", "upward", layer, "--height-m", "1.0", "--out", tmp_path / "up.usdc")
     assert said["figures"]["height"]["value"] == 1.0
     up = load_map(tmp_path / "up.usdc")
     exact = a_field().magnitude_nt(*up.grid.poses(), height_m=1.0)
     assert np.abs(up.values_nt - exact).max() < 0.004
     assert up.method.endswith("continued from 0.35 to 1 m by its harmonic field")
     assert "height_m is a height above the floor, 0 m or more, got -1.0" in refused(
-        capsys, "map", "continue", layer, "--height", "-1", "--out", tmp_path / "down.usdc"
+        capsys, "map", "upward", layer, "--height-m", "-1", "--out", tmp_path / "down.usdc"
     )
     assert not (tmp_path / "down.usdc").exists()
 
@@ -245,7 +245,7 @@ def test_diff_tells_and_draws_what_changed(tmp_path, layer, capsys):
 def test_plot_draws_each_quantity_as_png_and_svg(tmp_path, layer, capsys, what):
     for suffix, head in (("png", b"\x89PNG"), ("svg", b"<?xml")):
         out = tmp_path / f"a.{suffix}"
-        main(["map", "plot", str(layer), "--out", str(out), "--what", what])
+        main(["map", "plot", str(layer), "--out", str(out), "--quantity", what])
         assert out.read_bytes().startswith(head)
 
 
@@ -257,7 +257,7 @@ def test_plot_shows_the_headings_and_the_day_that_are_asked_for(tmp_path, series
             str(series),
             "--out",
             str(tmp_path / "a.svg"),
-            "--headings",
+            "--headings-deg",
             "45",
             "--date",
             "2026-01-06",
@@ -270,7 +270,7 @@ def test_plot_shows_the_headings_and_the_day_that_are_asked_for(tmp_path, series
 
 
 def test_a_map_in_many_headings_is_drawn_in_four_unless_asked(tmp_path):
-    from magtwin.figures.plots import plot_map
+    from magtwin.figures.maps import plot_map
 
     headings = np.radians(np.arange(0, 360, 15.0))
     values = np.repeat(a_map().values_nt[:1], 24, axis=0)

@@ -17,7 +17,7 @@ def run(*arguments):
 
 def test_a_survey_becomes_a_map_that_knows_where_it_comes_from(lab_scene, tmp_path, capsys):
     out = tmp_path / "coarse.usdc"
-    run(lab_scene, "--out", out, "--spacing", 0.5, "--headings", "0,120,240", "--seed", 3, "--json")
+    run(lab_scene, "--out", out, "--spacing-m", 0.5, "--headings-deg", "0,120,240", "--seed", 3, "--json")
     field = load_map(out)
     assert field.values_nt.shape == (3, 8, 13)
     assert np.degrees(field.headings_rad) == pytest.approx([0, 120, 240])
@@ -34,7 +34,7 @@ def test_a_survey_becomes_a_map_that_knows_where_it_comes_from(lab_scene, tmp_pa
 
 def test_a_survey_of_the_shipped_scene_finds_the_shipped_map_but_for_its_error(lab_scene, tmp_path):
     out = tmp_path / "again.usdc"
-    run(lab_scene, "--out", out, "--position-error", 0, "--heading-error", 0)
+    run(lab_scene, "--out", out, "--position-error-m", 0, "--heading-error-deg", 0)
     again, shipped = load_map(out), load_map(lab_scene.parent / "map" / "lab.usdc")
     _, rows, columns = again.values_nt.shape
     x, y = (again.origin_m[k] + again.cell_m[k] * np.arange(count) for k, count in ((0, columns), (1, rows)))
@@ -48,7 +48,7 @@ def test_one_seed_gives_one_file_and_another_another(lab_scene, tmp_path):
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         folder = tmp_path / name
         folder.mkdir()
-        run(lab_scene, "--out", folder / "m.usdc", "--spacing", 1, "--readings", 1, "--seed", seed)
+        run(lab_scene, "--out", folder / "m.usdc", "--spacing-m", 1, "--readings", 1, "--seed", seed)
     a, b, c = ((tmp_path / name / "m.usdc").read_bytes() for name in "abc")
     assert a == b
     assert a != c
@@ -60,13 +60,13 @@ def test_a_survey_becomes_readings_whose_headings_deviate(lab_scene, tmp_path):
         lab_scene,
         "--out",
         out,
-        "--spacing",
+        "--spacing-m",
         0.5,
-        "--heading-error",
+        "--heading-error-deg",
         7,
-        "--position-error",
+        "--position-error-m",
         0.01,
-        "--height",
+        "--height-m",
         0.2,
     )
     read = load_readings(out)
@@ -78,13 +78,13 @@ def test_a_survey_becomes_readings_whose_headings_deviate(lab_scene, tmp_path):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--spacing", "0"], "spacing_m must be above 0 m"),
-        (["--spacing", "9"], "spacing_m 9 leaves no cell on 6 x 3.5 m"),
-        (["--headings", "north"], "headings are degrees with commas between"),
+        (["--spacing-m", "0"], "spacing_m must be above 0 m"),
+        (["--spacing-m", "9"], "spacing_m 9 leaves no cell on 6 x 3.5 m"),
+        (["--headings-deg", "north"], "headings are degrees with commas between"),
         (["--readings", "0"], "readings must be at least 1"),
         (["--seed", "-1"], "seed must be a whole number from 0 up"),
-        (["--height", "nan"], "height_m is a height above the floor, 0 m or more"),
-        (["--position-error", "-1"], "position_error_m must not be below 0"),
+        (["--height-m", "nan"], "height_m is a height above the floor, 0 m or more"),
+        (["--position-error-m", "-1"], "position_error_m must not be below 0"),
     ],
 )
 def test_a_survey_that_cannot_be_made_is_refused_in_one_line_and_nothing_is_written(

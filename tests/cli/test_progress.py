@@ -72,7 +72,7 @@ def test_lines_come_at_most_every_10_s_however_many_steps_and_reports_there_are(
         clock.now += 0.1
         before = stream.getvalue()
         if k % 30 == 0:
-            watch.step(f"Step {k}", quiet=True)
+            watch.step(f"Step {k}", announced=False)
         with watch.progress("Driving", "runs") as advance:
             advance(k, 1000)
         if stream.getvalue() != before:
@@ -283,9 +283,9 @@ def test_json_stays_json_while_progress_goes_to_stderr(tmp_path):
     slow = f"""
 import sys, time
 from magtwin.cli import main
-from magtwin.cli import file
-whole = file._info_of_run
-file._info_of_run = lambda path: time.sleep(2.2) or whole(path)
+from magtwin.io import info
+whole = info.info_of
+info.info_of = lambda path: time.sleep(2.2) or whole(path)
 main(["info", {str(tmp_path / "run.parquet")!r}, "--json"])
 """
     import numpy as np

@@ -16,11 +16,12 @@ from magtwin.twin import open_twin
 def written(lab_scene, tmp_path_factory):
     """Everything that one run can leave."""
     folder = tmp_path_factory.mktemp("all")
-    arguments = ["run", str(lab_scene), "--net", "none", "--duration", "3", "--seed", "5", "--json"]
+    arguments = ["run", str(lab_scene), "--network", "none", "--duration-s", "3", "--seed", "5", "--json"]
     files = {kind: folder / f"a{end}" for kind, end in (("rrd", ".rrd"), ("bag", ".mcap"), ("csv", ".csv"))}
     files |= {"usd": folder / "deep" / "a.usda", "parquet": folder / "a.parquet"}
-    named = [text for kind, file in files.items() for text in (f"--{kind}", str(file))]
-    main([*arguments, "--out", str(folder / "out"), *named, "--usd-fps", "0", "--units", "nT"])
+    files["npz"] = folder / "a.npz"
+    named = [text for file in files.values() for text in ("--out", str(file))]
+    main([*arguments, "--out", str(folder / "out"), *named, "--usd-fps", "0", "--out-unit", "nT"])
     return folder, files
 
 
@@ -47,6 +48,7 @@ def test_one_kind_in_two_places_is_written_once(written):
         "a.mcap",
         "a.csv",
         "a.parquet",
+        "a.npz",
     }
 
 
@@ -61,16 +63,25 @@ def test_the_layer_names_its_scene_from_where_it_lies(written, lab_scene):
 
 def test_outputs_that_cannot_all_be_written_leave_none(lab_scene, tmp_path, capsys):
     (tmp_path / "file").touch()
-    arguments = ["run", str(lab_scene), "--net", "none", "--duration", "1", "--rrd", str(tmp_path / "a.rrd")]
-    for option, name, said in (
-        ("--usd", "file/a.usd", "cannot be written"),
-        ("--bag", "file/a.mcap", "cannot be written"),
-        ("--bag", "a.bag", "ends in .mcap or .db3"),
-        ("--csv", "a.txt", "ends in .csv"),
-        ("--csv", "a.rrd", "two outputs have one name"),
+    arguments = [
+        "run",
+        str(lab_scene),
+        "--network",
+        "none",
+        "--duration-s",
+        "1",
+        "--out",
+        str(tmp_path / "a.rrd"),
+    ]
+    for name, said in (
+        ("file/a.usd", "cannot be written"),
+        ("file/a.mcap", "cannot be written"),
+        ("a.txt", "unknown format of a run"),
+        ("a.json", "is read, not written"),
+        ("a.rrd", "two outputs have one name"),
     ):
         with pytest.raises(SystemExit):
-            main([*arguments, option, str(tmp_path / name)])
+            main([*arguments, "--out", str(tmp_path / name)])
         line = capsys.readouterr().err.splitlines()[-1]
         assert said in line
         assert ".a." not in line  # the place aside is no concern of the user's

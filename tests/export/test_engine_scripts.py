@@ -60,7 +60,7 @@ def test_the_script_for_isaac_sim_says_first_that_it_is_untested_and_reads_as_th
 
 def test_the_script_for_isaac_sim_is_sound_beside_stand_ins_for_isaac_sims_classes(lab_scene, tmp_path):
     pytest.importorskip("onnxruntime")
-    from magtwin.learn.models.onnx import export_onnx
+    from magtwin.learn.inference.onnx import export_onnx
 
     twin = open_twin(lab_scene)
     export_onnx(twin.scene.robot.magnetometer.network, tmp_path / "lab.onnx")
@@ -83,7 +83,7 @@ def test_the_script_for_isaac_sim_is_sound_beside_stand_ins_for_isaac_sims_class
 @pytest.fixture(scope="module")
 def driven(lab_scene, tmp_path_factory):
     """The exported stage's own script run in its folder, and what it wrote."""
-    from magtwin.learn.models.onnx import export_onnx
+    from magtwin.learn.inference.onnx import export_onnx
 
     folder = tmp_path_factory.mktemp("newton") / "lab"
     export_scene(lab_scene, folder, profile="newton", to_onnx=export_onnx, trusted=True)

@@ -18,18 +18,20 @@ from numpy.testing import assert_allclose
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, UsdValidation
 from validators import assert_valid
 
-from magtwin.author.scene import author_scene, read_scene, scene_from_toml
+from magtwin.author.scene import author_scene
+from magtwin.author.scene_file import scene_from_toml
 from magtwin.cli import main
 from magtwin.export.attached import BYTES, SCOPE
 from magtwin.export.glb import corner_normals
-from magtwin.export.package import HOWTO, PLUGIN, export_scene, licence_of
+from magtwin.export.package import PLUGIN, README, export_scene, licence_of
 from magtwin.export.usdz import ALIGNMENT, ALLOWED
-from magtwin.field.survey.gridded import import_survey
+from magtwin.field.survey.folder import read_survey
 from magtwin.files import sha256, shipped
 from magtwin.run.run import Run
 from magtwin.usd.animation import read_animation
 from magtwin.usd.geometry import read_shapes
 from magtwin.usd.maps import load_map, save_map
+from magtwin.usd.scene import read_scene
 
 LAB = shipped("scenes", "lab", "lab.usda")
 ROBOT, HEAT_MAP = "/World/turtlebot4", "/World/AnomalyMap/HeatMap"
@@ -346,7 +348,7 @@ def test_metadata_and_page_say_what_an_export_was_made_from_and_under_which_lice
     assert re.fullmatch("[0-9a-f]{64}", said["sourceSha256"])
     parts = ("lab/lab.usdc", "turtlebot4/turtlebot4.usda", f"weights/{WEIGHTS.name}")
     assert said["licences"] == dict.fromkeys(parts, "Apache-2.0")
-    page = (folder / HOWTO).read_text()
+    page = (folder / README).read_text()
     for word in (
         "lab.usda",
         "lab_run.usdc",
@@ -358,9 +360,9 @@ def test_metadata_and_page_say_what_an_export_was_made_from_and_under_which_lice
 
 
 def test_the_page_beside_an_export_says_what_plays_the_run(folder, package, isaac):
-    assert "`lab_run.usdc` plays a run" in (folder / HOWTO).read_text()
-    assert "`lab.usdz` plays a run" in (package.with_name("lab_magtwin") / HOWTO).read_text()
-    assert "plays a run" not in (isaac / HOWTO).read_text()
+    assert "`lab_run.usdc` plays a run" in (folder / README).read_text()
+    assert "`lab.usdz` plays a run" in (package.with_name("lab_magtwin") / README).read_text()
+    assert "plays a run" not in (isaac / README).read_text()
 
 
 @pytest.mark.parametrize(("metadata", "said"), [({"licence": "MIT"}, "MIT"), ({}, ""), (None, "")])
@@ -373,7 +375,7 @@ def test_the_licence_of_a_network_is_read_from_its_weights(metadata, said, tmp_p
 
 def test_a_released_network_is_handed_on_under_the_licence_that_it_was_converted_with(real_data, tmp_path):
     pth = real_data / "aprilab" / "models" / "nn_magnetometer_model_v0.0.1.pth"
-    main(["net", "convert", str(pth), "--out", str(tmp_path / "n.safetensors"), "--licence", "MIT"])
+    main(["network", "convert", str(pth), "--out", str(tmp_path / "n.safetensors"), "--licence", "MIT"])
     assert licence_of(tmp_path / "n.safetensors") == "MIT"
 
 
@@ -398,7 +400,7 @@ def test_robots_of_the_scene_that_newton_loads_have_what_newton_needs(tmp_path):
     assert (tmp_path / "lab" / "weights" / f"{WEIGHTS.stem}.onnx").is_file()
     assert (
         f"newton_magnetometer.py lab.usda weights/{WEIGHTS.stem}.onnx"
-        in (tmp_path / "lab" / HOWTO).read_text()
+        in (tmp_path / "lab" / README).read_text()
     )
 
 
@@ -529,7 +531,7 @@ def test_a_smooth_edge_shares_its_normal_and_a_sharp_one_does_not():
 def aprilab(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The APRILab lab with its own map and network."""
     home = tmp_path_factory.mktemp("aprilab")
-    save_map(import_survey(real_data / "aprilab" / "maps", name="aprilab", licence="MIT"), home / "map.usdc")
+    save_map(read_survey(real_data / "aprilab" / "maps", name="aprilab", licence="MIT")[0], home / "map.usdc")
     scene = scene_from_toml(
         shipped("scenes", "aprilab.toml"),
         map_layer=home / "map.usdc",

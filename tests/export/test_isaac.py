@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from pxr import Sdf, Usd, UsdPhysics, UsdShade
 
-from magtwin.author.scene import author_scene, read_scene
+from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
 from magtwin.export.isaac import GRAPHS, author_graph
 from magtwin.export.ogn import Graph, faults, fits, message_fields, node_types
@@ -19,6 +19,7 @@ from magtwin.io.bags.types import layout
 from magtwin.ros.magnetometer import INPUTS
 from magtwin.spec.robot import PlacedRobot
 from magtwin.usd.layers import open_stage
+from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import only_prim_with
 
 USD_TYPES = {

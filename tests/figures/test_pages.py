@@ -12,17 +12,10 @@ import pytest
 
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.figures.charts import pictures_of_run, short_names, thinned
-from magtwin.figures.pages import (
-    MOST_SPANS,
-    Told,
-    page_of_comparison,
-    page_of_runs,
-    to_html,
-    to_json,
-    to_markdown,
-    write_page,
-)
+from magtwin.figures.canvas import short_names, thinned
+from magtwin.figures.page import to_html, to_json, to_markdown, write_page
+from magtwin.figures.reports import MOST_SPANS, NamedRun, page_of_comparison, page_of_runs
+from magtwin.figures.runs import pictures_of_run
 from magtwin.io.tables import write_parquet
 from magtwin.run.compare import compare
 from magtwin.run.run import Run
@@ -50,7 +43,7 @@ def runs(twin):
 
 @pytest.fixture(scope="module")
 def page(runs, twin):
-    return page_of_runs([Told("a.parquet", runs[0], twin.field), Told("b.parquet", runs[1])])
+    return page_of_runs([NamedRun("a.parquet", runs[0], twin.field), NamedRun("b.parquet", runs[1])])
 
 
 class Reader(html.parser.HTMLParser):
@@ -97,7 +90,7 @@ def test_pictures_inside_a_page_are_png_and_svg(page):
 
 def test_what_a_file_says_of_itself_is_text_and_nothing_else(runs):
     run = runs[0].with_metadata(path=EVIL, scene=EVIL, note=EVIL * 100, **{EVIL: EVIL})
-    told = Told(EVIL, run, note=EVIL)
+    told = NamedRun(EVIL, run, note=EVIL)
     page = page_of_runs([told, told], pictures=False)
     read = Reader(to_html(page))
     assert read.open == []
@@ -134,7 +127,7 @@ def test_events_are_told_with_their_times(page, runs):
 
 def test_of_many_events_the_first_are_listed_and_the_rest_counted(runs):
     often = np.arange(runs[0].rows) % 4 == 0
-    text = to_markdown(page_of_runs([Told("a", runs[0].with_columns(flag_bump=often))], pictures=False))
+    text = to_markdown(page_of_runs([NamedRun("a", runs[0].with_columns(flag_bump=often))], pictures=False))
     assert f"and {often.sum() - MOST_SPANS} more" in text
 
 
@@ -142,7 +135,7 @@ def test_a_run_of_few_columns_is_told_by_what_it_has():
     t = np.arange(50.0)
     field = 41_000 + 10 * np.sin(t)
     field[7] = np.nan
-    page = page_of_runs([Told("bare", Run({"t": t, "b_measured_nt": field}, {"weight": float("nan")}))])
+    page = page_of_runs([NamedRun("bare", Run({"t": t, "b_measured_nt": field}, {"weight": float("nan")}))])
     titles = [picture.title for picture in page.sections[0].pictures]
     assert titles == ["Field"]
     assert json.loads(to_json(page))["metadata"]["weight"] is None
@@ -172,7 +165,7 @@ def test_charts_shorten_long_names_and_tell_two_apart(runs):
     found = compare(*runs, align="path")
     widths = []
     for pair in (("a", "b"), names):
-        page = page_of_comparison(Told(pair[0], runs[0]), Told(pair[1], runs[1]), found)
+        page = page_of_comparison(NamedRun(pair[0], runs[0]), NamedRun(pair[1], runs[1]), found)
         svg = page.sections[0].pictures[0].data.decode()
         left, right = (
             float(x)
@@ -184,7 +177,7 @@ def test_charts_shorten_long_names_and_tell_two_apart(runs):
 
 def test_the_same_runs_give_the_same_bytes(runs, twin, tmp_path):
     for name in ("a.html", "b.html"):
-        write_page(page_of_runs([Told("a.parquet", runs[0], twin.field)]), tmp_path / name)
+        write_page(page_of_runs([NamedRun("a.parquet", runs[0], twin.field)]), tmp_path / name)
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
 
 
@@ -203,7 +196,7 @@ def test_a_thinned_line_keeps_its_ends_and_its_extremes():
 def test_a_comparison_says_the_shift_and_what_metadata_differ(runs):
     a, b = runs
     found = compare(a, b, align="path")
-    page = page_of_comparison(Told("a", a), Told("b", b), found)
+    page = page_of_comparison(NamedRun("a", a), NamedRun("b", b), found)
     text = to_markdown(page)
     assert "| seed | 1 | 2 |" in text
     assert "| speed\\_m\\_s | 0.2 | 0.25 |" in text.replace("speed_m_s", "speed\\_m\\_s")
@@ -243,7 +236,7 @@ def test_a_map_that_is_no_longer_what_the_run_read_is_not_shown(runs, tmp_path, 
 
 
 def test_what_cannot_be_reported_is_refused_and_nothing_is_written(runs, tmp_path):
-    page = page_of_runs([Told("a", runs[0])], pictures=False)
+    page = page_of_runs([NamedRun("a", runs[0])], pictures=False)
     (tmp_path / "there.html").write_text("precious")
     with pytest.raises(InputError, match="exists already; give --force"):
         write_page(page, tmp_path / "there.html")
@@ -253,7 +246,7 @@ def test_what_cannot_be_reported_is_refused_and_nothing_is_written(runs, tmp_pat
         page_of_runs([])
     empty = Run({name: values[:0] for name, values in runs[0].items()})
     with pytest.raises(InputError, match="empty: has no readings to report on"):
-        page_of_runs([Told("empty", empty)])
+        page_of_runs([NamedRun("empty", empty)])
     assert pictures_of_run(Run({"t": np.arange(3.0)})) == []
     assert [p.name for p in tmp_path.iterdir()] == ["there.html"]
     assert (tmp_path / "there.html").read_text() == "precious"

@@ -205,7 +205,7 @@ def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_sce
     assert stage.GetPrimAtPath("/World/turtlebot4/base_link").IsValid()  # its scene is below it
     main(["convert", str(written / "run.csv"), str(tmp_path / "b.usdc"), "--usd-fps", "0"])
     assert Usd.Stage.Open(str(tmp_path / "b.usdc")).GetTimeCodesPerSecond() == pytest.approx(135)
-    main(["convert", str(written / "run.csv"), str(tmp_path / "c.mcap"), "--units", "nT"])
+    main(["convert", str(written / "run.csv"), str(tmp_path / "c.mcap"), "--out-unit", "nT"])
     assert np.array_equal(read_run(tmp_path / "c.mcap")["b_measured_nt"], run["b_measured_nt"])
     stray = run.with_metadata(scene_file="gone.usda")
     write_run(stray, tmp_path / "stray.parquet")
@@ -220,7 +220,7 @@ def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_sce
     [
         ("run.parquet", "run.csv", [], "run.csv: exists already; give --force"),
         ("run.parquet", "new.xyz", [], "unknown format of a run; known: .csv"),
-        ("run.parquet", "new.csv", ["--units", "nT"], "CSV has no option 'units'; drop it"),
+        ("run.parquet", "new.csv", ["--out-unit", "nT"], "CSV has no option 'units'; drop it"),
         ("run.parquet", "new.csv", ["--scene", "x.usda"], "a table shows no scene; drop --scene"),
         ("run.parquet", "new.rrd", ["--scene", "x.usda"], "x.usda: no such scene"),
         ("run.parquet", "new.mcap", ["--usd-fps", "5"], "rosbag2 has no option 'fps'"),
@@ -261,7 +261,7 @@ def shown(monkeypatch):
     """What the viewer is given, in place of a window."""
     seen = []
 
-    def show(rrd, *, shown=None):
+    def show(rrd, *, source=None):
         from magtwin.io.rerun.file import read_runs
 
         seen.append(read_runs(rrd))

@@ -10,13 +10,13 @@ from test_gp import survey
 from test_latch import gridded
 from test_rosbag import at_middle, drive, write_bag
 
-from magtwin.author.scene import read_scene
+from magtwin.author.earth import earth_of
 from magtwin.cli import main
-from magtwin.cli.map_input import earth_nt
 from magtwin.field.sources.earth import earth_field_nt
-from magtwin.field.survey.gridded import import_survey
+from magtwin.field.survey.folder import import_survey
 from magtwin.io.surveys.readings import load_readings, save_readings
 from magtwin.usd.maps import load_map
+from magtwin.usd.scene import read_scene
 
 
 def run(*arguments):
@@ -32,7 +32,7 @@ def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, cap
     assert report["figures"]["masked nodes"]["value"] == np.count_nonzero(~field.valid) > 68
     assert np.isnan(field.lookup([-1.25, 0.75], 0.0))
     assert_array_equal(field.valid, import_survey(maps).valid)
-    run("map", "import", maps, "--out", tmp_path / "b.usdc", "--keep-latched", "--json")
+    run("map", "import", maps, "--out", tmp_path / "b.usdc", "--keep-stuck", "--json")
     whole = load_map(tmp_path / "b.usdc")
     assert whole.valid.all()
     assert whole.lookup([-1.25, 0.75], 0.0) == pytest.approx(35_602.1, abs=0.1)
@@ -42,7 +42,7 @@ def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, cap
 
 def test_readings_kept_as_parquet_make_the_same_layer_as_the_folder(tmp_path, capsys, real_data):
     maps = real_data / "aprilab/maps"
-    about = ("--name", "lab", "--created", "2024-05-01", "--height", "0.35", "--licence", "MIT")
+    about = ("--name", "lab", "--created", "2024-05-01", "--height-m", "0.35", "--licence", "MIT")
     run("map", "import", maps, "--out", tmp_path / "a.parquet", *about)
     run("map", "import", tmp_path / "a.parquet", "--out", tmp_path / "b.usdc", "--name", "lab")
     run("map", "import", maps, "--out", tmp_path / "c.usdc", *about)
@@ -133,8 +133,8 @@ def test_a_survey_whose_sensor_was_stuck_throughout_is_refused_unless_it_is_to_b
     arguments = ("map", "import", tmp_path / "a.parquet", "--out", tmp_path / "a.usdc")
     line = refused(capsys, *arguments)
     assert f"all {len(readings)} readings are those of a sensor that was stuck" in line
-    assert "--keep-latched" in line
-    run(*arguments, "--keep-latched")
+    assert "--keep-stuck" in line
+    run(*arguments, "--keep-stuck")
     assert load_map(tmp_path / "a.usdc").valid.all()
 
 
@@ -149,7 +149,7 @@ def test_a_fit_and_a_check_run_from_readings_with_latched_ones_out(tmp_path, cap
     assert report["figures"]["latched at every heading"]["value"] == 12
     field = load_map(tmp_path / "a.usdc")
     assert field.values_nt[field.valid].min() > 32_000
-    run("map", "check", tmp_path / "a.parquet", "--method", "trilinear", "--json")
+    run("map", "validate", tmp_path / "a.parquet", "--method", "trilinear", "--json")
     report = json.loads(capsys.readouterr().out)
     assert report["figures"]["readings predicted"]["value"] == 4 * 11 * 17 - 48
 
@@ -157,7 +157,15 @@ def test_a_fit_and_a_check_run_from_readings_with_latched_ones_out(tmp_path, cap
 @pytest.mark.parametrize("headings", ["", "north", "0,nan", "0;90"])
 def test_headings_that_are_none_are_refused(tmp_path, capsys, headings):
     save_readings(gridded(0), tmp_path / "a.parquet")
-    arguments = ("map", "fit", tmp_path / "a.parquet", "--out", tmp_path / "a.usdc", "--headings", headings)
+    arguments = (
+        "map",
+        "fit",
+        tmp_path / "a.parquet",
+        "--out",
+        tmp_path / "a.usdc",
+        "--headings-deg",
+        headings,
+    )
     assert "headings are degrees with commas between" in refused(capsys, *arguments)
 
 
@@ -179,8 +187,8 @@ def test_frame_and_datum_are_said_at_import_or_fit_and_kept_from_readings_to_map
     ("said", "why"),
     [
         (("--created", "yesterday"), "--created must be a day YYYY-MM-DD, got 'yesterday'"),
-        (("--height", "-1"), "height_m of Readings is a height above the floor, 0 m or more, got -1.0"),
-        (("--height", "nan"), "height_m of Readings is a height above the floor, 0 m or more, got nan"),
+        (("--height-m", "-1"), "height_m of Readings is a height above the floor, 0 m or more, got -1.0"),
+        (("--height-m", "nan"), "height_m of Readings is a height above the floor, 0 m or more, got nan"),
     ],
 )
 def test_a_day_or_a_height_that_is_none_is_refused(tmp_path, capsys, real_data, said, why):
@@ -214,15 +222,15 @@ def test_runs_under_several_licences_keep_all_of_them(tmp_path, capsys):
 
 
 def test_the_earths_field_is_taken_from_a_place_and_day_as_numbers_or_from_a_scene(lab_scene):
-    place = earth_nt("29.64, -82.35, 50, 2024-06-01")
+    place = earth_of("29.64, -82.35, 50, 2024-06-01")
     assert place == earth_field_nt(29.64, -82.35, 50.0, "2024-06-01")
-    assert earth_nt("-2700,24000,-38400") == (-2700.0, 24000.0, -38400.0)
-    assert earth_nt(str(lab_scene)) == read_scene(lab_scene, check_network=False).earth.b_world_nt
+    assert earth_of("-2700,24000,-38400") == (-2700.0, 24000.0, -38400.0)
+    assert earth_of(str(lab_scene)) == read_scene(lab_scene, check_network=False).earth.b_world_nt
 
 
 def test_a_survey_of_a_twin_knows_the_earths_field_and_keeps_it(tmp_path, capsys, lab_scene):
     out = tmp_path / "a.parquet"
-    run("map", "survey", lab_scene, "--out", out, "--spacing", "1", "--readings", "1")
+    run("map", "survey", lab_scene, "--out", out, "--spacing-m", "1", "--readings", "1")
     assert load_readings(out).earth_nt == read_scene(lab_scene, check_network=False).earth.b_world_nt
 
 
@@ -230,7 +238,7 @@ def test_a_check_takes_the_kernel_of_the_gaussian_process_and_leaves_headings_ou
     save_readings(survey(rows=5, columns=5), tmp_path / "a.parquet")
 
     def told(*more):
-        run("map", "check", tmp_path / "a.parquet", "--json", *more)
+        run("map", "validate", tmp_path / "a.parquet", "--json", *more)
         report = json.loads(capsys.readouterr().out)
         return report["metadata"]["split"], report["figures"]
 
@@ -275,7 +283,7 @@ def test_a_fit_of_one_heading_and_of_few_readings_says_that_they_are_doubtful(tm
         tmp_path / "hall.csv",
         "--method",
         "gp",
-        "--spacing",
+        "--spacing-m",
         "0.5",
         "--out",
         tmp_path / "z.usdc",

@@ -141,10 +141,10 @@ def test_a_run_once_along_its_path_comes_out_again(twin, tmp_path):
 
 def test_a_run_of_a_data_set_comes_out_again_in_its_session(lab_scene, tmp_path, capsys):
     out = tmp_path / "runs"
-    options = ["--duration", "1", "--rate-hz", "20", "--columns", "p_world_base", "b_total_nt", "battery_v"]
+    options = ["--duration-s", "1", "--rate-hz", "20", "--keep", "p_world_base", "b_total_nt", "battery_v"]
     main(
         [
-            "runs",
+            "sweep",
             str(lab_scene),
             "--out",
             str(out),
@@ -158,7 +158,7 @@ def test_a_run_of_a_data_set_comes_out_again_in_its_session(lab_scene, tmp_path,
         ]
     )
     capsys.readouterr()
-    main(["rerun-of", str(out / "run_00002.parquet"), "--json"])
+    main(["reproduce", str(out / "run_00002.parquet"), "--json"])
     figures = json.loads(capsys.readouterr().out)["figures"]
     assert figures["equal"]["value"] == "yes, to the bit"
     assert figures["equal columns"]["value"] == 4
@@ -189,7 +189,7 @@ def test_what_changed_is_named_first_and_the_columns_that_differ(lab_scene, tmp_
     claims = {"map_sha256": "0" * 64, "magtwin": "0.0.1"}
     write_parquet(run.with_columns(b_total_nt=total).with_metadata(**claims), file)
     with pytest.raises(SystemExit) as stop:
-        main(["rerun-of", str(file)])
+        main(["reproduce", str(file)])
     lines = capsys.readouterr().out.splitlines()
     assert stop.value.code == 1
     assert lines[0].startswith("another version of magtwin: magtwin was 0.0.1, is ")

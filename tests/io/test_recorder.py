@@ -221,8 +221,18 @@ def test_ctrl_c_ends_a_live_run_and_keeps_what_was_driven(lab_scene, tmp_path, c
 
     over, hand = threading.Event(), threading.Thread(target=interrupt)
     hand.start()
-    arguments = ["run", str(lab_scene), "--net", "none", "--duration", "300", "--rate-hz", "50", "--json"]
-    outputs = ["--out", str(tmp_path / "out"), "--csv", str(tmp_path / "run.csv")]
+    arguments = [
+        "run",
+        str(lab_scene),
+        "--network",
+        "none",
+        "--duration-s",
+        "300",
+        "--rate-hz",
+        "50",
+        "--json",
+    ]
+    outputs = ["--out", str(tmp_path / "out"), "--out", str(tmp_path / "run.csv")]
     try:
         main([*arguments, *outputs, "--viewer", deaf_address()])
     finally:
@@ -236,7 +246,16 @@ def test_ctrl_c_ends_a_live_run_and_keeps_what_was_driven(lab_scene, tmp_path, c
 
 
 def test_a_viewer_that_is_not_there_is_refused_before_anything_is_written(lab_scene, tmp_path, capsys):
-    arguments = ["run", str(lab_scene), "--net", "none", "--duration", "1", "--out", str(tmp_path / "out")]
+    arguments = [
+        "run",
+        str(lab_scene),
+        "--network",
+        "none",
+        "--duration-s",
+        "1",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     for address, said in (
         ("rerun+http://127.0.0.1:9/proxy", "no viewer listens there"),
         ("127.0.0.1:9", "no address of a viewer"),
@@ -245,12 +264,12 @@ def test_a_viewer_that_is_not_there_is_refused_before_anything_is_written(lab_sc
             main([*arguments, "--viewer", address])
         assert said in capsys.readouterr().err.splitlines()[-1]
     for options, said in (
-        (["--pace", "2"], "--pace is for a run that is shown live"),
+        (["--pace", "2"], "--pace is for a run that is shown"),
         (["--live", "--pace", "0"], "--pace must be above 0"),
         (["--live", "--viewer", "rerun+http://127.0.0.1:9/proxy"], "give one of them"),
-        (["--units", "nT"], "--units is for a bag"),
+        (["--out-unit", "nT"], "--out-unit is for a bag"),
         (["--usd-fps", "10"], "--usd-fps is for a layer"),
-        (["--usd", str(tmp_path / "run.csv")], r"ends in .usd or .usda or .usdc"),
+        (["--out", str(tmp_path / "run.csv")], r"ends in .usd or .usda or .usdc"),
     ):
         with pytest.raises(SystemExit):
             main([*arguments, *options])
@@ -261,13 +280,13 @@ def test_a_viewer_that_is_not_there_is_refused_before_anything_is_written(lab_sc
 def test_a_live_run_that_is_refused_leaves_nothing(lab_scene, tmp_path, capsys):
     far = tmp_path / "far.csv"
     far.write_text("x,y\n0,0\n50,0\n")
-    live = ["--viewer", deaf_address(), "--out", str(tmp_path / "out"), "--bag", str(tmp_path / "a.mcap")]
+    live = ["--viewer", deaf_address(), "--out", str(tmp_path / "out"), "--out", str(tmp_path / "a.mcap")]
     with pytest.raises(SystemExit):
-        main(["run", str(lab_scene), "--net", "none", "--path", str(far), *live])
+        main(["run", str(lab_scene), "--network", "none", "--path", str(far), *live])
     assert "far.csv" in capsys.readouterr().err
     (tmp_path / "a.partial.mcap").touch()
     with pytest.raises(SystemExit):
-        main(["run", str(lab_scene), "--net", "none", "--duration", "1", *live])
+        main(["run", str(lab_scene), "--network", "none", "--duration-s", "1", *live])
     assert "a.partial.mcap: exists already" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.partial.mcap", "far.csv"]
 

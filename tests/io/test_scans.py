@@ -94,8 +94,19 @@ def test_the_recording_holds_every_scan_and_is_cleared_when_the_lidar_stops(twin
 
 
 def test_the_command_line_writes_scans_beside_the_run(lab_scene, tmp_path):
-    run = ["run", str(lab_scene), "--net", "none", "--duration", "2", "--lidar", "on", "--scans", "--json"]
-    main([*run, "--parquet", str(tmp_path / "a.parquet")])
+    run = [
+        "run",
+        str(lab_scene),
+        "--network",
+        "none",
+        "--duration-s",
+        "2",
+        "--lidar",
+        "on",
+        "--scans",
+        "--json",
+    ]
+    main([*run, "--out", str(tmp_path / "a.parquet")])
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.parquet", "a.scans.parquet"]
     assert len(read_scans(tmp_path / "a.scans.parquet").t) == 15
     main([*run, "--out", str(tmp_path / "out")])

@@ -30,7 +30,7 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
         (
             "magnetometer",
             "lab.usda units:=nT --ros-args -r __ns:=/tb4 -r __node:=m -p use_sim_time:=true",
-            "ros magnetometer lab.usda units:=nT use_sim_time:=true --namespace=tb4 --name=m",
+            "ros magnetometer lab.usda units:=nT use_sim_time:=true --namespace=tb4 --node-name=m",
         ),
         (
             "sim",
@@ -44,8 +44,8 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
         ),
         (
             "magnetometer",
-            "--ros-args --log-level warn -p scene:=lab.usda -p duration:=5 --disable-stdout-logs odom:=o",
-            "ros magnetometer lab.usda --duration=5 --remap odom:=o",
+            "--ros-args --log-level warn -p scene:=lab.usda -p duration_s:=5 --disable-stdout-logs odom:=o",
+            "ros magnetometer lab.usda --duration-s=5 --remap odom:=o",
         ),
         ("replay", "a.mcap --ros-args -p use_sim_time:=true -r x:__ns:=/", "ros replay a.mcap --namespace="),
     ],
@@ -63,7 +63,9 @@ def test_parameters_of_a_file_are_read_where_they_are_the_nodes(arguments, tmp_p
     file = tmp_path / "settings.yaml"
     file.write_text(yaml.safe_dump(sections))
     given = f"lab.usda --ros-args -r __ns:=/tb4 -r __node:=m --params-file {file} -p lidar:=on".split()
-    wanted = "ros magnetometer lab.usda lidar:=on rate_hz:=50.0 use_sim_time:=true --namespace=tb4 --name=m"
+    wanted = (
+        "ros magnetometer lab.usda lidar:=on rate_hz:=50.0 use_sim_time:=true --namespace=tb4 --node-name=m"
+    )
     assert arguments("magnetometer", given) == wanted.split()
 
 

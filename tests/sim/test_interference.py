@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
-from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.sim import interference
 from magtwin.sim.interference import (
     ambient_field_nt,

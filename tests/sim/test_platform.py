@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from magtwin.author.scene import scene_from_toml
+from magtwin.author.scene_file import scene_from_toml
 from magtwin.files import from_table, read_toml, shipped
 from magtwin.learn.data.features import FULL, features
 from magtwin.learn.data.labels import labels

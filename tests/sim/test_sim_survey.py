@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.field.maps.difference import difference
+from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.field.sources.magnets import body_of
-from magtwin.field.sources.point_dipoles import dipole_field_nt
 from magtwin.frames import quat_from_yaw, rotate
 from magtwin.sim.interference import ambient_gradient_nt_m
 from magtwin.sim.survey import field_at_rest_nt, pose_error_nt2, survey, survey_readings
@@ -231,9 +231,9 @@ def test_errors_and_heights_that_are_none_are_refused(options, message):
 def test_a_desk_moved_in_the_stage_changes_the_next_survey_by_what_its_steel_says(tmp_path, lab_scene):
     from pxr import Gf, Usd
 
-    from magtwin.author.scene import read_scene
     from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
     from magtwin.sim.interference import ambient_field_nt
+    from magtwin.usd.scene import read_scene
 
     folder = Path(shutil.copytree(lab_scene.parent, tmp_path / "lab"))
     before = read_scene(folder / lab_scene.name)
@@ -329,7 +329,7 @@ def test_nodes_where_the_sensor_lost_lock_are_masked():
 
 @pytest.fixture(scope="module")
 def lab(lab_scene):
-    from magtwin.author.scene import read_scene
+    from magtwin.usd.scene import read_scene
 
     return read_scene(lab_scene, check_network=False)
 

@@ -13,8 +13,8 @@ from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf import convert_urdf, read_notes
 from magtwin.urdf.description.description import read_description
-from magtwin.urdf.inertia import principal_axes, quaternion
 from magtwin.urdf.meshes.mesh import corner_normals, read_mesh
+from magtwin.urdf.physics.inertia import principal_axes, quaternion
 from magtwin.usd.geometry import read_links, read_shapes
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
@@ -343,10 +343,10 @@ NO_NUMBER = '<link name="b"><visual><geometry><sphere radius="big"/></geometry><
 NEGATIVE = '<gazebo reference="base_link"><mu1>-1</mu1></gazebo>'
 
 REFUSED = {
-    "twice": (LINK + "\n" + LINK, r"arm\.urdf:4: link 'base_link' is there twice, first on line 3; rename"),
+    "twice": (LINK + "\n" + LINK, r"arm\.urdf:4: link 'base_link' exists twice, first on line 3; rename"),
     "no name": ("<link/>", r"arm\.urdf:3: a <link> has no name"),
     "no link": ("", r"arm\.urdf:2: the robot has no <link>"),
-    "two roots": (LINK + '<link name="b"/>', "link 'b' hangs in the air: a robot has one root, this has"),
+    "two roots": (LINK + '<link name="b"/>', "link 'b' is not connected: a robot has one root, this has"),
     "mesh missing": (mesh_link("no.stl"), r"arm\.urdf:3: mesh 'no\.stl' is missing; looked for .*no\.stl"),
     "mesh above": (mesh_link("../up.stl"), r"mesh '\.\./up\.stl' lies outside .*; files are read from there"),
     "mesh absolute": (mesh_link("/etc/x.stl"), r"mesh '/etc/x\.stl' lies outside"),

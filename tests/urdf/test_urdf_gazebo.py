@@ -98,7 +98,7 @@ def test_tags_about_nothing_that_is_there_are_a_loss_that_names_it(tmp_path):
 
 def test_friction_that_differs_across_is_a_loss(tmp_path):
     _, _, report = cart(tmp_path, on("left_wheel", "<mu1>1</mu1><mu2>0.2</mu2>"))
-    assert report.losses == ("link 'left_wheel': friction 1 is taken for that across it too, mu2 0.2",)
+    assert report.losses == ("link 'left_wheel': friction 1 is used across too, in place of mu2 0.2",)
 
 
 def test_one_link_that_collides_with_its_robot_switches_all_on(tmp_path):
@@ -110,7 +110,7 @@ def test_one_link_that_collides_with_its_robot_switches_all_on(tmp_path):
 def test_a_link_without_gravity_floats_in_physx(tmp_path):
     _stage, robot, report = cart(tmp_path, on("left_wheel", "<gravity>false</gravity>"))
     assert robot.GetPrimAtPath("left_wheel").GetAttribute("physxRigidBody:disableGravity").Get() is True
-    assert any("knows no gravity in PhysX" in note for note in report.notes)
+    assert any("has no gravity in PhysX" in note for note in report.notes)
 
 
 # --- sensors --------------------------------------------------------------------------------------
@@ -298,7 +298,7 @@ def test_older_plugins_give_a_diameter_and_limits_come_from_the_wheels(tmp_path,
     spec = read_drive(robot)
     assert_allclose([spec.wheel_separation_m, spec.wheel_radius_m], [0.31, 0.041])
     assert_allclose([spec.v_max, spec.w_max], [10 * 0.041, 2 * 10 * 0.041 / 0.31])
-    assert any("not told, so as TurtleBot4's: a_max" in note for note in report.notes)
+    assert any("TurtleBot 4's values are used for a_max" in note for note in report.notes)
 
 
 def test_a_size_that_no_plugin_tells_is_measured_on_the_robot(tmp_path):
@@ -307,7 +307,7 @@ def test_a_size_that_no_plugin_tells_is_measured_on_the_robot(tmp_path):
     _stage, robot, report = cart(tmp_path, plugin)
     spec = read_drive(robot)
     assert_allclose([spec.wheel_separation_m, spec.wheel_radius_m], [0.3, 0.04])
-    assert sum("is not told" in note for note in report.notes) == 2
+    assert sum("given: " in note for note in report.notes) == 2
 
 
 YAML = """/**:
@@ -336,7 +336,7 @@ def test_a_controllers_settings_become_the_drive_of_the_robot(tmp_path):
         [spec.wheel_separation_m, spec.wheel_radius_m, spec.v_max, spec.w_max], [0.33, 0.04, 0.6, 2.5]
     )
     assert (spec.command_timeout_s, spec.odometry_rate_hz) == (0.25, 40)
-    assert spec.alpha_max == 7.725  # its limit is switched off, so it is not told
+    assert spec.alpha_max == 7.725  # its limit is switched off, so it is not used
 
 
 def test_settings_that_are_missing_are_a_loss_that_names_them(tmp_path):
@@ -530,8 +530,9 @@ def test_the_real_robot_passes_the_validators_and_nothing_is_silent(turtlebot, t
 
 
 def test_settings_come_before_tags_and_leave_one_sensor_of_each_kind(tmp_path, real_data):
-    from magtwin.author.robot import RobotSettings, build_robot, read_robot
+    from magtwin.author.robot import RobotSettings, build_robot
     from magtwin.spec.sensors import ImuSpec, LidarSpec, MagnetometerSpec
+    from magtwin.usd.robot import load_robot
 
     settings = RobotSettings(
         lidar=LidarSpec(link="rplidar_link", scan_rate_hz=7.5),
@@ -542,7 +543,7 @@ def test_settings_come_before_tags_and_leave_one_sensor_of_each_kind(tmp_path, r
     urdf = real_data / "turtlebot4" / "turtlebot4_gazebo_tags.urdf"
     out = tmp_path / "turtlebot4" / "turtlebot4.usda"
     report = build_robot(urdf, settings, out)
-    spec = read_robot(out)  # needs one of each
+    spec = load_robot(out)  # needs one of each
     assert (spec.lidar.scan_rate_hz, spec.imu.link, spec.drive.v_max) == (7.5, "oakd_imu_frame", 0.46)
     assert "lidar 'rplidar' of link 'rplidar_link': the settings say what it is, not the URDF's tags" in (
         report.notes
@@ -552,8 +553,9 @@ def test_settings_come_before_tags_and_leave_one_sensor_of_each_kind(tmp_path, r
 
 
 def test_a_robot_without_settings_takes_its_sensors_and_drive_from_its_tags(tmp_path, real_data):
-    from magtwin.author.robot import RobotSettings, build_robot, read_robot
+    from magtwin.author.robot import RobotSettings, build_robot
     from magtwin.spec.sensors import MagnetometerSpec
+    from magtwin.usd.robot import load_robot
 
     settings = RobotSettings(
         magnetometer=MagnetometerSpec(link="tower_sensor_plate"),
@@ -561,6 +563,6 @@ def test_a_robot_without_settings_takes_its_sensors_and_drive_from_its_tags(tmp_
     )
     out = tmp_path / "turtlebot4" / "turtlebot4.usda"
     build_robot(real_data / "turtlebot4" / "turtlebot4_gazebo_tags.urdf", settings, out)
-    spec = read_robot(out)
+    spec = load_robot(out)
     assert (spec.imu.link, spec.imu.rate_hz, spec.lidar.link) == ("imu_link", 62, "rplidar_link")
     assert (spec.drive.wheel_radius_m, spec.drive.v_max) == (0.03575, 0.46)

@@ -198,9 +198,9 @@ LOST = {
     "outside": ("map_Kd ../up.png", "texture '../up.png' lies outside the robot's packages and is left out"),
     "absolute": ("map_Kd /etc/passwd", "texture '/etc/passwd' lies outside the robot's packages"),
     "linked": ("map_Kd link.png", "texture 'link.png' lies outside the robot's packages and is left out"),
-    "no picture": ("map_Kd bad.png", "texture 'bad.png' is no picture that can be read and is left out"),
-    "colour": ("Kd red", "squares.obj: material 'blue' has a malformed colour; taken as grey"),
-    "invisible": ("d 0", "squares.obj: material 'blue' would be invisible; taken as opaque"),
+    "no picture": ("map_Kd bad.png", "texture 'bad.png' is not a readable image and is left out"),
+    "colour": ("Kd red", "squares.obj: material 'blue' has a malformed colour; grey is used"),
+    "invisible": ("d 0", "squares.obj: material 'blue' would be invisible; made opaque"),
 }
 
 
@@ -384,7 +384,7 @@ DAE_REFUSED = {
         "<instance_nothing",
         r"n\.dae: has no scene to show; export it again",
     ),
-    "other": ("COLLADA", "KOLLADA", r"n\.dae: begins with <KOLLADA>, a COLLADA file with <COLLADA>"),
+    "other": ("COLLADA", "KOLLADA", r"n\.dae: begins with <KOLLADA>; a COLLADA file begins with <COLLADA>"),
 }
 
 
@@ -875,7 +875,7 @@ DAMAGED = {
     "m.stl": (nan_stl, r"m\.stl: has vertices that are not finite numbers; export it again"),
     "cut.stl": (
         lambda p: cut(p, stl),
-        r"cut\.stl: is of \d+ bytes, though its \d+ triangles need \d+; export it again",
+        r"cut\.stl: has \d+ bytes, though its \d+ triangles need \d+; export it again",
     ),
     "cut_text.stl": (
         lambda p: p.write_text("solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1"),
@@ -900,7 +900,7 @@ DAMAGED = {
         r"rows\.obj: its v are not 3 numbers each; export",
     ),
     "cut.glb": (lambda p: cut(p, gltf), r"cut\.glb: is cut short; export it again"),
-    "old.glb": (lambda p: gltf(p, asset={"version": "1.0"}), r"old\.glb: is glTF of version 1\.0; only 2\.0"),
+    "old.glb": (lambda p: gltf(p, asset={"version": "1.0"}), r"old\.glb: is glTF version 1\.0; only 2\.0"),
     "small.glb": (
         lambda p: gltf(p, extensionsRequired=["KHR_draco_mesh_compression"]),
         r"small\.glb: cannot be read without KHR_draco_mesh_compression; export it without compression",
@@ -915,7 +915,7 @@ DAMAGED = {
     ),
     "zeros.gltf": (
         lambda p: p.write_text(ZEROS),
-        r"zeros\.gltf: accessor 0 is of 10+ zeros, over \d+; export anew",
+        r"zeros\.gltf: accessor 0 has 10+ zeros, over \d+; export it again",
     ),
     "json.gltf": (lambda p: p.write_text("{"), r"json\.gltf: cannot be read as a mesh: .+; export it again"),
     "doubles.dae": (

@@ -19,12 +19,12 @@ URDF = DATA / "urdf"
 XACRO = '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">\n{}\n</robot>\n'
 
 REFUSED = {
-    "link_twice.urdf": r":3: link 'base_link' is there twice, first on line 2; rename one",
-    "joint_twice.urdf": r":9: joint 'j' is there twice, first on line 5; rename one",
+    "link_twice.urdf": r":3: link 'base_link' exists twice, first on line 2; rename one",
+    "joint_twice.urdf": r":9: joint 'j' exists twice, first on line 5; rename one",
     "link_without_name.urdf": r":2: a <link> has no name",
     "robot_without_name.urdf": r":1: <robot> has no name",
     "no_link.urdf": r":1: the robot has no <link>",
-    "two_roots.urdf": r":3: link 'hand' hangs in the air: a robot has one root, this has base_link, hand",
+    "two_roots.urdf": r":3: link 'hand' is not connected: a robot has one root, this has base_link, hand",
     "circle_without_root.urdf": r":4: joint 'j' closes a circle: no link is the root; remove one joint",
     "circle_beside_root.urdf": r":5: joint 'j' closes a circle; remove one joint of it",
     "held_twice.urdf": r":8: joint 'k' holds 'hand', which 'j' holds already",
@@ -36,7 +36,7 @@ REFUSED = {
     "mesh_climbs.urdf": r":4: mesh '\.\./\.\./\.\./secret\.stl' lies outside .*urdf; files are",
     "mesh_absolute.urdf": r":4: mesh 'file:///etc/passwd\.stl' lies outside .*urdf; files are",
     "mesh_climbs_out_of_package.urdf": r":4: mesh 'package:.*' lies outside .*/arm_description;",
-    "mesh_scheme.urdf": r":4: mesh 'http:.*' is of scheme 'http'; known: file, model, package",
+    "mesh_scheme.urdf": r":4: mesh 'http:.*' has scheme 'http'; known: file, model, package",
     "package_not_there.urdf": r":4: mesh .* no package 'arm_descripton' .*; did you mean 'arm_description'\?",
     "mesh_without_filename.urdf": r":4: link 'base_link' has a <mesh> without filename=",
     "two_shapes.urdf": r":4: link 'base_link' has a <geometry> of 2 shapes; give one of box, capsule, cylind",
@@ -79,7 +79,7 @@ REFUSED = {
     "macro_of_itself.xacro": r":3: expands without end: a macro or an include leads to itself",
     "text_that_doubles.xacro": r":11: a value of over 65536 characters or entries",
     "list_that_doubles.xacro": r":11: a value of over 65536 characters or entries",
-    "power.xacro": r":2: a whole number of over 4096 bits \(in expression '9\*\*9\*\*9'\)",
+    "power.xacro": r":2: an integer of over 4096 bits \(in expression '9\*\*9\*\*9'\)",
     "argument_not_given.xacro": r":2: no argument 'prefix'; give --arg prefix=VALUE",
     "no_expression.xacro": r":2: not an expression: '1 \+'",
     "not_closed.xacro": r":2: not closed: '\$\{1'",
@@ -124,7 +124,7 @@ def test_every_bad_input_has_its_message():
 def test_what_is_not_there_is_refused_with_the_near_name():
     with pytest.raises(InputError, match=r"no such URDF file; did you mean 'input_capsule\.urdf'"):
         read_source(URDF / "input_capsul.urdf")
-    with pytest.raises(InputError, match=r"cannot be read .*; a URDF file is wanted"):
+    with pytest.raises(InputError, match=r"cannot be read .*; expected a URDF file"):
         read_source(URDF)
     with pytest.raises(MissingFileError, match="is missing"):
         read(URDF / "input_refused_mesh_missing.urdf")
@@ -133,7 +133,7 @@ def test_what_is_not_there_is_refused_with_the_near_name():
 def test_arguments_that_nobody_asks_for_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"arm\.xacro: no xacro argument 'prefx'; did you mean 'prefix'\?"):
         read_source(write_xacro(tmp_path, '<xacro:arg name="prefix" default=""/>'), arguments={"prefx": "a"})
-    with pytest.raises(InputError, match="is no xacro and takes no arguments; leave out prefix"):
+    with pytest.raises(InputError, match="is not a xacro and takes no arguments; leave out prefix"):
         read_source(URDF / "input_capsule.urdf", arguments={"prefix": "a"})
 
 
@@ -215,7 +215,7 @@ SLIPS = {
     '<l x="${xacro.fatal(1, 2)}"/>': "1 2",
     """<l x="${xacro.load_yaml('merges.yaml')}"/>""": "is not YAML: a table of over 10000 entries",
     """<l x="${xacro.load_yaml('deep.yaml')}"/>""": "deep.yaml nests too deep",
-    '<l x="${xacro}"/>': "a method is no value",
+    '<l x="${xacro}"/>': "a .* is not a value",
     '<l x="$(cwd)"/>': r"\$\(cwd\) is not known; known: arg, dirname, env, eval, find, optenv",
 }
 
@@ -235,7 +235,7 @@ def test_what_a_xacro_says_and_what_it_hides_is_noted(tmp_path):
     assert read_source(write_xacro(tmp_path, body)).notes == (
         "arm.xacro:2: careful",
         "arm.xacro:2: redefining global symbol: e",
-        "arm.xacro:2: include 'none*.xacro' names no file that is there",
+        "arm.xacro:2: include 'none*.xacro' matches no file",
     )
 
 
@@ -363,7 +363,7 @@ def test_slips_are_repaired_and_noted():
     ]
     assert description.dropped == dropped
     assert description.notes[:2] == [
-        "link 'base_link': rgba of <color> is above 1 in '255 0 0': brought down to it",
+        "link 'base_link': rgba of <color> is above 1 in '255 0 0': reduced to it",
         "link 'base_link': rgba of <color> has 3 numbers in '255 0 0': completed by 1",
     ]
 
@@ -438,7 +438,7 @@ def test_a_package_that_is_there_twice_is_noted(tmp_path):
     path = robot(tmp_path)
     package(tmp_path / "a", "hand"), package(tmp_path / "b", "hand")
     description = read(path)
-    assert description.notes == ["package 'hand' is there 2 times; a is used"]
+    assert description.notes == ["package 'hand' exists 2 times; a is used"]
 
 
 def test_relative_paths_reach_to_the_package_and_no_further(tmp_path):
@@ -464,7 +464,7 @@ def test_the_search_for_packages_is_bounded_and_ignores_what_is_hidden_or_broken
 
 
 def test_a_given_package_must_be_a_folder(tmp_path):
-    with pytest.raises(InputError, match=r"package 'hand': .*nowhere is no folder"):
+    with pytest.raises(InputError, match=r"package 'hand': .*nowhere is not a folder"):
         Packages({"hand": tmp_path / "nowhere"}, tmp_path / "arm.urdf")
 
 

@@ -11,9 +11,9 @@ from validators import assert_valid
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf import convert_urdf, read_notes
-from magtwin.urdf.inertia import MassProperties, combined
-from magtwin.urdf.meshes import solid as solids
 from magtwin.urdf.options import DriveRule, Options
+from magtwin.urdf.physics import solid as solids
+from magtwin.urdf.physics.inertia import MassProperties, combined
 
 LIMIT = '<limit effort="3" velocity="2" lower="-1" upper="0.5"/>'
 
@@ -146,7 +146,7 @@ def test_without_a_density_a_link_without_inertial_is_left_to_the_engine_and_not
     assert not robot.GetPrimAtPath("hand").HasAPI(UsdPhysics.MassAPI)
     assert "link 'hand' has no <inertial>: engines take its mass from its colliders" in notes
     _stage, robot, notes = convert(arm(tmp_path, "fixed|", f"<visual>{BALL}</visual>"))
-    assert any("with no collider either, it has no mass" in note for note in notes)
+    assert any("without a collider, engines cannot find its mass" in note for note in notes)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_a_range_that_is_half_told_ends_at_0_and_one_of_an_endless_joint_is_note
     joint = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath("/arm/joints/j"))
     assert (joint.GetLowerLimitAttr().Get(), joint.GetUpperLimitAttr().Get()) == (0, pytest.approx(57.29578))
     assert UsdPhysics.DriveAPI(joint, "angular").GetMaxForceAttr().Get() == np.inf
-    assert "joint 'j' gives no lower limit: 0, as URDF has it" in notes
+    assert "joint 'j' gives no lower limit: 0, URDF's default" in notes
     _, _, notes = convert(arm(tmp_path, f"continuous|{limit}"))
     assert any("is continuous, which has no range: upper 1 of its <limit>" in n for n in notes)
 
@@ -427,7 +427,7 @@ def test_what_follows_a_welded_joint_is_welded_too(tmp_path):
     ("mimic", "kind", "message"),
     [
         ('<mimic joint="lead" multiplier="0"/>', "revolute", "mimics with multiplier 0; make it fixed"),
-        ('<mimic joint="lead"/>', "planar", "is planar and has no one value with which to mimic 'lead'"),
+        ('<mimic joint="lead"/>', "planar", "is planar and has no single value to mimic 'lead' with"),
     ],
 )
 def test_impossible_mimics_are_refused_with_their_line(tmp_path, mimic, kind, message):
@@ -555,7 +555,7 @@ def test_diff_drive_drives_the_wheels_frees_the_casters_and_welds_the_dead_suspe
         drive, stiffness, damping = drive_of(robot, name)
         assert (stiffness, damping) == (0, 0)
         assert np.isfinite(drive.GetMaxForceAttr().Get())
-        assert f"joint {name!r} is no driven wheel: it turns freely" in notes
+        assert f"joint {name!r} is not a driven wheel: it turns freely" in notes
     assert prim(robot, "spring").IsA(UsdPhysics.FixedJoint)
     assert "joint 'spring' (prismatic) is a suspension without effort or speed: welded" in notes
     found = [friction(robot, link) for link in ("left_wheel", "right_wheel", "skid", "base_link")]
@@ -580,7 +580,7 @@ def test_all_wheels_that_a_plugin_names_are_driven_not_the_first_of_each_side(tm
     assert len(joints) == 4
     assert all(UsdPhysics.DriveAPI(joint, "angular").GetDampingAttr().Get() > 0 for joint in joints)
     assert not any("caster" in note or "freely" in note for note in notes)
-    assert "drive plugin: of 2 <left_joint> the first is the drive's" in notes
+    assert "drive plugin: the first of 2 <left_joint> is used" in notes
 
 
 def test_what_the_urdf_says_of_its_wheels_wins_over_the_profile(tmp_path):
@@ -600,7 +600,7 @@ def test_the_general_profile_keeps_a_suspension_that_is_not_quite_dead(tmp_path)
 
 
 def test_a_robot_without_two_wheels_is_no_diff_drive(tmp_path):
-    with pytest.raises(InputError, match=r"profile diff-drive wants two wheels, .* found none"):
+    with pytest.raises(InputError, match=r"profile diff-drive needs two wheels, .* found none"):
         convert(arm(tmp_path, f'revolute|<axis xyz="0 1 0"/>{LIMIT}'), profile="diff-drive")
 
 

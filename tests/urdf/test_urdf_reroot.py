@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from magtwin.author.robot import read_description
-from magtwin.author.scene import author_scene, scene_from_toml
+from magtwin.author.scene import author_scene
+from magtwin.author.scene_file import scene_from_toml
 from magtwin.errors import InputError
 from magtwin.files import shipped
 from magtwin.frames import matrix_from_quat, quat_from_rpy

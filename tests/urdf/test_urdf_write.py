@@ -233,9 +233,9 @@ def _no_robot(stage):
     [
         (_ball, "URDF has no PhysicsSphericalJoint"),
         (_second, "'arm' is held by two joints, in a circle"),
-        (_scaled, "is scaled, which no link of a URDF is"),
+        (_scaled, "is scaled, which a URDF cannot do to links"),
         (_off, "turns about a point of 'arm' that is not its origin"),
-        (_no_robot, "a URDF is of one articulation, found none"),
+        (_no_robot, "a URDF has one articulation, found none"),
     ],
 )
 def test_what_no_urdf_holds_is_refused_with_nothing_written(tmp_path, change, said):
@@ -247,16 +247,13 @@ def test_what_no_urdf_holds_is_refused_with_nothing_written(tmp_path, change, sa
 
 def test_the_command_goes_both_ways_and_says_what_stays_behind(tmp_path, capfd):
     out = tmp_path / "back.urdf"
-    main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), "--to-urdf", str(out), "--json"])
+    main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), "--out", str(out), "--json"])
     said = json.loads(capfd.readouterr().out)
     assert said["figures"]["links"]["value"] == len(read_description(out).links)
     assert "MagtwinMagnetometerAPI" in said["metadata"]["notes"][0]
     for words, message in (
-        ([], "give one of them"),
-        (["--out", "x", "--to-urdf", "y.urdf"], "give one of them"),
-        (["--to-urdf", str(out), "--mass", "3"], "leave the others out"),
-        (["--to-urdf", str(out)], "exists already"),
-        (["--to-urdf", "a.xml"], "a URDF ends in .urdf"),
+        (["--out", str(out), "--mass-kg", "3"], "without other options than --force"),
+        (["--out", str(out)], "exists already"),
     ):
         with pytest.raises(SystemExit):
             main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), *words])

@@ -12,8 +12,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 from validators import assert_valid
 
 from magtwin.errors import InputError
-from magtwin.field.maps.colours import colour_limits
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.statistics import colour_limits
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.maps import (
     HEAT_MAP,
@@ -338,9 +338,9 @@ def test_headings_come_back_to_the_last_bit_or_the_one_before(tmp_path):
 
 
 def test_the_real_survey_survives_its_layer_to_half_a_step_of_single_precision(tmp_path, real_data):
-    from magtwin.field.survey.gridded import import_survey
+    from magtwin.field.survey.folder import read_survey
 
-    field = import_survey(real_data / "aprilab" / "maps", name="aprilab", licence="MIT")
+    field = read_survey(real_data / "aprilab" / "maps", name="aprilab", licence="MIT")[0]
     back = save_and_load(field, tmp_path)
     assert_allclose(back.values_nt, field.values_nt, rtol=2**-24, atol=0)
     assert_array_equal(back.valid, field.valid)

@@ -14,7 +14,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.epochs import at_date
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.survey.gridded import import_survey, write_survey
+from magtwin.field.survey.folder import read_survey, write_survey
 from magtwin.io.surveys.readings import read_readings
 from magtwin.usd.maps import load_epochs, load_map, save_map, save_map_series
 
@@ -58,7 +58,7 @@ FITTED = {
 def test_a_fitted_map_comes_back_from_its_csvs_with_all_that_it_knew(tmp_path):
     made = survey(3, **FITTED)
     write_survey(made, tmp_path / "csv")
-    back = import_survey(tmp_path / "csv")
+    back = read_survey(tmp_path / "csv")[0]
     for name in (f.name for f in fields(AnomalyMap) if f.name not in ("source", "harmonic")):
         assert np.array_equal(getattr(back, name), getattr(made, name)), name
     assert "0_map.csv sha256:" in back.source
@@ -69,7 +69,7 @@ def test_a_fitted_map_comes_back_from_its_csvs_with_all_that_it_knew(tmp_path):
 
 def test_what_is_asked_for_goes_before_what_the_csvs_say(tmp_path):
     write_survey(survey(3, **FITTED), tmp_path / "csv")
-    back = import_survey(tmp_path / "csv", name="mine", created="2025-01-01", height_m=0.0)
+    back = read_survey(tmp_path / "csv", name="mine", created="2025-01-01", height_m=0.0)[0]
     assert (back.name, back.created, back.height_m, back.licence) == ("mine", "2025-01-01", 0.0, "MIT")
 
 
@@ -109,7 +109,7 @@ def test_other_programs_read_our_csvs(tmp_path):
         ("# parameters: [1]", [], r"0_map.csv:2: parameters cannot be '\[1\]'"),
         ("# created: 1 May", [], "0_map.csv:2: created must be a day YYYY-MM-DD, got '1 May'"),
         ("# masked_rows: [15]", [], "0_map.csv: masked_rows names row 15, and it has 15"),
-        ("# licence: MIT", [], "licence is 'CC0-1.0', in 0_map.csv it is 'MIT'; these are files of two maps"),
+        ("# licence: MIT", [], "licence is 'CC0-1.0', but 'MIT' in 0_map.csv; they are of two maps"),
         ("# name: a", ["# name: b"], r"0_map.csv:\d+: name is given a second time"),
     ],
 )
@@ -119,7 +119,7 @@ def test_a_header_that_cannot_be_is_refused_by_file_and_line(tmp_path, line, ext
     first, *rest = [x for x in file.read_text().splitlines() if not x.startswith(line.split(":")[0])]
     file.write_text("\n".join([first, line, *rest, *extra]) + "\n")
     with pytest.raises(InputError, match=said):
-        import_survey(tmp_path / "csv")
+        read_survey(tmp_path / "csv")[0]
 
 
 def test_a_single_file_of_a_map_is_read_as_a_table(tmp_path):
@@ -134,7 +134,7 @@ def test_comments_of_others_are_left_alone(tmp_path):
     write_survey(survey(), tmp_path / "csv")
     file = tmp_path / "csv" / "0_map.csv"
     file.write_text(file.read_text() + "# measured by: N. N.\n#\n# frame: axes of the room\n")
-    assert import_survey(tmp_path / "csv").frame == "axes of the room"
+    assert read_survey(tmp_path / "csv")[0].frame == "axes of the room"
 
 
 def test_the_real_survey_comes_back_from_usd_row_by_row(real_data, tmp_path, capfd):
@@ -155,7 +155,7 @@ def test_any_survey_comes_back_from_csv_and_from_usd_to_the_bit(tmp_path_factory
     folder, made = tmp_path_factory.mktemp("trip"), survey(seed)
     save_map(made, folder / "a.usdc")
     write_survey(load_map(folder / "a.usdc"), folder / "csv")
-    back = import_survey(folder / "csv", keep_latched=True)
+    back = read_survey(folder / "csv", keep_stuck=True)[0]
     for name in ("values_nt", "recorded_yaw", "headings_rad", "origin_m", "cell_m"):
         assert np.array_equal(getattr(back, name), getattr(made, name)), name
     save_map(replace(back, name="made"), folder / "b.usdc")

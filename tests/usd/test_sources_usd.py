@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade
 
-from magtwin.author.furniture import FURNITURE, define_furniture, read_magnets
 from magtwin.errors import InputError
 from magtwin.field.sources.earth import earth_field_nt
 from magtwin.field.sources.magnets import body_of
@@ -18,6 +17,7 @@ from magtwin.frames import rotate
 from magtwin.spec.furniture import KINDS, FurnitureSpec, parts_of
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.usd.earth import DERIVED_FROM, checked, define_earth, read_earth
+from magtwin.usd.furniture import FURNITURE, define_furniture, read_magnets
 from magtwin.usd.schema import apply_api
 from magtwin.usd.sources import SOURCES, define_source, define_sources, read_source
 

@@ -9,12 +9,11 @@ from pathlib import Path
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils
 
 from magtwin.errors import InputError, find
-from magtwin.export.validation.rule import Subject, is_absolute, named_files
-from magtwin.export.validation.rules import NETWORK_SHA256, map_file_of, network_of
-from magtwin.files import output, sha256
-from magtwin.usd.maps import checksums
-from magtwin.usd.schema import NOUNS, attribute_name
-from magtwin.usd.sensors import MAP_CHECKSUM
+from magtwin.export.contents import named_files
+from magtwin.export.validation.rule import Subject
+from magtwin.export.validation.rules import is_absolute
+from magtwin.files import output
+from magtwin.usd.schema import NOUNS
 
 Mend = Callable[["Patient"], Iterator[str]]
 
@@ -54,9 +53,6 @@ class Fix:
 SAFE: dict[str, Fix] = {}
 """What nobody can have meant otherwise, by name."""
 
-ASKED: dict[str, Fix] = {}
-"""What is mended only where it is asked for by name, since the fault may be the other end's."""
-
 
 def _into(fixes: dict[str, Fix]) -> Callable[[Mend], Mend]:
     def enter(mend: Mend) -> Mend:
@@ -72,7 +68,7 @@ def mend(file: Path, names: Collection[str]) -> list[str]:
 
     Args:
         file: Its root layer. Layers that it names below its folder are mended too, others are left alone.
-        names: Of `SAFE` and `ASKED`.
+        names: Keys of `SAFE`.
 
     Returns:
         What was done, a line each.
@@ -80,7 +76,7 @@ def mend(file: Path, names: Collection[str]) -> list[str]:
     Raises:
         InputError: A name is unknown, or a file cannot be written; no file is half-written.
     """
-    fixes = {name: find("fix", name, {**SAFE, **ASKED}) for name in names}
+    fixes = {name: find("fix", name, SAFE) for name in names}
     patient, done = Patient(Usd.Stage.Open(str(file)), file), list[str]()
     for fix in fixes.values():
         done += fix.mend(patient)
@@ -196,46 +192,3 @@ def _home(patient: Patient, prim: Usd.Prim) -> Sdf.Layer | None:
         if spec.specifier == Sdf.SpecifierDef:
             return spec.layer if spec.layer in own and patient.owns(spec.layer) else None
     return None
-
-
-@_into(ASKED)
-def map_checksum(patient: Patient) -> Iterator[str]:
-    """The checksum of a map is that of the arrays that its layer holds now."""
-    name = attribute_name("anomalyMap", "checksum")
-    for prim in patient.having("anomalyMap"):
-        pairs = checksums(prim)
-        if all(said == taken for said, taken in pairs):
-            continue
-        if len(pairs) > 1:
-            raise InputError(
-                f"<{prim.GetPath()}>: a map of several days; make it anew with magtwin map epochs"
-            )
-        spec = prim.GetAttribute(name).GetPropertyStack()[0]
-        patient.edit(spec.layer)
-        spec.default = pairs[0][1]
-        yield f"{patient.name_of(spec.layer)}: {name} is {pairs[0][1]}"
-
-
-@_into(ASKED)
-def map_file(patient: Patient) -> Iterator[str]:
-    """The magnetometer keeps the checksum of the map's file that is there now."""
-    for prim in patient.having("magnetometer"):
-        file = map_file_of(patient, prim)
-        yield from _keep(patient, prim, MAP_CHECKSUM, file)
-
-
-@_into(ASKED)
-def network_file(patient: Patient) -> Iterator[str]:
-    """The magnetometer keeps the checksum of the file of weights that is there now."""
-    for prim in patient.having("magnetometer"):
-        yield from _keep(patient, prim, NETWORK_SHA256, network_of(prim))
-
-
-def _keep(patient: Patient, prim: Usd.Prim, name: str, file: Path | None) -> Iterator[str]:
-    """Write a file's checksum to an attribute that says another, in the layer that says it."""
-    stack = prim.GetAttribute(name).GetPropertyStack()
-    if file is None or not stack or (seen := sha256(file)) == stack[0].default:
-        return
-    patient.edit(stack[0].layer)
-    stack[0].default = seen
-    yield f"{patient.name_of(stack[0].layer)}: {name} is {seen}"

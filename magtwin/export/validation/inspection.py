@@ -117,9 +117,10 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
 
     from magtwin.export.attached import detach
     from magtwin.export.validation.fix import mend
-    from magtwin.export.validation.isaac_rules import ISAAC_RULES
-    from magtwin.export.validation.rule import Subject
-    from magtwin.export.validation.rules import RULES, robot_assets
+
+    importlib.import_module("magtwin.export.validation.isaac_rules")  # fills RULES
+    from magtwin.export.validation.rule import RULES, Subject
+    from magtwin.export.validation.rules import robot_assets
 
     file, root = Path(job["file"]), Path(job["root"])
     packed = None if job["home"] is None else Path(job["home"])
@@ -142,7 +143,7 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
             checks.append(_core(stage if packed is None else Usd.Stage.Open(str(file))))
         inputs = None if job["inputs"] is None else frozenset(job["inputs"])
         subject = Subject(stage, root, inputs, packed)
-        for name, rules in (("isaac", ISAAC_RULES), ("magtwin", RULES)):
+        for name, rules in RULES.items():
             if name in job["against"]:
                 found = [finding for rule in rules.values() for finding in rule.findings(subject)]
                 found += lost if name == "magtwin" else []

@@ -8,11 +8,8 @@ from collections.abc import Iterator
 
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 
-from magtwin.export.validation.rule import Rule, Subject, Wrong, rule_into
+from magtwin.export.validation.rule import Subject, Wrong, rule
 from magtwin.usd.sensors import IMU_TYPE, LIDAR_API, LIDAR_TYPE
-
-ISAAC_RULES: dict[str, Rule] = {}
-"""By name."""
 
 ROBOT_API, LINK_API, JOINT_API = "IsaacRobotAPI", "IsaacLinkAPI", "IsaacJointAPI"
 LINKS, JOINTS = "isaac:physics:robotLinks", "isaac:physics:robotJoints"
@@ -45,7 +42,7 @@ def below(prim: Usd.Prim) -> list[Usd.Prim]:
     return list(Usd.PrimRange(prim))
 
 
-@rule_into(ISAAC_RULES, "magtwin robot makes an articulation that says it")
+@rule("isaac", "magtwin robot makes an articulation that says it")
 def robot_schema(subject: Subject) -> Iterator[Wrong]:
     """Every articulation is a robot to Isaac Sim, one articulation each, and says of what type it is."""
     found = robots(subject)
@@ -63,7 +60,7 @@ def robot_schema(subject: Subject) -> Iterator[Wrong]:
             yield Wrong("does not say isaac:robotType", where, severity="warning")
 
 
-@rule_into(ISAAC_RULES, "list them with magtwin robot, or in Isaac Sim's robot schema panel")
+@rule("isaac", "list them with magtwin robot, or in Isaac Sim's robot schema panel")
 def robot_lists(subject: Subject) -> Iterator[Wrong]:
     """Every robot lists all its bodies, then all its joints, each once, and nothing that is not there."""
     for robot in robots(subject):
@@ -85,7 +82,7 @@ def robot_lists(subject: Subject) -> Iterator[Wrong]:
                 yield Wrong(f"{_few(bare)} lack {api}", where)
 
 
-@rule_into(ISAAC_RULES, "point body0 and body1 to rigid bodies, or body0 to the robot for the world")
+@rule("isaac", "point body0 and body1 to rigid bodies, or body0 to the robot for the world")
 def joint_bodies(subject: Subject) -> Iterator[Wrong]:
     """Every joint holds a rigid body to another, or to the world."""
     for prim in subject.prims:
@@ -104,7 +101,7 @@ def joint_bodies(subject: Subject) -> Iterator[Wrong]:
             yield Wrong("holds no rigid body", where)
 
 
-@rule_into(ISAAC_RULES, "give it a drive of finite force; one of no gains leaves it free")
+@rule("isaac", "give it a drive of finite force; one of no gains leaves it free")
 def joint_drives(subject: Subject) -> Iterator[Wrong]:
     """Every joint that moves and follows no other has a drive whose greatest force is finite and above 0."""
     for prim in subject.prims:
@@ -119,9 +116,7 @@ def joint_drives(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"has a drive of force {force:g}", str(prim.GetPath()))
 
 
-@rule_into(
-    ISAAC_RULES, "say convexHull or convexDecomposition: a body that moves cannot collide as triangles"
-)
+@rule("isaac", "say convexHull or convexDecomposition: a body that moves cannot collide as triangles")
 def collider_shapes(subject: Subject) -> Iterator[Wrong]:
     """No rigid body collides as bare triangles."""
     for body in subject.prims:
@@ -136,7 +131,7 @@ def collider_shapes(subject: Subject) -> Iterator[Wrong]:
                 yield Wrong("is a triangle mesh that moves", str(prim.GetPath()))
 
 
-@rule_into(ISAAC_RULES, "take the scale into the shapes below")
+@rule("isaac", "take the scale into the shapes below")
 def rigid_scale(subject: Subject) -> Iterator[Wrong]:
     """No rigid body is scaled, and none lies in another."""
     cache = UsdGeom.XformCache()
@@ -151,7 +146,7 @@ def rigid_scale(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"lies in the rigid body <{above}>", str(path), "let bodies lie side by side")
 
 
-@rule_into(ISAAC_RULES, "magtwin robot and magtwin export author it so")
+@rule("isaac", "magtwin robot and magtwin export author it so")
 def sensor_mounts(subject: Subject) -> Iterator[Wrong]:
     """Every sensor of Isaac Sim's rides on a rigid body and has the figures that it runs by."""
     for prim in subject.prims:
@@ -186,7 +181,7 @@ def sensor_mounts(subject: Subject) -> Iterator[Wrong]:
                     yield Wrong(f"has {emitters} emitters and {len(values)} of {name}", where)
 
 
-@rule_into(ISAAC_RULES, "add a PhysicsScene: magtwin scene authors one with the lab")
+@rule("isaac", "add a PhysicsScene: magtwin scene authors one with the lab")
 def physics_scene(subject: Subject) -> Iterator[Wrong]:
     """A stage with robots in a lab has one physics scene, whose gravity pulls down."""
     if not (subject.having("lab") and robots(subject)):
@@ -200,7 +195,7 @@ def physics_scene(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"pulls along {tuple(direction)}", str(prim.GetPath()))
 
 
-@rule_into(ISAAC_RULES, "bind a material to it, or to a prim above it")
+@rule("isaac", "bind a material to it, or to a prim above it")
 def materials(subject: Subject) -> Iterator[Wrong]:
     """Everything that is shown wears a material."""
     for prim in subject.stage.Traverse(Usd.TraverseInstanceProxies()):
@@ -212,7 +207,7 @@ def materials(subject: Subject) -> Iterator[Wrong]:
             yield Wrong("wears no material", str(prim.GetPath()), severity="warning")
 
 
-@rule_into(ISAAC_RULES, "author it with magtwin export --profile isaac")
+@rule("isaac", "author it with magtwin export --profile isaac")
 def action_graph(subject: Subject) -> Iterator[Wrong]:
     """Every node of an Action Graph has what its definition has, and takes what it can from outputs."""
     from magtwin.export.ogn import faults, ports

@@ -7,6 +7,8 @@ the checksum of the whole file, which the magnetometer keeps (`map_file`).
 
 import json
 import math
+import os
+import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -14,27 +16,24 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils
 
-from magtwin.author.furniture import read_magnets
-from magtwin.author.lab import read_lab
-from magtwin.author.robot import robot_of
 from magtwin.errors import InputError
 from magtwin.export.attached import attached_sha256
+from magtwin.export.contents import named_files, weights_metadata
 from magtwin.export.validation.findings import Severity
 from magtwin.export.validation.rule import (
-    Rule,
     Subject,
     Wrong,
-    climbs,
-    is_absolute,
-    named_files,
-    rule_into,
+    rule,
     wrong_of,
 )
 from magtwin.files import sha256
 from magtwin.usd.attributes import plain_value, target
 from magtwin.usd.earth import read_earth
+from magtwin.usd.furniture import read_magnets
+from magtwin.usd.lab import read_lab
 from magtwin.usd.maps import HEAT_MAP, checksums, heading_variants, read_map
 from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.robot import read_robot
 from magtwin.usd.schema import NOUNS, attribute_name
 from magtwin.usd.sensors import (
     IMU_TYPE,
@@ -46,9 +45,6 @@ from magtwin.usd.sensors import (
     read_lidar,
     read_magnetometer,
 )
-
-RULES: dict[str, Rule] = {}
-"""By name."""
 
 NETWORK = attribute_name("magnetometer", "network")
 NETWORK_SHA256 = attribute_name("magnetometer", "network_sha256")
@@ -63,11 +59,8 @@ SAME_M = 1e-6
 UPRIGHT = 1 - 1e-9
 """Cosine of the tilt of a robot that stands."""
 
-MOST_HEADER = 1 << 24
-"""Bytes of a network's header that are read."""
 
-
-@rule_into(RULES, "put the file where it is named, or export the scene anew")
+@rule("magtwin", "put the file where it is named, or export the scene anew")
 def references(subject: Subject) -> Iterator[Wrong]:
     """Every layer, texture and other file that is named is there."""
     networks = {_path(prim, NETWORK) for prim in subject.having("magnetometer")}
@@ -80,7 +73,7 @@ def references(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"names {path}, which is not there")
 
 
-@rule_into(RULES, "name it relative to the layer: --fix does that for what is there")
+@rule("magtwin", "name it relative to the layer: --fix does that for what is there")
 def absolute_paths(subject: Subject) -> Iterator[Wrong]:
     """No layer names a file by a path that holds on one machine alone."""
     for layer in subject.layers:
@@ -89,7 +82,7 @@ def absolute_paths(subject: Subject) -> Iterator[Wrong]:
                 yield Wrong(f"{subject.name_of(layer)} names {named.path}", named.where)
 
 
-@rule_into(RULES, "magtwin export makes a folder that can be moved alone")
+@rule("magtwin", "magtwin export makes a folder that can be moved alone")
 def climbing_paths(subject: Subject) -> Iterator[Wrong]:
     """Nothing leads out of the stage's folder: a warning, but an error in a .usdz."""
     for layer in subject.layers:
@@ -105,7 +98,7 @@ def climbing_paths(subject: Subject) -> Iterator[Wrong]:
                 )
 
 
-@rule_into(RULES, "magtwin export --convert-units turns such a stage into metres with Z up")
+@rule("magtwin", "convert it to metres with Z up where it was made")
 def units(subject: Subject) -> Iterator[Wrong]:
     """The stage says that it is in metres and kilograms with Z up, and no layer below says otherwise."""
     root = subject.stage.GetRootLayer()
@@ -128,7 +121,7 @@ def units(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"{name}is in units of {kilograms:g} kg; USD does not convert them")
 
 
-@rule_into(RULES, "set it to the prim that holds all others: --fix does where there is one")
+@rule("magtwin", "set it to the prim that holds all others: --fix does where there is one")
 def default_prim(subject: Subject) -> Iterator[Wrong]:
     """The stage has a default prim, so that others can refer to it."""
     if not subject.stage.GetDefaultPrim():
@@ -136,7 +129,7 @@ def default_prim(subject: Subject) -> Iterator[Wrong]:
         yield Wrong(f"its default prim {name!r} is not there" if name else "has no default prim")
 
 
-@rule_into(RULES, "take the name that is meant from docs/schema.md")
+@rule("magtwin", "take the name that is meant from docs/schema.md")
 def schema_names(subject: Subject) -> Iterator[Wrong]:
     """Every schema and attribute in magtwin's name is one that it has, on a prim with its schema."""
     for prim in subject.prims:
@@ -152,7 +145,7 @@ def schema_names(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"has {name}, {why}", str(prim.GetPath()))
 
 
-@rule_into(RULES, "point it to the prim that is meant")
+@rule("magtwin", "point it to the prim that is meant")
 def targets(subject: Subject) -> Iterator[Wrong]:
     """Every relationship and every connection points to something that is there."""
     for prim in subject.prims:
@@ -168,7 +161,7 @@ def targets(subject: Subject) -> Iterator[Wrong]:
                     )
 
 
-@rule_into(RULES, "make the map anew with magtwin map")
+@rule("magtwin", "make the map anew with magtwin map")
 def map_complete(subject: Subject) -> Iterator[Wrong]:
     """Every map has its arrays, its grid and its unit, authored, and they fit together."""
     for prim in subject.having("anomalyMap"):
@@ -184,7 +177,7 @@ def map_complete(subject: Subject) -> Iterator[Wrong]:
             read_map(prim)
 
 
-@rule_into(RULES, "put the map's own arrays back, or, where they are meant, --fix-also map-checksum")
+@rule("magtwin", "put the map's own arrays back, or make the map anew")
 def map_checksum(subject: Subject) -> Iterator[Wrong]:
     """The arrays of every map, of each of its days, are those that its checksum was taken of."""
     for prim in subject.having("anomalyMap"):
@@ -196,7 +189,7 @@ def map_checksum(subject: Subject) -> Iterator[Wrong]:
                 )
 
 
-@rule_into(RULES, "the checksum does not cover the grid: make the map anew with magtwin map")
+@rule("magtwin", "the checksum does not cover the grid: make the map anew with magtwin map")
 def map_grid(subject: Subject) -> Iterator[Wrong]:
     """The coloured floor of every map lies where its grid does, with a variant for each of its headings."""
     for prim in subject.having("anomalyMap"):
@@ -226,9 +219,7 @@ def map_grid(subject: Subject) -> Iterator[Wrong]:
             )
 
 
-@rule_into(
-    RULES, "put the map back that the scene was made with, or, where this one is meant, --fix-also map-file"
-)
+@rule("magtwin", "put the map back that the scene was made with, or make the scene anew with this one")
 def map_file(subject: Subject) -> Iterator[Wrong]:
     """The file of the map's layer is the one that the magnetometer keeps the checksum of."""
     for prim in subject.having("magnetometer"):
@@ -253,7 +244,7 @@ def map_file_of(subject: Subject, magnetometer: Usd.Prim) -> Path | None:
     return Path(layer.realPath)
 
 
-@rule_into(RULES, "point magtwin:magnetometer:map to the map's prim")
+@rule("magtwin", "point magtwin:magnetometer:map to the map's prim")
 def magnetometer_map(subject: Subject) -> Iterator[Wrong]:
     """Every magnetometer in a lab reads a map that is on the stage, all of them one."""
     first = None
@@ -266,7 +257,7 @@ def magnetometer_map(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"reads <{end.GetPath()}>, another than <{first.GetPath()}>", str(prim.GetPath()))
 
 
-@rule_into(RULES, "put the weights back, or, where these are meant, --fix-also network-file")
+@rule("magtwin", "put the weights back, or make the scene anew with these")
 def network_file(subject: Subject) -> Iterator[Wrong]:
     """The weights that a magnetometer names are there, and are those that it keeps the checksum of."""
     for prim in subject.having("magnetometer"):
@@ -306,7 +297,7 @@ def network_of(magnetometer: Usd.Prim) -> Path | None:
     return network if network is not None and network.is_file() else None
 
 
-@rule_into(RULES, "train it on inputs that magtwin knows (magtwin train --help lists them)")
+@rule("magtwin", "train it on inputs that magtwin knows (magtwin train --help lists them)")
 def network_inputs(subject: Subject) -> Iterator[Wrong]:
     """The inputs of every network are known, none is there twice, and the file of weights has the same."""
     for prim in subject.having("magnetometer"):
@@ -325,18 +316,15 @@ def network_inputs(subject: Subject) -> Iterator[Wrong]:
 
 
 def _inputs_of(weights: Path) -> tuple[str, ...] | None:
-    """The names of the inputs in the header of a safetensors file; None where it says none."""
-    with weights.open("rb") as file:
-        size = int.from_bytes(file.read(8), "little")
-        try:
-            header = json.loads(file.read(min(size, MOST_HEADER)))
-            names = json.loads(header["__metadata__"]["features"])
-        except (ValueError, KeyError, TypeError):
-            return None
+    """Names of the inputs in the header of a safetensors file; None if it has none."""
+    try:
+        names = json.loads(weights_metadata(weights)["features"])
+    except (ValueError, KeyError, TypeError):
+        return None
     return tuple(map(str, names)) if isinstance(names, list) else None
 
 
-@rule_into(RULES, "move the map or the lab to the origin of the world, in its axes")
+@rule("magtwin", "move the map or the lab to the origin of the world, in its axes")
 def frames(subject: Subject) -> Iterator[Wrong]:
     """Lab and map stand in the world's own axes, and the map lies within the floor."""
     cache, labs = UsdGeom.XformCache(), subject.having("lab")
@@ -357,7 +345,7 @@ def frames(subject: Subject) -> Iterator[Wrong]:
             )
 
 
-@rule_into(RULES, "start it on the floor, upright, clear of the walls")
+@rule("magtwin", "start it on the floor, upright, clear of the walls")
 def robot_inside(subject: Subject) -> Iterator[Wrong]:
     """Every robot stands upright on the floor, its footprint within it."""
     labs = subject.having("lab")
@@ -379,7 +367,7 @@ def robot_inside(subject: Subject) -> Iterator[Wrong]:
             yield Wrong("does not stand upright", where)
 
 
-@rule_into(RULES, "start it elsewhere: a run that begins in something is refused")
+@rule("magtwin", "start it elsewhere: a run that begins in something is refused")
 def robot_clear(subject: Subject) -> Iterator[Wrong]:
     """Every robot stands clear of what it collides with, and of the other robots."""
     robots = subject.having("robot")
@@ -401,11 +389,11 @@ def robot_clear(subject: Subject) -> Iterator[Wrong]:
                 yield Wrong(f"stands {apart:.3g} m from <{robots[j].GetPath()}>", str(prim.GetPath()))
 
 
-@rule_into(RULES, "set the figure within the range that docs/schema.md gives")
+@rule("magtwin", "set the figure within the range that docs/schema.md gives")
 def figures(subject: Subject) -> Iterator[Wrong]:
     """Lab, Earth's field, sources and robots have all their parts, and no figure is out of its range."""
     looks: list[tuple[Callable[[], object], Usd.Prim]] = []
-    for noun, read in (("lab", read_lab), ("earth", read_earth), ("robot", robot_of)):
+    for noun, read in (("lab", read_lab), ("earth", read_earth), ("robot", read_robot)):
         looks += [(partial(read, prim), prim) for prim in subject.having(noun)]
     if subject.having("source"):
         looks.append((partial(read_magnets, subject.stage), subject.stage.GetPseudoRoot()))
@@ -420,7 +408,7 @@ def figures(subject: Subject) -> Iterator[Wrong]:
             yield Wrong(f"is a second {NOUNS[noun]}", str(prim.GetPath()), "keep one of them")
 
 
-@rule_into(RULES, "author the sensor anew with magtwin robot or magtwin scene")
+@rule("magtwin", "author the sensor anew with magtwin robot or magtwin scene")
 def sensor_types(subject: Subject) -> Iterator[Wrong]:
     """The sensors that Isaac Sim runs have the rates and ranges of magtwin's, whose children they are."""
     single = {"rel_tol": 1e-6, "abs_tol": 1e-9}
@@ -450,6 +438,17 @@ def robot_assets(subject: Subject) -> dict[str, Path | None]:
         whole = prim == subject.stage.GetDefaultPrim()
         found[str(prim.GetPath())] = subject.file if whole else file
     return found
+
+
+def is_absolute(path: str) -> bool:
+    """Whether an asset path holds on one machine, or on a network, alone."""
+    return bool(re.match(r"^(/|\\|[A-Za-z]:[\\/]|[A-Za-z][A-Za-z0-9+.-]+:)", path))
+
+
+def climbs(path: str, layer: Sdf.Layer, folder: Path) -> bool:
+    """Whether a relative asset path of a layer leads out of a folder."""
+    target = Path(os.path.normpath(Path(layer.realPath).resolve().parent / path))
+    return not target.is_relative_to(folder)
 
 
 def _articulations(subject: Subject) -> list[Usd.Prim]:

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
-from magtwin.field.fit.fit import METHODS, fit
+from magtwin.field.fit.fit import fit
 from magtwin.field.fit.interpolation import check_readings
+from magtwin.field.fit.methods import METHODS
 from magtwin.field.survey.bins import spacing_m
 from magtwin.field.survey.readings import Readings
 from magtwin.report import Figure, Report
@@ -31,7 +32,7 @@ BLOCKS = 5
 
 def check(
     readings: Readings,
-    methods: Sequence[str] = tuple(METHODS),
+    methods: Sequence[str] | None = None,
     *,
     split: str | Sequence[tuple[Rows, Rows]] | None = None,
     within_m: float | None = None,
@@ -45,7 +46,7 @@ def check(
 
     Args:
         readings: A survey.
-        methods: Names of `METHODS`.
+        methods: Names of map methods. Default: all.
         split: "checkerboard": every other node of a gridded survey is left out, at all its headings,
             then the others. "heading": one nominal heading of a gridded survey at a time. "run": one run at
             a time. "block": every fifth block of three spacings, in five
@@ -65,10 +66,11 @@ def check(
     Raises:
         InputError: No such method or split, the split does not fit, or nothing is left to predict.
     """
+    methods = list(METHODS) if methods is None else list(methods)
     for name in methods:
-        find("method", name, METHODS)
+        METHODS[name]  # refuses unknown names
     if not methods or len(set(methods)) < len(methods):
-        raise InputError(f"methods of a check must be one or more, each once, got {list(methods)}")
+        raise InputError(f"methods of a check must be one or more, each once, got {methods}")
     check_readings(readings)
     named, turns = _turns(readings, split)
     turns = [(train, _near(readings, train, test, within_m)) for train, test in turns]

@@ -14,10 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.errors import InputError, find, hint
-from magtwin.field.fit.gp import fit_gp
-from magtwin.field.fit.interpolation import fit_cubic, fit_trilinear
-from magtwin.field.fit.model import FieldModel
+from magtwin.errors import InputError, hint
+from magtwin.field.fit.methods import METHODS, FieldModel
 from magtwin.field.fit.resolution import resolution
 from magtwin.field.grid import TURN, Grid
 from magtwin.field.maps.map import AnomalyMap
@@ -44,23 +42,6 @@ MOST_THREADS = 4
 """Headings of a raster that are told beside each other: each holds blocks of 100 MB."""
 
 
-def fit_harmonic(readings: Readings, **options: Any) -> FieldModel:
-    """Equivalent dipoles and the platform: `magtwin.field.fit.harmonic.inversion.fit_harmonic`, loaded when
-    asked for.
-    """
-    from magtwin.field.fit.harmonic import inversion
-
-    return inversion.fit_harmonic(readings, **options)
-
-
-METHODS: dict[str, Callable[..., FieldModel]] = {
-    "trilinear": fit_trilinear,
-    "cubic": fit_cubic,
-    "gp": fit_gp,
-    "harmonic": fit_harmonic,
-}
-"""What fits readings, by name; options are those of each function."""
-
 ON_NODES = ("trilinear",)
 """Methods whose raster of a gridded survey is the survey's own nodes."""
 
@@ -79,8 +60,9 @@ def fit(
     Raises:
         InputError: There is no such method or option; or as the method refuses.
     """
-    function = find("method", method, METHODS)
-    known = _options(method)
+    function = METHODS[method]
+    kinds = inspect.signature(function).parameters.values()
+    known = [p.name for p in kinds if p.kind is p.KEYWORD_ONLY]
     for name in options:
         if name not in known:
             ends = hint(name, known) if known else "it has none"
@@ -97,17 +79,6 @@ def _one_thread() -> Any:
     from threadpoolctl import threadpool_limits
 
     return threadpool_limits(1)
-
-
-def _options(method: str) -> list[str]:
-    """Names of a method's options."""
-    function: Callable[..., FieldModel] = METHODS[method]
-    if function is fit_harmonic:
-        from magtwin.field.fit.harmonic import inversion
-
-        function = inversion.fit_harmonic
-    kinds = inspect.signature(function).parameters.values()
-    return [p.name for p in kinds if p.kind is p.KEYWORD_ONLY]
 
 
 def raster(

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.field.fit.covariance import Covariance, Kernel
 from magtwin.field.fit.interpolation import check_readings, flat_poses
-from magtwin.field.fit.model import FittedModel
+from magtwin.field.fit.methods import FittedModel
+from magtwin.field.fit.roughness import local_mean, tail
 from magtwin.field.survey.bins import GRAIN_M, Bins, bin_readings, spacing_m
 from magtwin.field.survey.readings import Readings
-from magtwin.field.survey.roughness import local_mean, tail
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int, str], Any]

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.fit.model import FittedModel
+from magtwin.field.fit.methods import FittedModel
+from magtwin.field.fit.roughness import Roughness
 from magtwin.field.grid import TURN, Grid
 from magtwin.field.survey.bins import Bins, bin_readings, spacing_m
-from magtwin.field.survey.reading_errors import node_errors
+from magtwin.field.survey.node_errors import node_errors
 from magtwin.field.survey.readings import Readings
-from magtwin.field.survey.roughness import Roughness
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -54,7 +54,7 @@ def fit_trilinear(readings: Readings, *, fill: bool = False) -> "GridInterpolati
     Returns:
         The model. Its variance is what places that were left out in turn show interpolation to miss
         (`Roughness`), and at the nodes, and between them by the weights, that of a reading
-        (`magtwin.field.survey.reading_errors`); of a scattered survey, that of the readings of one place.
+        (`magtwin.field.survey.node_errors`); of a scattered survey, that of the readings of one place.
 
     Raises:
         InputError: There are fewer than four good readings, they lie on one line, or are all the same.
@@ -81,7 +81,7 @@ def check_readings(readings: Readings) -> None:
     good = readings.good
     count, of = int(np.count_nonzero(good)), f"of {len(readings)} in {readings.name or 'the survey'}"
     if count < LEAST:
-        masked = "; all others are latched or stuck" if count < len(readings) else ""
+        masked = "; all others are stuck" if count < len(readings) else ""
         raise InputError(f"{count} good readings {of}{masked}; a map needs {LEAST} at least")
     p, b = readings.p_xy[good], readings.b_nt[good]
     if np.ptp(b) == 0:

@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.field.fit.model import FieldModel
+from magtwin.field.fit.methods import FieldModel
 from magtwin.field.grid import TURN
 from magtwin.field.survey.bins import spacing_m
 from magtwin.field.survey.readings import Readings

@@ -1,4 +1,4 @@
-"""The field at other heights from the map of one."""
+"""Continuation: the field at other heights from the map of one height."""
 
 from dataclasses import replace
 from typing import Any
@@ -13,48 +13,46 @@ from magtwin.field.sources.harmonic import HarmonicField
 Array = NDArray[np.float64]
 
 LARGEST_STEP_DOWN = 0.25
-"""Greatest step down of a grid, in cells: its shortest waves then grow threefold, and soon without bound."""
+"""Largest step down of a grid, in cells: its shortest waves then grow threefold."""
 
 GRAIN_M = 1e-6
-"""Heights closer than this are one."""
+"""Heights closer than this are equal."""
 
 
 def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
     """The map of the same nodes at another height of the sensor.
 
     **From a harmonic field** the values are exact: the field of its dipoles at that height, as the survey's
-    robot would read it there.
+    robot would read it.
 
-    **From the grid alone** each heading's layer goes up by its waves (Blakely, Potential Theory in Gravity
-    and Magnetic Applications, 1995, eq. 12.8):
+    **From the grid alone** each heading's layer is continued by its waves (Blakely, Potential Theory in
+    Gravity and Magnetic Applications, 1995, eq. 12.8):
 
         F[B(z + dz)] = F[B(z)] exp(-dz |k|),  k = (k_x, k_y)
 
-    after its mean is taken out, the layer is mirrored at its border and tapered to nothing a layer's
-    width away. The filter is exact for harmonic functions. A magnitude is none, yet |B| = F + b . F / F +
-    |b_perp|^2 / 2F + ... of an anomaly b on a uniform field F is harmonic to first order, so the result
-    holds where b is small beside F: parts of size (sd of the map)^2 / 2F are continued wrongly, which
-    `parameters` tell as `second_order_nt`. It errs near the border too, for what lies beyond is a guess,
-    and so are masked nodes, which are filled with their nearest neighbours.
+    after subtracting its mean; the layer is mirrored at its border and tapered to zero a layer's width away.
+    The filter is exact for harmonic functions. A magnitude is not harmonic, but |B| = F + b . F / F +
+    |b_perp|^2 / 2F + ... of an anomaly b on a uniform field F is to first order. So the result holds for b
+    small against F; the parameter `second_order_nt`, (sd of the map)^2 / 2F, is the size of the error. Values
+    near the border and near masked nodes, which take the nearest valid value, are less certain.
 
-    **Variance.** The filter's kernel K weighs nodes, so a value's variance is at most (sum |K| sd)^2
-    however their errors go together; that bound is what the result carries. A filled node or one beyond
-    the border counts with what the guess may miss: the root mean square slope of the layer over twice the
-    distance to the nearest node that is known, at most the spread of the layer times the root of 2.
+    **Variance.** The filter's kernel K weighs nodes, so a value's variance is at most (sum |K| sd)^2, however
+    the errors correlate; the result carries this bound. A masked node or one beyond the border counts with
+    its guess error: the RMS slope of the layer times twice the distance to the nearest valid node, at most
+    sqrt(2) times the layer's spread.
 
     Args:
-        field: The map; its height must be known: the dipoles of a survey whose height was not lie below its
-            sensor, nobody knows how far above the floor.
-        height_m: Height of the sensor above the floor [m]. A grid goes down by a quarter of a cell at
-            most, for its noise grows as exp(dz |k|); a harmonic field down to the floor, and not nearer to a
-            layer of dipoles, below the sensor or above it, than these are to each other.
+        field: The map; its height must be known.
+        height_m: Height of the sensor above the floor [m]. A grid can go down by a quarter of a cell, since
+            its noise grows as exp(dz |k|). A harmonic field can go down to the floor, but no nearer to a
+            layer of dipoles than their spacing.
 
     Returns:
-        The map there, with `method` and `parameters` that say how; valid where the map is. Its variance
-        is unknown where the map's is, and farther below it than a grid goes down.
+        The continued map, valid where the map is. Its variance is None if the map's is, or if it is farther
+        below than a grid can go.
 
     Raises:
-        InputError: The map's height is unknown, or `height_m` is none that the map can be taken to.
+        InputError: The map's height is unknown, or `height_m` is out of reach.
     """
     if not np.isfinite(height_m):
         raise InputError(f"height_m must be a length [m], got {height_m!r}")
@@ -104,10 +102,10 @@ def _of_the_dipoles(field: AnomalyMap, start: float, height_m: float) -> Anomaly
 
 
 def _reach_m(harmonic: HarmonicField, start: float) -> tuple[float, float]:
-    """Heights that a harmonic field holds from and up to [m]: the floor, or dipoles' own spacing off them.
+    """Range of heights in which a harmonic field holds [m]: the floor, or one dipole spacing off a layer.
 
-    A layer of equivalent dipoles s apart is a smooth field but for ripples of about exp(-2 pi d / s) at a
-    distance d, two parts in a thousand at d = s. Dipoles at heights of their own have no such spacing.
+    A layer of equivalent dipoles with spacing s has ripples of about exp(-2 pi d / s) at distance d: 0.2 % at
+    d = s. Dipoles that are alone at their height have no spacing.
     """
     places = harmonic.p_world_dipole
     below, above = places[places[:, 2] <= start], places[places[:, 2] > start]
@@ -122,7 +120,7 @@ def _reach_m(harmonic: HarmonicField, start: float) -> tuple[float, float]:
 
 
 def _apart_m(layer: Array) -> float:
-    """Median distance of dipoles of one height to the next of them [m]."""
+    """Median distance of a layer's dipoles to their nearest neighbour [m]."""
     from scipy.spatial import cKDTree
 
     return float(np.median(cKDTree(layer).query(layer, 2)[0][:, 1])) if len(layer) > 1 else GRAIN_M
@@ -168,14 +166,14 @@ def _said(field: AnomalyMap, start: float, height_m: float, how: str) -> str:
 
 
 def _variance(field: AnomalyMap, step: float) -> Array:
-    """Greatest variance that the values can have at `step` above the map [nT^2]."""
+    """Upper bound of the variance at `step` above the map [nT^2]."""
     assert field.variance_nt2 is not None
     layers = zip(field.values_nt, field.valid, np.sqrt(field.variance_nt2), strict=True)
     return np.stack([_Layer(v, valid, field.cell_m).deviation(sd, step) ** 2 for v, valid, sd in layers])
 
 
 class _Layer:
-    """One heading's field, filled where masked, mirrored at its border, and tapered beyond."""
+    """One heading's field, filled at masked nodes, mirrored at its border, and tapered beyond."""
 
     def __init__(self, values: Array, valid: NDArray[np.bool_], cell_m: tuple[float, float]) -> None:
         from scipy.ndimage import distance_transform_edt
@@ -199,7 +197,7 @@ class _Layer:
         return self.mean + self._filtered(anomaly, self._response(step, anomaly.shape))
 
     def deviation(self, sd: Array, step: float) -> Array:
-        """Greatest standard deviation that its values can have, from that of the nodes [nT], shape (Y, X)."""
+        """Upper bound of the sd at `step` above, from that of the nodes [nT], shape (Y, X)."""
         along = np.gradient(self.filled, *self.cell_m)
         slope = float(np.sqrt(np.mean(np.square(along).sum(axis=0))))
         spread = np.sqrt(2) * float(self.values[self.valid].std())

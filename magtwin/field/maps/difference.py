@@ -1,4 +1,4 @@
-"""MapDifference: two surveys of one floor against each other, what changed and where."""
+"""MapDifference: compare two surveys of one floor, and find what changed and where."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,24 +16,24 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 FALSE_SHARE = 0.05
-"""Share of the nodes called changed that may have kept their field, in the mean: the false-discovery rate."""
+"""False-discovery rate: expected share of the nodes called changed that did not change."""
 
 SD_PER_MAD = 1.4826
-"""Standard deviation of a normal distribution, for each median absolute deviation."""
+"""Standard deviation of a normal distribution per median absolute deviation."""
 
 GRAIN_M = 1e-3
-"""Heights that differ by less are one: 5 nT in a steep field."""
+"""Heights that differ by less are equal: 5 nT in a steep field."""
 
 TOLD = 20
-"""Regions that a report tells of, those of the greatest z first."""
+"""Most regions in a report, those of the greatest z first."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Region:
-    """Nodes side by side, or corner to corner, whose field changed in some heading."""
+    """Adjacent nodes, also diagonally, whose field changed at some heading."""
 
     centre_m: tuple[float, float]
-    """World x and y of its middle, each node weighed by its greatest change [m]."""
+    """World x and y of its centre, weighted by change [m]."""
 
     extent_m: tuple[float, float, float, float]
     """Least x, greatest x, least y, greatest y of its nodes [m]."""
@@ -42,22 +42,22 @@ class Region:
     """Number of nodes."""
 
     peak_nt: float
-    """Local change where z is greatest [nT]."""
+    """Local change at the greatest |z| [nT]."""
 
     peak_sd_nt: float
-    """Standard deviation of that change where the field kept still [nT]."""
+    """Standard deviation of that change if the field did not change [nT]."""
 
     peak_z: float
-    """z there: that change in standard deviations."""
+    """z at that node."""
 
     peak_m: tuple[float, float]
     """World x and y of that node [m]."""
 
     peak_heading_rad: float
-    """Heading there [rad]."""
+    """Heading of that node [rad]."""
 
     def said(self) -> str:
-        """Where it is and how sure, in words."""
+        """Place and significance, as text."""
         (x, y), (x0, x1, y0, y1) = self.centre_m, self.extent_m
         return (
             f"z {self.peak_z:.3g}, about ({x:.2f}, {y:.2f}) m, x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m, "
@@ -67,47 +67,47 @@ class Region:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class MapDifference(Summarized):
-    """Field of a later survey minus that of an earlier one, on the nodes that both know.
+    """Field of a later survey minus that of an earlier one, on their common nodes.
 
-    Arrays are nan where one of the surveys knows nothing.
+    Arrays are nan where one of the surveys is masked.
     """
 
     names: tuple[str, str]
-    """What the surveys are called, the earlier first."""
+    """Names of the surveys, the earlier first."""
 
     days: tuple[str, str]
-    """Their days, "" where unknown."""
+    """Their days, "" if unknown."""
 
     grid: Grid
     """Nodes of the comparison."""
 
     change_nt: Array
-    """The later field minus the earlier [nT], shape (H, Y, X)."""
+    """Later minus earlier field [nT], shape (H, Y, X)."""
 
     bias_nt: Array
-    """What every node of a heading has in common, the median of its changes [nT], shape (H,)."""
+    """Change common to all nodes of a heading, their median [nT], shape (H,)."""
 
     sd_nt: Array
-    """Standard deviation of a change where the field kept still [nT], shape (H, Y, X)."""
+    """Standard deviation of a change if the field did not change [nT], shape (H, Y, X)."""
 
     from_variance: bool
-    """Whether `sd_nt` comes from the surveys' variances; else from the spread of the changes."""
+    """Whether `sd_nt` comes from the maps' variances, or else from the spread of the changes."""
 
     z: Array
     """Local change in standard deviations, shape (H, Y, X)."""
 
     threshold_z: float
-    """Least |z| that is called a change."""
+    """Least |z| of a changed node."""
 
     regions: tuple[Region, ...]
-    """Where the field changed, the greatest |z| first."""
+    """Changed regions, the greatest |z| first."""
 
     cautions: tuple[str, ...] = ()
-    """What the two surveys say of themselves that may make them incomparable."""
+    """Reasons to doubt that the surveys are comparable."""
 
     @property
     def local_nt(self) -> Array:
-        """Change less the bias of its heading [nT], shape (H, Y, X)."""
+        """Change minus the bias of its heading [nT], shape (H, Y, X)."""
         return self.change_nt - self.bias_nt[:, None, None]
 
     @property
@@ -116,7 +116,7 @@ class MapDifference(Summarized):
         return np.abs(self.z) >= self.threshold_z  # false for nan
 
     def report(self) -> Report:
-        """What changed, where, and how much against the standard deviation."""
+        """What changed, where, and how significantly."""
         known = np.isfinite(self.z)
         local = self.local_nt[known]
         count, changed = int(known.sum()), int(self.changed.sum())
@@ -167,7 +167,6 @@ class MapDifference(Summarized):
         return f"at ({x:g}, {y:g}) m, heading {np.degrees(self.grid.headings_rad[h]):g} deg"
 
     def _summary(self) -> Summary:
-        """What is compared; how much changed, and where most."""
         before, after = (" ".join(t for t in pair if t) for pair in zip(self.names, self.days, strict=True))
         known, changed = (int(a.any(axis=0).sum()) for a in (np.isfinite(self.z), self.changed))
         return Summary(
@@ -185,34 +184,32 @@ class MapDifference(Summarized):
 
 
 def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
-    """What changed from one survey to another.
+    """Compare two surveys of one floor.
 
-    They are compared at the nodes of the coarser grid, in the headings of the map that has fewer, wherever
-    both know the field; the other is looked up there. Its interpolation errs as any does, and that is in
-    no variance: surveys to be compared closely are best fitted on one grid.
+    They are compared at the nodes of the coarser grid and the headings of the map with fewer, where both are
+    valid; the other map is interpolated there. The interpolation error is in no variance: fit surveys on one
+    grid to compare them closely.
 
-    The change of a node is b - a. Its heading's median is the bias that all nodes have in common, such as
-    the day's field of the Earth and the sensor's own offset; what is left is local. With the variances
-    of both maps its standard deviation is sqrt(V_a + V_b), of a node looked up at most that between
-    its neighbours'. Without, it is taken to be one for all nodes, 1.4826 times their median absolute
-    deviation, which changes of less than half of the floor hardly move. Neither is below a step of
-    single precision, as layers keep it.
+    A node's change is b - a. The median over a heading is the bias common to all nodes, such as the day's
+    Earth field and the sensor's offset; the rest is local. If both maps have variances, the standard
+    deviation of a change is sqrt(V_a + V_b). Otherwise it is one value for all nodes, 1.4826 times their
+    median absolute deviation, which is robust to changes on less than half of the floor. It is at least one
+    step of single precision, the precision of map layers.
 
-    A node is called changed where |z| reaches the threshold of Benjamini and Hochberg (J. R. Statist.
-    Soc. B 57, 289, 1995): with two-sided normal p-values in ascending order, the last p_k <= k q / m.
-    Of the nodes called so a share of q = 5 % in the mean kept their field, for errors that are
-    independent or go together.
+    A node has changed if |z| reaches the threshold of Benjamini and Hochberg (J. R. Statist. Soc. B 57, 289,
+    1995): with two-sided normal p-values in ascending order, the last p_k <= k q / m. The false-discovery
+    rate is q = 5 %, for independent or positively dependent errors.
 
     Args:
         a: The earlier survey.
         b: The later one.
 
     Returns:
-        Changes, bias, z and the regions of changed nodes, neighbours at sides and corners.
+        Changes, bias, z and the regions of changed nodes.
 
     Raises:
-        InputError: The maps have no node in common, or differ in frame, datum or height; where one is
-            unknown, the report says so.
+        InputError: The maps have no node in common, or differ in frame, datum or height. If one of these is
+            unknown, the report has a caution.
     """
     cautions = _compared(a, b)
     grid = _common(a, b)
@@ -250,7 +247,7 @@ def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
 
 
 def _compared(a: AnomalyMap, b: AnomalyMap) -> tuple[str, ...]:
-    """What is doubtful about comparing two maps; refused where nodes of one name are other places."""
+    """Cautions about comparing two maps; refuses maps whose nodes are different places."""
     for name in ("frame", "datum"):
         first, second = getattr(a, name), getattr(b, name)
         if first != second and first and second:
@@ -276,7 +273,7 @@ def _compared(a: AnomalyMap, b: AnomalyMap) -> tuple[str, ...]:
 
 
 def _common(a: AnomalyMap, b: AnomalyMap) -> Grid:
-    """Nodes to compare at."""
+    """Nodes of the comparison."""
     coarse = b if np.prod(b.cell_m) > np.prod(a.cell_m) * (1 + 1e-9) else a
     few = b if len(b.headings_rad) < len(a.headings_rad) else a
     rows, columns = coarse.values_nt.shape[1:]
@@ -290,7 +287,7 @@ def _common(a: AnomalyMap, b: AnomalyMap) -> Grid:
 
 
 def _variance(field: AnomalyMap, p_xy: Array, yaw: Array) -> Array:
-    """Variance of a map's values at poses, as between its nodes' [nT^2]."""
+    """Variance of a map's values at poses, interpolated [nT^2]."""
     assert field.variance_nt2 is not None
     return replace(field, values_nt=field.variance_nt2, variance_nt2=None, harmonic=None).lookup(p_xy, yaw)
 
@@ -300,7 +297,7 @@ def _robust_sd(values: Array) -> float:
 
 
 def _threshold(size: Array) -> float:
-    """|z| whose two-sided p-value is q k / m, k as many as Benjamini and Hochberg call, or 1."""
+    """|z| with the two-sided p-value q k / m; k is the number of nodes called changed, at least 1."""
     from scipy.special import erfc, erfcinv
 
     p = np.sort(erfc(size / np.sqrt(2)))
@@ -310,7 +307,7 @@ def _threshold(size: Array) -> float:
 
 
 def _regions(grid: Grid, local: Array, z: Array, threshold: float) -> tuple[Region, ...]:
-    """Connected nodes of the floor that changed in some heading."""
+    """Connected nodes of the floor that changed at some heading."""
     from scipy.ndimage import find_objects, label
 
     size = np.nan_to_num(np.abs(z))

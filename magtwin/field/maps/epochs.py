@@ -1,4 +1,4 @@
-"""Epochs: one map surveyed on several days, the field between them, and how it drifts."""
+"""Epochs: one map surveyed on several days, the field between them, and its drift."""
 
 import datetime
 import itertools
@@ -14,17 +14,17 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.report import Figure, Report
 
 COMMON = ("headings_rad", "origin_m", "cell_m", "frame", "datum", "height_m")
-"""What the epochs of a map must have in common, beside the number of nodes."""
+"""What all epochs of a map share, besides the number of nodes."""
 
 GRAIN = 1e-9
-"""Lengths [m] and angles [rad] closer than this are one."""
+"""Lengths [m] and angles [rad] closer than this are equal."""
 
 
 def day_of(field: AnomalyMap) -> datetime.date:
     """The day of a map.
 
     Raises:
-        InputError: It has none.
+        InputError: It is unknown.
     """
     if field.created == "":
         raise InputError(
@@ -34,14 +34,14 @@ def day_of(field: AnomalyMap) -> datetime.date:
 
 
 def in_order(maps: Sequence[AnomalyMap]) -> tuple[AnomalyMap, ...]:
-    """Maps of one floor, the earliest first.
+    """Sort maps of one floor by day.
 
     Args:
-        maps: Two or more, each with its day in `created`, in any order.
+        maps: Two or more, each with its day in `created`.
 
     Raises:
-        InputError: There are fewer than two, one has no day, two have one, or the nodes, the frame,
-            the datum or the height of one are not those of the others.
+        InputError: There are fewer than two, a day is missing or occurs twice, or nodes, frame, datum or
+            height differ.
     """
     if len(maps) < 2:
         raise InputError(f"epochs of a map are two at least, got {len(maps)}; save_map keeps a single one")
@@ -71,19 +71,19 @@ def in_order(maps: Sequence[AnomalyMap]) -> tuple[AnomalyMap, ...]:
 
 
 def at_date(maps: Sequence[AnomalyMap], date: str | datetime.date) -> AnomalyMap:
-    """The map of a day: an epoch's own, or linear in time between the two around it.
+    """The map of a day: an epoch, or the linear interpolation in time between two epochs.
 
-    B = (1 - w) B_0 + w B_1, w the share of the time that has passed. Two surveys err independently, so
-    the variance is (1 - w)^2 V_0 + w^2 V_1: below that of either amid them, which holds where the field
-    did drift evenly. A node is valid where it is on both days. What lies between has no harmonic field:
-    magnitudes are interpolated, not vectors.
+    B = (1 - w) B_0 + w B_1, where w is the elapsed share of the time. The surveys' errors are independent, so
+    the variance is (1 - w)^2 V_0 + w^2 V_1. It is below that of either epoch between them, which holds if the
+    field drifted evenly. A node is valid if it is valid on both days. An interpolated map has no harmonic
+    field, since magnitudes are interpolated, not vectors.
 
     Args:
-        maps: One map, or epochs as from `in_order`.
-        date: The day, or its name YYYY-MM-DD.
+        maps: One map, or epochs from `in_order`.
+        date: The day, or YYYY-MM-DD.
 
     Raises:
-        InputError: It is no day, or not from the first epoch to the last.
+        InputError: It is not a day, or outside the epochs.
     """
     day = parse_day(date)
     days = [day_of(m) for m in maps]
@@ -115,17 +115,17 @@ def at_date(maps: Sequence[AnomalyMap], date: str | datetime.date) -> AnomalyMap
 
 
 def drift(maps: Sequence[AnomalyMap]) -> Report:
-    """How fast the field changed at the nodes that are valid on every day.
+    """Drift of the field at the nodes that are valid on every day.
 
-    The drift of a node is the slope of the line through its values by least squares. Its standard
-    deviation follows from the variances where every epoch has them.
+    A node's drift is the slope of the least-squares line through its values. Its standard deviation follows
+    from the variances, if every epoch has them.
 
     Args:
-        maps: Epochs as from `in_order`.
+        maps: Epochs from `in_order`.
 
     Returns:
-        Days, mean drift with the spread over the nodes, and the greatest with its place and its own
-        standard deviation; [nT/day].
+        Days, mean drift with its spread over the nodes, and the largest drift with place and standard
+        deviation [nT/day].
     """
     days = np.array([day_number(day_of(m)) for m in maps], float)
     figures = [
@@ -154,7 +154,7 @@ def drift(maps: Sequence[AnomalyMap]) -> Report:
 
 
 def _same(a: Any, b: Any) -> bool:
-    """Whether texts are equal, and lengths and angles but for rounding."""
+    """Whether texts are equal, and lengths and angles up to rounding."""
     if isinstance(a, str) or a is None or b is None:
         return a == b
     return np.shape(a) == np.shape(b) and bool(np.allclose(a, b, rtol=0, atol=GRAIN))

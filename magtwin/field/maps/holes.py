@@ -1,4 +1,4 @@
-"""Holes: nodes of a map that nobody could measure, filled from those around them."""
+"""Holes: fill the masked nodes of a map from the nodes around them."""
 
 from dataclasses import replace
 
@@ -10,14 +10,14 @@ from magtwin.field.maps.map import AnomalyMap
 
 
 def filled(field: AnomalyMap) -> AnomalyMap:
-    """A map whose nodes that are not valid have values between those of the nodes around them.
+    """Fill the masked nodes of a map.
 
-    A value in a hole is the mean of its four neighbours (the discrete Laplace equation), so it lies
-    between the least and the greatest value on the hole's edge. Its standard deviation is the spread of
-    the values on the edges of the holes of its heading.
+    A filled value is the mean of its four neighbours (the discrete Laplace equation), so it lies between the
+    least and the greatest value on the hole's edge. Its standard deviation is the spread of the values on the
+    edges of all holes of its heading.
 
     Args:
-        field: The map; what it holds at nodes that are not valid is not read.
+        field: The map; values at masked nodes are ignored.
 
     Returns:
         The map with every node valid.

@@ -24,25 +24,24 @@ Array = NDArray[np.float64]
 
 TURN = 2 * np.pi
 TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")
-"""What a map says of itself in words."""
+"""Metadata that are texts."""
 
 CONSTANT_NT = 1e-3
-"""Range of a map's values up to which it is constant [nT]."""
+"""Range of values up to which a map is constant [nT]."""
 
 Outside = Literal["nan", "clamp", "raise"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class AnomalyMap(Summarized):
-    """Total field on a grid over x, y and heading, as a robot reads it that stands at each node.
+    """Total field on a grid over x, y and heading, as read by a robot at rest at each node.
 
-    Node (h, j, i) lies at x = origin_m[0] + i cell_m[0], y = origin_m[1] + j cell_m[1] in world, with
-    the robot's heading at headings_rad[h]. Arrays are copied at birth and cannot be written to; two
-    maps are equal when every field is.
+    Node (h, j, i) is at x = origin_m[0] + i cell_m[0], y = origin_m[1] + j cell_m[1] in world, at heading
+    headings_rad[h]. Arrays are copied and read-only. Two maps are equal if every field is.
     """
 
     values_nt: Array
-    """Field magnitude at the nodes [nT], shape (H, Y, X); anything, even nan, where not `valid`."""
+    """Field magnitude at the nodes [nT], shape (H, Y, X); any value, also nan, where not `valid`."""
 
     origin_m: tuple[float, float]
     """World x and y of node [0, 0] [m]."""
@@ -54,43 +53,44 @@ class AnomalyMap(Summarized):
     """Headings of the layers [rad], ascending in [0, 2 pi), shape (H,)."""
 
     valid: NDArray[np.bool_] = None  # type: ignore[assignment]
-    """Nodes whose value is field, shape (H, Y, X); all of them unless given."""
+    """Nodes whose value is field, shape (H, Y, X). Default: all."""
 
     variance_nt2: Array | None = None
-    """Variance of each value [nT^2], shape (H, Y, X); none where unknown."""
+    """Variance of each value [nT^2], shape (H, Y, X); None if unknown."""
 
     name: str = ""
-    """What the map is called, and its layer."""
+    """Name of the map and of its layer."""
 
     method: str = ""
-    """How the values came about."""
+    """How the values were obtained."""
 
     source: str = ""
-    """What they were made from: files with checksums, or a script with its seed."""
+    """Source files with checksums, or a script with its seed."""
 
     licence: str = ""
-    """SPDX name of the licence that they are under."""
+    """SPDX name of their licence."""
 
     created: str = ""
-    """Day on which they were made, YYYY-MM-DD; "" where unknown."""
+    """Day of the survey, YYYY-MM-DD; "" if unknown."""
 
     frame: str = ""
-    """Axes that x, y and heading are in, such as "world: x east, y north, z up"."""
+    """Axes of x, y and heading, such as "world: x east, y north, z up"."""
 
     datum: str = ""
-    """Where that frame lies: its origin in the room or on Earth, and what heights are above."""
+    """Origin of that frame in the room or on Earth, and the reference of heights."""
 
     height_m: float | None = None
-    """Height of the sensor above the floor at which the values hold [m]; none where unknown."""
+    """Height of the sensor above the floor [m]; None if unknown."""
 
     recorded_yaw: Array | None = None
-    """Yaw of the robot when each value was read [rad], shape (H, Y, X); none where values are no readings."""
+    """Recorded yaw of the robot at each node [rad], shape (H, Y, X); None if values are not single
+    readings."""
 
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    """Figures of the method, by name: plain numbers, texts, and lists of them, as JSON can hold."""
+    """Parameters of the method by name: numbers, texts, and lists of them, as in JSON."""
 
     harmonic: HarmonicField | None = None
-    """The vector field that the values were computed from; none where there is no such thing."""
+    """The vector field from which the values were computed; None if there is none."""
 
     def __post_init__(self) -> None:
         values = _frozen(self.values_nt, float)
@@ -171,7 +171,7 @@ class AnomalyMap(Summarized):
         return x, x + dx * (columns - 1), y, y + dy * (rows - 1)
 
     def contains(self, p_xy: ArrayLike) -> NDArray[np.bool_]:
-        """Whether points lie on the grid, its border included, masked nodes or not.
+        """Whether points are on the grid, including its border and masked nodes.
 
         Args:
             p_xy: Points in world [m], shape (..., 2).
@@ -184,54 +184,50 @@ class AnomalyMap(Summarized):
         return np.all((u >= -EDGE) & (u <= np.array([columns - 1, rows - 1]) + EDGE), axis=-1)
 
     def lookup(self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan") -> Array:
-        """Field at poses, linear in heading, y and x between the nodes around each.
+        """Field at poses, trilinear in heading, y and x.
 
-        B = sum over the 8 nodes of w_h w_y w_x B_hyx. Heading lies on a circle: between the last
-        layer and 2 pi above the first one it is interpolated as between any two. With one layer only
-        the heading does not matter. A pose gives the same bytes alone and among others.
+        B = sum over the 8 nodes around of w_h w_y w_x B_hyx. Heading is periodic. A map of one heading does
+        not depend on it. A pose gives the same bytes alone and among others.
 
         Args:
             p_xy: Points in world [m], shape (..., 2).
             yaw: Headings [rad], any real number, shape (...); the two shapes are broadcast.
-            outside: What a point off the grid gives: nan, the nearest point's field, or a refusal.
+            outside: Result off the grid: "nan", "clamp" (the field of the nearest point on it) or "raise".
 
         Returns:
-            Field magnitude [nT], shape (...); nan where an input is nan, and where a masked node has
-            weight.
+            Field magnitude [nT], shape (...); nan if an input is nan or a masked node has weight.
 
         Raises:
-            InputError: A point lies off the grid and `outside` is "raise".
+            InputError: A point is off the grid and `outside` is "raise".
         """
         return self._look(p_xy, yaw, outside, gradient=False)[0]
 
     def gradient(self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan") -> Array:
-        """What `lookup` changes by, per metre and per radian: its exact derivatives within a cell.
-
-        At a border between cells they are those of the cell with the greater x, y or heading.
+        """Exact derivatives of `lookup` within a cell; at a border, those of the cell at greater x, y or
+        heading.
 
         Args:
             p_xy: Points in world [m], shape (..., 2).
             yaw: Headings [rad], shape (...); the two shapes are broadcast.
-            outside: What a point off the grid gives: nan, the nearest point's, without a change
-                across the border, or a refusal.
+            outside: As for `lookup`; with "clamp" the field does not change across the border.
 
         Returns:
-            dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad], shape (..., 3); nan where `lookup` is, and where
-            a masked node would have a part.
+            dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad], shape (..., 3); nan if `lookup` is, or if a masked node
+            would enter.
 
         Raises:
-            InputError: A point lies off the grid and `outside` is "raise".
+            InputError: A point is off the grid and `outside` is "raise".
         """
         return self._look(p_xy, yaw, outside, gradient=True)[1]
 
     def lookup_with_gradient(
         self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
     ) -> tuple[Array, Array]:
-        """What `lookup` and `gradient` give, shapes (...) and (..., 3), for the price of the latter."""
+        """Results of `lookup` and `gradient`, shapes (...) and (..., 3), in one pass."""
         return self._look(p_xy, yaw, outside, gradient=True)
 
     def at(self, x: float, y: float, yaw: float, *, outside: Outside = "nan") -> float:
-        """Field at one pose [nT]: what `lookup` gives, in about a microsecond.
+        """Field at one pose [nT], as `lookup`, without the overhead of arrays.
 
         Args:
             x: World x [m].
@@ -240,7 +236,7 @@ class AnomalyMap(Summarized):
             outside: As for `lookup`.
 
         Raises:
-            InputError: The point lies off the grid and `outside` is "raise".
+            InputError: The point is off the grid and `outside` is "raise".
         """
         if outside == "nan":
             return self._lookup.at(x, y, yaw)
@@ -250,32 +246,32 @@ class AnomalyMap(Summarized):
     def at_with_gradient(
         self, x: float, y: float, yaw: float, *, outside: Outside = "nan"
     ) -> tuple[float, float, float, float]:
-        """Field at one pose [nT], dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad]; all else as for `at`."""
+        """Field at one pose [nT], dB/dx, dB/dy [nT/m] and dB/dyaw [nT/rad]; otherwise as `at`."""
         if outside != "nan":
             self._check_outside(np.array([[x, y]]), outside)
         return self._lookup.at_with_gradient(x, y, yaw, clamp=outside == "clamp")
 
     def plot(self, quantity: str = "field", headings: Sequence[float] | None = None) -> "Picture":
-        """Draw the map as filled contours, a panel per heading; see `magtwin.plot`.
+        """Draw the map as filled contours, one panel per heading; see `magtwin.plot`.
 
         Args:
             quantity: "field", "gradient", "variance", "mask" or "headings".
-            headings: Headings to show [rad]. None shows the map's own, of more than eight four.
+            headings: Headings to show [rad]. None: the map's own, at most four if there are more than eight.
 
         Returns:
-            A matplotlib figure. A notebook shows it; `figure.savefig("map.png")` writes it.
+            A matplotlib figure.
 
         Raises:
-            InputError: No heading is to be shown, or nothing is known of the quantity.
+            InputError: No heading is to be shown, or the map does not have the quantity.
         """
         return importlib.import_module("magtwin").plot(self, quantity=quantity, headings=headings)  # loads io
 
     def report(self) -> Report:
-        """The figures that tell one map from another, over its valid nodes.
+        """Statistics over the valid nodes.
 
         The gradient is that of the magnitude along the floor, by central differences, one-sided at the
-        border. The heading amplitude is that of a + c cos(heading) + s sin(heading), fitted by least
-        squares to the means of the layers over the nodes valid in all of them; it needs three layers.
+        border. The heading amplitude is that of a + c cos(heading) + s sin(heading), a least-squares fit to
+        the layers' means over the nodes valid in all of them; it needs three layers.
         """
         values = np.where(self.valid, self.values_nt, np.nan)
         along_y, along_x = np.gradient(values, self.cell_m[1], self.cell_m[0], axis=(1, 2))
@@ -310,7 +306,7 @@ class AnomalyMap(Summarized):
 
     @cached_property
     def is_constant(self) -> bool:
-        """Whether all valid nodes have the same value, within 1 pT, or no node is valid."""
+        """Whether all valid nodes have the same value within 1 pT, or no node is valid."""
         values = self.values_nt[self.valid]
         return not values.size or float(np.ptp(values)) <= CONSTANT_NT
 
@@ -319,7 +315,6 @@ class AnomalyMap(Summarized):
         return Lookup(self.values_nt, self.valid, self.origin_m, self.cell_m, self.headings_rad)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The fields: what lookup keeps is made anew from them."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
     def _look(
@@ -354,7 +349,6 @@ class AnomalyMap(Summarized):
             )
 
     def _summary(self) -> Summary:
-        """Name and range; nodes and extent; headings; how well it is known; method."""
         known, (x0, x1, y0, y1) = self.values_nt[self.valid], self.extent
         title = f"AnomalyMap {self.name or 'without a name'}: "
         if known.size:
@@ -388,7 +382,7 @@ class AnomalyMap(Summarized):
 
 
 def _frozen(values: ArrayLike, kind: type) -> NDArray[Any]:
-    """A copy that cannot be written to."""
+    """A read-only copy."""
     array: NDArray[Any] = np.array(values, kind)
     array.flags.writeable = False
     return array

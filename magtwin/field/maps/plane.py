@@ -1,4 +1,4 @@
-"""Plane: the field at one height, where robots drive, computed once a place and looked up from then on."""
+"""Plane: the field of magnetised bodies at one height, computed once per square and then looked up."""
 
 from functools import cache
 from threading import Lock
@@ -9,23 +9,22 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.field.maps.lookup import AS_MANY, LOOPS
 from magtwin.field.sources.bodies import CELL_M, FARTHEST_CELL, Bodies
-from magtwin.field.sources.point_dipoles import dipole_block, in_blocks, in_two_threads
+from magtwin.field.sources.dipoles import dipole_block, in_blocks, in_two_threads
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 HALF_M = CELL_M / 2
-"""Half the side of a square [m]; squares are the level cuts of the cells of `Bodies`."""
+"""Half the side of a square [m]; squares are level cuts of the cells of `Bodies`."""
 
 NODES = 10
 """Chebyshev nodes along each side of a square."""
 
 CLEAR_M = 0.35
-"""Distance from a square beyond which what is there is interpolated [m]; what is nearer is added up point by
-point."""
+"""Distance from a square beyond which sources are interpolated [m]; nearer ones are summed for each point."""
 
 MOST_SQUARES = 40_000
-"""Squares that are kept: 2,500 m2, 0.1 GB. When there are more, all are forgotten."""
+"""Squares kept: 2,500 m2, 0.1 GB. Beyond, all are dropped."""
 
 BLOCK = 32_768
 """Points worked on at a time; they lie in fewer squares than are kept."""
@@ -35,22 +34,22 @@ PER_SQUARE = 100
 poses of a map."""
 
 ERROR, SLOPE_ERROR = 2e-7, 2e-5
-"""What interpolation errs by at most, over the greatest field and slope that a source makes at the distance
-`CLEAR_M`, where it errs most: 0.01 nT where that is as strong as the Earth's. A test holds it to them."""
+"""Bounds of the interpolation error of field and slope, relative to the largest that a source makes at
+distance `CLEAR_M`: 0.01 nT for a source as strong there as the Earth's field. A test checks them."""
 
 
 class Plane:
-    """The field of magnetised bodies on a level plane, as polynomials over squares of it.
+    """The field of magnetised bodies on a level plane, as polynomials over squares.
 
-    In a square, what lies farther off than `CLEAR_M` is computed at Chebyshev nodes, as `Bodies` has it
-    there, when a point is first asked for. The error of the polynomial through them falls as rho^-n, with
-    rho = d / a + sqrt((d / a)^2 - 1), a half the square's side and d the distance of what is nearest from its
-    middle (Trefethen 2013, Approximation Theory and Practice, theorem 8.2): 8.3^-10. What a point is told
-    depends on its place alone, to the last bit but for what is nearer than `CLEAR_M`.
+    In each square, the field of what is farther away than `CLEAR_M` is computed at Chebyshev nodes when a
+    point in it is first needed. The error of the polynomial falls as rho^-n, rho = d / a + sqrt((d / a)^2 -
+    1), where a is half the square's side and d the distance of the nearest source from its centre (Trefethen
+    2013, Approximation Theory and Practice, theorem 8.2): 8.3^-10. The result at a point depends on its
+    position only, to the last bit except for sources nearer than `CLEAR_M`.
     """
 
     def __init__(self, bodies: Bodies, height_m: float) -> None:
-        """Take in what is magnetised, and the height of the plane above the floor [m]."""
+        """Take the bodies and the height of the plane above the floor [m]."""
         self.bodies, self.height_m = bodies, float(height_m)
         self._lock = Lock()
         self._forget()
@@ -61,14 +60,14 @@ class Plane:
         self._close: dict[int, Bodies] = {}
 
     def field_and_slopes_nt(self, p_xy: ArrayLike) -> tuple[Array, Array]:
-        """The field, and how it changes along x and y.
+        """The field and its slopes along x and y.
 
         Args:
             p_xy: Points of the plane [m], shape (N, 2).
 
         Returns:
-            Field in world axes [nT], shape (N, 3), and its derivatives dB/dx, dB/dy [nT/m], shape (N, 2, 3).
-            nan where a point is not finite or 130 km from the origin.
+            Field in world axes [nT], shape (N, 3), and dB/dx, dB/dy [nT/m], shape (N, 2, 3); nan if a point
+            is not finite or over 130 km from the origin.
         """
         p = np.asarray(p_xy, float)
         if p.ndim != 2 or p.shape[1] != 2:
@@ -118,7 +117,7 @@ class Plane:
             out[rows, 0] += field
 
     def _slots_of(self, keys: Numbers) -> Numbers:
-        """Where squares are in the table; those that are not there yet are computed."""
+        """Table slots of squares; new squares are computed."""
         new = [key for key in keys.tolist() if key not in self._slots]
         if len(self._slots) + len(new) > MOST_SQUARES and self._slots:
             self._forget()
@@ -135,7 +134,7 @@ class Plane:
         return np.array([self._slots[key] for key in keys.tolist()], np.int64)
 
     def _make(self, keys: list[int], first: int) -> None:
-        """Polynomials of squares, into the table from a slot on."""
+        """Compute the polynomials of squares into consecutive table slots."""
         node, powers = _nodes()
         reach = CLEAR_M + np.sqrt(2) * HALF_M
         layer = np.clip(np.floor(self.height_m / CELL_M), -FARTHEST_CELL, FARTHEST_CELL - 1)
@@ -173,13 +172,13 @@ class Plane:
 
 @cache
 def _nodes() -> tuple[Array, Array]:
-    """Chebyshev nodes in -1..1, and the matrix from values there to coefficients of powers."""
+    """Chebyshev nodes in -1..1, and the matrix from values at them to coefficients of powers."""
     node = np.cos(np.pi * (np.arange(NODES) + 0.5) / NODES)
     return node, np.linalg.inv(np.vander(node, increasing=True))
 
 
 def _by_numpy(table: Array, u: Array, w: Array) -> Array:
-    """A square's polynomial and its slopes at points in -1..1, as `compiled.polynomials` has them."""
+    """A square's polynomial and its slopes at points in -1..1, as `loops.polynomials` computes them."""
     a = np.repeat(table[-1][:, None], len(u), axis=1)
     slope = np.zeros(a.shape)
     for row in table[-2::-1]:

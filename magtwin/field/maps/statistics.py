@@ -1,21 +1,29 @@
-"""Statistics of a map, heading by heading."""
+"""What is known about a map: statistics per heading, metadata, colour limits."""
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from magtwin.field.maps.epochs import drift
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.sources.harmonic import HarmonicField
+from magtwin.report import Figure, Report
+from magtwin.summary import span
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeadingStatistics:
-    """One heading of a map, over its valid nodes; figures are nan where there is none."""
+    """Statistics of one heading over its valid nodes; nan if there is none."""
 
     heading_deg: float
-    """The heading [deg]."""
+    """Heading [deg]."""
 
     nodes: int
-    """Nodes of the heading."""
+    """Number of nodes."""
 
     masked: int
     """Nodes that are not valid."""
@@ -33,17 +41,17 @@ class HeadingStatistics:
     """Largest value [nT]."""
 
     median_gradient_nt_m: float
-    """Median slope of the magnitude along the floor, by central differences [nT/m]."""
+    """Median horizontal gradient of the magnitude, by central differences [nT/m]."""
 
     greatest_gradient_nt_m: float
-    """Largest slope [nT/m]."""
+    """Largest gradient [nT/m]."""
 
     median_error_nt: float
-    """Median standard deviation of a value, the root of the map's variance [nT]; nan where unknown."""
+    """Median standard deviation of a value [nT]; nan if unknown."""
 
 
 def statistics(field: AnomalyMap) -> tuple[HeadingStatistics, ...]:
-    """The statistics of each heading of a map, in the order of its layers."""
+    """Statistics of each heading of a map, in the order of its layers."""
     found = []
     for h, heading in enumerate(np.degrees(field.headings_rad)):
         valid = field.valid[h]
@@ -66,3 +74,151 @@ def statistics(field: AnomalyMap) -> tuple[HeadingStatistics, ...]:
             )
         )
     return tuple(found)
+
+
+_FILE = re.compile(r"(?P<name>.+?) sha256:(?P<sha256>[0-9a-f]{64})")
+
+_TEXTS = ("method", "frame", "datum", "created", "licence")
+
+
+def map_metadata(field: AnomalyMap, epochs: Sequence[AnomalyMap] = ()) -> Report:
+    """All that is known about a map: statistics, uncertainty, method and source.
+
+    Args:
+        field: The map.
+        epochs: All epochs of the map, from `magtwin.usd.maps.load_epochs`. With two or more, their drift is
+            added.
+
+    Returns:
+        Statistics of the map and of each heading, share of valid nodes, standard deviation, height, the
+        harmonic field and the robot of the survey, drift. The metadata: method with its parameters, frame,
+        datum, day, licence, and source files with checksums. Unknown entries are "unknown".
+    """
+    figures = [*field.report().figures]
+    share = 100 * float(field.valid.mean())
+    figures.append(Figure("valid share", round(share, 2), "%", note="of the nodes, over all headings"))
+    x0, x1, y0, y1 = field.extent
+    dx, dy = field.cell_m
+    figures.append(
+        Figure("extent", f"x {x0:g}..{x1:g}, y {y0:g}..{y1:g}", "m", note=f"cells {dx:g} x {dy:g} m")
+    )
+    figures += [_deviation(field), _height(field), *_headings(field)]
+    if field.harmonic is not None:
+        figures += _harmonic(field.harmonic, "sensor" if field.height_m is None else "floor")
+    if len(epochs) > 1:
+        figures += drift(epochs).figures
+    metadata: dict[str, Any] = {"headings deg": ", ".join(f"{h:.6g}" for h in np.degrees(field.headings_rad))}
+    metadata |= {name: getattr(field, name) or "unknown" for name in _TEXTS}
+    if field.parameters:
+        metadata["parameters"] = dict(field.parameters)
+    files = source_files(field.source)
+    metadata |= {"files": files} if files else {"source": field.source or "unknown"}
+    if len(epochs) > 1:
+        metadata["epochs"] = {m.created: m.source or "source unknown" for m in epochs}
+    return Report(f"map {field.name}", tuple(figures), metadata)
+
+
+def source_files(source: str) -> dict[str, str]:
+    """Source files of a map with their SHA-256, by name; empty if the source has another format.
+
+    Args:
+        source: `AnomalyMap.source`, as "name sha256:hex; name sha256:hex". Different files of one name are
+            numbered: "name (2)".
+    """
+    files: dict[str, str] = {}
+    for part in source.split("; "):
+        found = _FILE.fullmatch(part)
+        if found is None:
+            return {}
+        name, count = found["name"], 1
+        while files.get(name, found["sha256"]) != found["sha256"]:
+            count += 1
+            name = f"{found['name']} ({count})"
+        files[name] = found["sha256"]
+    return files
+
+
+def _headings(field: AnomalyMap) -> list[Figure]:
+    """Mean and standard deviation of each heading, with its range and masked share."""
+    return [
+        Figure(
+            f"heading {one.heading_deg:.6g}",
+            round(one.mean_nt, 1),
+            "nT",
+            round(one.sd_nt, 1),
+            f"{span(one.least_nt, one.greatest_nt, 'nT')}; {100 * one.masked / one.nodes:.3g} % masked",
+        )
+        if one.masked < one.nodes
+        else Figure(f"heading {one.heading_deg:.6g}", "no valid node")
+        for one in statistics(field)
+    ]
+
+
+def _deviation(field: AnomalyMap) -> Figure:
+    known = None if field.variance_nt2 is None else field.variance_nt2[field.valid]
+    if known is None or not known.size:
+        return Figure("standard deviation", "unknown")
+    low, middle, high = np.sqrt(np.percentile(known, (0, 50, 100)))
+    return Figure("standard deviation", float(middle), "nT", note=f"median; from {low:.3g} to {high:.3g} nT")
+
+
+def _height(field: AnomalyMap) -> Figure:
+    if field.height_m is None:
+        return Figure("height", "unknown")
+    return Figure("height", field.height_m, "m", note="of the sensor above the floor")
+
+
+def _harmonic(harmonic: HarmonicField, above: str) -> list[Figure]:
+    """Figures of the sources and of the robot; depths count from `above`."""
+    depths = -harmonic.p_world_dipole[:, 2]
+    below = f"{depths.min():.3g} to {depths.max():.3g} m below the {above}" if len(depths) else ""
+    x, y, z = harmonic.p_base_sensor
+    return [
+        Figure("dipoles", len(depths), note=below),
+        Figure(
+            "uniform field",
+            float(np.linalg.norm(harmonic.b_uniform_nt)),
+            "nT",
+            note=_said(harmonic.b_uniform_nt),
+        ),
+        Figure(
+            "hard iron", float(np.linalg.norm(harmonic.hard_iron_nt)), "nT", note=_said(harmonic.hard_iron_nt)
+        ),
+        Figure(
+            "soft iron",
+            float(np.linalg.norm(harmonic.soft_iron, 2)),
+            "nT/nT",
+            note="greatest part of a field that it adds",
+        ),
+        Figure("sensor", f"({x:.4g}, {y:.4g}, {z:.4g})", "m", note="in base_link"),
+    ]
+
+
+def _said(vector: np.ndarray) -> str:
+    return "(" + ", ".join(f"{c:.5g}" for c in vector) + ")"
+
+
+COLOUR_MAP = "viridis"
+"""Name of the colour map for fields."""
+
+OUTER_PERCENT = 0.5
+"""Share of nodes left out at either end of a colour scale: a few nodes beside a source would flatten the
+rest."""
+
+
+def colour_limits(values: ArrayLike, outer_percent: float = OUTER_PERCENT) -> tuple[float, float]:
+    """Values at the two ends of a colour scale.
+
+    Args:
+        values: Values to show, any shape; those that are not finite are ignored.
+        outer_percent: Share left out at either end [%].
+
+    Returns:
+        Least and greatest of the rest; 0 and 1 if no value is finite.
+    """
+    known = np.asarray(values, float)
+    known = known[np.isfinite(known)]
+    if not known.size:
+        return 0.0, 1.0
+    low, high = np.percentile(known, (outer_percent, 100 - outer_percent))
+    return float(low), float(high)

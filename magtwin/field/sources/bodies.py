@@ -1,4 +1,4 @@
-"""Magnetised bodies: boxes, cylinders, spheres, closed meshes; near by, far away, in the Earth's field."""
+"""Magnetised bodies: boxes, cylinders, spheres, closed meshes; near, far, and in the Earth's field."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.sources.point_dipoles import (
+from magtwin.field.sources.dipoles import (
     MU_0_OVER_4_PI,
     NT_PER_T,
     dipole_block,
@@ -28,28 +28,29 @@ MU_0 = 4 * math.pi * MU_0_OVER_4_PI
 """Magnetic constant [T m/A]."""
 
 TOLERANCE = 1e-4
-"""Error that dipoles which stand for a box or a cylinder are chosen for, over the greatest field that it
-makes at that distance from its box. One in a hundred of random ones exceeds it, none reaches twice that."""
+"""Target error of the dipoles that replace a box or a cylinder, relative to its largest field at that
+distance from its box. One in a hundred random bodies exceeds it, none reaches twice as much."""
 
 MESH_SIZES = 3.0
-"""Longest sides of its box within which a mesh's field is exact; beyond, four dipoles stand for it, within
-0.2 % for meshes that are not far from convex."""
+"""Distance up to which a mesh's field is exact, in its longest side; beyond, four dipoles replace it,
+within 0.2 % for nearly convex meshes."""
 
 MOST_DIPOLES = 512
-"""Dipoles that a box or a cylinder is cut into at most; nearer than they hold, its field is exact."""
+"""Most dipoles that replace a box or a cylinder; nearer than they suffice, its field is exact."""
 
 LADDER, RUNGS = 1.25, 48
-"""Ratio of the distances at which a body is cut anew, and how often it is: to 45,000 times as far."""
+"""Ratio of the distances at which a body gets a new set of dipoles, and their number: up to 45,000 times
+as far."""
 
 CELL_M = 0.25
-"""Side of the cells of space in which one set of dipoles is used [m]."""
+"""Side of the cells of space that share one set of dipoles [m]."""
 
 FARTHEST_CELL = 1 << 19
-"""Cells beyond this one, 130 km from the origin, count as it does."""
+"""Cells beyond this one, 130 km from the origin, use its dipoles."""
 
 STEP_M = 1e-5
-"""Step of the differences that give the rate of change near a body [m]; along an edge of a box 1 cm away they
-err by (1e-5 / 1e-2)^2 / 6, 2e-7 of it."""
+"""Step of the differences for the rate of change near a body [m]. 1 cm from an edge of a box the error is
+(1e-5 / 1e-2)^2 / 6, 2e-7 of it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,13 +61,13 @@ class Body:
     """One of `magtwin.spec.magnetics.SHAPES`."""
 
     size_m: Array
-    """Sides of its box along its own axes [m], shape (3,); a cylinder's axis is its own z."""
+    """Sides of its bounding box along its own axes [m], shape (3,); a cylinder's axis is z."""
 
     p_world: Array
-    """Where its own origin is [m], shape (3,): the middle of all but a mesh."""
+    """Origin of its own axes [m], shape (3,): the centre, except for a mesh."""
 
     q_world_xyzw: Array
-    """Its axes in world, shape (4,)."""
+    """Rotation of its axes in world, shape (4,)."""
 
     magnetization: Array
     """Magnetization in its own axes [A/m], shape (3,)."""
@@ -75,7 +76,7 @@ class Body:
     """Vertices of a mesh in its own axes [m], shape (V, 3)."""
 
     faces: Triangles | None = None
-    """Corners of its triangles, counter-clockwise seen from outside, shape (F, 3)."""
+    """Vertices of its triangles, counter-clockwise seen from outside, shape (F, 3)."""
 
     @property
     def volume_m3(self) -> float:
@@ -89,18 +90,18 @@ class Body:
 
     @cached_property
     def rotation(self) -> Array:
-        """Matrix from its own axes to world's, shape (3, 3)."""
+        """Matrix from its axes to world, shape (3, 3)."""
         return matrix_from_quat(self.q_world_xyzw)
 
     @cached_property
     def middle(self) -> Array:
-        """Middle of its box in its own axes [m], shape (3,)."""
+        """Centre of its bounding box in its own axes [m], shape (3,)."""
         if self.vertices is None:
             return np.zeros(3)
         return np.asarray((self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2)
 
     def exact_field_nt(self, p_world: ArrayLike) -> Array:
-        """Its field everywhere, inside too, by magpylib (Ortner and Coliado Bandeira 2020).
+        """Its exact field, also inside, by magpylib (Ortner and Coliado Bandeira 2020).
 
         Args:
             p_world: Points [m], shape (N, 3).
@@ -113,13 +114,13 @@ class Body:
         return np.asarray(NT_PER_T * field @ self.rotation.T)
 
     def clearance(self, p_world: Array) -> Array:
-        """Distance of points from its box [m], 0 inside, shape (N, 3) -> (N,)."""
+        """Distance of points from its bounding box [m], 0 inside, shape (N, 3) -> (N,)."""
         beyond = np.abs((p_world - self.p_world) @ self.rotation - self.middle) - self.size_m / 2
         return np.asarray(np.sqrt(np.square(np.maximum(beyond, 0)).sum(axis=1)))
 
 
 def _magnet(body: Body) -> Any:
-    """The body in its own frame, as magpylib has it."""
+    """The body in its own axes, as a magpylib object."""
     import magpylib  # its scipy takes 0.3 s
 
     polarization = MU_0 * body.magnetization
@@ -141,9 +142,9 @@ def _magnet(body: Body) -> Any:
 
 
 def mesh_moments(vertices: Array, faces: Triangles) -> tuple[float, Array, Array]:
-    """Volume [m3], centroid [m] (3,) and second moments about it by volume [m2] (3, 3) of a closed mesh.
+    """Volume [m3], centroid [m] (3,) and second moments about it per volume [m2] (3, 3) of a closed mesh.
 
-    Sums over the tetrahedra between a middle point and each triangle (Tonon 2004, for the covariance).
+    Sums over the tetrahedra between a centre and each triangle (Tonon 2004, for the covariance).
     """
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     corner = (vertices - middle)[faces]
@@ -163,20 +164,20 @@ def mesh_moments(vertices: Array, faces: Triangles) -> tuple[float, Array, Array
 
 
 def induced_magnetization(body: Body, susceptibility: float, b_world_nt: ArrayLike) -> Array:
-    """What the Earth's field magnetises a body to.
+    """Magnetization that the Earth's field induces in a body.
 
-    M = chi (1 + chi N)^-1 H, H = B / mu_0, N the demagnetising tensor of the shape. That is exact for a
-    sphere, which is magnetised uniformly. For a box N is the mean over its volume (Aharoni 1998, J. Appl.
-    Phys. 83, 3432), for a cylinder Sato and Ishii's fit of that (1989, J. Appl. Phys. 66, 983), for a mesh
-    that of the box with its second moments. What other bodies add to the Earth's field there is left out.
+    M = chi (1 + chi N)^-1 H, H = B / mu_0, with N the demagnetising tensor of the shape. This is exact for a
+    sphere. For a box N is the mean over its volume (Aharoni 1998, J. Appl. Phys. 83, 3432), for a cylinder
+    Sato and Ishii's fit of it (1989, J. Appl. Phys. 66, 983), for a mesh that of the box with its second
+    moments. The fields of other bodies are neglected.
 
     Args:
-        body: Its shape and turn; its magnetization is not read.
+        body: Shape and rotation; its magnetization is ignored.
         susceptibility: chi [1].
         b_world_nt: The Earth's field in world axes [nT], shape (3,).
 
     Returns:
-        Magnetization in the body's own axes [A/m], shape (3,).
+        Magnetization in the body's axes [A/m], shape (3,).
     """
     h = np.asarray(b_world_nt, float) @ body.rotation / (NT_PER_T * MU_0)
     return np.asarray(susceptibility * np.linalg.solve(np.eye(3) + susceptibility * demagnetising(body), h))
@@ -197,13 +198,13 @@ def demagnetising(body: Body) -> Array:
 
 
 def _of_a_box(size: Array) -> Array:
-    """Demagnetising factors of a box by its sides (Aharoni 1998, eq. 1), shape (3,) -> (3,)."""
+    """Demagnetising factors of a box from its sides (Aharoni 1998, eq. 1), shape (3,) -> (3,)."""
     along = np.array([_along_c(*np.roll(size, -k - 1)) for k in range(3)])
     return along / along.sum()  # the factors sum to 1 but for rounding, which thin plates magnify
 
 
 def _along_c(a: float, b: float, c: float) -> float:
-    """The factor along the side c of a box with sides a, b, c."""
+    """Demagnetising factor along side c of a box with sides a, b, c."""
     a, b, c = (float(side) / max(a, b, c) for side in (a, b, c))
     ab, bc, ca, abc = math.hypot(a, b), math.hypot(b, c), math.hypot(a, c), math.hypot(a, b, c)
     total = (b * b - c * c) / (2 * b * c) * math.log((abc - a) / (abc + a))
@@ -221,9 +222,9 @@ def _along_c(a: float, b: float, c: float) -> float:
 
 @cache
 def _gauss(count: int) -> tuple[Array, Array, Array]:
-    """Nodes in -1..1 and weights, of sum 1, of the Gauss-Legendre rule; and weights for (f'(1) - f'(-1)) / 2.
+    """Gauss-Legendre nodes in -1..1, weights of sum 1, and weights that give (f'(1) - f'(-1)) / 2.
 
-    The latter are the slopes of the polynomial through the nodes, sum_k (2k + 1) / 2 <f, P_k> P_k.
+    The latter are slopes of the polynomial through the nodes, sum_k (2k + 1) / 2 <f, P_k> P_k.
     """
     nodes, weights = np.polynomial.legendre.leggauss(count)
     even = np.arange(0, count, 2)
@@ -233,11 +234,11 @@ def _gauss(count: int) -> tuple[Array, Array, Array]:
 
 
 def _count(half: float, distance: float) -> int:
-    """Nodes that a rule over -half..half needs for the field of what lies `distance` aside.
+    """Nodes that a rule over -half..half needs for a field point at distance `distance` aside.
 
-    One does where the second moment that it leaves out is small. The error of n nodes falls as rho^-2n, with
-    rho = d / a + sqrt(1 + (d / a)^2) the Bernstein ellipse through the nearest singularity (Trefethen 2013,
-    Approximation Theory and Practice, theorem 19.3), and grows as n^3/2 as that of a dipole is steep.
+    One is enough if the neglected second moment is small. The error of n nodes falls as rho^-2n, with rho = d
+    / a + sqrt(1 + (d / a)^2) the Bernstein ellipse through the nearest singularity (Trefethen 2013,
+    Approximation Theory and Practice, theorem 19.3), and grows as n^3/2, since a dipole's field is steep.
     """
     if SECOND * (half / distance) ** 2 <= TOLERANCE:
         return 1
@@ -248,7 +249,8 @@ def _count(half: float, distance: float) -> int:
 
 
 SECOND, AMPLIFIED, FOURTH = 4.0, 60.0, 80.0
-"""Errors over (a / d)^2, (2 n)^3/2 rho^-2n and (b / d)^4, above those measured; a test holds them to it."""
+"""Bounds of the errors over (a / d)^2, (2 n)^3/2 rho^-2n and (b / d)^4, above the measured ones; a test
+checks them."""
 
 
 def _line(half: float, thin: float, distance: float) -> tuple[Array, Array]:
@@ -261,11 +263,11 @@ def _line(half: float, thin: float, distance: float) -> tuple[Array, Array]:
 
 
 def _dipoles_of(body: Body, distance: float) -> tuple[Array, Array]:
-    """Places in the body's axes (K, 3) and shares (K,) of dipoles that stand for it from `distance` on.
+    """Positions in the body's axes (K, 3) and shares (K,) of dipoles that replace it from `distance` on.
 
-    The field's Laplacian is nought, so the second derivative across the thinnest side, c, whose mean over it
-    is c^2 / 6 of that, is less the sum of those along the others: these take it over, and one node does
-    across. A cube is one dipole, a rod a row of them, a plate a sheet, all right to the fourth order in c.
+    The field's Laplacian is 0, so the second derivative across the thinnest side, c, is minus the sum of
+    those along the others. These take over its mean, c^2 / 6 times it, and one node is enough across. A cube
+    is one dipole, a rod a row, a plate a sheet, all correct to fourth order in c.
     """
     half = body.size_m / 2
     if body.shape == "sphere":  # exactly a dipole
@@ -282,7 +284,7 @@ def _dipoles_of(body: Body, distance: float) -> tuple[Array, Array]:
 
 
 def _how_many(body: Body, distance: float) -> int:
-    """How many dipoles `_dipoles_of` gives a box or a cylinder, or some more."""
+    """Number of dipoles from `_dipoles_of` for a box or a cylinder, or slightly more."""
     sides = body.size_m / 2
     counts = [_count(half, distance) for half in sides]
     if body.shape == "cylinder":
@@ -294,12 +296,12 @@ def _how_many(body: Body, distance: float) -> int:
 
 
 def _is_thin(half: float, distance: float) -> bool:
-    """Whether one node does across a side, its second moment taken over by the others."""
+    """Whether one node is enough across a side, with its second moment moved to the others."""
     return FOURTH * (half / distance) ** 4 <= TOLERANCE
 
 
 def _of_a_cylinder(radius: float, half: float, distance: float) -> tuple[Array, Array]:
-    """A rule along the axis, times one in the square of the radius with evenly spaced angles."""
+    """A rule along the axis, times one in the squared radius with evenly spaced angles."""
     disc, part = np.zeros((1, 2)), np.ones(1)
     if _is_thin(radius, distance) and half > radius:  # second moments are half^2 / 3 and radius^2 / 4
         along, share = _line(half, math.sqrt(0.75) * radius, distance)
@@ -317,7 +319,7 @@ def _of_a_cylinder(radius: float, half: float, distance: float) -> tuple[Array, 
 
 
 def _of_a_mesh(vertices: Array, faces: Triangles) -> tuple[Array, Array]:
-    """Two dipoles on either side of the centroid, along each of the two longer axes of its second moments."""
+    """Two dipoles on either side of the centroid along each of the two longer principal axes."""
     _, centroid, second = mesh_moments(vertices, faces)
     spread, axes = np.linalg.eigh(second)
     arms = [math.sqrt(2 * max(spread[k] - spread[0], 0.0)) * axes[:, k] for k in (1, 2)]
@@ -325,7 +327,7 @@ def _of_a_mesh(vertices: Array, faces: Triangles) -> tuple[Array, Array]:
 
 
 class _Cut:
-    """A body and the dipoles that stand for it, finer the nearer they are seen from."""
+    """A body and the dipoles that replace it, finer at shorter distances."""
 
     def __init__(self, body: Body) -> None:
         self.body = body
@@ -340,7 +342,7 @@ class _Cut:
                 self.near, distance = distance, distance / LADDER
 
     def dipoles(self, rung: int) -> tuple[Array, Array]:
-        """Places [m] and moments [A m2] in world that stand for it from near * LADDER^rung of its box on."""
+        """Positions [m] and moments [A m2] in world that replace it from near * LADDER^rung of its box on."""
         if rung not in self._sets:
             places, shares = _dipoles_of(self.body, self.near * LADDER**rung)
             self._sets[rung] = (
@@ -351,10 +353,10 @@ class _Cut:
 
 
 class Bodies:
-    """Magnetised bodies and dipoles, made ready for their field to be asked for.
+    """Magnetised bodies and dipoles, prepared for field computations.
 
-    Near a body its field is exact; farther on it is that of as many dipoles as `TOLERANCE` asks for at that
-    distance, chosen by cells of space: what a point is told depends on its place alone, but for rounding.
+    Near a body its field is exact. Farther away, dipoles replace it, as many as `TOLERANCE` requires at that
+    distance, chosen per cell of space. The result at a point depends on its position only, up to rounding.
     """
 
     def __init__(
@@ -363,7 +365,7 @@ class Bodies:
         p_world_dipole: ArrayLike = (),
         m_world: ArrayLike = (),
     ) -> None:
-        """Take in bodies, and dipoles: places [m] and moments [A m2] in world, each of shape (D, 3)."""
+        """Take bodies, and dipoles as positions [m] and moments [A m2] in world, each of shape (D, 3)."""
         self.bodies = tuple(bodies)
         self._cuts = [_Cut(body) for body in self.bodies if np.any(body.magnetization)]
         self._dipoles = (
@@ -384,7 +386,7 @@ class Bodies:
             p_world: Points [m], shape (..., 3).
 
         Returns:
-            Field in world axes [nT], shape (..., 3); not finite at a dipole itself and where a point is not.
+            Field in world axes [nT], shape (..., 3); not finite at a dipole or if a point is not.
         """
         p = np.asarray(p_world, float)
         if p.ndim == 0 or p.shape[-1] != 3:
@@ -392,10 +394,9 @@ class Bodies:
         return self._evaluate(p.reshape(-1, 3), None)[0].reshape(p.shape)
 
     def field_and_rate_nt(self, p_world: ArrayLike, v_world: ArrayLike) -> tuple[Array, Array]:
-        """Their field at points that move, and how fast it changes there, (v . grad) B.
+        """Their field at moving points, and its rate of change, (v . grad) B.
 
-        The rate is analytic where dipoles stand for a body, and where its field is exact the difference of
-        that over 20 um along the motion.
+        The rate is analytic for dipoles; for exact fields it is a difference over 20 um along the motion.
 
         Args:
             p_world: Points [m], shape (..., 3).
@@ -467,7 +468,7 @@ class Bodies:
     def _work(
         self, p: Array, rows: Rows, centre: Array, exact: list[list[Rows]]
     ) -> list[tuple[Rows, Array, Array]]:
-        """The dipoles to add up for the points of a cell; notes in `exact` who is near which body."""
+        """The dipoles to sum for the points of a cell; adds rows near a body to `exact`."""
         places, moments, close = self._seen_from(centre)
         work = []
         for k in close:
@@ -482,7 +483,7 @@ class Bodies:
 
 
 def _cells(p: Array, known: Rows) -> Iterator[tuple[Rows, Array]]:
-    """The rows of `known` by the cell of space that they lie in, with its centre [m]."""
+    """The rows of `known` grouped by cell of space, with the cell's centre [m]."""
     cell = np.clip(np.floor(p[known] / CELL_M), -FARTHEST_CELL, FARTHEST_CELL - 1).astype(np.int64)
     key = (
         ((cell[:, 0] + FARTHEST_CELL) << 40)
@@ -497,7 +498,7 @@ def _cells(p: Array, known: Rows) -> Iterator[tuple[Rows, Array]]:
 
 
 def _difference(body: Body, p: Array, v: Array) -> Array:
-    """Rate of a body's exact field at moving points [nT/s], by the central difference along the motion."""
+    """Rate of a body's exact field at moving points [nT/s], by central differences along the motion."""
     speed = np.sqrt(np.square(v).sum(axis=1, keepdims=True))
     ahead = STEP_M * np.divide(v, speed, out=np.zeros_like(v), where=speed > 0)
     change = body.exact_field_nt(p + ahead) - body.exact_field_nt(p - ahead)

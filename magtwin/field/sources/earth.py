@@ -1,4 +1,4 @@
-"""The Earth's main field at a place and a day, by the IGRF."""
+"""The Earth's main field at a place and a day, from the IGRF."""
 
 import datetime
 
@@ -21,19 +21,18 @@ def earth_field_nt(
     """The field of the IGRF-14 (Alken et al. 2021 and its 2024 revision), to degree 13, by ppigrf.
 
     Args:
-        latitude_deg: Geodetic latitude [deg], -90 to 90, the poles themselves left out.
-        longitude_deg: Longitude [deg], east of Greenwich.
+        latitude_deg: Geodetic latitude [deg], between -90 and 90, without the poles.
+        longitude_deg: Longitude [deg], positive east of Greenwich.
         height_m: Height above the WGS 84 ellipsoid [m].
-        date: The day, or its name YYYY-MM-DD. Its field is that of its first moment, 00:00 UTC, as tables
-            of the IGRF have it; within a day it changes by some tenths of a nT.
-        north_deg: Where true north lies in world: angle from world +y about world +z, counter-clockwise
-            seen from above [deg].
+        date: The day, or YYYY-MM-DD; its field is that of 00:00 UTC, as in tables of the IGRF. Within a day
+            it changes by some tenths of a nT.
+        north_deg: Angle from world +y to true north about world +z, counter-clockwise seen from above [deg].
 
     Returns:
-        Field in world axes [nT]; with true north along +y these are its east, north and up parts.
+        Field in world axes [nT]; east, north and up if true north is along +y.
 
     Raises:
-        InputError: The day is none, or the model does not reach it; the place is none on Earth.
+        InputError: The day is invalid or outside the model's span, or the place is not on Earth.
     """
     import ppigrf  # its pandas takes 0.3 s
 

@@ -1,4 +1,4 @@
-"""HarmonicField: a magnetic field without curl or divergence, as equivalent dipoles and the Earth make it."""
+"""HarmonicField: a magnetic field without curl or divergence, from equivalent dipoles and the Earth."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.summary import Summarized
 
@@ -25,34 +25,34 @@ SHAPES = {
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class HarmonicField(Summarized):
-    """The field of dipoles below a floor and of the Earth, and the robot that it was surveyed with.
+    """The field of dipoles below a floor and of the Earth, and the robot of the survey.
 
-    B(p) = B_0 + sum of the dipoles' fields has neither curl nor divergence above them, so it is known at
-    every height. What the survey's robot reads at (x, y) with heading yaw is
+    B(p) = B_0 + the dipoles' fields has neither curl nor divergence above them, so it is known at every
+    height. The survey's robot at (x, y) with heading yaw reads
 
         |(1 + S) R(yaw)^T B(p + R(yaw) l) + h|
 
-    with its hard iron h, soft iron S and the sensor's place l in base_link. Arrays are copied at birth and
-    cannot be written to; two fields are equal when every array is.
+    with hard iron h, soft iron S and the sensor at l in base_link. Arrays are copied and read-only. Two
+    fields are equal if every array is.
     """
 
     p_world_dipole: Array
-    """Places of the dipoles [m], shape (D, 3)."""
+    """Dipole positions [m], shape (D, 3)."""
 
     m_world: Array
-    """Their moments [A m^2], shape (D, 3)."""
+    """Dipole moments [A m^2], shape (D, 3)."""
 
     b_uniform_nt: Array
     """Uniform part B_0 in world axes [nT], shape (3,)."""
 
     hard_iron_nt: Array
-    """Permanent field h of the robot, in base_link axes [nT], shape (3,)."""
+    """Hard iron h of the robot, in base_link axes [nT], shape (3,)."""
 
     soft_iron: Array
-    """Induced part S of the robot [nT per nT], shape (3, 3)."""
+    """Soft iron S of the robot [nT per nT], shape (3, 3)."""
 
     p_base_sensor: Array
-    """Place l of the sensor in base_link, its height above the floor as z [m], shape (3,)."""
+    """Position l of the sensor in base_link, with its height above the floor as z [m], shape (3,)."""
 
     def __post_init__(self) -> None:
         for name, shape in SHAPES.items():
@@ -82,7 +82,7 @@ class HarmonicField(Summarized):
         return float(self.p_base_sensor[2])
 
     def field_nt(self, p_world: ArrayLike) -> Array:
-        """The field without the robot, in world axes.
+        """Field without the robot, in world axes.
 
         Args:
             p_world: Points above the dipoles [m], shape (..., 3).
@@ -93,27 +93,27 @@ class HarmonicField(Summarized):
         return dipole_field_nt(p_world, self.p_world_dipole, self.m_world) + self.b_uniform_nt
 
     def field_and_gradient_nt(self, p_world: ArrayLike) -> tuple[Array, Array]:
-        """The field without the robot and how it changes in space, for planners; compiled, for loops.
+        """Field without the robot, and its gradient; compiled.
 
         Args:
             p_world: Points above the dipoles [m], shape (..., 3).
 
         Returns:
-            Field [nT], shape (..., 3), and dB_i/dx_j [nT/m], shape (..., 3, 3), in world axes: symmetric
-            and of trace 0, for the field has neither curl nor divergence.
+            Field [nT], shape (..., 3), and dB_i/dx_j [nT/m], shape (..., 3, 3), in world axes: symmetric and
+            of trace 0.
         """
-        from magtwin.field.sources.dipole_sums import dipole_field_and_gradient_nt
+        from magtwin.field.sources.compiled_dipoles import dipole_field_and_gradient_nt
 
         field, gradient = dipole_field_and_gradient_nt(p_world, self.p_world_dipole, self.m_world)
         return field + self.b_uniform_nt, gradient
 
     def magnitude_nt(self, p_xy: ArrayLike, yaw: ArrayLike, *, height_m: float | None = None) -> Array:
-        """What the survey's robot reads, standing at a pose.
+        """What the survey's robot reads at rest at a pose.
 
         Args:
-            p_xy: Where base_link is, in world [m], shape (..., 2).
+            p_xy: Positions of base_link in world [m], shape (..., 2).
             yaw: Headings [rad], shape (...); the two shapes are broadcast.
-            height_m: Height of the sensor above the floor [m]; the survey's unless given.
+            height_m: Height of the sensor above the floor [m]. Default: the survey's.
 
         Returns:
             Field magnitude [nT], shape (...).
@@ -125,21 +125,21 @@ class HarmonicField(Summarized):
     def magnitude_with_gradient(
         self, p_xy: ArrayLike, yaw: ArrayLike, *, height_m: float | None = None
     ) -> tuple[Array, Array]:
-        """What the survey's robot reads, and what that changes by as it moves and turns.
+        """What the survey's robot reads, and its derivatives by position and heading; compiled.
 
-        With m = (1 + S) R^T B + h, d|m| = m . dm / |m|; in x and y dm = (1 + S) R^T (dB/dx, dB/dy), and in
-        heading (1 + S) (R^T dB (z x R l) - z x R^T B). Compiled, for loops: opening takes half a second.
+        With m = (1 + S) R^T B + h, d|m| = m . dm / |m|. In x and y, dm = (1 + S) R^T (dB/dx, dB/dy); in
+        heading, dm = (1 + S) (R^T dB (z x R l) - z x R^T B).
 
         Args:
-            p_xy: Where base_link is, in world [m], shape (..., 2).
+            p_xy: Positions of base_link in world [m], shape (..., 2).
             yaw: Headings [rad], shape (...); the two shapes are broadcast.
-            height_m: Height of the sensor above the floor [m]; the survey's unless given.
+            height_m: Height of the sensor above the floor [m]. Default: the survey's.
 
         Returns:
-            Field magnitude [nT], that of `magnitude_nt` but for rounding, shape (...), and its derivatives
-            by x, y [nT/m] and yaw [nT/rad], shape (..., 3).
+            Field magnitude [nT], as `magnitude_nt` up to rounding, shape (...), and its derivatives by x, y
+            [nT/m] and yaw [nT/rad], shape (..., 3).
         """
-        from magtwin.field.sources.dipole_sums import dipole_field_and_gradient_nt
+        from magtwin.field.sources.compiled_dipoles import dipole_field_and_gradient_nt
 
         at, turn, place = self._placed(p_xy, yaw, height_m)
         field, change = dipole_field_and_gradient_nt(at, self.p_world_dipole, self.m_world)
@@ -154,7 +154,7 @@ class HarmonicField(Summarized):
         return np.asarray(size), np.stack(slopes, axis=-1)
 
     def _placed(self, p_xy: ArrayLike, yaw: ArrayLike, height_m: float | None) -> tuple[Array, Array, Array]:
-        """Where the sensor is [m], shape (..., 3), its turn, and its way from base_link in world axes."""
+        """Sensor positions [m], shape (..., 3), the rotations, and the lever arms in world axes."""
         p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
         shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
         turn = quat_from_yaw(np.broadcast_to(yaw, shape))
@@ -165,5 +165,5 @@ class HarmonicField(Summarized):
         return at, turn, arm
 
     def _read(self, b_base: Array) -> Array:
-        """The field at the sensor with the robot's part in it, both in base_link axes."""
+        """The field at the sensor including the robot's own, both in base_link axes."""
         return b_base + b_base @ self.soft_iron.T + self.hard_iron_nt

@@ -1,4 +1,4 @@
-"""Bins: readings averaged where they crowd, and how densely a survey was walked."""
+"""Bins: average readings that lie together, and measure how dense a survey is."""
 
 from dataclasses import dataclass
 
@@ -7,25 +7,26 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.survey.readings import Readings
+from magtwin.frames import wrap_angle
 
 Array = NDArray[np.float64]
 
 PROBES = 40_000
-"""Points at which the distance to the nearest reading is asked, for the spacing of a scattered survey."""
+"""Points at which the distance to the nearest reading is measured."""
 
 MEDIAN_OF_GRID = (2 * np.pi) ** -0.5
 """Median distance to the nearest node of a square grid of spacing 1: circles of this radius cover half."""
 
 GRAIN_M = 1e-4
-"""Readings closer than this are at one place, whatever the survey."""
+"""Readings closer than this are at one place."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bins:
-    """Means of readings that share a cell of the floor, a sector of heading and, where wanted, a run."""
+    """Means of readings that share a cell of the floor, a sector of heading and, optionally, a run."""
 
     p_xy: Array
-    """Mean places [m], shape (M, 2)."""
+    """Mean positions [m], shape (M, 2)."""
 
     yaw: Array
     """Mean headings, on the circle [rad], shape (M,)."""
@@ -34,10 +35,10 @@ class Bins:
     """Mean magnitudes [nT], shape (M,)."""
 
     count: NDArray[np.intp]
-    """Readings in each, shape (M,)."""
+    """Readings per bin, shape (M,)."""
 
     run: NDArray[np.intp]
-    """Run that each is of, shape (M,); 0 where runs were not kept apart."""
+    """Run of each bin, shape (M,); 0 if runs are averaged."""
 
 
 def bin_readings(
@@ -48,8 +49,8 @@ def bin_readings(
     Args:
         readings: A survey.
         cell_m: Side of a cell of the floor [m].
-        sectors: Sectors of heading that are kept apart; 1 averages all headings.
-        by_run: Whether runs are kept apart.
+        sectors: Number of heading sectors; 1 averages all headings.
+        by_run: Whether to keep runs apart.
 
     Returns:
         The bins, ordered by run, sector, row and column; and the bin of each good reading, shape (good,).
@@ -69,11 +70,11 @@ def bin_readings(
 
 
 def spacing_m(readings: Readings) -> float:
-    """Distance between the nodes of the square grid that is as dense as a survey.
+    """Spacing of the square grid that is as dense as a survey [m].
 
-    For a gridded survey its own, the shorter of the two. For a scattered one that of the grid whose median
-    distance from a point of the floor to the nearest node is as large as that to the nearest good reading,
-    over the points of the readings' bounding box within its longer side's tenth of any.
+    For a gridded survey the shorter side of its cells. For a scattered one, the spacing at which the median
+    distance from a point to the nearest node equals the measured median distance to the nearest good reading.
+    Points are taken in the bounding box, at most a tenth of its longer side from a reading.
 
     Raises:
         InputError: All good readings are at one place.
@@ -99,5 +100,76 @@ def spacing_m(readings: Readings) -> float:
 
 
 def distance_m(tree: object, p_xy: ArrayLike) -> Array:
-    """Distance from points to the nearest of a tree's [m], shape (...)."""
+    """Distance from points to the nearest point of a cKDTree [m], shape (...)."""
     return np.asarray(tree.query(np.asarray(p_xy, float))[0])  # type: ignore[attr-defined]
+
+
+CELL = 1 / 6
+"""Distance along which readings of a drive are averaged, in depths of the first layer."""
+
+TURN_M = 0.1
+"""Distance that a turn of 1 rad counts as [m]."""
+
+MOST_MEANS = 900
+"""Most means along a drive; the distance grows until there are so few."""
+
+LONGEST = 0.75
+"""Longest averaging distance, in depths of the first layer; beyond, all passes of one place are averaged."""
+
+BIN = 2 / 3
+"""Side of the squares in which passes are averaged, in depths of the first layer."""
+
+SECTORS = 4
+"""Heading sectors kept apart in a square."""
+
+MOST_BINS = 1800
+"""Most means of squares and sectors; the squares grow until there are so few."""
+
+WIDEN = 1.1
+
+
+def means(good: Readings, depth_m: float) -> tuple[NDArray[np.intp], bool]:
+    """Assign each reading to the mean that it belongs to.
+
+    A reading of a gridded survey stands alone. Readings of a drive are averaged along the way. A long drive
+    passes each place often; its readings are averaged by place and heading instead, since longer means along
+    the way would blur the field.
+
+    Args:
+        good: Good readings of a survey.
+        depth_m: Depth of the first layer of dipoles below the sensor [m].
+
+    Returns:
+        Index of each reading's mean, without gaps, shape (N,); and whether consecutive means are consecutive
+        parts of a drive.
+    """
+    if good.node is not None:
+        return np.arange(len(good)), False
+    along = _along(good, CELL * depth_m, LONGEST * depth_m)
+    return (_in_squares(good, BIN * depth_m), False) if along is None else (along, True)
+
+
+def _along(good: Readings, way_m: float, longest_m: float) -> NDArray[np.intp] | None:
+    """Means along the way; None if they would be longer than `longest_m`."""
+    order = np.lexsort((np.arange(len(good)) if good.t is None else good.t, good.run))
+    step = np.linalg.norm(np.diff(good.p_xy[order], axis=0), axis=1)
+    step += TURN_M * np.abs(wrap_angle(np.diff(good.yaw[order])))
+    other = np.diff(good.run[order]) != 0
+    way = np.concatenate([[0.0], np.cumsum(step)])
+    while way_m <= longest_m:
+        stretch = np.floor(way / way_m).astype(np.int64)
+        new = (np.diff(stretch) != 0) | other
+        if np.count_nonzero(new) < MOST_MEANS:
+            cell = np.empty(len(good), np.intp)
+            cell[order] = np.concatenate([[0], np.cumsum(new)])
+            return cell
+        way_m *= WIDEN
+    return None
+
+
+def _in_squares(good: Readings, side_m: float) -> NDArray[np.intp]:
+    while True:
+        bins, cell = bin_readings(good, side_m, sectors=SECTORS)
+        if len(bins.count) <= MOST_BINS:
+            return np.asarray(cell)
+        side_m *= WIDEN

@@ -1,7 +1,7 @@
-"""The comment lines above the rows of a survey's CSV: what a map knows of itself beside its values.
+"""Comment lines above the rows of a survey's CSV: a map's metadata.
 
-A line is `# KEY: VALUE` with the value in JSON. Other programs skip it as a comment. The first line stays
-`# x,y,theta,scalar_mag`, the only one that surveys of others have.
+A line is `# KEY: VALUE` with a JSON value. Other programs skip it as a comment. The first line stays `#
+x,y,theta,scalar_mag`.
 """
 
 import json
@@ -19,27 +19,24 @@ from magtwin.field.maps.map import TEXTS, AnomalyMap
 from magtwin.field.maps.statistics import statistics
 
 KEPT = (*(name for name in TEXTS if name != "source"), "height_m", "parameters")
-"""Fields of a map that an import restores. Its source becomes the files that are imported."""
+"""Fields of a map that an import restores. Its source becomes the imported files."""
 
 MASKED, ERROR = "masked_rows", "median_error_nt"
-"""Rows of a file that are not field, counted from 0; and the median standard deviation of its values [nT]."""
+"""Keys: rows of a file that are not field, counted from 0; median standard deviation of its values [nT]."""
 
 _LINE = re.compile(r"#\s*(\w+):\s*(.*?)\s*$")
 _SAID = 60
 
 
 def header_lines(field: AnomalyMap, heading: int) -> list[str]:
-    """Comment lines of the file of one heading.
+    """Comment lines for the file of one heading: metadata, statistics and masked rows.
 
     Args:
         field: The map.
         heading: Index of the heading.
 
-    Returns:
-        Lines for what the map knows: texts, height, method's figures, spacing, statistics, and masked rows.
-
     Raises:
-        InputError: A figure of the map cannot be written as JSON.
+        InputError: A parameter of the map cannot be written as JSON.
     """
     figures = {name: value for name, value in asdict(statistics(field)[heading]).items() if _known(value)}
     named = {name: getattr(field, name) for name in (*KEPT, "source")}
@@ -57,15 +54,14 @@ def header_lines(field: AnomalyMap, heading: int) -> list[str]:
 
 
 def read_header(path: Path, lines: list[tuple[int, str]]) -> dict[str, Any]:
-    """What the comment lines of a file say, of the keys that an import restores; all others are left out.
+    """Read the comment lines that an import restores; others are ignored.
 
     Args:
-        path: The file, for refusals.
-        lines: Numbers and texts of its comment lines.
+        path: The file, for errors.
+        lines: Line numbers and texts of its comment lines.
 
     Raises:
-        InputError: A value is not JSON, or not what its key is for, or a key comes twice; with file and
-            line.
+        InputError: A value is not JSON, has the wrong type, or its key occurs twice; with file and line.
     """
     told: dict[str, Any] = {}
     for number, line in lines:
@@ -91,7 +87,6 @@ def read_header(path: Path, lines: list[tuple[int, str]]) -> dict[str, Any]:
 
 
 def _fits(key: str, value: Any) -> bool:
-    """Whether a value is of the kind that its key is for."""
     if key in TEXTS:
         return isinstance(value, str)
     if key == "parameters":

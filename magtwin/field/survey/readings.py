@@ -1,4 +1,4 @@
-"""Readings: what a magnetometer said at known poses, the stuff that maps are made of."""
+"""Readings: what a magnetometer measured at known poses, from which maps are made."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -15,70 +15,69 @@ from magtwin.summary import Summarized, Summary, listed, rectangle, span
 Array = NDArray[np.float64]
 
 FARTHEST_M = 1e8
-"""Distance from the origin beyond which a coordinate is none: twice round the Earth [m]."""
+"""Largest coordinate accepted [m]: twice round the Earth."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Readings(Summarized):
-    """Readings of a magnetometer on a robot at known poses, one row each.
+    """Readings of a magnetometer on a robot at known poses, one per row.
 
-    A reading has a magnitude, a vector, or both. Arrays are copied at birth and cannot be written to.
+    A reading has a magnitude, a vector, or both. Arrays are copied and read-only.
     """
 
     p_xy: Array
-    """Where base_link was, world x and y [m], shape (N, 2)."""
+    """Positions of base_link in world [m], shape (N, 2)."""
 
     yaw: Array
-    """Heading of the robot, as recorded [rad], shape (N,)."""
+    """Recorded headings of the robot [rad], shape (N,)."""
 
     b_nt: Array = None  # type: ignore[assignment]
-    """Magnitude of the field [nT], shape (N,); that of `b_body_nt` unless given."""
+    """Field magnitude [nT], shape (N,). Default: that of `b_body_nt`."""
 
     b_body_nt: Array | None = None
-    """Field in the robot's axes, forward, left, up [nT], shape (N, 3); none where only
-    magnitudes are known."""
+    """Field in the robot's axes, forward, left, up [nT], shape (N, 3); None if only magnitudes are known."""
 
     run: NDArray[np.intp] = None  # type: ignore[assignment]
-    """Which of `runs` each row belongs to, shape (N,); all to the first unless given."""
+    """Index into `runs` of each row, shape (N,). Default: 0."""
 
     runs: tuple[str, ...] = ("",)
-    """Names of the runs, or of the files, that the rows come from."""
+    """Names of the runs or files that the rows come from."""
 
     t: Array | None = None
-    """Time of each row in its run [s], shape (N,); none where unknown."""
+    """Time of each row in its run [s], shape (N,); None if unknown."""
 
     good: NDArray[np.bool_] = None  # type: ignore[assignment]
-    """Rows that are field, shape (N,): not latched, not stuck; all of them unless given."""
+    """Rows that are field, not a stuck sensor, shape (N,). Default: all."""
 
     grid: Grid | None = None
-    """Nodes that the survey was to stand on; none where it was not gridded."""
+    """Nodes of a gridded survey; None for a scattered one."""
 
     node: NDArray[np.intp] | None = None
-    """Node of `grid` that each row stands on, heading, row, column, shape (N, 3); given with `grid`."""
+    """Heading, row and column of each row's node, shape (N, 3); given with `grid`."""
 
     height_m: float | None = None
-    """Height of the sensor above the floor [m]; none where unknown."""
+    """Height of the sensor above the floor [m]; None if unknown."""
 
     name: str = ""
-    """What the survey is called."""
+    """Name of the survey."""
 
     source: str = ""
     """Files that the rows come from, with checksums."""
 
     licence: str = ""
-    """SPDX name of the licence that they are under."""
+    """SPDX name of their licence."""
 
     created: str = ""
-    """Day of the survey, YYYY-MM-DD; "" where unknown."""
+    """Day of the survey, YYYY-MM-DD; "" if unknown."""
 
     frame: str = ""
-    """Axes that x, y and heading are in, such as "world: x east, y north, z up"; "" where unknown."""
+    """Axes of x, y and heading, such as "world: x east, y north, z up"; "" if unknown."""
 
     datum: str = ""
-    """Where that frame lies: its origin in the room or on Earth; "" where unknown."""
+    """Origin of that frame in the room or on Earth; "" if unknown."""
 
     earth_nt: tuple[float, float, float] | None = None
-    """The Earth's field in that frame [nT]; none where unknown."""
+    """The Earth's field in that frame [nT]; None if unknown."""
 
     def __post_init__(self) -> None:
         p = np.asarray(self.p_xy, float)
@@ -141,21 +140,14 @@ class Readings(Summarized):
         return len(self.p_xy)
 
     def take(self, rows: ArrayLike) -> "Readings":
-        """Some of the readings.
-
-        Args:
-            rows: Their indices, or flags of shape (N,).
-
-        Returns:
-            Readings with these rows, in that order; all else as here.
-        """
+        """Select readings by their indices, or by flags of shape (N,)."""
         index = np.asarray(rows)
         given = {f.name: getattr(self, f.name) for f in fields(self)}
         some: dict[str, Any] = {k: None if given[k] is None else given[k][index] for k in SHAPES}
         return Readings(**{**given, **some})
 
     def report(self) -> Report:
-        """The figures that tell one survey from another, over its good readings."""
+        """Statistics of the good readings."""
         good = self.take(self.good) if self.good.any() else self
         (x0, y0), (x1, y1) = good.p_xy.min(axis=0), good.p_xy.max(axis=0)
         figures = [
@@ -172,11 +164,10 @@ class Readings(Summarized):
         return Report(f"readings {self.name}", tuple(figures), {k: v for k, v in metadata.items() if v})
 
     def with_(self, **changes: Any) -> "Readings":
-        """The same readings with other values of some fields, such as `good`."""
+        """A copy with other values of some fields, such as `good`."""
         return Readings(**{**{f.name: getattr(self, f.name) for f in fields(self)}, **changes})
 
     def _summary(self) -> Summary:
-        """Name and number; extent; range; runs; day, height and licence."""
         good = self.b_nt[self.good] if self.good.any() else self.b_nt
         (x0, y0), (x1, y1) = self.p_xy.min(axis=0), self.p_xy.max(axis=0)
         bad = len(self) - int(self.good.sum())
@@ -202,14 +193,14 @@ class Readings(Summarized):
 
 
 TAKEN = "taken "
-"""How a part of `source` begins that says what was found by a name or a size."""
+"""Start of a part of `source` that lists what was deduced from names or sizes."""
 
 TEXTS = ("name", "source", "licence", "created", "frame", "datum")
-"""What readings say of themselves in words."""
+"""Metadata that are texts."""
 
 
 def checked_earth_nt(earth_nt: ArrayLike) -> tuple[float, float, float]:
-    """The Earth's field in world axes [nT], refused where it is not three numbers that are not all 0."""
+    """The Earth's field in world axes [nT]; InputError unless it is three finite numbers, not all 0."""
     field = np.asarray(earth_nt, float)
     if field.shape != (3,) or not np.all(np.isfinite(field)) or not np.any(field):
         raise InputError(
@@ -229,4 +220,4 @@ SHAPES: dict[str, tuple[int, type]] = {
     "good": (0, bool),
     "node": (3, np.intp),
 }
-"""Columns of a row's share in each array, 0 for a plain column, and its kind."""
+"""Columns (0 for a plain column) and type of each array of rows."""

@@ -1,28 +1,26 @@
-"""Latched, stuck and outlying readings of a survey, found without being told where.
+"""Find stuck and outlying readings of a survey, without being told where they are.
 
 Three tests, each with its rate of false alarms:
 
-- **Stuck.** A sensor that is stuck gives the same number to the last digit while the robot moves; a
-  field seldom does. Over a way d it stays within the sensor's resolution q by chance with probability
-  q f / d, with f the density at 0 of the field's slopes thereabouts; ways of `REACH_M` count as
-  independent. Of the stretches found one in a hundred is false, and one sound survey in a hundred
-  shows any (Benjamini & Hochberg 1995, at `FALSE_STUCK`).
-- **Latched.** A sensor that lost lock reads about one level wherever it is and however it is turned.
-  Where stretches that are stuck agree on a level, every node (every stretch of a drive) near that
-  level is asked which is likelier: that its readings are the level's, or that they are the field that
-  their neighbours in place and heading, latched ones left out, say they should be. They are masked
-  where the odds for latched, prior included, are 19 to 1 or better (`SURE`), so that of a hundred
-  readings masked fewer than five are field; the report states the expected number. On a drive a
-  stretch that stays within the sensor's noise is also asked whether its neighbours refute it, at
-  `FALSE_FLAT` a survey.
-- **Outlying.** A reading that differs from what the others say more than one in a whole survey does by
-  chance is named, with its size, and left in: it may be iron.
+- **Frozen.** A frozen sensor repeats the same number to the last digit while the robot moves. A field seldom
+  does: over a distance d it stays within the sensor's resolution q by chance with probability q f / d, where
+  f is the density at 0 of the field's slopes nearby; distances of `REACH_M` count as independent. One in a
+  hundred of the stretches found is false, and one sound survey in a hundred shows any (Benjamini & Hochberg
+  1995, at `FALSE_FROZEN`).
+- **Stuck.** A sensor that lost lock reads about one level at any place and heading. If frozen stretches
+  agree on a level, every node (every stretch of a drive) near that level is tested: are its readings more
+  likely to be the level, or the field that its neighbours in place and heading predict? It is masked at odds
+  of 19 to 1 for stuck, prior included (`SURE`), so fewer than five in a hundred masked readings are field;
+  the report gives the expected number. A stretch of a drive that stays within the sensor's noise is also
+  masked if its neighbours refute it, at `FALSE_FLAT` per survey.
+- **Outlying.** A reading that differs from its neighbours' prediction by more than chance allows once per
+  survey is listed with its size, but kept: it may be iron.
 
-Not seen are a sensor that clips on a drive without repeating itself, for its neighbours are clipped as it
-is, and more levels than one.
+Not found: a sensor that clips on a drive without repeating itself, since its neighbours are clipped as well,
+and more than one level.
 
 Chance is Student's t with 4 degrees of freedom about a Gaussian process on the nearest readings
-(`magtwin.field.survey.local`).
+(`magtwin.field.survey.neighbours`).
 """
 
 import itertools
@@ -33,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.field.survey.local import FREEDOM, LEAST, LocalFit, deviation
+from magtwin.field.survey.neighbours import FREEDOM, LEAST, LocalFit, deviation
 from magtwin.field.survey.readings import Readings
 from magtwin.frames import wrap_angle
 from magtwin.report import Figure, Report
@@ -41,59 +39,58 @@ from magtwin.report import Figure, Report
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
-FALSE_STUCK = 0.01
-"""Share of stuck stretches that are false, and of sound surveys that show any."""
+FALSE_FROZEN = 0.01
+"""Share of frozen stretches that are false, and of sound surveys that show any."""
 
 FALSE_FLAT = 0.01
-"""Flat stretches refuted by their neighbours that a drive with a sound sensor is expected to show."""
+"""Expected number of sound flat stretches per survey that are masked."""
 
 SURE = 0.95
-"""Probability from which a reading counts as latched."""
+"""Probability from which a reading counts as stuck."""
 
 REACH_M = 0.1
-"""Distance over which the slope of the field is taken to stay the same."""
+"""Distance over which the field's slope is assumed constant."""
 
 BESIDE = 48
-"""Slopes nearest to a stretch that tell how rough the field is there; those of 0 tell nothing."""
+"""Slopes nearest to a stretch from which the field's roughness is estimated; slopes of 0 do not count."""
 
 WIDTH = 12.0
-"""How far from the level latched readings are looked for, in sds of the stuck stretches' levels."""
+"""Range about the level in which stuck readings are searched, in standard deviations of the level."""
 
 CELL_M = 0.05
-"""Length of a drive whose readings count as one where the field is fitted."""
+"""Length of a drive whose readings are averaged for the fit."""
 
 LEAST_SLOPES = 8
-"""With fewer slopes nothing is known of the field's roughness, and no stretch is called stuck."""
+"""With fewer slopes the roughness is unknown, and no stretch is called frozen."""
 
 FLAT_M = 0.25
-"""Length from which a stretch of a drive without change is suspect."""
+"""Least length of a flat stretch of a drive."""
 
 MOST_TOGETHER = 12
-"""Readings of one place that are asked about together, evenly through it where there are more."""
+"""Most readings of one place that are tested jointly; more are thinned evenly."""
 
 ROUNDS = 4
-"""Rounds in which level, spread and share of latched readings settle."""
+"""Rounds in which level, spread and share of stuck readings converge."""
 
 SPREAD_ROWS = 51
-"""Readings of a drive from which the usual size of a jump is taken."""
+"""Readings of a drive from which the usual size of a jump is estimated."""
 
 NAMED = 20
-"""Outliers that the report names, the largest first."""
+"""Most outliers listed in the report, the largest first."""
 
 
-def mask_latched(readings: Readings) -> tuple[Readings, Report]:
-    """Find the readings that are not field, and take them out of the good ones.
+def mask_stuck(readings: Readings) -> tuple[Readings, Report]:
+    """Find the readings that are not field, and mark them as not good.
 
     Args:
-        readings: A survey; rows that are not `good` already stay so and count for nothing.
+        readings: A survey; rows that are not `good` stay so and are ignored.
 
     Returns:
-        The readings with stuck and latched ones no longer good. And what was found: numbers of stuck
-        and of latched readings, the level, the nodes that are latched at every heading, the expected
-        number of readings masked falsely, outliers with place and size.
+        The readings with frozen and stuck ones no longer good; and the report: counts, the level, nodes stuck
+        at every heading, the expected number masked falsely, outliers with place and size.
     """
-    found = find_latched(readings)
-    good = readings.good & ~found.stuck & ~found.latched
+    found = find_stuck(readings)
+    good = readings.good & ~found.frozen & ~found.stuck
     return readings.with_(good=good), found.report(readings)
 
 
@@ -101,38 +98,38 @@ def mask_latched(readings: Readings) -> tuple[Readings, Report]:
 class Findings:
     """What is wrong with which readings."""
 
-    stuck: NDArray[np.bool_]
+    frozen: NDArray[np.bool_]
     """Repeats to the last digit, shape (N,)."""
 
-    latched: NDArray[np.bool_]
-    """On the level of a sensor that lost lock, shape (N,); a stuck reading may be one as well."""
+    stuck: NDArray[np.bool_]
+    """At the level of a sensor that lost lock, shape (N,); may also be frozen."""
 
     doubt: Array
-    """Probability that a latched reading is field after all, shape (N,); 0 where it is not latched."""
+    """Probability that a stuck reading is field, shape (N,); 0 if it is not stuck."""
 
     outlier: Array
-    """Difference from what the others say [nT], shape (N,); 0 where it is nothing unusual."""
+    """Difference from the neighbours' prediction [nT], shape (N,); 0 if it is not unusual."""
 
     level_nt: float | None
-    """Level at which the sensor latches; none where no stretches agree on one."""
+    """Level of the stuck sensor; None if no stretches agree on one."""
 
     spread_nt: float
-    """Standard deviation of latched readings about the level [nT]."""
+    """Standard deviation of stuck readings about the level [nT]."""
 
     judged: bool
-    """Whether there were readings enough to say what neighbours make likely."""
+    """Whether there were enough readings to compare with neighbours."""
 
     def report(self, readings: Readings) -> Report:
-        """The figures of the findings."""
-        masked = self.stuck | self.latched
+        """Counts, level, doubt and outliers of the findings."""
+        masked = self.frozen | self.stuck
         figures = [
-            Figure("stuck readings", int(self.stuck.sum()), note="repeat to the last digit, robot moving"),
-            Figure("latched readings", int(masked.sum()), note="stuck ones included"),
+            Figure("frozen readings", int(self.frozen.sum()), note="repeat to the last digit, robot moving"),
+            Figure("stuck readings", int(masked.sum()), note="frozen ones included"),
         ]
         metadata: dict[str, object] = {}
         if self.level_nt is not None:
             figures.append(
-                Figure("latch level", round(self.level_nt, 1), "nT", spread=round(self.spread_nt, 1))
+                Figure("stuck level", round(self.level_nt, 1), "nT", spread=round(self.spread_nt, 1))
             )
         if masked.any():
             doubt = float(self.doubt[masked].sum())
@@ -143,14 +140,14 @@ class Findings:
                 at = np.zeros(readings.grid.shape, bool)
                 at[tuple(readings.node[masked].T)] = True
                 every = int(at.all(axis=0).sum())
-                figures.append(Figure("latched nodes", int(at.any(axis=0).sum()), note="at any heading"))
-                figures.append(Figure("latched at every heading", every, "nodes"))
-                metadata["latched"] = {
+                figures.append(Figure("stuck nodes", int(at.any(axis=0).sum()), note="at any heading"))
+                figures.append(Figure("stuck at every heading", every, "nodes"))
+                metadata["stuck"] = {
                     f"{np.degrees(h):g} deg": f"{int(layer.sum())} nodes"
                     for h, layer in zip(readings.grid.headings_rad, at, strict=True)
                 }
             else:
-                metadata["latched"] = {
+                metadata["stuck"] = {
                     readings.runs[r] or f"run {r}": f"{int(masked[readings.run == r].sum())} readings"
                     for r in np.unique(readings.run[masked])
                 }
@@ -161,48 +158,48 @@ class Findings:
         if len(outliers):
             first = outliers[np.argsort(-np.abs(self.outlier[outliers]), kind="stable")][:NAMED]
             metadata["outliers"] = [_say(readings, int(row), float(self.outlier[row])) for row in first]
-        return Report(f"latched and outlying readings of {readings.name}", tuple(figures), metadata)
+        return Report(f"stuck and outlying readings of {readings.name}", tuple(figures), metadata)
 
 
-def find_latched(readings: Readings) -> Findings:
-    """What `mask_latched` masks and reports, as flags of rows."""
+def find_stuck(readings: Readings) -> Findings:
+    """Findings of `mask_stuck`, as flags of rows."""
     count, b = len(readings), readings.b_nt
-    stretches = _stuck(readings)
-    stuck = np.zeros(count, bool)
+    stretches = _frozen(readings)
+    frozen = np.zeros(count, bool)
     for rows in stretches:
-        stuck[rows] = True
-    latched, doubt, outlier = np.zeros(count, bool), np.zeros(count), np.zeros(count)
+        frozen[rows] = True
+    stuck, doubt, outlier = np.zeros(count, bool), np.zeros(count), np.zeros(count)
     level, spread = _level(np.unique([b[rows[0]] for rows in stretches]), b[readings.good])
-    sound = readings.good & ~stuck
+    sound = readings.good & ~frozen
     cells, cell = _cells(readings)
     near_level = np.zeros(count, bool) if level is None else np.abs(b - level) <= WIDTH * spread
     flats = _flats(readings, sound & ~near_level) if readings.grid is None else []
-    suspect = readings.good & (stuck | near_level)
+    suspect = readings.good & (frozen | near_level)
     for rows in flats:
         suspect[rows] = True
     pool = np.flatnonzero(np.bincount(cell, suspect | ~readings.good, len(cells)) == 0)
     if len(pool) < LEAST or np.ptp(cells.b_nt[pool]) == 0:
-        return Findings(stuck, latched, doubt, outlier, level, spread, judged=False)
+        return Findings(frozen, stuck, doubt, outlier, level, spread, judged=False)
     fit = LocalFit.to(cells, pool)
     for rows in _refuted(flats, cell, fit, pool):
-        latched[rows] = True
+        stuck[rows] = True
         doubt[rows] = FALSE_FLAT / len(flats)
     if level is not None:
         places = _places(readings, near_level & readings.good)
         held = [np.unique(cell[rows]) for rows in places]
-        known = np.array([bool(stuck[rows].any()) for rows in places])
+        known = np.array([bool(frozen[rows].any()) for rows in places])
         sure, level, spread = _odds(cells, held, known, fit, pool, level, spread)
         for rows, probability in zip(places, sure, strict=True):
             if probability >= SURE:
-                latched[rows] = True
+                stuck[rows] = True
                 doubt[rows] = 1 - probability
-    kept = np.bincount(cell, latched | stuck | ~readings.good, len(cells)) == 0
+    kept = np.bincount(cell, stuck | frozen | ~readings.good, len(cells)) == 0
     outlier = _outliers(readings, cells, cell, fit, np.flatnonzero(kept))
-    return Findings(stuck, latched, doubt, outlier, level, spread, judged=True)
+    return Findings(frozen, stuck, doubt, outlier, level, spread, judged=True)
 
 
 def _sequences(readings: Readings) -> list[Rows]:
-    """Good rows in the orders in which neighbours follow each other: rows and columns of nodes, or runs."""
+    """Good rows in orders in which neighbours follow each other: rows and columns of nodes, or runs."""
     good = np.flatnonzero(readings.good)
     if readings.node is None:
         clock = np.zeros(len(readings)) if readings.t is None else readings.t
@@ -219,14 +216,14 @@ def _sequences(readings: Readings) -> list[Rows]:
 
 
 def _moved(readings: Readings, rows: Rows) -> Array:
-    """How far the sensor came from one row to the next [m]; a radian counts as `REACH_M`."""
+    """Distance from one row to the next [m]; a radian counts as `REACH_M`."""
     way = np.diff(readings.p_xy[rows], axis=0)
     turn = wrap_angle(np.diff(readings.yaw[rows]))
     return np.asarray(np.hypot(way[:, 0], way[:, 1]) + REACH_M * np.abs(turn))
 
 
-def _stuck(readings: Readings) -> list[Rows]:
-    """Rows of each stretch that repeats to the last digit too long for chance."""
+def _frozen(readings: Readings) -> list[Rows]:
+    """Rows of each stretch that repeats to the last digit for longer than chance allows."""
     b = readings.b_nt
     gaps = np.diff(np.unique(b[readings.good]))
     sequences = _sequences(readings)
@@ -255,13 +252,13 @@ def _stuck(readings: Readings) -> list[Rows]:
             found.append((trials * np.log(min(1.0, chance)), held))
     found.sort(key=lambda one: one[0])
     tests = sum(len(rows) - 1 for rows in sequences)
-    allowed = np.log(FALSE_STUCK / max(tests, 1) * np.arange(1, len(found) + 1))
+    allowed = np.log(FALSE_FROZEN / max(tests, 1) * np.arange(1, len(found) + 1))
     passed = [k for k, (chance, _) in enumerate(found) if chance <= allowed[k]]
     return [held for _, held in found[: passed[-1] + 1]] if passed else []
 
 
 def _slopes(readings: Readings, sequences: list[Rows]) -> tuple[Array, Array]:
-    """Places (N, 2) and sizes [nT/m] of the field's slopes along the way, over `REACH_M` or more."""
+    """Places (N, 2) and sizes [nT/m] of the field's slopes along the way, over at least `REACH_M`."""
     places, slopes = [], []
     for rows in sequences:
         moved = _moved(readings, rows)
@@ -278,13 +275,13 @@ def _slopes(readings: Readings, sequences: list[Rows]) -> tuple[Array, Array]:
 
 
 def _stretches(flags: NDArray[np.bool_]) -> list[slice]:
-    """Where flags are true without a break."""
+    """Slices in which flags are true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def _level(levels: Array, b_nt: Array) -> tuple[float | None, float]:
-    """Level that stuck stretches agree on, and its spread [nT]; three of them at least have to."""
+    """Level on which at least three frozen stretches agree, and its spread [nT]; None if there is none."""
     if len(levels) < 3:
         return None, 0.0
     spread = deviation(levels)
@@ -295,7 +292,7 @@ def _level(levels: Array, b_nt: Array) -> tuple[float | None, float]:
 
 
 def _cells(readings: Readings) -> tuple[Readings, Rows]:
-    """The survey with the rows of `CELL_M` of a drive as one reading, their median; and each row's cell."""
+    """The survey with each `CELL_M` of a drive as one reading, its median; and the cell of each row."""
     if readings.node is not None:
         return readings, np.arange(len(readings))
     cell = np.empty(len(readings), np.intp)
@@ -320,12 +317,12 @@ def _cells(readings: Readings) -> tuple[Readings, Rows]:
 
 
 def _driven(readings: Readings, rows: Rows) -> list[Rows]:
-    """The parts of a sequence without a jump: from one to the next the field is like itself."""
+    """Parts of a sequence without a jump."""
     return np.split(rows, np.flatnonzero(_moved(readings, rows) > REACH_M) + 1)
 
 
 def _flats(readings: Readings, sound: NDArray[np.bool_]) -> list[Rows]:
-    """Stretches of a drive that stay within the sensor's noise over `FLAT_M` or more."""
+    """Stretches of a drive that stay within the sensor's noise for `FLAT_M` or more."""
     flats = []
     drives = (_driven(readings, rows) for rows in _sequences(readings.with_(good=sound)))
     for rows in itertools.chain.from_iterable(drives):
@@ -348,7 +345,7 @@ def _flats(readings: Readings, sound: NDArray[np.bool_]) -> list[Rows]:
 
 
 def _refuted(flats: list[Rows], cell: Rows, fit: LocalFit, pool: Rows) -> list[Rows]:
-    """The flat stretches that their neighbours refute."""
+    """Flat stretches that their neighbours refute."""
     from scipy.special import fdtrc
 
     refuted = []
@@ -364,7 +361,7 @@ def _refuted(flats: list[Rows], cell: Rows, fit: LocalFit, pool: Rows) -> list[R
 
 
 def _places(readings: Readings, rows: NDArray[np.bool_]) -> list[Rows]:
-    """Rows that stand or fall together: those at one node, or without a break on a drive."""
+    """Groups of rows that are tested together: those at one node, or consecutive ones of a drive."""
     if readings.node is not None:
         index = np.flatnonzero(rows)
         place = readings.node[index, 1] * (readings.node[:, 2].max() + 1) + readings.node[index, 2]
@@ -382,11 +379,11 @@ def _odds(
     level: float,
     spread: float,
 ) -> tuple[Array, float, float]:
-    """Probability that each place is latched, and the level and its spread that follow.
+    """Probability that each place is stuck, with the level and its spread.
 
-    Bayes' rule between two densities of a place's readings: Student's t about the level, and about
-    what the neighbours say, with the share of latched cells as the prior. Share, level and spread
-    are those that the answers give (empirical Bayes), found in `ROUNDS` rounds from the stuck ones.
+    Bayes' rule between two densities of a place's readings: Student's t about the level, and about the
+    neighbours' prediction, with the share of stuck cells as the prior. Share, level and spread are updated
+    from the result (empirical Bayes) in `ROUNDS` rounds, starting from the frozen readings.
     """
     held = [_thinned(cell) for cell in places]
     field = np.array([_log_t(*fit.together(cell, pool)) for cell in held])
@@ -394,10 +391,10 @@ def _odds(
     for _ in range(ROUNDS):
         share = sum(p * len(cell) for p, cell in zip(sure, places, strict=True)) / len(cells)
         share = min(max(share, 1 / len(cells)), 0.5)
-        latched = [
+        stuck = [
             float(np.sum(_log_t1((cells.b_nt[cell] - level) / spread) - np.log(spread))) for cell in held
         ]
-        odds = np.log(share / (1 - share)) + np.array(latched) - field
+        odds = np.log(share / (1 - share)) + np.array(stuck) - field
         sure = 1 / (1 + np.exp(-np.clip(odds, -500, 500)))
         on_level = np.concatenate([cells.b_nt[cell] for p, cell in zip(sure, held, strict=True) if p >= SURE])
         if len(on_level) >= 3:
@@ -406,13 +403,13 @@ def _odds(
 
 
 def _thinned(rows: Rows) -> Rows:
-    """At most `MOST_TOGETHER` of the rows, evenly through them."""
+    """At most `MOST_TOGETHER` of the rows, evenly spaced."""
     picked = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_TOGETHER)).astype(np.intp))
     return rows[picked]
 
 
 def _log_t(residual: Array, covariance: Array) -> float:
-    """Logarithm of the multivariate t density (Kotz & Nadarajah 2004, eq. 1.1) with `FREEDOM`."""
+    """Logarithm of the multivariate t density with `FREEDOM` (Kotz & Nadarajah 2004, eq. 1.1)."""
     count = len(residual)
     size = residual @ np.linalg.solve(covariance, residual)
     constant = lgamma((FREEDOM + count) / 2) - lgamma(FREEDOM / 2) - count / 2 * np.log(FREEDOM * np.pi)
@@ -421,13 +418,13 @@ def _log_t(residual: Array, covariance: Array) -> float:
 
 
 def _log_t1(z: Array) -> Array:
-    """Logarithm of the t density of each of `z`."""
+    """Logarithm of the univariate t density."""
     constant = lgamma((FREEDOM + 1) / 2) - lgamma(FREEDOM / 2) - np.log(FREEDOM * np.pi) / 2
     return np.asarray(constant - (FREEDOM + 1) / 2 * np.log1p(z**2 / FREEDOM))
 
 
 def _outliers(readings: Readings, cells: Readings, cell: Rows, fit: LocalFit, pool: Rows) -> Array:
-    """Difference of each outlying reading from what the others say [nT], shape (N,); 0 for all others."""
+    """Difference of each outlier from its neighbours' prediction [nT], shape (N,); 0 for other readings."""
     from scipy.special import stdtrit
 
     outlier = np.zeros(len(readings))
@@ -445,10 +442,10 @@ def _outliers(readings: Readings, cells: Readings, cell: Rows, fit: LocalFit, po
 
 
 def _spikes(b: Array) -> Array:
-    """Difference of each spike of a drive from the mean of the readings beside it [nT], 0 for all others.
+    """Difference of each spike of a drive from the mean of its two neighbours [nT]; 0 for other readings.
 
-    Hampel's filter: the scale is the median of such differences over `SPREAD_ROWS`, for they grow with
-    speed and with the field's curvature. Of two side by side the larger is the spike.
+    Hampel's filter: the scale is the median difference over `SPREAD_ROWS`, since differences grow with speed
+    and with the field's curvature. Of two adjacent spikes the larger counts.
     """
     from scipy.ndimage import maximum_filter1d, median_filter
     from scipy.special import stdtrit
@@ -468,7 +465,7 @@ def _spikes(b: Array) -> Array:
 
 
 def _say(readings: Readings, row: int, off_nt: float) -> str:
-    """Where an outlier is and how far it is off."""
+    """Place and size of an outlier, as text."""
     x, y = readings.p_xy[row]
     run = readings.runs[readings.run[row]]
     return (

@@ -1,4 +1,4 @@
-"""Rerun: a Run, or several to compare, as a recording with a ready layout, and back."""
+"""File: a Run, or several to compare, as a Rerun recording with a layout, and back."""
 
 import os
 import struct
@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 from rerun.chunk import RrdReader
@@ -14,20 +15,11 @@ from rerun.chunk import RrdReader
 from magtwin.errors import InputError
 from magtwin.files import existing, output
 from magtwin.io.recorder import PARTIAL
-from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, layout, plotted
-from magtwin.io.rerun.recording import (
-    ROOM,
-    Recording,
-    content_id,
-    metadata_page,
-    send_properties,
-    size_of,
-    stream,
-    title_of,
-)
+from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted
+from magtwin.io.rerun.recording import ROOM, Recording, content_id, recording_of, size_of, stream, title_of
 from magtwin.io.rerun.series import COLUMNS_ENTITY, entity_of, table_of
 from magtwin.io.rerun.viewer import check_decodes, show
-from magtwin.io.rerun.world import Interior, Room, heading_of
+from magtwin.io.rerun.world import Interior, Robot, heading_of, send_room
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
@@ -43,41 +35,33 @@ def write_rrd(
     scans: Scans | None = None,
     force: bool = False,
 ) -> None:
-    """Write a run as a Rerun recording that opens in a ready layout.
+    """Write a run as a Rerun recording with a layout.
 
-    Every column is in it at full rate and to the bit, on the timeline `sim_time`; poses are drawn at 50 Hz
-    or less. The recording's id comes from the run's content, so two files of one run hold the same
-    recording; only what Rerun stamps itself varies between them (ids of chunks, rows and views), which
-    `rerun rrd compare --unordered` does not look at.
+    Every column is stored exactly and at full rate on the timeline `sim_time`; poses are drawn at 50 Hz at
+    most. The recording's id comes from the run's content, so two files of one run hold the same recording.
+    Only Rerun's own ids of chunks, rows and views differ, which `rerun rrd compare --unordered` ignores.
 
     Args:
-        run: What happened.
+        run: The run.
         path: The .rrd file to make.
-        twin: What it happened in: its stage and its map are shown. Without it there are series only.
-        planned: The path that was to be driven; none where there was none.
-        scans: What the LiDAR saw, drawn as points in world; none draws none.
-        force: Whether a file that exists is replaced.
+        twin: Where the run took place: its stage and its map are shown. None: only series.
+        planned: The planned path, or None.
+        scans: LiDAR scans, drawn as points in world, or None.
+        force: Whether to replace an existing file.
 
     Raises:
         InputError: The file exists and `force` was not given or it cannot be written, the stage cannot be
             read, or the run has no rows.
     """
     _check_rows(run, path)
-    lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, run))
-    interior = None if twin is None else Interior.of(twin)
-    room = ROOM + size_of(run, scans) + (interior.size if interior else 0)
-    views = layout(run, lab, heading=heading)
-    name = title_of(run) or FilePath(path).stem
+    name, size = title_of(run) or FilePath(path).stem, size_of(run, scans)
+    shown: dict[str, Any] = {"planned": planned, "scans": scans}
     with (
         output(path, force=force) as aside,
-        stream(content_id(run), name, views, file=aside, said=FilePath(path), room=room) as rec,
+        recording_of(
+            run, content_id(run), name, twin, **shown, room=size, file=aside, final=FilePath(path)
+        ) as recording,
     ):
-        send_properties(rec, run.metadata)
-        rec.log("metadata", metadata_page(run.metadata, run.rows), static=True)
-        robot = None
-        if interior is not None:
-            robot = Room.enter(rec, interior, run, planned=planned).robot()
-        recording = Recording(rec, robot=robot, scans=scans)
         recording.append(run)
         recording.close()
 
@@ -91,80 +75,92 @@ def write_comparison(
     planned: Path | None = None,
     force: bool = False,
 ) -> None:
-    """Write several runs into one recording, on a common timeline, each in a colour of its own.
+    """Write several runs into one recording, on a common timeline, each in its own colour.
 
     Args:
-        runs: Runs by the names that they are to have.
+        runs: The runs by name.
         path: The .rrd file to make.
-        twin: What they happened in; without it there are series only.
-        offsets_s: What to add to the times of some of them [s], by name.
-        planned: The path that was to be driven.
-        force: Whether a file that exists is replaced.
+        twin: Where they took place. None: only series.
+        offsets_s: Offsets added to the times of some of them [s], by name.
+        planned: The planned path, or None.
+        force: Whether to replace an existing file.
 
     Raises:
-        InputError: There is no run or one has no rows, two names would be one in Rerun, an offset is of
-            no run or not finite, or the file cannot be made as in `write_rrd`.
+        InputError: There is no run or one has no rows, two names are the same to Rerun, an offset is not
+            finite or names no run, or the file cannot be made as in `write_rrd`.
     """
     if not runs:
         raise InputError(f"{path}: there are no runs to compare; name at least one")
     for run in runs.values():
         _check_rows(run, path)
-    if len({entity_of("", name) for name in runs}) < len(runs) or not all(
-        entity_of("", name) for name in runs
-    ):
+    entities = {entity_of("", name) for name in runs}
+    if len(entities) < len(runs) or "" in entities:
         raise InputError(f"{path}: runs that are compared need names that differ, got {', '.join(runs)}")
     offsets = dict(offsets_s or {})
     for name, offset in offsets.items():
         if name not in runs or not np.isfinite(offset):
             raise InputError(
-                f"{path}: the offset {offset!r} s of {name!r} is not a finite one of a run; "
+                f"{path}: the offset {offset!r} s of {name!r} must be finite and of a run; "
                 f"runs are {', '.join(runs)}"
             )
-    shown = [
+    compared = [
         Shown.of(
-            run,
-            name=name,
-            offset_s=float(offsets.get(name, 0.0)),
-            colour=RUN_COLOURS[number % len(RUN_COLOURS)],
+            run, name=name, offset_s=float(offsets.get(name, 0.0)), colour=RUN_COLOURS[k % len(RUN_COLOURS)]
         )
-        for number, (name, run) in enumerate(runs.items())
+        for k, (name, run) in enumerate(runs.items())
     ]
     first = next(iter(runs.values()))
     lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, first))
-    interior = None if twin is None else Interior.of(twin)
-    size = sum(map(size_of, runs.values())) + (interior.size if interior else 0)
+    size = ROOM + sum(map(size_of, runs.values()))
+    if twin is not None:
+        interior = Interior.of(twin.scene, twin.scene_file)
+        size += interior.size(twin.field)
     title = " and ".join(runs) if len(runs) < 4 else f"{len(runs)} runs"
+    views = comparison_layout(compared, lab, heading=heading)
     with (
         output(path, force=force) as aside,
-        stream(
-            content_id(*runs.values()),
-            title,
-            comparison_layout(shown, lab, heading=heading),
-            file=aside,
-            said=FilePath(path),
-            room=ROOM + size,
-        ) as rec,
+        stream(content_id(*runs.values()), title, views, file=aside, final=FilePath(path), room=size) as rec,
     ):
-        room = None if interior is None else Room.enter(rec, interior, first, planned=planned)
-        for one in shown:
-            robot = None
-            if room is not None:
-                robot = room.one_of_several(one.name, one.colour, one.offset_s)
-            recording = Recording(rec, one.name, one.offset_s, robot)
-            recording.append(runs[one.name])
+        if twin is not None:
+            send_room(rec, interior, twin.field, first, planned)
+        for shown in compared:
+            look: dict[str, Any] = {"name": shown.name, "offset_s": shown.offset_s}
+            robot = None if twin is None else Robot(rec, interior, colour=shown.colour, **look)
+            recording = Recording(rec, robot=robot, **look)
+            recording.append(runs[shown.name])
             recording.close()
 
 
-def read_run(path: str | os.PathLike[str]) -> Run:
-    """The run that a recording holds, equal to the bit to the one that was written.
+def show_run(run: Run, twin: Twin | None = None, *, file: str | os.PathLike[str]) -> None:
+    """Show a run in the Rerun viewer; returns when the viewer is closed.
 
-    A recording that was never finished, as its name `.partial.rrd` tells, is read as far as it goes.
+    Args:
+        run: The run.
+        twin: Where it took place. None: only series.
+        file: The file that the run was read from; errors and the window name it.
+
+    Raises:
+        InputError: The run has no rows or, without a twin, nothing to plot; or the viewer cannot run here.
+    """
+    _check_rows(run, file)
+    if twin is None and not plotted(run):
+        raise InputError(f"{file}: holds none of the columns that are plotted, such as b_total_nt")
+    with tempfile.TemporaryDirectory() as folder:
+        rrd = FilePath(folder) / f"{FilePath(file).stem}.rrd"
+        write_rrd(run, rrd, twin)
+        show(rrd, source=file)
+
+
+def read_run(path: str | os.PathLike[str]) -> Run:
+    """The run of a recording, equal to the written one to the bit.
+
+    Of an unfinished recording, whose name ends in `.partial.rrd`, the rows so far are read.
 
     Args:
         path: The .rrd file.
 
     Raises:
-        InputError: The file is missing, is no recording, was cut short, or holds no run or several.
+        InputError: The file is missing, is not a recording, was cut short, or holds no run or several.
     """
     runs = read_runs(path)
     if len(runs) > 1:
@@ -176,7 +172,7 @@ def read_run(path: str | os.PathLike[str]) -> Run:
 
 
 def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
-    """The runs that a recording holds, by name; a run that is alone is called "run".
+    """The runs of a recording by name; a single run is called "run".
 
     Args:
         path: The .rrd file.
@@ -190,15 +186,15 @@ def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
     partial = PARTIAL in path.suffixes
     chunks: dict[str, list] = {}
     with _readable(path, partial=partial) as file, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that a file without an end has none
+        warnings.simplefilter("ignore")  # an unfinished file has no end
         check_decodes(file, path)
         try:
-            found = RrdReader(file).stream().filter(content=f"/{COLUMNS_ENTITY}/**").to_chunks()
-            for chunk in found:
+            for chunk in RrdReader(file).stream().filter(content=f"/{COLUMNS_ENTITY}/**").to_chunks():
                 chunks.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
         except (RuntimeError, ValueError, OSError) as error:
+            reason = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {file}: ")
             raise InputError(
-                f"{path}: not a Rerun recording that can be read ({_first_line(error, file)}); write it again"
+                f"{path}: not a Rerun recording that can be read ({reason}); write it again"
             ) from error
     if not chunks:
         raise InputError(
@@ -221,12 +217,9 @@ def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
 
 @contextmanager
 def _readable(path: FilePath, *, partial: bool) -> Iterator[FilePath]:
-    """A file that Rerun can read: of one that broke off in the middle of a message, what comes before."""
-    if not partial:
-        yield path
-        return
-    end = _whole_messages(path)
-    if end == path.stat().st_size:
+    """A file that Rerun can read; of a partial one, a copy without its last, incomplete message."""
+    end = _whole_messages(path) if partial else None
+    if end is None or end == path.stat().st_size:
         yield path
         return
     with tempfile.TemporaryDirectory() as folder, open(path, "rb") as source:
@@ -239,7 +232,7 @@ def _readable(path: FilePath, *, partial: bool) -> Iterator[FilePath]:
 
 
 def _whole_messages(path: FilePath) -> int:
-    """Bytes up to the end of the last whole message: a header of 12, then of each kind, length and body."""
+    """End of the last complete message [bytes]: a header of 12, then messages of kind, length and body."""
     size, at = path.stat().st_size, 12
     with open(path, "rb") as file:
         while at + 16 <= size:
@@ -249,37 +242,6 @@ def _whole_messages(path: FilePath) -> int:
                 break
             at += 16 + length
     return min(at, size)
-
-
-def _first_line(error: Exception, file: FilePath) -> str:
-    """What Rerun says, without the name of the file and what it knows of its own insides."""
-    text = str(error).splitlines()[0]
-    return text.removeprefix(f"Failed to read RRD file at {file}: ")
-
-
-def view(path: str | os.PathLike[str]) -> None:
-    """Show a recording in the Rerun viewer, and return when it is closed.
-
-    Args:
-        path: A .rrd file, or any file of a run, whose series are then shown.
-
-    Raises:
-        InputError: The file is missing, holds no run, or the viewer cannot run here.
-    """
-    from magtwin.io.formats import read_run as read_any
-
-    path = existing(path, "recording")
-    if path.suffix == ".rrd":
-        show(path)
-        return
-    run = read_any(path)
-    _check_rows(run, path)
-    if not plotted(run):
-        raise InputError(f"{path}: holds none of the columns that are plotted, such as b_total_nt")
-    with tempfile.TemporaryDirectory() as folder:
-        rrd = FilePath(folder) / f"{path.stem}.rrd"
-        write_rrd(run, rrd)
-        show(rrd, shown=path)
 
 
 def _check_rows(run: Run, path: str | os.PathLike[str]) -> None:

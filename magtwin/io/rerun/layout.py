@@ -1,4 +1,4 @@
-"""Layout: which plots and views a recording opens with, and what they show."""
+"""Layout: the plots and views of a recording."""
 
 import math
 from collections.abc import Sequence
@@ -27,16 +27,16 @@ from magtwin.spec.lab import LabSpec
 Array = NDArray[np.float64]
 
 _ROOM = 0.08
-"""Room beyond the values and the ticks of an axis, as a share of the values' range."""
+"""Room beyond the values and the ticks of an axis, as a share of the range of the values."""
 
 _LEGEND_ROW, _LEGEND_MOST = 0.1, 0.65
-"""Height of a legend's row, as a share of the tall first plot, and the most that a legend may take."""
+"""Height of a row of a legend, as a share of the tall first plot, and greatest height of a legend."""
 
 _LEGEND_WIDTH, _LEGEND_LETTER = 0.07, 0.01
-"""Width of a legend without text, and of a letter, as shares of a plot's."""
+"""Width of a legend without text, and of a letter, as shares of the width of a plot."""
 
 _LOOKED_AT = 4000
-"""Readings of a series by which its legend is placed."""
+"""Readings of a series that are used to place a legend."""
 
 Colour = tuple[int, int, int]
 
@@ -50,7 +50,7 @@ RUN_COLOURS: tuple[Colour, ...] = (
     (80, 210, 214),
     (240, 98, 82),
 )
-"""Colours of runs that are compared, over again where there are more."""
+"""Colours of runs that are compared; repeated for more runs."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,10 @@ class Series:
     name: str
     colour: Colour
     part: str = ""
-    """Name of the part, such as x, of a column that has several."""
+    """Name of the part, such as x, of a vector column."""
+
     width: float = 1.5
-    """Width of the line [points]; wide ones stand under narrow ones that they would hide."""
+    """Width of the line [points]. Wide lines are drawn below narrow ones."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,7 @@ PANELS = (
     TILT_PANEL,
     *BATTERY_PANELS,
 )
-"""Every plot of the recording; series that a run has not got, or that are nan throughout, are left out."""
+"""Every plot of a recording. Series that a run lacks, or that are all nan, are left out."""
 
 _COMPARED = (
     ("Total field [nT]", "b_total_nt", ""),
@@ -151,7 +152,7 @@ _COMPARED = (
     ("Heading [rad]", "yaw", ""),
     ("Battery voltage [V]", "battery_v", ""),
 )
-"""Plots of runs that are compared: title, column, part; a line a run."""
+"""Plots of runs that are compared: title, column, part; one line per run."""
 
 
 @dataclass(frozen=True)
@@ -159,23 +160,23 @@ class Shown:
     """A run whose series are plotted."""
 
     run: Run
-    """Its columns, with those that are derived for the plots."""
+    """Its columns, and those derived for the plots."""
 
     name: str = ""
-    """What it is called among others; "" where it is alone."""
+    """Its name among several runs; "" for a single run."""
 
     offset_s: float = 0.0
-    """What is added to its times [s]."""
+    """Offset added to its times [s]."""
 
     colour: Colour = _ORANGE
 
     @classmethod
     def of(cls, run: Run, **rest: Any) -> "Shown":
-        """A run, with what is derived from it."""
+        """A run with its derived columns."""
         return cls(run.with_columns(**derived(run)), **rest)
 
     def values(self, series: Series) -> Array | None:
-        """What a series shows, shape (N,); none where the run has nothing of it."""
+        """Values of a series, shape (N,); None if the run has none."""
         column = self.run.columns.get(series.column)
         if column is None:
             return None
@@ -183,15 +184,9 @@ class Shown:
             column = column[:, COLUMNS[series.column].parts.index(series.part)]
         return column if np.isfinite(column).any() else None
 
-    @property
-    def ends(self) -> tuple[float, float]:
-        """First and last time on the timeline [s]."""
-        t = self.run["t"]
-        return float(t[0]) + self.offset_s, float(t[-1]) + self.offset_s
-
 
 def plotted(run: Run) -> bool:
-    """Whether a run has anything that a plot shows."""
+    """Whether a run has a column that is plotted."""
     shown = Shown.of(run)
     return any(shown.values(series) is not None for panel in PANELS for series in panel.series)
 
@@ -204,20 +199,19 @@ def layout(
     events: Sequence[str] | None = None,
     whole: bool = True,
 ) -> rrb.Blueprint:
-    """The views of a run, on its timeline; the lab and the robot in 3D first, where a lab is given.
+    """The views of a run: plots, states and events, and with a lab also the lab and the robot in 3D.
 
     Args:
-        run: What its plots show.
-        lab: The room; none for plots only.
-        heading: Heading of the map on its floor [rad], for the title.
-        events: Flags that may yet be raised, of a run that goes on; none takes those that the run raised.
-        whole: Whether the run is whole; of one that goes on, axes grow with it.
+        run: The run.
+        lab: The lab. None: no 3D views.
+        heading: Heading of the map on the floor [rad], for the title.
+        events: Flags that get a lane of states. Default: those that the run raised.
+        whole: Whether the run is complete. The axes of an unfinished run grow with it.
     """
     shown = Shown.of(run)
     axis = _whole([shown]) if whole else None
-    series = _stacked(
-        [(shown, FIELD_PANEL)], [(shown, DISTURBANCE_PANEL)], [(shown, ERROR_PANEL)], whole=axis, tall=0
-    )
+    panels = (FIELD_PANEL, DISTURBANCE_PANEL, ERROR_PANEL)
+    series = _stacked(*([(shown, panel)] for panel in panels), whole=axis, tall=0)
     tabs = [
         rrb.Vertical(*views, name=name)
         for name, panels in (
@@ -227,56 +221,67 @@ def layout(
         )
         if (views := _stacked(*([(shown, panel)] for panel in panels), whole=axis))
     ]
-    shares = [2.2, 1.2, 1.2][: len(series)]
-    side = rrb.Vertical(
-        *series, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=[*shares, *([2.6] if tabs else [])]
-    )
+    shares = [2.2, 1.2, 1.2][: len(series)] + [2.6] * bool(tabs)
+    side = rrb.Vertical(*series, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=shares)
     if events is None:
-        events = [key for key in STATES if _raised(run, key)]
+        events = [key for key in STATES if key in run and run[key].any()]
     lanes = [STATES[key].name for key in STATES if key == "lidar_on" or key in events]
     states = rrb.StateTimelineView(
         origin="states", contents=[f"$origin/{name}" for name in lanes], name="States", time_view=axis
     )
     pages = rrb.Tabs(_event_view(), rrb.TextDocumentView(origin="metadata", name="Run"))
     about = rrb.Vertical(states, pages, row_shares=[1.2, 1.4])
-    if lab is None:
-        root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
-    else:
-        below = rrb.Horizontal(_robot_view(), _floor_view(lab, [""]), about, column_shares=[0.9, 1.1, 1.6])
-        left = rrb.Vertical(_lab_view(lab, heading, [""]), below, row_shares=[2.0, 1.0])
-        root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
-    return _blueprint(root)
+    below = [_robot_view(), _floor_view(lab, [""])] if lab else []
+    return _blueprint(lab, heading, [""], side, [*below, about], [0.9, 1.1, 1.6])
 
 
 def comparison_layout(
     runs: Sequence[Shown], lab: LabSpec | None = None, *, heading: float = 0.0
 ) -> rrb.Blueprint:
-    """The views of several runs on a common timeline, a colour each.
+    """The views of several runs on a common timeline, each in its own colour.
 
     Args:
-        runs: What is compared.
-        lab: The room that they were driven in; none for plots only.
-        heading: Heading of the map on its floor [rad], for the title.
+        runs: The runs.
+        lab: Their lab. None: no 3D views.
+        heading: Heading of the map on the floor [rad], for the title.
     """
     whole = _whole(runs)
     rows = [
-        [(one, Panel(title, (Series(column, one.name, one.colour, part),))) for one in runs]
+        [(shown, Panel(title, (Series(column, shown.name, shown.colour, part),))) for shown in runs]
         for title, column, part in _COMPARED
     ]
     side = rrb.Vertical(*_stacked(*rows, whole=whole, tall=0))
-    metadata = [rrb.TextDocumentView(origin=entity_of("metadata", one.name), name=one.name) for one in runs]
+    metadata = [
+        rrb.TextDocumentView(origin=entity_of("metadata", shown.name), name=shown.name) for shown in runs
+    ]
     about = rrb.Tabs(_event_view(), *metadata)
+    names = [shown.name for shown in runs]
+    below = [_floor_view(lab, names)] if lab else []
+    return _blueprint(lab, heading, names, side, [*below, about], [1.0, 1.0])
+
+
+def drive_layout(lab: LabSpec) -> rrb.Blueprint:
+    """The view of a lab in which a robot is driven by hand."""
+    position, target = lab_eye(lab)
+    eye: dict[str, Any] = {"without": "world/robot/sensors", "position": position, "target": target}
+    return rrb.Blueprint(_view_3d("world", "Lab, driven by hand", [""], **eye), collapse_panels=True)
+
+
+def _blueprint(
+    lab: LabSpec | None,
+    heading: float,
+    names: Sequence[str],
+    side: Any,
+    below: list[Any],
+    shares: list[float],
+) -> rrb.Blueprint:
+    """The plots in `side`, beside the lab with the views `below` it; without a lab, beside these views."""
     if lab is None:
-        root = rrb.Horizontal(side, about, column_shares=[3.0, 1.0])
+        root = rrb.Horizontal(side, *below, column_shares=[3.0, 1.0])
     else:
-        names = [one.name for one in runs]
-        below = rrb.Horizontal(_floor_view(lab, names), about)
-        left = rrb.Vertical(_lab_view(lab, heading, names), below, row_shares=[1.6, 1.0])
+        lower = rrb.Horizontal(*below, column_shares=shares)
+        left = rrb.Vertical(_lab_view(lab, heading, names), lower, row_shares=[2.0, 1.0])
         root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
-    return _blueprint(root)
-
-
-def _blueprint(root: Any) -> rrb.Blueprint:
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
@@ -286,31 +291,23 @@ def _blueprint(root: Any) -> rrb.Blueprint:
 
 
 def _whole(runs: Sequence[Shown]) -> rrb.TimeAxis:
-    """The axis on which all of the runs are seen."""
-    ends = np.array([one.ends for one in runs])
-    return rrb.TimeAxis(
-        view_range=rr.TimeRange(
-            start=rrb.TimeRangeBoundary.absolute(seconds=float(ends.min())),
-            end=rrb.TimeRangeBoundary.absolute(seconds=float(ends.max())),
-        )
-    )
-
-
-def _raised(run: Run, column: str) -> bool:
-    return column in run.columns and bool(run[column].any())
+    """The axis that covers all of the runs."""
+    ends = [shown.run["t"][[0, -1]] + shown.offset_s for shown in runs]
+    first, last = (rrb.TimeRangeBoundary.absolute(seconds=float(k(ends))) for k in (np.min, np.max))
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
 
 
 def _stacked(
     *rows: Sequence[tuple[Shown, Panel]], whole: rrb.TimeAxis | None, tall: int | None = None
 ) -> list[rrb.TimeSeriesView]:
-    """A plot each of the panels that have a series; the one of number `tall` has the room of two."""
+    """One plot for each row with a series; the row number `tall` has twice the height."""
     plots = []
     for number, row in enumerate(rows):
         lines = [
-            (one, series, values)
-            for one, panel in row
+            (shown, series, values)
+            for shown, panel in row
             for series in panel.series
-            if (values := one.values(series)) is not None
+            if (values := shown.values(series)) is not None
         ]
         if lines:
             plots.append(_plot(row[0][1].title, lines, whole, tall=number == tall))
@@ -320,45 +317,40 @@ def _stacked(
 def _plot(
     title: str, lines: Sequence[tuple[Shown, Series, Array]], whole: rrb.TimeAxis | None, *, tall: bool
 ) -> rrb.TimeSeriesView:
-    """Lines of one unit, the legend in the corner where it needs least room of its own."""
+    """Lines of one unit, with the legend in the corner where it needs least room."""
     legend = len(lines) > 1
     corner = rrb.Corner2D.LeftTop
     ends = value_range(np.array([(np.nanmin(values), np.nanmax(values)) for _, _, values in lines]))
     if legend and ends:
-        height = min(
-            _LEGEND_MOST, len({series.name for _, series, _ in lines}) * _LEGEND_ROW * (1.0 if tall else 2.0)
-        )
+        count = len({series.name for _, series, _ in lines})
+        height = min(_LEGEND_MOST, count * _LEGEND_ROW * (1.0 if tall else 2.0))
         width = _LEGEND_WIDTH + _LEGEND_LETTER * max(len(series.name) for _, series, _ in lines)
         t, values = [], []
-        for one, _, line in lines:
+        for shown, _, line in lines:
             step = max(1, len(line) // _LOOKED_AT)
-            t.append(one.run["t"][::step] + one.offset_s)
+            t.append(shown.run["t"][::step] + shown.offset_s)
             values.append(line[::step])
         order = np.argsort(np.concatenate(t), kind="stable")
         corner, ends = legend_corner(
             np.concatenate(values)[order, None], np.concatenate(t)[order], ends, (width, height)
         )
-    overrides: dict[str, list[rrb.Visualizer]] = {}
-    for one, series, _ in lines:
-        overrides.setdefault(_entity_of(one, series), []).append(_line(series))
+    overrides: dict[Any, list[rrb.Visualizer]] = {}
+    for shown, series, _ in lines:
+        entity = entity_of(DERIVED_ENTITY if series.column in DERIVED else COLUMNS_ENTITY, shown.name)
+        overrides.setdefault(f"/{entity}", []).append(_line(series))
     return rrb.TimeSeriesView(
         origin="/",
-        contents=[f"/{entity}" for entity in overrides],
+        contents=list(overrides),
         name=title,
         axis_x=whole,
         axis_y=rrb.ScalarAxis(range=ends) if ends and whole else None,
         plot_legend=rrb.PlotLegend(corner, visible=legend),
-        overrides={f"/{entity}": lines for entity, lines in overrides.items()},
+        overrides=overrides,
     )
 
 
-def _entity_of(shown: Shown, series: Series) -> str:
-    """The entity whose component a series shows."""
-    return entity_of(DERIVED_ENTITY if series.column in DERIVED else COLUMNS_ENTITY, shown.name)
-
-
 def _line(series: Series) -> rrb.Visualizer:
-    """How the component of a column is drawn."""
+    """Style and source of a series."""
     source = VisualizerComponentMapping(
         "Scalars:scalars",
         ComponentSourceKind.SourceComponent,
@@ -370,14 +362,14 @@ def _line(series: Series) -> rrb.Visualizer:
 
 
 def value_range(values: Array) -> tuple[float, float] | None:
-    """Ends of a plot's axis: room beyond the values, and beyond every tick, so that no label is cut.
+    """Ends of an axis with room beyond the values and beyond every tick, so that no label is cut.
 
     Args:
-        values: What is plotted, any shape; nan is not.
+        values: The plotted values, any shape; nan is ignored.
 
     Returns:
-        Least and greatest value of the axis; none for values that do not vary, where the viewer's own
-        choice is as good.
+        Least and greatest value of the axis; None for values that do not vary, where the viewer's default
+        is as good.
     """
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
@@ -394,45 +386,41 @@ def value_range(values: Array) -> tuple[float, float] | None:
 def legend_corner(
     values: Array, t: Array, ends: tuple[float, float], size: tuple[float, float]
 ) -> tuple[rrb.Corner2D, tuple[float, float]]:
-    """The corner in which a legend hides no line, and the axis that this takes.
+    """The corner for a legend that hides no line, and the axis that this needs.
 
     Args:
         values: Series of a plot, shape (N, S).
-        t: Their times, ascending [s], shape (N,).
-        ends: Ends of the axis that all values fit in.
+        t: Ascending times [s], shape (N,).
+        ends: Ends of an axis that all values fit in.
         size: Width and height of the legend, as shares of the plot.
 
     Returns:
-        The corner for which the axis grows least, and the ends of the axis then. A hundredth of the
-        readings beside the legend may be under it: the ramp with which a run begins.
+        The corner for which the axis grows least, and the ends of that axis. One hundredth of the readings
+        beside the legend may be under it, such as the ramp at the start of a run.
     """
-    low, high = ends
     width, height = size
     span = (t[-1] - t[0]) * width
-    found = []
-    for corner, beside in (
-        (rrb.Corner2D.LeftTop, t <= t[0] + span),
-        (rrb.Corner2D.RightTop, t >= t[-1] - span),
-        (rrb.Corner2D.LeftBottom, t <= t[0] + span),
-        (rrb.Corner2D.RightBottom, t >= t[-1] - span),
+    choices = []
+    for corner, beside, sign in (
+        (rrb.Corner2D.LeftTop, t <= t[0] + span, 1),
+        (rrb.Corner2D.RightTop, t >= t[-1] - span, 1),
+        (rrb.Corner2D.LeftBottom, t <= t[0] + span, -1),
+        (rrb.Corner2D.RightBottom, t >= t[-1] - span, -1),
     ):
-        part = values[beside]
+        low, high = sorted(sign * end for end in ends)  # a lower corner is an upper one turned over
+        part = sign * values[beside]
         part = part[np.isfinite(part)]
-        if corner in (rrb.Corner2D.LeftTop, rrb.Corner2D.RightTop):
-            most = float(np.quantile(part, 0.99)) if part.size else low
-            grown = (low, max(high, (most - height * low) / (1 - height)))
-        else:
-            least = float(np.quantile(part, 0.01)) if part.size else high
-            grown = (min(low, (least - height * high) / (1 - height)), high)
-        found.append((grown[1] - grown[0], corner, grown))
-    _, corner, grown = min(found, key=lambda f: f[0])
+        most = float(np.quantile(part, 0.99)) if part.size else low
+        high = max(high, (most - height * low) / (1 - height))
+        choices.append((high - low, corner, (low, high) if sign > 0 else (-high, -low)))
+    _, corner, grown = min(choices, key=lambda choice: choice[0])
     return corner, grown
 
 
 def lab_eye(lab: LabSpec) -> tuple[Vec3, Vec3]:
-    """Position and target of the eye that sees a lab whole [m], in world.
+    """Position and target of an eye that sees a whole lab, in world [m].
 
-    It is above the near edge of the floor, inside the capture frame, so that no rail crosses the floor.
+    The eye is above the near edge of the floor, inside the capture frame, so that no rail crosses the floor.
     """
     x, y = lab.floor_m
     height = max(0.9 * max(x, 1.7 * y), 1.5 * lab.post_height_m)
@@ -440,33 +428,21 @@ def lab_eye(lab: LabSpec) -> tuple[Vec3, Vec3]:
 
 
 def _lab_view(lab: LabSpec, heading: float, names: Sequence[str]) -> rrb.Spatial3DView:
-    """The lab seen whole, with what each of the runs named left in it."""
+    """The whole lab, with the paths of the named runs."""
     position, target = lab_eye(lab)
-    return _view_3d(
-        "world",
-        f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, "
-        + ("readings along the path" if names == [""] else "a robot and its path for each run"),
-        names,
-        without="world/robot/sensors",
-        position=position,
-        look_target=target,
-    )
+    text = "readings along the path" if names == [""] else "a robot and its path for each run"
+    title = f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, {text}"
+    return _view_3d("world", title, names, without="world/robot/sensors", position=position, target=target)
 
 
 def _robot_view() -> rrb.Spatial3DView:
-    """The robot from behind its left shoulder; the view's axes are the robot's, so that it stays in sight."""
-    return _view_3d(
-        "world/robot",
-        "Robot",
-        [""],
-        without="world/scale",
-        position=(-0.62, 0.42, 0.55),
-        look_target=(0.08, 0, 0.17),
-    )
+    """The robot from behind its left shoulder, in the robot's axes, so that it stays in view."""
+    eye = {"position": (-0.62, 0.42, 0.55), "target": (0.08, 0.0, 0.17)}
+    return _view_3d("world/robot", "Robot", [""], without="world/scale", **eye)
 
 
 def _floor_view(lab: LabSpec, names: Sequence[str]) -> rrb.Spatial2DView:
-    """The map from above, with the paths on it; x to the right and y up, in metres."""
+    """The map and the paths from above, x to the right and y up, in metres."""
     x, y = (0.5 * side + lab.wall_thickness_m for side in lab.floor_m)
     return rrb.Spatial2DView(
         origin="floor",
@@ -486,7 +462,7 @@ def _event_view() -> rrb.TextLogView:
 
 
 def _visible(*, all_time: bool) -> rrb.VisibleTimeRanges:
-    """What is seen of an entity that piles up: all of it at once, or what has come by the time shown."""
+    """Visible part of an entity that accumulates: all of it, or all up to the time shown."""
     infinite = rrb.TimeRangeBoundary.infinite()
     end = infinite if all_time else rrb.TimeRangeBoundary.cursor_relative()
     return rrb.VisibleTimeRanges(rrb.VisibleTimeRange(TIMELINE, start=infinite, end=end))
@@ -499,9 +475,9 @@ def _view_3d(
     *,
     without: str,
     position: tuple[float, ...],
-    look_target: tuple[float, ...],
+    target: tuple[float, ...],
 ) -> rrb.Spatial3DView:
-    """The world in the axes of `origin`, from a position [m]; readings appear as time goes on."""
+    """The world in the axes of `origin`, from a position [m]; readings appear with time."""
     piling_up: dict[Any, Any] = {entity_of("world/driven", name): _visible(all_time=True) for name in names}
     piling_up |= {entity_of("world/readings", name): _visible(all_time=False) for name in names}
     return rrb.Spatial3DView(
@@ -510,6 +486,6 @@ def _view_3d(
         name=title,
         background=(24, 26, 31),
         line_grid=False,
-        eye_controls=rrb.EyeControls3D(position=position, look_target=look_target, eye_up=(0, 0, 1)),
+        eye_controls=rrb.EyeControls3D(position=position, look_target=target, eye_up=(0, 0, 1)),
         overrides=piling_up,
     )

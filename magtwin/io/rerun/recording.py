@@ -1,4 +1,4 @@
-"""Recording: a Run on its way into a Rerun stream, whole or block by block, to a file, a viewer, or both."""
+"""Recording: a Run in a Rerun stream, whole or block by block, to a file, a viewer, or both."""
 
 import errno
 import hashlib
@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
@@ -18,36 +18,39 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from magtwin.errors import InputError
+from magtwin.io.rerun.layout import layout
 from magtwin.io.rerun.series import Flags, entity_of, send_columns, send_metadata, send_rows
-from magtwin.io.rerun.world import Feed, Robot
+from magtwin.io.rerun.world import Feed, Interior, Robot, heading_of, send_room
+from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
+from magtwin.twin import Twin
 
 APPLICATION = "magtwin"
 
 PATIENCE_S = 60.0
-"""How long Rerun may take to write what it was given [s]."""
+"""Time that Rerun may take to write its data [s]."""
 
 END = b"RRF2FOOT"
-"""What stands at the end of a file that Rerun finished."""
+"""Bytes at the end of a complete file."""
 
 ROOM = 1 << 20
-"""Bytes that a layout, the metadata and what names all columns take, or more."""
+"""Upper bound of the bytes of a layout, the metadata and the column names."""
 
 POSED = frozenset(("p_world_base", "q_world_base_xyzw"))
 """Columns that place a robot."""
 
 
-def check_room(file: FilePath, size: int, said: FilePath | None = None) -> None:
-    """Refuse to begin what the disk has no room for.
+def check_room(file: FilePath, size: int, final: FilePath | None = None) -> None:
+    """Refuse a recording for which the disk has no room.
 
-    It is asked beforehand, as Rerun writes from a thread of its own, and waits for that thread for ever where
-    a full disk has ended it.
+    Rerun writes from its own thread, and waits for that thread for ever after a full disk ended it. So the
+    room is checked first.
 
     Args:
-        file: The file that grows; nothing is done to it.
-        size: Bytes that it will have, or more.
-        said: The file that a refusal names, where that is another.
+        file: The file that grows; it is not changed.
+        size: Upper bound of its size [bytes].
+        final: The file that errors name. Default: `file`.
 
     Raises:
         InputError: There is no room, or its folder cannot be written.
@@ -60,19 +63,19 @@ def check_room(file: FilePath, size: int, said: FilePath | None = None) -> None:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     except OSError as error:
         raise InputError(
-            f"{said or file}: cannot be written ({error.strerror}): up to {size / 1e6:.1f} MB are needed; "
+            f"{final or file}: cannot be written ({error.strerror}): up to {size / 1e6:.1f} MB are needed; "
             "make room"
         ) from error
 
 
 def size_of(run: Run, scans: Scans | None = None) -> int:
-    """Bytes that the rows of a run take in a recording, or more, and the scans while it lasts."""
-    own = sum(values.nbytes + 4 * run.rows for values in run.values())
+    """Upper bound of the bytes of a run's rows in a recording, and of the scans in the same time."""
+    columns = sum(values.nbytes + 4 * run.rows for values in run.values())
     seen = 0
     if scans is not None and run.rows:
         first, last = np.searchsorted(scans.t, run["t"][[0, -1]])
         seen = (int(last - first) + 2) * (16 * scans.ranges_m.shape[1] + 64)
-    return own + 24 * run.rows + 2 * (24 + 4 * 8) * run.rows + seen
+    return columns + 24 * run.rows + 2 * (24 + 4 * 8) * run.rows + seen
 
 
 @contextmanager
@@ -83,30 +86,30 @@ def stream(
     *,
     file: FilePath | None = None,
     address: str | None = None,
-    said: FilePath | None = None,
+    final: FilePath | None = None,
     room: int = ROOM,
 ) -> Iterator[rr.RecordingStream]:
-    """A stream to a file, to the viewer at an address, or to both; complete and closed at the end.
+    """A stream to a file, to the viewer at an address, or to both; completed and closed with the block.
 
     Args:
-        recording_id: Recordings of one id are one to the viewer.
-        name: What the viewer calls it.
-        views: What it opens with.
+        recording_id: The viewer merges recordings of one id.
+        name: Name in the viewer.
+        views: The layout that it opens with.
         file: The file to make; it can be read at any time up to the last flush.
-        address: Where a viewer listens.
-        said: The file that a refusal names, where that is another.
-        room: Bytes that the disk must have for it.
+        address: Address of a viewer.
+        final: The file that errors name. Default: `file`.
+        room: Upper bound of the file's size [bytes].
 
     Raises:
         InputError: Rerun is switched off, or the file cannot be written.
     """
-    said = said or file
+    final = final or file
     if file is not None:
-        check_room(file, room, said)
+        check_room(file, room, final)
     strict = rr.strict_mode()
     rec = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
     if not rr.is_enabled(rec):
-        raise InputError(f"{said}: Rerun is switched off by the environment variable RERUN; unset it")
+        raise InputError(f"{final}: Rerun is switched off by the environment variable RERUN; unset it")
     rr.set_strict_mode(True)
     try:
         sinks: list[Any] = [] if file is None else [rr.FileSink(str(file))]
@@ -116,20 +119,23 @@ def stream(
         yield rec
         rec.flush(timeout_sec=PATIENCE_S)
     except RuntimeError as error:
-        raise InputError(_unwritten(said, error)) from error
+        raise unwritten(final, error) from error
     finally:
         rr.set_strict_mode(strict)
         with suppress(RuntimeError):
             rec.disconnect()
     if file is not None:
-        with open(file, "rb") as written:  # Rerun does not say when its last bytes met a full disk
+        with open(file, "rb") as written:  # Rerun does not report a disk that was full at the end
             written.seek(-min(64, file.stat().st_size), 2)
             if END not in written.read():
-                raise InputError(_unwritten(said, "its end is missing"))
+                raise unwritten(final, "its end is missing")
 
 
-def _unwritten(path: FilePath | None, why: object) -> str:
-    return f"{path}: cannot be written ({why}); is the disk full, or a limit on file sizes reached?"
+def unwritten(path: FilePath | None, why: object) -> InputError:
+    """The error of a file that could not be written."""
+    return InputError(
+        f"{path}: cannot be written ({why}); is the disk full, or a limit on file sizes reached?"
+    )
 
 
 @dataclass
@@ -138,13 +144,16 @@ class Recording:
 
     rec: rr.RecordingStream
     name: str = ""
-    """What it is called among others in the same recording; "" where it is alone."""
+    """Its name among several runs; "" for a single run."""
+
     offset_s: float = 0.0
-    """What is added to its times [s]."""
+    """Offset added to its times [s]."""
+
     robot: Robot | None = None
-    """Its robot, in the room; none for series only."""
+    """Its robot in the room. None: only series."""
+
     scans: Scans | None = None
-    """What its LiDAR saw; shown where there is a robot."""
+    """Its LiDAR scans, drawn if there is a robot."""
 
     _rows: int = 0
     _last: Run | None = None
@@ -157,7 +166,7 @@ class Recording:
             self._feed = Feed(self.rec, self.scans)
 
     def append(self, run: Run) -> None:
-        """The next rows."""
+        """Add the next rows."""
         if not run.rows:
             return
         if not self._rows:
@@ -172,7 +181,7 @@ class Recording:
         self._last = run.take(slice(-1, None))
 
     def close(self) -> None:
-        """No rows come any more."""
+        """Complete the run; no rows can follow."""
         if self._last is None:
             return
         self._flags.close()
@@ -186,11 +195,60 @@ class Recording:
         )
 
 
-def send_properties(rec: rr.RecordingStream, metadata: Mapping[str, Any]) -> None:
-    """The metadata of a run as properties of the recording, for the viewer and for catalogs."""
-    known: dict[str, Any] = {key: [value] for key, value in metadata.items() if not _too_large(value)}
-    if known:
-        rec.send_property("run", rr.AnyValues(**known))
+@contextmanager
+def recording_of(
+    run: Run,
+    recording_id: str,
+    name: str,
+    twin: Twin | None = None,
+    *,
+    known: Run | None = None,
+    planned: Path | None = None,
+    scans: Scans | None = None,
+    events: Sequence[str] | None = None,
+    room: int = 0,
+    whole: bool = True,
+    rate_hz: float = 0.0,
+    **sinks: Any,
+) -> Iterator[Recording]:
+    """A recording of one run with its layout, metadata and lab; it holds no rows yet.
+
+    Args:
+        run: The run, or its first rows.
+        recording_id: As for `stream`.
+        name: Name in the viewer.
+        twin: Where the run took place. None: only series.
+        known: The run that sets axes and colours. Default: `run`.
+        planned: The planned path, or None.
+        scans: LiDAR scans, or None.
+        events: As for `layout`, like `whole`.
+        room: Upper bound of the size of the rows [bytes].
+        whole: Whether `known` is the whole run.
+        rate_hz: Rows per second. Default: the rate of the first rows.
+        sinks: `file`, `address` and `final` of `stream`.
+
+    Raises:
+        InputError: The stage cannot be read, or as for `stream`.
+    """
+    known = run if known is None else known
+    lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, known))
+    views = layout(known, lab, heading=heading, events=events, whole=whole)
+    room += ROOM
+    if twin is not None:
+        interior = Interior.of(twin.scene, twin.scene_file)
+        room += interior.size(twin.field)
+    with stream(recording_id, name, views, room=room, **sinks) as rec:
+        properties: dict[str, Any] = {
+            key: [value] for key, value in run.metadata.items() if not _too_large(value)
+        }
+        if properties:
+            rec.send_property("run", rr.AnyValues(**properties))
+        rec.log("metadata", metadata_page(run.metadata), static=True)
+        robot = None
+        if twin is not None:
+            scale = send_room(rec, interior, twin.field, known, planned)
+            robot = Robot(rec, interior, scale, rate_hz=rate_hz)
+        yield Recording(rec, robot=robot, scans=scans)
 
 
 def _too_large(value: object) -> bool:
@@ -198,12 +256,12 @@ def _too_large(value: object) -> bool:
 
 
 def title_of(run: Run) -> str:
-    """What the viewer calls a run: path and seed."""
+    """Name of a run in the viewer: its path and seed."""
     return ", ".join(f"{key} {run.metadata[key]}" for key in ("path", "seed") if key in run.metadata)
 
 
 def content_id(*runs: Run) -> str:
-    """An id that the same runs always get, and no others."""
+    """An id that depends only on the content of the runs."""
     digest = hashlib.sha256()
     for run in runs:
         sums = {
@@ -216,11 +274,7 @@ def content_id(*runs: Run) -> str:
 
 def metadata_page(metadata: Mapping[str, Any], rows: int | None = None) -> rr.TextDocument:
     """The metadata of a run as a page with a table."""
-    said = {**({} if rows is None else {"readings": f"{rows:,}"}), **metadata}
-    cells = [(_cell(key), _cell(value)) for key, value in said.items()]
-    lines = ["| fact | value |", "|---|---|", *(f"| {key} | {value} |" for key, value in cells)]
+    values = {**({} if rows is None else {"readings": f"{rows:,}"}), **metadata}
+    cells = [[" ".join(str(text).replace("|", r"\|").split()) for text in pair] for pair in values.items()]
+    lines = ["| metadata | value |", "|---|---|", *(f"| {key} | {value} |" for key, value in cells)]
     return rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
-
-
-def _cell(value: object) -> str:
-    return " ".join(str(value).replace("|", r"\|").split())

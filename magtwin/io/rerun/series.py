@@ -1,9 +1,8 @@
-"""Series: the columns of a Run in a Rerun recording, block by block, and back; its states and events.
+"""Series: the columns of a Run in a Rerun recording and back, and its states and events.
 
-A recording holds a run's every column at full rate and to the bit, each a component of the one entity
-`run` under its own name: a scalar as a float64 or a bool, a vector as a struct of its parts. Rerun's own
-readers thus give the Run's table, and the viewer's plots take their lines from it. What they show beyond
-it, in the entity `derived`, is made from it and never read back.
+A recording stores every column of a run exactly and at full rate, each as a component of the entity `run`:
+a scalar as a float64 or a bool, a vector as a struct of its parts. Rerun's own readers thus give the run's
+table, and the viewer plots it. The entity `derived` holds further lines of the plots; it is never read back.
 """
 
 import json
@@ -21,43 +20,41 @@ from rerun.chunk import Chunk
 from magtwin.errors import InputError
 from magtwin.run.arrow import said_of, spec_said
 from magtwin.run.run import COLUMNS, Column, Run
+from magtwin.verdict import Z_90
 
 Array = NDArray[np.float64]
 
 TIMELINE = "sim_time"
-"""Name of the timeline that a recording runs on."""
+"""Name of the timeline of a recording."""
 
 BLOCK = 4096
-"""Rows sent in one chunk: few enough for the viewer to skip what it does not show, and for LZ4, which looks
-64 kB back, to see that every list of a chunk has the same offsets."""
+"""Rows per chunk: few enough for the viewer to skip what it does not show, and for LZ4, with its window of
+64 kB, to compress the repeated offsets of the lists."""
 
 COLUMNS_ENTITY, DERIVED_ENTITY = "run", "derived"
-"""Entities of a run's columns, and of what plots show beside them."""
+"""Entities of the columns of a run, and of further lines of the plots."""
 
 FACTS, NAMES, NAME, ROWS = "magtwin_facts", "magtwin_columns", "magtwin_name", "magtwin_rows"
-"""Components beside the columns, without time: metadata and columns in JSON; the name of the run among
-others;
-the rows of a run that ended."""
-
-INTERVAL = 1.645
-"""Half the width of the 90 % prediction interval, in standard deviations."""
+"""Components without time: metadata and columns as JSON, the name of the run among several, and the number of
+rows of a complete run."""
 
 GAP_S = 0.5
-"""How long a flag must be down for what it told of to be over [s]; a shorter gap is none."""
+"""Time that a flag must be down for its event to be over [s]."""
 
 
 @dataclass(frozen=True)
 class State:
-    """A lane of states: what a flag says while it is down and while it is up."""
+    """The states of a flag, down and up, and the texts of its events."""
 
     name: str
     down: str
     up: str
     begins: str
-    """What the event log says when it goes up."""
+    """Text of the event when the flag is raised."""
+
     ends: str
     level: str = "WARN"
-    """How much it matters, in the words of Rerun's log."""
+    """Level in Rerun's log."""
 
 
 STATES: Mapping[str, State] = MappingProxyType(
@@ -80,7 +77,7 @@ STATES: Mapping[str, State] = MappingProxyType(
         ),
     }
 )
-"""The flags that are states and, as they begin and end, events."""
+"""Flags with states and events."""
 
 DERIVED = (
     "interval_low_nt",
@@ -90,51 +87,49 @@ DERIVED = (
     "error_low_nt",
     "error_high_nt",
 )
-"""What is plotted beside the columns: see `derived`."""
+"""Lines of the plots that are not columns: see `derived`."""
 
 
 def derived(run: Run) -> dict[str, Array]:
-    """What plots show that follows from the columns; what a run knows nothing of is left out.
+    """Lines of the plots that follow from the columns; those that a run has no columns for are left out.
 
     interval = b_total -+ 1.645 b_sd, error = b_total - b_truth, measured_error = b_measured - b_truth, and
-    error_low, error_high = -+ 1.645 b_sd, within which 9 of 10 errors lie if b_sd is right.
+    error_low, error_high = -+ 1.645 b_sd, which contain 90 % of the errors if b_sd is right.
     """
     made: dict[str, Array] = {}
-    total, truth, measured, sd = (
-        run.columns.get(name) for name in ("b_total_nt", "b_truth_nt", "b_measured_nt", "b_sd_nt")
+    total, measured = run.get("b_total_nt"), run.get("b_measured_nt")
+    truth, sd = (
+        run[name] if name in run and np.isfinite(run[name]).any() else None
+        for name in ("b_truth_nt", "b_sd_nt")
     )
-    if truth is not None and not np.isfinite(truth).any():
-        truth = None
-    if sd is not None and not np.isfinite(sd).any():
-        sd = None
     if sd is not None and total is not None:
-        half = INTERVAL * sd
+        half = Z_90 * sd
         made |= {"interval_low_nt": total - half, "interval_high_nt": total + half}
         if truth is not None:
             made |= {"error_low_nt": -half, "error_high_nt": half}
     if total is not None and truth is not None and (error := total - truth).any():
-        made["error_nt"] = error  # of a physical magnetometer it is 0 throughout
+        made["error_nt"] = error  # always 0 for a physical magnetometer
     if measured is not None and truth is not None:
         made["measured_error_nt"] = measured - truth
     return made
 
 
 def entity_of(entity: str, name: str) -> str:
-    """The entity of one run among several, by its name; `entity` itself for a run that is alone.
+    """The entity of one run among several, by its name; `entity` itself for a single run.
 
-    Only letters, digits, _ and - need no escape in the path of an entity; what else a name has becomes _.
+    Characters other than letters, digits, _ and - would need an escape in an entity path; they become _.
     """
     plain = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name)
     return f"{entity}/{plain}" if plain else entity
 
 
 def nanoseconds(t: Array) -> NDArray[Any]:
-    """Times [s] as the viewer's clock counts them."""
+    """Times [s] in the resolution of the viewer's clock."""
     return np.rint(t * 1e9).astype("timedelta64[ns]")
 
 
 def send(rec: rr.RecordingStream, entity: str, t: Array, archetype: Any, **values: Any) -> None:
-    """Columns of an archetype at times t [s], in blocks."""
+    """Send columns of an archetype at times t [s], in blocks."""
     times = nanoseconds(t)
     for start in range(0, len(t), BLOCK):
         part = slice(start, start + BLOCK)
@@ -143,20 +138,20 @@ def send(rec: rr.RecordingStream, entity: str, t: Array, archetype: Any, **value
 
 
 def send_metadata(rec: rr.RecordingStream, run: Run, name: str) -> None:
-    """What is known of a run before its first row: metadata, and the columns in their order."""
-    told = {key: said_of(run.spec(key), key) for key in run}
-    texts = {FACTS: dict(run.metadata), NAMES: told}
+    """Send the metadata of a run, and its columns in their order."""
+    specs = {key: said_of(run.spec(key), key) for key in run}
+    texts = {FACTS: dict(run.metadata), NAMES: specs}
     as_json: dict[str, Any] = {key: [json.dumps(value, ensure_ascii=False)] for key, value in texts.items()}
     rec.log(entity_of(COLUMNS_ENTITY, name), rr.AnyValues(**as_json | {NAME: [name]}), static=True)
 
 
 def send_rows(rec: rr.RecordingStream, rows: int, name: str) -> None:
-    """That a run ended, after so many rows."""
+    """Send the number of rows of a complete run."""
     rec.log(entity_of(COLUMNS_ENTITY, name), rr.AnyValues(**cast(Any, {ROWS: [rows]})), static=True)
 
 
 def send_columns(rec: rr.RecordingStream, run: Run, t: Array, name: str) -> None:
-    """The columns of a run, or of a part of it, at times t [s]."""
+    """Send the columns of a run, or of a part of it, at times t [s]."""
     parts = {key: run.spec(key).parts for key in run}
     _send_table(rec, entity_of(COLUMNS_ENTITY, name), t, run, parts)
     lines = {key: values.astype(np.float32) for key, values in derived(run).items()}
@@ -171,23 +166,23 @@ def _send_table(
     columns: Mapping[str, NDArray[Any]],
     parts: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
 ) -> None:
-    """Columns as the components of one entity, in blocks; `parts` names those of vectors."""
+    """Send columns as the components of one entity, in blocks; `parts` names the parts of vectors."""
     times, path = pa.array(nanoseconds(t)), f"/{entity}"
     for start in range(0, len(t), BLOCK):
         arrays, fields = [times.slice(start, BLOCK)], [pa.field(TIMELINE, times.type)]
         each = pa.array(np.arange(len(arrays[0]) + 1, dtype=np.int32))
         for key, values in columns.items():
             rows = _arrow(key, values[start : start + BLOCK], parts.get(key, ()))
-            one = pa.ListArray.from_arrays(each, rows)
+            values_of_rows = pa.ListArray.from_arrays(each, rows)
             about = {"rerun:kind": "data", "rerun:component": key, "rerun:entity_path": path}
-            arrays.append(one)
-            fields.append(pa.field(key, one.type, metadata=about))
+            arrays.append(values_of_rows)
+            fields.append(pa.field(key, values_of_rows.type, metadata=about))
         batch = pa.RecordBatch.from_arrays(arrays, schema=pa.schema(fields))
         rec.send_chunks(Chunk.from_record_batch(batch, index=TIMELINE, entity_path=path))
 
 
 def _arrow(name: str, values: NDArray[Any], parts: tuple[str, ...]) -> pa.Array:
-    """A column, or a struct of the parts of one."""
+    """A column as an array, or as a struct of its parts."""
     if values.ndim > 2 or values.dtype.kind not in "bfiu" or 0 in values.shape[1:]:
         raise InputError(
             f"column {name!r} cannot be recorded: numbers or flags of shape (N,) or (N, width) can, "
@@ -199,28 +194,28 @@ def _arrow(name: str, values: NDArray[Any], parts: tuple[str, ...]) -> pa.Array:
 
 
 def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | None]:
-    """The run that chunks of its entity hold: its name, itself, and the rows that it ended with, if it did.
+    """The run in the chunks of its entity: its name, the run, and its number of rows if it is complete.
 
     Args:
         chunks: Every chunk of the entity, in any order.
-        what: What they are of, for refusals.
+        what: Name of the file, for errors.
 
     Raises:
-        InputError: They hold no run.
+        InputError: The chunks hold no run.
     """
-    told: dict[str, Any] = {}
+    static: dict[str, Any] = {}
     tables = []
     for batch in chunks:
         if TIMELINE in batch.schema.names:
             tables.append(batch)
         else:
             known = [key for key in (FACTS, NAMES, NAME, ROWS) if key in batch.schema.names]
-            told |= {key: batch.column(key)[0][0].as_py() for key in known}
+            static |= {key: batch.column(key)[0][0].as_py() for key in known}
     try:
-        metadata, names = (json.loads(told[key]) for key in (FACTS, NAMES))
-        rows = int(told[ROWS]) if ROWS in told else None
-        whole = all(isinstance(one, dict) for one in (metadata, names))
-        if not whole or not all(isinstance(fact, str | int | float | bool) for fact in metadata.values()):
+        metadata, names = (json.loads(static[key]) for key in (FACTS, NAMES))
+        rows = int(static[ROWS]) if ROWS in static else None
+        whole = isinstance(metadata, dict) and isinstance(names, dict)
+        if not whole or not all(isinstance(value, str | int | float | bool) for value in metadata.values()):
             raise ValueError("metadata and columns must be tables of plain values")
         order = np.argsort([table.column(TIMELINE)[0].value for table in tables], kind="stable")
         columns = {
@@ -234,21 +229,21 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
             f"{what}: a Rerun recording, but not one of a run that magtwin can read "
             f"({type(error).__name__}: {error}); read the run's Parquet, or record it again"
         ) from error
-    return str(told.get(NAME) or COLUMNS_ENTITY), run, rows
+    return str(static.get(NAME) or COLUMNS_ENTITY), run, rows
 
 
 def _spec(column: pa.Array, said: dict[str, str]) -> Column:
-    """What a column of the user's own holds; the fields of its struct are its parts."""
+    """Description of a custom column; the fields of its struct are its parts."""
     kind = column.type.value_type
     parts = tuple(field.name for field in kind) if pa.types.is_struct(kind) else ()
     return spec_said({key: str(text) for key, text in said.items()}, parts)
 
 
 def _values(column: pa.Array) -> NDArray[Any]:
-    """The column that a component holds, shape (N,) or (N, parts)."""
+    """The column of a component, shape (N,) or (N, parts)."""
     flat = column.flatten()
     if len(flat) != len(column) or flat.null_count:
-        raise ValueError("one value a row is wanted")
+        raise ValueError("each row must have one value")
     if pa.types.is_struct(flat.type):
         return np.column_stack([part.to_numpy(zero_copy_only=False) for part in flat.flatten()])
     return flat.to_numpy(zero_copy_only=False)
@@ -256,7 +251,7 @@ def _values(column: pa.Array) -> NDArray[Any]:
 
 @dataclass
 class Flags:
-    """The states and events of a run that comes block by block."""
+    """Sends the states and events of a run that comes block by block."""
 
     rec: rr.RecordingStream
     name: str = ""
@@ -264,17 +259,17 @@ class Flags:
 
     _before: dict[str, bool] = field(default_factory=dict)
     _open: dict[str, tuple[float, float, str]] = field(default_factory=dict)
-    """What goes on, or may: since when, until when it was last seen, and where that was."""
+    """Open events by column: time of the start and of the last raised row [s], and place of the latter."""
 
     def append(self, run: Run) -> None:
-        """The next rows."""
+        """Add the next rows."""
         events: list[tuple[float, str, str]] = []
         for column, state in STATES.items():
             if column not in run.columns:
                 continue
             flag = run[column]
             before = self._before.get(column)
-            first = flag[0] != before  # a first row always is a change, from nothing
+            first = flag[0] != before  # the first row always is a change
             rows = np.flatnonzero(np.append(first, flag[1:] != flag[:-1]))
             if before is None and not self.name:
                 values = [state.down, state.up]
@@ -290,19 +285,14 @@ class Flags:
         self._send(events)
 
     def close(self) -> None:
-        """No rows come any more."""
+        """End the open events; no rows can follow."""
         self._send([self._end(column) for column in sorted(self._open) if not self._before[column]])
 
     def _episodes(self, column: str, run: Run) -> Iterator[tuple[float, str, str]]:
-        """Beginnings and ends of what a flag tells of."""
+        """Starts and ends of the events of a flag."""
         flag, t = run[column], run["t"]
         edges = np.diff(flag.astype(np.int8), prepend=0, append=0)
         begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-        apart = t[begins[1:]] - t[ends[:-1]] > GAP_S
-        begins, ends = (
-            begins[np.append(True, apart)[: len(begins)]],
-            ends[np.append(apart, True)[: len(ends)]],
-        )
         for first, last in zip(begins, ends, strict=True):
             since = float(t[first])
             if column in self._open and since - self._open[column][1] > GAP_S:
@@ -330,8 +320,8 @@ class Flags:
         send(self.rec, "events", at, rr.TextLog, text=named, level=list(levels))
 
 
-def _place(run: Run, row: int) -> str:
-    """Where the robot was at a row, in words."""
+def _place(run: Run, row: np.intp) -> str:
+    """Position of the robot at a row, as text."""
     if "p_world_base" not in run.columns:
         return ""
     x, y = run["p_world_base"][row, :2]

@@ -1,6 +1,6 @@
-"""Viewer: the Rerun viewer that comes with its wheel, on a window or, for pictures, on none.
+"""Viewer: the Rerun viewer of the installed wheel, in a window or, for pictures, without one.
 
-It is started here rather than through `rerun.spawn`, which listens on every network interface.
+It is not started by `rerun.spawn`, which listens on every network interface.
 """
 
 import os
@@ -26,30 +26,30 @@ from magtwin.io.rerun.series import TIMELINE
 LOCALHOST = "127.0.0.1"
 
 MAGIC = b"RRF"
-"""First bytes of a recording, before the number of its format."""
+"""First bytes of a recording, before its format number."""
 
 LEAST_SIZE, MOST_SIZE = 200, 8000
-"""Sides of a picture between which the viewer still lays out its views, and fits in a texture [pixels]."""
+"""Least and greatest side of a picture: room for the views, and the limit of a texture [pixels]."""
 
 START_S = 60.0
-"""How long the viewer may take to start on a busy machine without a graphics card [s]."""
+"""Time that the viewer may take to start, on a busy machine without a graphics card [s]."""
 
 NOTHING_S = 10.0
-"""How long a file that was loaded may show nothing [s]."""
+"""Time that a loaded file may show nothing [s]."""
 
 TITLE_BAR = 36
-"""Height of the bar that the viewer keeps for its window, without anything in it [pixels]."""
+"""Height of the viewer's empty title bar [pixels]."""
 
 TOASTS_S = 6.0
-"""How long the viewer's notices about itself stay in the picture [s]."""
+"""Time until the viewer's own notices have disappeared [s]."""
 
 
-def show(rrd: str | os.PathLike[str], *, shown: str | os.PathLike[str] | None = None) -> None:
-    """Show a recording in a window; returns when it is closed.
+def show(rrd: str | os.PathLike[str], *, source: str | os.PathLike[str] | None = None) -> None:
+    """Show a recording in a window; returns when the window is closed.
 
     Args:
         rrd: The recording.
-        shown: The file that a refusal names, where `rrd` was made from it for this window alone.
+        source: The file that errors name, if `rrd` is a temporary recording of it. Default: `rrd`.
 
     Raises:
         InputError: The file is missing, or the viewer cannot run here.
@@ -60,11 +60,11 @@ def show(rrd: str | os.PathLike[str], *, shown: str | os.PathLike[str] | None = 
     if result.returncode:
         advice = (
             f"use a browser: rerun --web-viewer --bind {LOCALHOST} {rrd}"
-            if shown is None
+            if source is None
             else "view the .rrd of this run, which a browser shows too"
         )
         raise InputError(
-            f"{shown or rrd}: the Rerun viewer opened no window: {_reason(result.stderr)}; "
+            f"{source or rrd}: the Rerun viewer opened no window: {_reason(result.stderr)}; "
             f"without a display {advice}"
         )
 
@@ -77,17 +77,17 @@ def screenshot(
     size: tuple[int, int] = (1600, 1000),
     force: bool = False,
 ) -> list[str]:
-    """Draw a recording as the viewer shows it, on a machine with or without a display.
+    """Draw a recording as the viewer shows it, with or without a display.
 
     Args:
         rrd: The recording.
         png: The picture to make.
-        time_s: Moment on the timeline `sim_time` [s]. Default: where the viewer starts.
+        time_s: Time on the timeline `sim_time` [s]. Default: where the viewer starts.
         size: Width and height of the picture [pixels].
-        force: Whether a picture that exists is replaced.
+        force: Whether to replace an existing picture.
 
     Returns:
-        The warnings and errors of the recording's views, a line each; empty when all is well.
+        The warnings and errors of the recording's views, one line each; empty if there are none.
 
     Raises:
         InputError: The recording is missing, cannot be read or has no such moment; the size is out of
@@ -114,30 +114,30 @@ def screenshot(
 
 
 def _draw(
-    client: ViewerClient, path: Path, said: str | os.PathLike[str], png: Path, time_s: float | None
+    client: ViewerClient, path: Path, source: str | os.PathLike[str], png: Path, time_s: float | None
 ) -> list[View]:
-    """Open a recording, go to a moment, save what is shown; returns the state of the views."""
+    """Open a recording, go to a time and save the picture; returns the state of the views."""
     client.open(str(path))
-    _wait_until(lambda: not client.get_state().loading, f"{said}: the viewer did not load it")
-    nothing = f"{said}: holds nothing that the viewer shows; if the recording was cut short, write it again"
+    _wait_until(lambda: not client.get_state().loading, f"{source}: the viewer did not load it")
+    nothing = f"{source}: holds nothing that the viewer shows; if the recording was cut short, write it again"
     _wait_until(lambda: _timelines(client) != [], nothing, NOTHING_S)
     if time_s is not None:
         timelines = _timelines(client)
-        line = next((one for one in timelines if one.name == TIMELINE), None)
+        line = next((timeline for timeline in timelines if timeline.name == TIMELINE), None)
         if line is None or line.start is None or line.end is None:
             raise InputError(
-                f"{said}: has no timeline {TIMELINE!r} to find a time on; it has "
-                f"{', '.join(one.name for one in timelines)}"
+                f"{source}: has no timeline {TIMELINE!r} to find a time on; it has "
+                f"{', '.join(timeline.name for timeline in timelines)}"
             )
         first, last = line.start / 1e9, line.end / 1e9
         if not first <= time_s <= last:
             raise InputError(
-                f"{said}: the recording goes from {first:g} to {last:g} s; there is no {time_s:g} s in it"
+                f"{source}: the recording goes from {first:g} to {last:g} s; there is no {time_s:g} s in it"
             )
         client.set_time(TIMELINE, duration=time_s, play_state="paused")
     client.run_command("ui.toggle_top_panel")
     end = time.monotonic() + TOASTS_S
-    while time.monotonic() < end:  # its clock goes on only while it draws
+    while time.monotonic() < end:  # its clock advances only while it draws
         client.take_screenshot(max_size=64)
     client.save_screenshot(str(png))
     _crop(png)
@@ -146,13 +146,13 @@ def _draw(
 
 @contextmanager
 def headless_viewer(size: tuple[int, int] = (1600, 1000)) -> Iterator[ViewerClient]:
-    """A viewer without a window that listens on this machine only; ended with the block.
+    """A viewer without a window that listens on localhost only; ended with the block.
 
     Args:
-        size: Width and height of what it draws [pixels].
+        size: Width and height of its pictures [pixels].
 
     Raises:
-        InputError: It cannot run here; the text says what it said.
+        InputError: It cannot run here; the text has its reason.
     """
     with _started("--headless", "--window-size", f"{size[0]}x{size[1]}") as (_, client):
         yield client
@@ -160,16 +160,16 @@ def headless_viewer(size: tuple[int, int] = (1600, 1000)) -> Iterator[ViewerClie
 
 @contextmanager
 def live_viewer(*, headless: bool = False) -> Iterator[tuple[str, ViewerClient]]:
-    """A viewer in a window, for what is still going on; ended with the block.
+    """A viewer for a run that goes on; ended with the block.
 
     Args:
-        headless: Whether it has no window, but can be asked for pictures.
+        headless: Whether it has no window, and only draws pictures.
 
     Yields:
-        The address that recordings connect to, on this machine only, and a client.
+        The address on localhost that recordings connect to, and a client.
 
     Raises:
-        InputError: It cannot run here; the text says what it said.
+        InputError: It cannot run here; the text has its reason.
     """
     with _started(*["--headless"] * headless) as viewer:
         yield viewer
@@ -177,7 +177,7 @@ def live_viewer(*, headless: bool = False) -> Iterator[tuple[str, ViewerClient]]
 
 @contextmanager
 def _started(*options: str) -> Iterator[tuple[str, ViewerClient]]:
-    """A viewer process that listens on this machine only, its address and a client; ended with the block."""
+    """A viewer process that listens on localhost only: its address and a client; ended with the block."""
     port = _free_port()
     command = [_binary(), "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen", *options]
     process = None
@@ -193,7 +193,7 @@ def _started(*options: str) -> Iterator[tuple[str, ViewerClient]]:
 
 @contextmanager
 def _interrupt_later() -> Iterator[None]:
-    """Delay Ctrl-C to the end of the block, so that no process is started whose handle is lost."""
+    """Delay Ctrl-C to the end of the block, so that the handle of a started process is not lost."""
     if threading.current_thread() is not threading.main_thread():  # Python interrupts the main thread only
         yield
         return
@@ -208,7 +208,7 @@ def _interrupt_later() -> Iterator[None]:
 
 
 def _connected(process: "subprocess.Popen[bytes]", port: int, log: IO[str]) -> ViewerClient:
-    """A client of a viewer that was just started, once it draws: it listens before it knows if it can."""
+    """A client of a started viewer, once it draws. It listens before it knows whether it can draw."""
     clients: list[ViewerClient] = []
 
     def draws() -> bool:
@@ -229,42 +229,43 @@ def _connected(process: "subprocess.Popen[bytes]", port: int, log: IO[str]) -> V
     return clients[-1]
 
 
-def check_decodes(rrd: Path, said: str | os.PathLike[str]) -> None:
+def check_decodes(rrd: Path, source: str | os.PathLike[str]) -> None:
     """Refuse a recording that Rerun's own verifier cannot decode.
 
-    It is a process of its own: where bytes were changed, Rerun's decoder may end the process that it is in.
-    That a recording has no end is no fault here: one that is still growing has none.
+    The verifier is a separate process, as changed bytes may make Rerun's decoder end its process. A missing
+    end is accepted: a recording that still grows has none.
 
     Args:
         rrd: The recording.
-        said: The file that a refusal names.
+        source: The file that errors name.
 
     Raises:
-        InputError: It is no recording, was cut short, or its bytes were changed.
+        InputError: It is not a recording, was cut short, or its bytes were changed.
     """
     with rrd.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise InputError(
-                f"{said}: not a Rerun recording that can be read (it does not start with RRF); write it again"
+                f"{source}: not a Rerun recording that can be read (it does not start with RRF); "
+                "write it again"
             )
     done = subprocess.run([_binary(), "rrd", "verify", str(rrd)], capture_output=True, text=True, check=False)
-    told = [line for line in done.stderr.splitlines() if "Missing RRD footer" not in line and line.strip()]
-    endless = done.returncode == 1 and [line.rpartition(" with ")[2] for line in told] == ["1 errors"]
+    lines = [line for line in done.stderr.splitlines() if "Missing RRD footer" not in line and line.strip()]
+    endless = done.returncode == 1 and [line.rpartition(" with ")[2] for line in lines] == ["1 errors"]
     if done.returncode and not endless:
         raise InputError(
-            f"{said}: not a Rerun recording that can be read ({_reason(done.stderr)}); write it again"
+            f"{source}: not a Rerun recording that can be read ({_reason(done.stderr)}); write it again"
         )
 
 
 def _crop(png: Path) -> None:
-    """Take the empty title bar off a picture."""
+    """Remove the empty title bar from a picture."""
     from matplotlib.image import imread, imsave
 
     imsave(png, imread(png)[TITLE_BAR:], metadata={"Software": "magtwin"}, pil_kwargs={"optimize": True})
 
 
 def _binary() -> str:
-    """The viewer's program, as its own launcher finds it."""
+    """Path of the viewer's program."""
     name = "rerun.exe" if os.name == "nt" else "rerun"
     return str(existing(Path(rerun_cli.__file__).with_name(name), "Rerun viewer; install rerun-sdk again"))
 
@@ -276,12 +277,12 @@ def _free_port() -> int:
 
 
 def _timelines(client: ViewerClient) -> list[Timeline]:
-    """The timelines of what a viewer has open."""
+    """The timelines of the recordings in a viewer."""
     return [line for recording in client.get_state().recordings for line in recording.timelines]
 
 
 def _wait_until(done: Callable[[], bool], refusal: str, limit_s: float = START_S) -> None:
-    """Ask again and again; refuse after some time."""
+    """Wait for a condition; raise an error after a time limit."""
     end = time.monotonic() + limit_s
     while not done():
         if time.monotonic() > end:
@@ -290,15 +291,15 @@ def _wait_until(done: Callable[[], bool], refusal: str, limit_s: float = START_S
 
 
 def _reason(log: str) -> str:
-    """What a log says of the end of its program: its panic, its error, or else its last line."""
-    found = re.search(r"panicked at '(.+?)'|^Error: (.+)$", log, re.MULTILINE)
+    """Why a program ended, by its log: its panic, its error, or else its last line."""
+    match = re.search(r"panicked at '(.+?)'|^Error: (.+)$", log, re.MULTILINE)
     lines = [line.strip() for line in log.splitlines() if line.strip()] or ["it gave no reason"]
-    text = next(group for group in found.groups() if group) if found else lines[-1]
-    return re.sub(r"\S+ at /\S+ ", "", text).rstrip(".")  # the viewer's own file names help nobody
+    text = next(group for group in match.groups() if group) if match else lines[-1]
+    return re.sub(r"\S+ at /\S+ ", "", text).rstrip(".")  # without file names of the viewer's source
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """End a process and what it started."""
+    """End a process and its children."""
     for sign in (signal.SIGTERM, signal.SIGKILL):
         if process.poll() is None:
             os.killpg(process.pid, sign)

@@ -21,7 +21,7 @@ from magtwin.spec.robot import RobotSpec
 
 Array = NDArray[np.float64]
 
-ROBOT_FACTS = ("robot_name", "sensor_m", "platform_sha256", "mocap_offset_m", "mocap_latency_s")
+ROBOT_METADATA = ("robot_name", "sensor_m", "platform_sha256", "mocap_offset_m", "mocap_latency_s")
 """Metadata of a run that tell which robot drove, and how motion capture saw it."""
 
 UNKNOWN, SEVERAL = "unknown", "several"
@@ -56,9 +56,9 @@ class Mismatch:
 
 def shared_metadata(runs: Iterable[Mapping[str, Any]]) -> dict[str, str]:
     """What the metadata of recordings tell of their robot: one value, `UNKNOWN` or `SEVERAL` for each."""
-    told: dict[str, set[str]] = {name: set() for name in ROBOT_FACTS}
+    told: dict[str, set[str]] = {name: set() for name in ROBOT_METADATA}
     for metadata in runs:
-        for name in ROBOT_FACTS:
+        for name in ROBOT_METADATA:
             told[name].add(str(metadata.get(name, UNKNOWN)))
     return {
         name: next(iter(values)) if len(values) == 1 else SEVERAL for name, values in told.items() if values

@@ -27,7 +27,7 @@ from magtwin.learn.data.labels import Alignment, labelled
 from magtwin.learn.data.recording import thinned
 from magtwin.learn.data.split import split
 from magtwin.learn.evaluation.scores import Errors, Score, scores
-from magtwin.learn.magnetometer import NeuralMagnetometer, Read
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer, Read
 from magtwin.learn.models.linear import fit_linear
 from magtwin.path import CASES
 from magtwin.run.run import Run

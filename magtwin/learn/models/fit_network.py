@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError, find
 from magtwin.learn.data.features import feature_names
 from magtwin.learn.models.descent import Course, Epoch, check_device, descend
-from magtwin.learn.models.network import Fact, FieldNet
+from magtwin.learn.models.network import FieldNet, MetadataValue
 from magtwin.learn.models.state import digest
 
 Array = NDArray[np.float64]
@@ -32,7 +32,7 @@ def train(
     batch: int = 1024,
     lr: float = 1e-3,
     patience: int | None = None,
-    metadata: Mapping[str, Fact] | None = None,
+    metadata: Mapping[str, MetadataValue] | None = None,
     init: FieldNet | None = None,
     freeze: Sequence[str] = (),
     checkpoint: str | os.PathLike[str] | None = None,

@@ -37,8 +37,6 @@ class Hybrid(Regressor):
     """What the spread of the base is multiplied by."""
 
     kind = "hybrid"
-    context = 0
-    step_s = 0.0
 
     def __post_init__(self) -> None:
         self.inputs = self.base.inputs

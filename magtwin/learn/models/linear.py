@@ -53,8 +53,6 @@ class Linear(Regressor):
     """Whether rows counted by how well the map is known there."""
 
     kind = "linear"
-    context = 0
-    step_s = 0.0
 
     @property
     def layers_text(self) -> str:
@@ -111,7 +109,7 @@ class Linear(Regressor):
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedLinear:
     """A linear model, and what it says of rows by fits that had left their recordings out."""
 
     model: Linear
@@ -137,7 +135,7 @@ def fit_linear(
     weighting: Weighting = "auto",
     start: Linear | None = None,
     inputs: Inputs | None = None,
-) -> Fitted:
+) -> FittedLinear:
     """Fit features to labels by ridge regression: least squares with |c|^2 held down.
 
     The penalty is chosen by cross-validation over groups of rows, never over rows: those of one recording
@@ -191,7 +189,7 @@ def fit_linear(
         penalty=best.penalty,
         weighted=best.weighted,
     )
-    return Fitted(model, best.held_out, groups, weight if best.weighted else None)
+    return FittedLinear(model, best.held_out, groups, weight if best.weighted else None)
 
 
 def linear_of(weights: Weights) -> Linear:

@@ -18,7 +18,15 @@ from magtwin.learn.data.inputs import Inputs, inputs_of
 from magtwin.learn.models.checkpoint import read_checkpoint
 from magtwin.learn.models.perceptron import outputs
 from magtwin.learn.models.regressor import summary_of
-from magtwin.learn.models.weights import Fact, Weights, is_checkpoint, read_weights, say, shown, write_weights
+from magtwin.learn.models.weights import (
+    MetadataValue,
+    Weights,
+    is_checkpoint,
+    read_weights,
+    say,
+    shown,
+    write_weights,
+)
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary
 
@@ -41,10 +49,6 @@ class FieldNet(Summarized, torch.nn.Module):
     kind = "mlp"
     """Among the predictors: a multilayer perceptron."""
 
-    context = 0
-    """A row's prediction looks at no earlier one."""
-    step_s = 0.0
-
     x_mean: torch.Tensor
     """Means of the training inputs, in the units of the features, shape (F,), float64."""
     x_scale: torch.Tensor
@@ -65,7 +69,7 @@ class FieldNet(Summarized, torch.nn.Module):
         *,
         dropout: float = 0.3,
         residual_sd_nt: float = math.nan,
-        metadata: Mapping[str, Fact] | None = None,
+        metadata: Mapping[str, MetadataValue] | None = None,
     ) -> None:
         """A network with random weights and scalers that change nothing.
 
@@ -81,7 +85,7 @@ class FieldNet(Summarized, torch.nn.Module):
         self.features = feature_names(features)
         self.dropout = dropout
         self.residual_sd_nt = residual_sd_nt
-        self.metadata: dict[str, Fact] = dict(metadata or {})
+        self.metadata: dict[str, MetadataValue] = dict(metadata or {})
         if not hidden or not all(width > 0 for width in hidden) or not 0 <= dropout < 1:
             raise InputError(
                 f"a network needs hidden layers above 0 wide and dropout in 0..1, "

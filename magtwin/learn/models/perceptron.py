@@ -1,4 +1,4 @@
-"""Layers worked through in blocks of rows, so that a row gives the same bytes whatever stands beside it."""
+"""The layers of a perceptron in blocks of rows; a row gives the same bytes whatever rows stand beside it."""
 
 import itertools
 import math
@@ -10,31 +10,30 @@ import torch
 from numpy.typing import NDArray
 
 from magtwin.learn.data.inputs import Inputs
-from magtwin.learn.models.sparse import Skipping
 
 Array = NDArray[np.float64]
 Layer = tuple[torch.Tensor, torch.Tensor]
 """Weights (out, in) and biases (out,), float32."""
 
 CHUNK = 512
-"""Rows worked on at once: layers of 512 then stay in a core's cache. 256 to 1,024 time alike."""
+"""Rows of a block: layers of 512 then stay in a core's cache."""
 
 TILE = 16
-"""Rows of the last chunk are filled up to a multiple of this, a whole number of the rows that
-matrix kernels take at once, so that a row's bytes do not depend on its neighbours."""
+"""Rows of the last block are padded to a multiple of this, a multiple of the rows that matrix kernels take at
+once, so that a row's bytes do not depend on its neighbours."""
 
 
 def in_threads(work: Callable[[], None], threads: int) -> None:
-    """Do `work` once in each of some threads, with torch's products in one thread each.
+    """Run `work` in several threads, each with torch products in one thread.
 
-    Both cores are then busy between products too, which torch's own threads leave idle.
+    All cores then stay busy between products, which torch's own threads leave idle.
 
     Args:
-        work: What each thread does; it takes its share of a common supply until none is left.
-        threads: How many; for one at most, it is done here, with torch as it is.
+        work: Takes items from a shared supply until none is left.
+        threads: Number of threads; with 1 or fewer, `work` runs in the calling thread.
 
     Raises:
-        BaseException: The first that a thread raised, after all have ended.
+        BaseException: The first exception of a thread, after all threads have ended.
     """
     if threads <= 1:
         work()
@@ -63,11 +62,11 @@ def in_threads(work: Callable[[], None], threads: int) -> None:
 
 
 def outputs(layers: Sequence[Layer], inputs: Inputs, x: Array) -> Array:
-    """What a multilayer perceptron gives for each row, shape (N, K), K the width of its last layer.
+    """Outputs of a multilayer perceptron, shape (N, K), K the width of its last layer.
 
-    Each block of rows is worked on by one thread, in a fixed order, and blocks are shared out among as
-    many threads as torch would use; so the result does not depend on the number of threads, nor a row's
-    on the other rows. Inputs are scaled in float64, products are float32; a row with a nan gives nan.
+    One thread computes each block of rows in a fixed order, so the result does not depend on the number of
+    threads, nor a row's on the other rows. Inputs are scaled in float64, products are float32; a row with a
+    nan gives nan.
 
     Args:
         layers: First to last; ReLU stands between them.
@@ -78,20 +77,19 @@ def outputs(layers: Sequence[Layer], inputs: Inputs, x: Array) -> Array:
     starts = itertools.count(0, CHUNK)  # next() on it is atomic
     threads = min(torch.get_num_threads(), math.ceil(len(x) / CHUNK))
     transposed = [(weight.t(), bias) for weight, bias in _widened(layers)]
-    skipping = Skipping(transposed)
-    in_threads(lambda: _work(transposed, skipping, inputs, x, y, starts), threads)
+    in_threads(lambda: _work(transposed, inputs, x, y, starts), threads)
     return y
 
 
 def _widened(layers: Sequence[Layer]) -> list[Layer]:
     """Layers whose products give a row the same bytes wherever it stands in a block.
 
-    Of less than a dozen outputs from inputs that are no multiple of 4 the matrix kernels round a row by its
-    place; such a layer gets further outputs, which are 0 and which the next one takes as nothing.
+    With few outputs, and inputs that are no multiple of 4, the rounding of matrix kernels depends on a row's
+    place. Such a layer gets more outputs, which are 0 and which the next layer ignores.
     """
-    found: list[Layer] = []
+    widened: list[Layer] = []
     for weight, bias in layers:
-        if found and (more := len(found[-1][1]) - weight.shape[1]):
+        if widened and (more := len(widened[-1][1]) - weight.shape[1]):
             weight = torch.nn.functional.pad(weight, (0, more))
         if len(bias) < TILE and weight.shape[1] % 4:
             more = TILE - len(bias)
@@ -99,19 +97,18 @@ def _widened(layers: Sequence[Layer]) -> list[Layer]:
                 torch.nn.functional.pad(weight, (0, 0, 0, more)),
                 torch.cat([bias, bias.new_zeros(more)]),
             )
-        found.append((weight, bias))
-    return found
+        widened.append((weight, bias))
+    return widened
 
 
 def _work(
     layers: Sequence[Layer],
-    skipping: Skipping,
     inputs: Inputs,
     x: Array,
     y: Array,
     starts: "itertools.count[int]",
 ) -> None:
-    """Go through chunks until none is left; nothing is allocated between the first and the last."""
+    """Compute chunks until none is left; memory is allocated once."""
     rows = CHUNK if len(x) > CHUNK else -(-len(x) // TILE) * TILE
     z = np.zeros((rows, x.shape[1]))
     with torch.inference_mode():
@@ -126,8 +123,6 @@ def _work(
             np.divide(z[:n], inputs.scale, out=z[:n])
             blocks[0].copy_(scaled)
             for i, (weight, bias) in enumerate(layers):
-                if 0 < i < len(layers) - 1 and skipping.forward(i, blocks[i], blocks[i + 1]):
-                    continue
                 torch.addmm(bias, blocks[i], weight, out=blocks[i + 1])
                 if i < len(layers) - 1:
                     blocks[i + 1].relu_()

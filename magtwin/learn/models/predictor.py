@@ -1,32 +1,50 @@
-"""Predictor: whatever tells a robot's disturbance from features, and how sure it is."""
+"""Predictors: models of the disturbance that a robot adds to the map, and the registry of their kinds.
+
+To add a kind, write a `Predictor` (subclass `magtwin.learn.models.regressor.Regressor`) and a
+`PredictorKind`, and register the latter under the predictor's `kind`:
+
+    @PREDICTORS.register("forest")
+    class ForestKind:
+        description = "A random forest"
+        options = {"features": "circular"}
+
+        @staticmethod
+        def fit(task: FitTask) -> Fit: ...
+
+        @staticmethod
+        def load(weights: Weights) -> Forest: ...
+
+A package registers it by an entry point of the group `magtwin.predictors`. Then `magtwin train --model
+forest` trains it, and every command reads its weights.
+"""
 
 import os
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.learn.models.ensemble import ensemble_of
-from magtwin.learn.models.hybrid import hybrid_of
-from magtwin.learn.models.linear import linear_of
-from magtwin.learn.models.network import net_of, net_of_checkpoint
-from magtwin.learn.models.temporal import temporal_of
-from magtwin.learn.models.weights import Fact, Weights, is_checkpoint, read_weights
+from magtwin.errors import InputError
+from magtwin.learn.data.recording import Rows
+from magtwin.learn.models.descent import Epoch
+from magtwin.learn.models.network import net_of_checkpoint
+from magtwin.learn.models.weights import MetadataValue, Weights, is_checkpoint, read_weights
+from magtwin.registry import Registry
 from magtwin.report import Report
 
 Array = NDArray[np.float64]
 
 
 class Predictor(Protocol):
-    """A disturbance with its standard deviation, row by row; of which kind is its own business."""
+    """Predicts a disturbance and its standard deviation, row by row."""
 
-    metadata: dict[str, Fact]
-    """Provenance: on what it was trained."""
+    metadata: dict[str, MetadataValue]
+    """Provenance: what it was trained on."""
 
     residual_sd_nt: float
-    """Root mean square error on recordings it never saw [nT]; nan where unknown."""
+    """Root mean square error on held-out recordings [nT]; nan if unknown."""
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -34,15 +52,7 @@ class Predictor(Protocol):
 
     @property
     def kind(self) -> str:
-        """Which kind it is: "mlp", "linear", "hybrid", "ensemble" or "tcn"."""
-
-    @property
-    def context(self) -> int:
-        """How many earlier rows of a run a row's prediction looks at."""
-
-    @property
-    def step_s(self) -> float:
-        """Time between the rows that it looks back over [s]; 0 where `context` is 0."""
+        """Name of its kind in `PREDICTORS`."""
 
     @property
     def layers_text(self) -> str:
@@ -50,15 +60,10 @@ class Predictor(Protocol):
 
     @property
     def parameters_count(self) -> int:
-        """How many numbers were fitted."""
+        """Number of fitted parameters."""
 
     def predict(self, x: ArrayLike) -> tuple[Array, Array]:
-        """Disturbances and the standard deviations of their errors [nT], each (N,).
-
-        Args:
-            x: Features in their units, shape (N, F); one run's rows in time order where `context` is
-                above 0.
-        """
+        """Disturbances and standard deviations of their errors [nT], each (N,), from features (N, F)."""
 
     def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
         """Whether an input of a row left the range of the training rows, shape (N,)."""
@@ -67,27 +72,147 @@ class Predictor(Protocol):
         """Write it to one safetensors file; the same predictor gives the same bytes."""
 
     def report(self, title: str) -> Report:
-        """What it is, in figures."""
+        """Its kind, shape and errors."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Whether a hybrid keeps its network, by mean absolute errors on the validation rows [nT]."""
+
+    base_mae_nt: float
+    """Of the base alone."""
+
+    whole_mae_nt: float
+    """Of base and network."""
+
+    @property
+    def kept(self) -> bool:
+        """Whether the network lowers the error."""
+        return self.whole_mae_nt < self.base_mae_nt
+
+    def text(self) -> str:
+        """The decision and its reason, in a sentence."""
+        decision = "is kept" if self.kept else "is left out, the base alone remains"
+        return (
+            f"on the validation recordings the base alone errs by {self.base_mae_nt:.1f} nT, with the "
+            f"network by {self.whole_mae_nt:.1f} nT: the network {decision}"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitTask:
+    """Everything that fitting a predictor needs."""
+
+    features: tuple[str, ...]
+    """Names of the inputs."""
+
+    train: Rows
+    """Rows to fit to."""
+
+    validation: Rows
+    """Rows of other recordings, to stop by and to calibrate by."""
+
+    train_groups: NDArray[np.intp]
+    """Session, recording or path of each training row, shape (N,)."""
+
+    validation_groups: NDArray[np.intp]
+    """Session, recording or path of each validation row, shape (M,)."""
+
+    options: Mapping[str, Any]
+    """Values of the options that the kind reads."""
+
+    rng: np.random.Generator
+    """Source of all randomness."""
+
+    init: Any = None
+    """Predictor of the same kind to continue from, or None."""
+
+    freeze: tuple[str, ...] = ()
+    """Layers that stay as in `init`."""
+
+    device: str = "cpu"
+    """Where torch trains."""
+
+    checkpoint: str | os.PathLike[str] | None = None
+    """File for the state after each epoch."""
+
+    resume: bool = False
+    """Whether to continue from `checkpoint`."""
+
+    progress: Callable[[Epoch], None] | None = None
+    """Called after each epoch."""
+
+    advance: Callable[[int, int], None] | None = None
+    """Called after each step with the rows done and the rows of all epochs."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted predictor."""
+
+    model: Predictor
+
+    history: tuple[Epoch, ...] = ()
+    """Its epochs; empty if it is fitted at once."""
+
+    choice: Choice | None = None
+    """Of a hybrid."""
+
+    held_out_nt: Array | None = None
+    """Disturbance at each training row by a fit without its group [nT], shape (N,); of a hybrid, by its base.
+    None for a kind that is fitted once."""
+
+
+class PredictorKind(Protocol):
+    """How predictors of one kind are fitted and loaded."""
+
+    description: str
+    """What it is, for the model card: "A multilayer perceptron, float32"."""
+
+    options: Mapping[str, Any]
+    """Options of `magtwin.learn.training.config.TrainConfig` that it reads, with their defaults; at least
+    `features`."""
+
+    @staticmethod
+    def fit(task: FitTask) -> Fit:
+        """Fit a predictor to training rows and calibrate it by validation rows.
+
+        Raises:
+            InputError: The task cannot be fitted.
+        """
+
+    @staticmethod
+    def load(weights: Weights) -> Predictor:
+        """The predictor of a weights file.
+
+        Raises:
+            InputError: The parts of the file do not fit each other.
+        """
+
+
+PREDICTORS: Registry[PredictorKind] = Registry(
+    "predictor kind",
+    "predictors",
+    {
+        "mlp": "magtwin.learn.models.kinds:Perceptrons",
+        "linear": "magtwin.learn.models.kinds:Linears",
+        "hybrid": "magtwin.learn.models.kinds:Hybrids",
+    },
+)
+"""Kinds of predictors by name."""
 
 
 def load_predictor(path: str | os.PathLike[str]) -> Predictor:
-    """A predictor of any kind from its file: magtwin's safetensors, or a released `.pth`.
+    """Load a predictor of any kind: magtwin's safetensors, or a released `.pth`.
 
     Raises:
-        InputError: Neither of the two, damaged, or parts that do not fit each other.
+        InputError: Neither of the two, damaged, or its parts do not fit each other.
     """
     if is_checkpoint(path):
         return net_of_checkpoint(path)
     weights = read_weights(path)
-    return _KINDS[weights.kind](weights)
-
-
-_KINDS: Mapping[str, Callable[[Weights], Predictor]] = MappingProxyType(
-    {
-        "mlp": net_of,
-        "linear": linear_of,
-        "hybrid": hybrid_of,
-        "ensemble": ensemble_of,
-        "tcn": temporal_of,
-    }
-)
+    try:
+        kind = PREDICTORS[weights.kind]
+    except InputError as error:
+        raise InputError(f"{path}: {error}; update magtwin, or install the package of this kind") from error
+    return kind.load(weights)

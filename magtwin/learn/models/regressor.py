@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.learn.data.inputs import Inputs
-from magtwin.learn.models.weights import Fact, shown, write_weights
+from magtwin.learn.models.weights import MetadataValue, shown, write_weights
 from magtwin.report import Figure, Report
 from magtwin.summary import Summarized, Summary, listed
 
@@ -22,7 +22,7 @@ class Regressor(Summarized, ABC):
 
     inputs: Inputs
     residual_sd_nt: float = math.nan
-    metadata: dict[str, Fact] = field(default_factory=dict)
+    metadata: dict[str, MetadataValue] = field(default_factory=dict)
 
     kind: ClassVar[str]
 

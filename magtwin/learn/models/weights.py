@@ -16,10 +16,12 @@ from magtwin.errors import InputError
 from magtwin.files import existing, output
 from magtwin.learn.data.features import FEATURES, feature_names
 
-Fact = str | int | float | bool
+MetadataValue = str | int | float | bool
 
-VERSIONS = {"mlp": 1, "linear": 2, "hybrid": 2, "ensemble": 2, "tcn": 2}
-"""Version of the file by the kind of predictor it holds; a reader refuses another."""
+VERSIONS = {"mlp": 1}
+"""Version of the file by kind of predictor, `VERSION` for all others; other versions are refused."""
+
+VERSION = 2
 
 _ZIP = b"PK\x03\x04"
 _TYPES = {"features": list, "units": list, "residual_sd_nt": float | None, "facts": dict}
@@ -149,7 +151,7 @@ def write_weights(
     *,
     features: Sequence[str],
     residual_sd_nt: float,
-    metadata: Mapping[str, Fact],
+    metadata: Mapping[str, MetadataValue],
     force: bool = False,
     **about: Any,
 ) -> None:
@@ -169,7 +171,7 @@ def write_weights(
         InputError: The file exists and `force` was not given.
     """
     told = {
-        "format_version": VERSIONS[kind],
+        "format_version": VERSIONS.get(kind, VERSION),
         "features": features,
         "units": [FEATURES[name].unit for name in features],
         "output": "disturbance of the field's magnitude",
@@ -217,14 +219,10 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
         raise InputError(f"{path}: its metadata is not JSON ({error})") from error
     version = about.get("format_version") if isinstance(about, dict) else None
     kind = about.get("kind", "mlp") if isinstance(about, dict) else "mlp"
-    if not isinstance(kind, str) or kind not in VERSIONS:
-        raise InputError(
-            f"{path}: holds a {kind!r}, this magtwin reads {', '.join(VERSIONS)}; update magtwin"
-        )
-    if version != VERSIONS[kind]:
-        raise InputError(
-            f"{path}: format version {version!r}, this magtwin reads {VERSIONS[kind]}; update magtwin"
-        )
+    if not isinstance(kind, str):
+        raise InputError(f"{path}: 'kind' of its metadata must be text, got {kind!r}")
+    if version != (known := VERSIONS.get(kind, VERSION)):
+        raise InputError(f"{path}: format version {version!r}, this magtwin reads {known}; update magtwin")
     for key, of in _TYPES.items():
         if key not in about or not isinstance(about[key], of):
             raise InputError(f"{path}: {key!r} of its metadata is missing or of the wrong type")
@@ -236,7 +234,7 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
             f"{path}: 'residual_sd_nt' of its metadata must be from 0 nT up and finite, got {sd}"
         )
     for key, value in about["facts"].items():
-        if not isinstance(value, Fact):
+        if not isinstance(value, MetadataValue):
             raise InputError(f"{path}: fact {key!r} of its metadata must be text, a number, true or false")
     for name, unit in zip(about["features"], about["units"], strict=False):
         if name in FEATURES and FEATURES[name].unit != unit:
@@ -248,7 +246,7 @@ def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     return about
 
 
-def shown(metadata: Mapping[str, Fact]) -> dict[str, Fact]:
+def shown(metadata: Mapping[str, MetadataValue]) -> dict[str, MetadataValue]:
     """Metadata for people: without the map's samples, which are for comparing maps."""
     return {name: fact for name, fact in metadata.items() if name != "map_samples_nt"}
 

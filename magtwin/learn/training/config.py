@@ -1,4 +1,4 @@
-"""TrainConfig: everything that decides a training, beside its data."""
+"""TrainConfig: everything that decides a training, except its data."""
 
 import itertools
 import json
@@ -10,161 +10,144 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, find
 from magtwin.files import from_table, read_toml
 from magtwin.learn.data.features import feature_names
 from magtwin.learn.data.split import By
 from magtwin.learn.models.linear import Weighting
+from magtwin.learn.models.predictor import PREDICTORS
 
-Model = Literal["paper", "released", "linear", "hybrid", "ensemble", "tcn"]
 Device = Literal["cpu", "cuda", "auto"]
 
-_DESCENT: Mapping[str, Any] = MappingProxyType({"epochs": 20, "batch": 1024, "lr": 1e-3, "patience": None})
-_TORCH: Mapping[str, Any] = MappingProxyType({"threads": None, "device": "auto", "freeze": ()})
-_PAPER: Mapping[str, Any] = MappingProxyType({"features": "full", "dropout": 0.3, **_DESCENT, **_TORCH})
-_RIDGE: Mapping[str, Any] = MappingProxyType({"penalty": None, "weighting": "auto"})
-
-MODELS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+PRESETS: Mapping[str, tuple[str, Mapping[str, Any]]] = MappingProxyType(
     {
-        "paper": {"layers": (512, 512, 512, 512), **_PAPER},
-        "released": {"layers": (512, 512, 512, 128), **_PAPER},
-        "linear": {"features": "circular", **_RIDGE},
-        "hybrid": {
-            "features": "platform",
-            **_RIDGE,
-            "layers": (64, 64),
-            "dropout": 0.1,
-            **_DESCENT,
-            **_TORCH,
-        },
-        "ensemble": {"features": "gradient", "members": 5, "layers": (64, 64), **_DESCENT, **_TORCH},
-        "tcn": {
-            "features": "gradient",
-            "layers": (32, 32, 32, 32),
-            "kernel": 3,
-            **_DESCENT,
-            "threads": None,
-            "device": "auto",
-        },
+        "paper": ("mlp", {}),
+        "released": ("mlp", {"layers": (512, 512, 512, 128)}),
     }
 )
-"""Models by name: the options that each reads beside those that all do, and what they are unless given."""
+"""Models that are a kind of predictor with other defaults; all other models are named by their kind."""
 
 MOST_WEIGHTS = 100_000_000
-"""Of a network: with its gradients and Adam's moments they take 1.6 GB."""
+"""Largest network; with gradients and Adam's moments it takes 1.6 GB."""
 
-ALL_READ = ("model", "seed", "split", "hold_out", "init", "licence")
+COMMON = ("model", "seed", "split", "hold_out", "init", "licence")
 """Options that every model reads."""
+
+
+def models() -> list[str]:
+    """Names of all models, those of installed packages included."""
+    return [*PRESETS, *(kind for kind in PREDICTORS if kind not in {of for of, _ in PRESETS.values()})]
+
+
+def options_of(model: str) -> dict[str, Any]:
+    """Options that a model reads beside `COMMON`, with their defaults.
+
+    Raises:
+        InputError: No such model.
+    """
+    find("model", model, dict.fromkeys(models()))
+    kind, changed = PRESETS.get(model, (model, {}))
+    return {**PREDICTORS[kind].options, **changed}
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """What a training does: a model and its options, those that are not given as `MODELS` has them.
+    """A model and its options. An option that is not given has the default of the model's kind.
 
-    An option that the model does not read is refused; it is None here. The paper does not tell its epochs,
-    batch, step size or split; those are magtwin's own.
+    An option that the model does not read is refused; its value is None. The paper does not state its epochs,
+    batch size, step size or split; these defaults are magtwin's.
     """
 
-    model: Model = "paper"
-    """Which model: the multilayer perceptron as the paper has it ("paper") or as its weights have
-    ("released"), "linear" (Tolles-Lawson by ridge regression), "hybrid", "ensemble" or "tcn"."""
+    model: str = "paper"
+    """The model: "paper" or "released" (multilayer perceptrons of the paper's or the released shape),
+    "linear" (Tolles-Lawson by ridge regression), "hybrid", or a kind of
+    `magtwin.learn.models.predictor.PREDICTORS`."""
 
     layers: tuple[int, ...] = ()
-    """Widths of the hidden layers; of a tcn, of its convolutions."""
+    """Widths of the hidden layers."""
 
     features: str = ""
-    """A set of `magtwin.learn.data.features.SETS`, or names of features with commas between."""
+    """A set of `magtwin.learn.data.features.SETS`, or names of features separated by commas."""
 
     dropout: float | None = None
     """Share of units dropped in training."""
 
-    members: int | None = None
-    """Networks of an ensemble."""
-
-    kernel: int | None = None
-    """Rows that each convolution of a tcn looks at."""
-
     penalty: float | None = None
-    """Of the ridge, as a share of the rows' own curvature; None chooses it by cross-validation."""
+    """Ridge penalty, relative to the curvature of the rows; None chooses it by cross-validation."""
 
     weighting: Weighting | None = None
-    """Whether a ridge weighs rows by how well the map is known there: "label_sd", "none", or "auto",
-    whichever does better on recordings left out."""
+    """Weights of rows in the ridge: "label_sd" by how well the map is known there, "none", or "auto", the
+    better of the two on recordings left out."""
 
     epochs: int | None = None
     """Passes over the training rows."""
 
     batch: int | None = None
-    """Rows a step."""
+    """Rows per step."""
 
     lr: float | None = None
     """Largest step size of Adam."""
 
     patience: int | None = None
-    """Epochs without a better one after which training stops; none stops it unless given."""
+    """Stop after this many epochs without improvement; None runs all epochs."""
 
     seed: int = 0
-    """Of the split, the first weights, the order of rows and dropout."""
+    """Seed of the split, the initial weights, the order of rows and dropout."""
 
     split: By = "session"
-    """What is never on two sides of training, validation and test."""
+    """Unit kept whole when splitting into training, validation and test."""
 
     hold_out: tuple[str, ...] = ()
-    """Sessions, runs, paths or recordings that are all in the test."""
+    """Sessions, runs, paths or recordings to put into the test."""
 
     threads: int | None = None
-    """Threads of torch; as many as it takes unless given. Another number gives other bits."""
+    """Threads of torch; None leaves them as they are. Another number gives other bits."""
 
     device: Device | None = None
-    """Where torch trains: "cpu", "cuda", or "auto", a GPU where torch sees one."""
+    """Where torch trains: "cpu", "cuda", or "auto" (a GPU if torch sees one)."""
 
     init: Path | None = None
-    """Weights file that training goes on from, .safetensors or .pth, of the same kind and features."""
+    """Weights file to continue from, .safetensors or .pth, of the same kind and features."""
 
     licence: str = ""
     """Licence of the weights, an SPDX identifier such as MIT."""
 
     freeze: tuple[str, ...] = ()
-    """Layers that stay as `init` has them: "layers.0" is the first; of a hybrid, "base" too."""
+    """Layers that stay as in `init`: "layers.0" is the first; for a hybrid also "base"."""
 
     def __post_init__(self) -> None:
-        known = MODELS[self.model]
+        known = options_of(self.model)
         for field in fields(self):
             given = getattr(self, field.name)
-            if field.name in ALL_READ or given is None or given in ((), ""):
+            if field.name in COMMON or given is None or given in ((), "") or field.name in known:
                 continue
-            if field.name not in known:
-                able = [name for name, options in MODELS.items() if field.name in options]
-                raise InputError(
-                    f"{field.name} is nothing to {self.model!r}; leave it out, or take one that reads it: "
-                    f"{', '.join(able)}"
-                )
-        for name, usual in known.items():
+            able = [name for name in models() if field.name in options_of(name)]
+            raise InputError(
+                f"{field.name} is no option of {self.model!r}; leave it out, or choose {', '.join(able)}"
+            )
+        for name, default in known.items():
             if getattr(self, name) in (None, (), ""):
-                object.__setattr__(self, name, usual)
+                object.__setattr__(self, name, default)
         self._check()
 
     def _check(self) -> None:
-        inputs = self.inputs  # refuses what is no feature
-        for name in ("epochs", "batch", "lr", "members"):
+        inputs = self.inputs  # refuses unknown features
+        for name in ("epochs", "batch", "lr"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise InputError(f"{name} must be above 0, got {value!r}")
         for name, count in (("patience", self.patience), ("threads", self.threads)):
             if count is not None and count < 1:
                 raise InputError(f"{name} must be 1 at least, got {count!r}; leave it out for none")
-        if self.kernel is not None and self.kernel < 2:
-            raise InputError(f"kernel must be 2 rows at least, got {self.kernel!r}")
         if self.penalty is not None and not 0 <= self.penalty < math.inf:
-            raise InputError(f"penalty must be from 0 up and finite, got {self.penalty!r}")
+            raise InputError(f"penalty must be 0 or more and finite, got {self.penalty!r}")
         if self.dropout is not None and not 0 <= self.dropout < 1:
-            raise InputError(f"dropout must lie in 0..1, 1 left out, got {self.dropout!r}")
+            raise InputError(f"dropout must be at least 0 and below 1, got {self.dropout!r}")
         if self.seed < 0:
             raise InputError(f"seed must be 0 or more, got {self.seed!r}")
         if not all(width > 0 for width in self.layers) or not inputs:
             raise InputError(f"layers must be above 0 wide, got {self.layers!r}")
-        widths = (len(inputs), *self.layers, 1)
-        weights = sum(a * b for a, b in itertools.pairwise(widths)) * (self.members or 1) * (self.kernel or 1)
+        weights = sum(a * b for a, b in itertools.pairwise((len(inputs), *self.layers, 1)))
         if weights > MOST_WEIGHTS:
             raise InputError(
                 f"layers {self.layers!r} make {weights:,} weights; take {MOST_WEIGHTS:,} at most"
@@ -174,13 +157,8 @@ class TrainConfig:
 
     @property
     def kind(self) -> str:
-        """Kind of the predictor: "mlp", "linear", "hybrid", "ensemble" or "tcn"."""
-        return "mlp" if self.model in ("paper", "released") else self.model
-
-    @property
-    def hidden(self) -> tuple[int, ...]:
-        """Widths of the hidden layers; none of a linear model."""
-        return self.layers
+        """Kind of the predictor, a name of `PREDICTORS`."""
+        return PRESETS.get(self.model, (self.model, {}))[0]
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -191,24 +169,25 @@ class TrainConfig:
         """
         return feature_names(self.features)
 
-    def options(self, *names: str) -> dict[str, Any]:
-        """Some of the options by name, such as a model's fit takes them."""
-        return {name: getattr(self, name) for name in names}
+    @property
+    def options(self) -> dict[str, Any]:
+        """Values of the options that the model reads beside `COMMON`."""
+        return {name: getattr(self, name) for name in options_of(self.model)}
 
     def with_options(self, **options: Any) -> "TrainConfig":
-        """With other options; those of another model are left behind where `model` is one of them."""
+        """The configuration with other options. Another `model` drops the options that it does not read."""
         keep = {field.name: getattr(self, field.name) for field in fields(self)}
         if options.get("model", self.model) != self.model:
-            usual, known = MODELS[self.model], MODELS[options["model"]]
+            default, known = options_of(self.model), options_of(options["model"])
             keep = {
                 name: value
                 for name, value in keep.items()
-                if name in ALL_READ or (name in known and name != "layers" and value != usual.get(name))
+                if name in COMMON or (name in known and name != "layers" and value != default.get(name))
             }
         return TrainConfig(**{**keep, **options})
 
     def to_toml(self) -> str:
-        """The file that `read_config` reads this from; what is not set is left out."""
+        """The configuration as TOML for `read_config`; options that are not set are left out."""
         lines = []
         for field in fields(self):
             value = getattr(self, field.name)
@@ -221,10 +200,10 @@ class TrainConfig:
 
 
 def read_config(path: str | os.PathLike[str]) -> TrainConfig:
-    """A configuration from a TOML file; what it does not say is as `MODELS` has it.
+    """Read a configuration from a TOML file; missing options have their defaults.
 
     Raises:
-        InputError: No such file, not TOML, an unknown key (the near one is named), an option that the model
-            does not read, or a value that cannot be, each with its line.
+        InputError: No such file, not TOML, an unknown key (the nearest one is named), an option that the
+            model does not read, or an invalid value, each with its line.
     """
     return from_table(TrainConfig, read_toml(path), path)

@@ -17,8 +17,8 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.sim.engines.sampled import SampledMotion
+from magtwin.sim.motion.closed_loop import ClosedLoop
 from magtwin.sim.motion.controllers import Controller
-from magtwin.sim.motion.course import Course
 from magtwin.sim.motion.drive import limiter, wheel_rates
 from magtwin.sim.motion.loop import LATE_S, REST_M_S, wrapped
 from magtwin.spec.obstacles import Obstacles
@@ -56,7 +56,7 @@ class Newton:
     name = "newton"
 
     def drive(
-        self, course: Course, controller: Controller | None, obstacles: Obstacles | None
+        self, course: ClosedLoop, controller: Controller | None, obstacles: Obstacles | None
     ) -> SampledMotion:
         """As for `magtwin.sim.motion.engine.Engine`.
 
@@ -143,7 +143,7 @@ def check_installed() -> None:
 class _Process:
     """`newton_world` in a process of its own, ended with the block."""
 
-    def __init__(self, engine: Newton, course: Course, step_s: float) -> None:
+    def __init__(self, engine: Newton, course: ClosedLoop, step_s: float) -> None:
         self._engine = engine
         drive = course.drive
         self._job = {

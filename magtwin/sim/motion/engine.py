@@ -2,8 +2,8 @@
 
 from typing import Protocol
 
+from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop, run_loops
 from magtwin.sim.motion.controllers import Controller
-from magtwin.sim.motion.course import Chassis, Course, run_courses
 from magtwin.sim.motion.drive import Motion
 from magtwin.sim.motion.sampling import Moving
 from magtwin.spec.obstacles import Obstacles
@@ -24,7 +24,7 @@ class Engine(Protocol):
     def name(self) -> str:
         """What it is called in the metadata of a run."""
 
-    def drive(self, course: Course, controller: Controller | None, obstacles: Obstacles | None) -> Travel:
+    def drive(self, course: ClosedLoop, controller: Controller | None, obstacles: Obstacles | None) -> Travel:
         """Drive until the controller is done and the robot stands, or the course's steps are over.
 
         Args:
@@ -39,10 +39,10 @@ class Kinematic:
 
     name = "kinematic"
 
-    def drive(self, course: Course, controller: Controller | None, obstacles: Obstacles | None) -> Motion:
+    def drive(self, course: ClosedLoop, controller: Controller | None, obstacles: Obstacles | None) -> Motion:
         """As for `Engine`."""
         if controller is None:
-            return run_courses([course], obstacles)[0]
+            return run_loops([course], obstacles)[0]
         chassis = Chassis(course, obstacles)
         for k in range(course.steps):
             chassis.step(controller.command(k * course.dt, *chassis.pose, *chassis.twist))

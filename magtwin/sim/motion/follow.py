@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
 from magtwin.path import Path, check_clear
+from magtwin.sim.motion.closed_loop import ClosedLoop
 from magtwin.sim.motion.controllers import Controller, guide_along, guide_by_commands
-from magtwin.sim.motion.course import Course
 from magtwin.sim.motion.drive import Pose
 from magtwin.sim.motion.engine import Engine, Kinematic, Travel
 from magtwin.sim.motion.plan import SLOWEST, drivable
@@ -22,7 +22,7 @@ LONGEST_S = 86_400.0
 """Longest run [s]: 11.7 million readings at 135 Hz, which still fit into the memory of a laptop."""
 
 
-def course_along(
+def loop_along(
     path: Path,
     drive: DriveSpec,
     *,
@@ -34,7 +34,7 @@ def course_along(
     obstacles: Obstacles | None = None,
     footprint_radius_m: float = 0.0,
     wheel_errors: tuple[float, float] = (0.0, 0.0),
-) -> Course:
+) -> ClosedLoop:
     """What drives along a path, checked and ready to run; arguments and refusals are those of `follow`."""
     dt = _step(rate_hz, drive)
     if duration_s is not None:
@@ -60,7 +60,7 @@ def course_along(
     if duration_s is None:
         stops = 1 + np.count_nonzero(guide.table[5] == 0)
         duration_s = min(60 + 10 * stops + 4 * way.length / min(SLOWEST, speed), LONGEST_S)
-    return Course(
+    return ClosedLoop(
         drive=drive,
         guide=guide,
         dt=dt,
@@ -110,7 +110,7 @@ def follow(
             obstacle, a command is not finite, or the end of the path was not reached in a time that
             suffices for any path.
     """
-    course = course_along(
+    course = loop_along(
         path,
         drive,
         speed=speed,
@@ -129,7 +129,7 @@ def follow(
     return motion
 
 
-def check_arrived(path: Path, speed: float, course: Course, motion: Travel) -> None:
+def check_arrived(path: Path, speed: float, course: ClosedLoop, motion: Travel) -> None:
     """Refuse a motion that took all the steps which its course allows for reaching the end of a path."""
     if motion.duration_s > (course.steps - 0.5) * course.dt:
         why = (
@@ -174,7 +174,7 @@ def play(
         InputError: Commands are not finite or not in order of time, `duration_s` or `rate_hz` is out of
             range, or the start touches an obstacle.
     """
-    course = course_by(
+    course = loop_by_commands(
         commands,
         drive,
         start=start,
@@ -186,7 +186,7 @@ def play(
     return (engine or Kinematic()).drive(course, controller, obstacles)
 
 
-def course_by(
+def loop_by_commands(
     commands: ArrayLike,
     drive: DriveSpec,
     *,
@@ -195,7 +195,7 @@ def course_by(
     rate_hz: float = CONTROL_RATE_HZ,
     footprint_radius_m: float = 0.0,
     wheel_errors: tuple[float, float] = (0.0, 0.0),
-) -> Course:
+) -> ClosedLoop:
     """What plays a script, ready to run; arguments and refusals are those of `play`."""
     dt = _step(rate_hz, drive)
     guide = guide_by_commands(commands, drive)
@@ -205,7 +205,7 @@ def course_by(
     else:
         end = duration_s
     _check_duration(end)
-    return Course(
+    return ClosedLoop(
         drive=drive,
         guide=guide,
         dt=dt,

@@ -6,9 +6,9 @@ from typing import Protocol
 
 import numpy as np
 
+from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop
 from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.controllers import guide_by_commands
-from magtwin.sim.motion.course import Chassis, Course
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 
@@ -156,7 +156,7 @@ def at_start(
     Raises:
         InputError: It would begin in an obstacle.
     """
-    course = Course(
+    course = ClosedLoop(
         drive=drive,
         guide=guide_by_commands([[0.0, 0.0, 0.0]], drive),
         dt=dt,

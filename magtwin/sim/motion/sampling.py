@@ -92,9 +92,9 @@ def moment_at(motion: Moving, stamps: Array) -> Moment:
 
 
 def into_sensor(v_base: Array, q_base_sensor_xyzw: Quat) -> Array:
-    """Vectors (N, 3) turned from base_link's axes into those of a sensor."""
+    """Vectors (..., 3) turned from base_link's axes into those of a sensor."""
     # einsum, as a product of so few columns is no work for the threads of a BLAS that `@` wakes.
-    return np.einsum("ni,ij->nj", v_base, axes_in_base(tuple(q_base_sensor_xyzw)))
+    return np.einsum("...i,ij->...j", v_base, axes_in_base(tuple(q_base_sensor_xyzw)))
 
 
 @lru_cache(maxsize=64)

@@ -1,16 +1,17 @@
-"""Battery: what drives the robot, its LiDAR and its electronics, and what that leaves in the pack."""
+"""Battery: the power that the robot, its LiDAR and its electronics draw, and the charge that is left."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.sim.motion.sampling import Columns, Moving, held
+from magtwin.sim.motion.drive import Moment
+from magtwin.sim.motion.sampling import Moving
+from magtwin.sim.sensors.clock import Array, Columns, SampleClock, SampledSensor
+from magtwin.sim.sensors.noise import accumulate
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.sensors import BatterySpec
-
-Array = NDArray[np.float64]
 
 SECONDS_PER_HOUR = 3600.0
 
@@ -22,16 +23,16 @@ _ROUNDS = 50
 
 
 def open_voltage(spec: BatterySpec, fraction: ArrayLike) -> Array:
-    """Voltage of a pack that rests at a charge from 0 to 1 [V]: along its discharge curve, no load on it."""
+    """Voltage of a resting pack with a charge from 0 to 1 [V], along its discharge curve."""
     curve = np.array(spec.discharge)
     share = np.interp(np.asarray(fraction, float), np.linspace(0.0, 1.0, len(curve)), curve)
     return spec.voltage_empty_v + (spec.voltage_full_v - spec.voltage_empty_v) * share
 
 
 def current_a(spec: BatterySpec, power_w: ArrayLike, fraction: ArrayLike) -> Array:
-    """Current of a pack that gives a power, through its inner resistance [A]: U I = (U_0 - R I) I = P.
+    """Current of a pack that delivers a power through its inner resistance [A].
 
-    Of the two solutions the smaller, for a power that the pack can give: at most U_0^2 / 4 R.
+    The smaller solution of U I = (U_0 - R I) I = P, for a power of at most U_0^2 / 4 R.
 
     Args:
         spec: Discharge curve and resistance R.
@@ -39,117 +40,162 @@ def current_a(spec: BatterySpec, power_w: ArrayLike, fraction: ArrayLike) -> Arr
         fraction: Charge, 0 to 1, of the same shape.
     """
     u, power = open_voltage(spec, fraction), np.asarray(power_w, float)
-    # 2 P / (U_0 + sqrt(...)), as the difference of the usual formula cancels where R is small.
+    # 2 P / (U_0 + sqrt(...)), because the difference in the usual formula cancels if R is small.
     return 2 * power / (u + np.sqrt(np.maximum(u * u - 4 * spec.resistance_ohm * power, 0.0)))
 
 
-def wheels_energy_j(spec: BatterySpec, drive: DriveSpec, motion: Moving, times: Array) -> Array:
-    """Energy that the motors draw in each interval between times (K + 1,) [s] in turn [J], shape (K,).
+def wheels_energy_j(spec: BatterySpec, drive: DriveSpec, moments: Moment) -> Array:
+    """Energy that the motors draw between successive moments [J], shape (K, ...) for K + 1 moments.
 
     Each wheel carries half of the robot. It works against half of the drag along its way, and for the
-    kinetic energy that it gains; braking gives nothing back. The motors draw that over their efficiency:
-    so a straight drive costs (drag x way + m v^2 / 2) / efficiency, however it went.
+    kinetic energy that it gains; braking gives nothing back. The motors draw this work over their efficiency.
+    So a straight drive costs (drag x way + m v^2 / 2) / efficiency, however it went.
     """
-    moment = motion.at(times)
-    side = moment.w * drive.wheel_separation_m / 2
-    speed = np.stack([moment.v - side, moment.v + side], axis=-1)
-    way = np.abs(np.diff(moment.wheel_angle, axis=0)) * drive.wheel_radius_m
+    side = moments.w * drive.wheel_separation_m / 2
+    speed = np.stack([moments.v - side, moments.v + side], axis=-1)
+    rolled = np.abs(np.diff(moments.wheel_angle, axis=0)) * drive.wheel_radius_m
     gain = np.maximum(np.diff(speed * speed, axis=0), 0.0)
-    return np.sum(spec.drag_n / 2 * way + spec.mass_kg / 4 * gain, axis=1) / spec.motor_efficiency
+    work = spec.drag_n / 2 * rolled + spec.mass_kg / 4 * gain
+    return np.asarray((work[..., 0] + work[..., 1]) / spec.motor_efficiency)
 
 
 @dataclass(frozen=True, eq=False)
 class Discharge:
-    """What became of a pack: its state at the end of steps, one after the other from t = 0."""
+    """Successive steps of a pack; arrays of shape (K, ...)."""
 
     power_w: Array
-    """Power drawn from the pack in each step, its own heat not counted [W], shape (K,)."""
+    """Power drawn from the pack in each step, its own heat not counted [W]."""
 
     fraction: Array
-    """Charge at the start and after each step, 0 to 1, shape (K + 1,)."""
+    """Charge at the end of each step, 0 to 1."""
 
     voltage_v: Array
-    """Voltage under load in the step that ended, of the first before the first [V], shape (K + 1,)."""
+    """Voltage under load in each step [V]."""
 
     current_a: Array
-    """Current in the step that ended, of the first before the first [A], shape (K + 1,)."""
-
-    def index(self, t: ArrayLike) -> NDArray[np.intp]:
-        """Which state holds at times [s], shape (N,): that of the last step that has ended by then."""
-        steps = np.floor(np.asarray(t, float) / STEP_S + 1e-9).astype(np.intp)
-        return np.clip(steps, 0, len(self.power_w))
+    """Current in each step [A]."""
 
 
-def discharge(
-    spec: BatterySpec,
-    drive: DriveSpec,
-    motion: Moving,
-    lidar_on: Callable[[Array], NDArray[np.bool_]],
-    duration_s: float,
-) -> Discharge:
-    """Discharge a pack through a run, as its model says.
+class Battery(SampledSensor):
+    """Charge, current, and a voltage with Gaussian noise.
 
-    "power": each step of `STEP_S` draws the mean power P of electronics, LiDAR and motors; the pack gives
-    it with the current I of `current_a`, never more than an empty one could, and loses (P + R I^2) dt of
-    its energy. What the pack loses is what was drawn, to rounding, until it is empty; an empty pack stays
-    at 0, as the run goes on.
-
-    "linear", the paper's: P is `load_w`, the charge falls by P t / E, and nothing sags.
-
-    Args:
-        spec: Pack and loads.
-        drive: The wheels that are driven.
-        motion: What the robot did.
-        lidar_on: Whether the LiDAR spins at times [s], of their shape.
-        duration_s: How long [s].
+    Each step of `STEP_S` draws the mean power P of electronics, LiDAR and motors. The pack delivers it with
+    the current I of `current_a`, at most what an empty pack can deliver, and loses (P + R I^2) dt of its
+    energy. An empty pack stays at 0, and the run goes on. In the "linear" model of the paper P is always
+    `load_w` and nothing sags. Columns: battery_v, battery_a, battery_fraction.
     """
-    count = int(duration_s / STEP_S) + 1
-    times = np.arange(count + 1, dtype=float) * STEP_S
-    energy_j = spec.capacity_wh * SECONDS_PER_HOUR
-    if spec.model == "linear":
-        power = np.full(count, spec.load_w)
-        fraction = np.maximum(spec.initial_fraction - spec.load_w * times / energy_j, 0.0)
-        voltage = open_voltage(spec, fraction)
-        return Discharge(power, fraction, voltage, spec.load_w / voltage)
-    power = wheels_energy_j(spec, drive, motion, times) / STEP_S
-    power += spec.load_w + spec.lidar_w * lidar_on(times[:-1])
-    if spec.resistance_ohm > 0:
-        np.minimum(power, spec.voltage_empty_v**2 / (4 * spec.resistance_ohm), out=power)
-    # f_{k+1} = f_k - (P_k + R I(P_k, f_k)^2) dt / E, solved for all k at once: a charge f changes I so
-    # little that each pass is exact to some digits more, and the last one to all of them.
-    left = np.full(count + 1, spec.initial_fraction)
-    for _ in range(_ROUNDS):
-        current = current_a(spec, power, np.maximum(left[:-1], 0.0))
-        spent = np.cumsum((power + spec.resistance_ohm * current * current) * (STEP_S / energy_j))
-        last, left = left, np.concatenate([left[:1], spec.initial_fraction - spent])
-        if np.array_equal(left, last):
-            break
-    fraction = np.maximum(left, 0.0)
-    current = current_a(spec, power, fraction[:-1])
-    voltage = open_voltage(spec, fraction[:-1]) - spec.resistance_ohm * current
-    return Discharge(
-        power, fraction, np.concatenate([voltage[:1], voltage]), np.concatenate([current[:1], current])
-    )
 
+    def __init__(
+        self,
+        spec: BatterySpec,
+        drive: DriveSpec,
+        lidar_on: Callable[[Array], NDArray[np.bool_]],
+        rng: np.random.Generator,
+    ) -> None:
+        """Begin at rest with the spec's charge.
 
-def sense_battery(spec: BatterySpec, pack: Discharge, t: ArrayLike, rng: np.random.Generator) -> Columns:
-    """What the robot's battery reports: charge, current, and a voltage with Gaussian noise.
+        Args:
+            spec: Pack, loads, rate, delays and noise.
+            drive: The wheels that are driven.
+            lidar_on: From times [s] to whether the LiDAR spins.
+            rng: Source of delays and noise.
+        """
+        delays, noise = rng.spawn(2)
+        super().__init__(noise, spent=0.0, initial=spec.initial_fraction)
+        if spec.model == "linear":
+            spec = replace(spec, model="power", resistance_ohm=0.0, lidar_w=0.0, drag_n=0.0, mass_kg=0.0)
+        self.spec, self._drive, self._lidar_on = spec, drive, lidar_on
+        self.clock = SampleClock(spec.rate_hz, spec.latency_s, spec.jitter_s, delays)
+        self._first, self._done = 0, 0
+        self._history: Array | None = None  # voltage, current and charge after step `_first` and later ones
 
-    Args:
-        spec: Rate, delays and noise.
-        pack: What became of the pack.
-        t: Times of the readings [s], shape (N,).
-        rng: Source of delays and noise.
+    def rest(self, lidar_on: ArrayLike) -> Discharge:
+        """A step of no length at rest: the state at the start; arrays of the shape of `lidar_on`."""
+        fraction = np.broadcast_to(self._left(self.state["spent"]), np.shape(lidar_on))
+        return self._loaded(np.zeros(np.shape(lidar_on)), lidar_on, fraction, fraction)
 
-    Returns:
-        battery_v, battery_a, battery_fraction at `rate_hz`, held.
-    """
-    delays, noise = rng.spawn(2)
-    stamps, latest = held(t, spec.rate_hz, latency_s=spec.latency_s, jitter_s=spec.jitter_s, rng=delays)
-    state = pack.index(stamps)
-    voltage = pack.voltage_v[state] + spec.voltage_noise_std_v * noise.standard_normal(len(stamps))
-    return {
-        "battery_v": voltage[latest],
-        "battery_a": pack.current_a[state][latest],
-        "battery_fraction": pack.fraction[state][latest],
-    }
+    def draw(self, energy_j: Array, lidar_on: ArrayLike, step_s: float) -> Discharge:
+        """Discharge the pack in successive steps.
+
+        f_{k+1} = f_k - (P_k + R I(P_k, f_k)^2) dt / E is solved for all k at once: I depends so little on the
+        charge f that each pass makes some more digits exact, and the last pass all of them.
+
+        Args:
+            energy_j: Energy that the motors draw in each step [J], shape (K,) or (K, R).
+            lidar_on: Whether the LiDAR spins in each step, of the same shape.
+            step_s: Length of a step [s].
+        """
+        spec = self.spec
+        power = self._power(energy_j / step_s, lidar_on)
+        per_watt = step_s / (spec.capacity_wh * SECONDS_PER_HOUR)
+        spent = np.broadcast_to(self.state["spent"], (len(power) + 1, *power.shape[1:]))
+        for _ in range(_ROUNDS):
+            current = current_a(spec, power, self._left(spent[:-1]))
+            heat = spec.resistance_ohm * current * current
+            last, spent = spent, accumulate(self.state["spent"], (power + heat) * per_watt)
+            if np.array_equal(spent, last):
+                break
+        self.state["spent"] = spent[-1]
+        return self._loaded(energy_j / step_s, lidar_on, self._left(spent[:-1]), self._left(spent[1:]))
+
+    def readings(self, steps: Discharge) -> Columns:
+        """What the battery reports of states of the pack, shape (K,) or (K, R): voltage with noise."""
+        noise = self.spec.voltage_noise_std_v * self.normal(len(steps.voltage_v), 1)[..., 0]
+        return {
+            "battery_v": steps.voltage_v + noise,
+            "battery_a": steps.current_a,
+            "battery_fraction": steps.fraction,
+        }
+
+    def sense(self, motion: Moving, t: Array, until_s: float | None = None) -> Columns:
+        """As for `SampledSensor`."""
+        self._discharge(motion, float(t[-1]) + STEP_S if until_s is None else until_s)
+        return super().sense(motion, t, until_s)
+
+    def sample(self, stamps: Array, now: Moment) -> Columns:
+        """As for `SampledSensor`, for one robot."""
+        power, fraction, voltage, current = self._states(stamps).T
+        return self.readings(Discharge(power, fraction, voltage, current))
+
+    def supply_a(self, t: Array) -> Array:
+        """Current drawn at the times of the last call of `sense` [A]."""
+        return self._states(t)[:, 3]
+
+    def _discharge(self, motion: Moving, until_s: float) -> None:
+        """Discharge the pack in the steps that end before a time, and keep their states."""
+        if self._history is None:
+            start = self.rest(self._lidar_on(np.zeros(1)))
+            self._history = np.column_stack([start.power_w, start.fraction, start.voltage_v, start.current_a])
+        else:
+            self._history, self._first = self._history[-1:], self._done
+        last = max(int(np.ceil((until_s - 1e-9) / STEP_S)) - 1, self._done)
+        times = np.asarray(np.arange(self._done, last + 1) * STEP_S, np.float64)
+        self._done = last
+        if len(times) > 1:
+            energy = wheels_energy_j(self.spec, self._drive, motion.at(times))
+            steps = self.draw(energy, self._lidar_on(times[:-1]), STEP_S)
+            rows = np.column_stack([steps.power_w, steps.fraction, steps.voltage_v, steps.current_a])
+            self._history = np.concatenate([self._history, rows])
+
+    def _states(self, t: Array) -> Array:
+        """The state at times [s]: that after the last step that has ended; shape (N, 4)."""
+        assert self._history is not None
+        steps = np.floor(t / STEP_S + 1e-9).astype(np.intp)
+        return self._history.take(np.clip(steps, self._first, self._done) - self._first, axis=0)
+
+    def _left(self, spent: Array) -> Array:
+        return np.maximum(self.state["initial"] - spent, 0.0)
+
+    def _power(self, motors_w: Array, lidar_on: ArrayLike) -> Array:
+        spec = self.spec
+        power = motors_w + spec.load_w + spec.lidar_w * np.asarray(lidar_on, float)
+        if spec.resistance_ohm > 0:
+            power = np.minimum(power, spec.voltage_empty_v**2 / (4 * spec.resistance_ohm))
+        return np.asarray(power)
+
+    def _loaded(self, motors_w: Array, lidar_on: ArrayLike, before: Array, after: Array) -> Discharge:
+        """Steps with a charge before and after."""
+        power = self._power(motors_w, lidar_on)
+        current = current_a(self.spec, power, before)
+        voltage = open_voltage(self.spec, before) - self.spec.resistance_ohm * current
+        return Discharge(power, after, voltage, current)

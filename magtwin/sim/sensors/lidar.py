@@ -1,5 +1,6 @@
 """LiDAR: when it spins, and what a planar one sees."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +20,9 @@ Array = NDArray[np.float64]
 
 _EDGE = 1e-9
 """Part of a ray's step by which a surface reaches past its ends, lest a ray slip between two."""
+
+_SAME_S = 1e-6
+"""How far past the last reading a scan still belongs to a run [s]."""
 
 _UPRIGHT = 1e-12
 """Sine of the angle from the vertical below which a LiDAR's axis counts as upright."""
@@ -76,7 +80,7 @@ def scan(
     """
     p, turn = np.asarray(pose[0], float), matrix_from_quat(pose[1])
     cuts = _cuts((obstacles.triangles - p) @ turn, 0.0)
-    return _told(_cast(cuts, spec.rays), spec, rng)
+    return _reported(_cast(cuts, spec.rays), spec, rng)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -116,44 +120,96 @@ class Scans(Summarized):
         )
 
 
+class Scanner:
+    """A LiDAR that scans once a turn while it spins, continued from call to call."""
+
+    def __init__(
+        self, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Generator, *, begin_s: float = 0.0
+    ) -> None:
+        """Begin a turn.
+
+        Args:
+            robot: Its LiDAR, and where it is mounted.
+            obstacles: What there is to see.
+            rng: Source of delays and noise.
+            begin_s: Time of the first scan [s].
+        """
+        self._robot, self._obstacles, self._begin_s = robot, obstacles, begin_s
+        self._delays, self._noise = rng.spawn(2)
+        self._next, self._arrived = 0, -np.inf
+        self._cuts: tuple[float, Array] | None = None
+
+    def scan(
+        self,
+        until_s: float,
+        poses: Callable[[Array], Array],
+        lidar_on: Callable[[Array], NDArray[np.bool_]],
+    ) -> Scans:
+        """The scans whose time comes before `until_s`, with the times at which they arrive.
+
+        Args:
+            until_s: End of the time [s].
+            poses: From times [s] to x [m], y [m], height [m], yaw [rad] of base_link, shape (N, 4).
+            lidar_on: From times [s] to whether the LiDAR spins.
+        """
+        spec, robot = self._robot.lidar, self._robot
+        last = int(np.ceil((until_s - self._begin_s) * spec.scan_rate_hz - 1e-9))
+        stamps = self._begin_s + np.arange(self._next, max(last, self._next)) / spec.scan_rate_hz
+        self._next += len(stamps)
+        late = spec.latency_s + spec.jitter_s * self._delays.exponential(1.0, len(stamps))
+        arrival = np.maximum.accumulate(np.concatenate([[self._arrived], stamps + late]))
+        self._arrived, spins = arrival[-1], lidar_on(stamps)
+        stamps, arrival = stamps[spins], arrival[1:][spins]
+        pose = poses(stamps)
+        q_base = quat_from_yaw(pose[:, 3])
+        p = pose[:, :3] + rotate(q_base, np.array(robot.p_base_lidar))
+        q = quat_multiply(q_base, robot.q_base_lidar_xyzw)
+        ranges = np.empty((len(stamps), spec.rays), np.float32)
+        upright = abs(abs(matrix_from_quat(robot.q_base_lidar_xyzw)[2, 2]) - 1) < _UPRIGHT
+        for row, (at, axes) in enumerate(zip(p, q, strict=True)):
+            if upright:
+                turn = matrix_from_quat(axes)[:2, :2]
+                hits = _cast((self._level_cuts(at[2]) - at[:2]) @ turn, spec.rays)
+                ranges[row] = _reported(hits, spec, self._noise)
+            else:
+                ranges[row] = scan(self._obstacles, (at, axes), spec, self._noise)
+        return Scans(stamps, arrival, p, q, ranges)
+
+    def _level_cuts(self, height: float) -> Array:
+        """Where the obstacles cross the plane of the last height; a robot on a floor has one."""
+        if self._cuts is None or self._cuts[0] != height:
+            self._cuts = height, _cuts(self._obstacles.triangles, height)
+        return self._cuts[1]
+
+
 def scans_of(run: Run, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Generator) -> Scans:
-    """What the LiDAR saw in a run, one scan a turn while it spun.
+    """The scans of a LiDAR in a run, one per turn while it spun.
 
     Args:
-        run: With t, p_world_base, yaw and lidar_on: a simulated one, or one that was recorded.
-        robot: Its LiDAR, and where it sits.
+        run: With t, p_world_base, yaw and lidar_on: simulated or recorded.
+        robot: Its LiDAR, and where it is mounted.
         obstacles: What there is to see.
         rng: Source of delays and noise.
 
     Raises:
-        InputError: There are more scans than memory could hold.
+        InputError: There are more scans than memory can hold.
     """
-    spec, t = robot.lidar, run["t"]
-    check_count("a LiDAR's scans", t[-1] - t[0], spec.scan_rate_hz)
-    delays, noise = rng.spawn(2)
-    stamps = t[0] + np.arange(int((t[-1] - t[0]) * spec.scan_rate_hz) + 1) / spec.scan_rate_hz
-    spins = run["lidar_on"][np.searchsorted(t, stamps, side="right") - 1]
-    late = spec.latency_s + spec.jitter_s * delays.exponential(1.0, len(stamps))
-    stamps, arrival = stamps[spins], np.maximum.accumulate(stamps + late)[spins]
-    base, yaw = run["p_world_base"], np.unwrap(run["yaw"])
-    p = np.column_stack([np.interp(stamps, t, base[:, k]) for k in range(3)])
-    q_base = quat_from_yaw(np.interp(stamps, t, yaw))
-    p = p + rotate(q_base, np.array(robot.p_base_lidar))
-    q = quat_multiply(q_base, robot.q_base_lidar_xyzw)
-    ranges = np.empty((len(stamps), spec.rays), np.float32)
-    level = matrix_from_quat(robot.q_base_lidar_xyzw)
-    if len(stamps) and abs(abs(level[2, 2]) - 1) < _UPRIGHT and np.ptp(p[:, 2]) == 0:
-        cuts = _cuts(obstacles.triangles, p[0, 2])
-        for row, (origin, axes) in enumerate(zip(p[:, :2], matrix_from_quat(q)[:, :2, :2], strict=True)):
-            ranges[row] = _told(_cast((cuts - origin) @ axes, spec.rays), spec, noise)
-    else:
-        for row, pose in enumerate(zip(p, q, strict=True)):
-            ranges[row] = scan(obstacles, pose, spec, noise)
-    return Scans(stamps, arrival, p, q, ranges)
+    t, base, yaw = run["t"], run["p_world_base"], np.unwrap(run["yaw"])
+    check_count("a LiDAR's scans", t[-1] - t[0], robot.lidar.scan_rate_hz)
+
+    def poses(stamps: Array) -> Array:
+        columns = [np.interp(stamps, t, base[:, k]) for k in range(3)]
+        return np.column_stack([*columns, np.interp(stamps, t, yaw)])
+
+    def spins(stamps: Array) -> NDArray[np.bool_]:
+        return np.asarray(run["lidar_on"][np.searchsorted(t, stamps, side="right") - 1])
+
+    scanner = Scanner(robot, obstacles, rng, begin_s=t[0])
+    return scanner.scan(t[-1] + _SAME_S, poses, spins)
 
 
-def _told(ranges: Array, spec: LidarSpec, rng: np.random.Generator | None) -> Array:
-    """True ranges [m] as a LiDAR tells them: with noise, as far and as near as it sees."""
+def _reported(ranges: Array, spec: LidarSpec, rng: np.random.Generator | None) -> Array:
+    """Ranges [m] with noise, from the nearest to the farthest that the LiDAR measures."""
     if rng is not None:
         ranges = ranges + spec.range_noise_std_m * rng.standard_normal(len(ranges))
     ranges = np.where(ranges > spec.range_max_m, np.inf, ranges)

@@ -5,13 +5,12 @@ from that distribution, not its mean. The error has a part that stays for a sess
 over seconds, as on recordings that the network never saw.
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.sim.sensors.noise import gauss_markov
+from magtwin.sim.sensors.noise import GaussMarkov
 
 Array = NDArray[np.float64]
 
@@ -56,15 +55,11 @@ class ModelError:
         o = self.offset if offset is None else np.asarray(offset, float)
         return np.asarray(constant * o + rest * np.asarray(process, float))
 
-    def process(self, white: ArrayLike, rate_hz: float) -> Array:
-        """U of successive readings, a Gauss-Markov process of correlation time `time_s`.
+    def process(self, rng: np.random.Generator, rate_hz: float) -> GaussMarkov:
+        """The process u of successive readings, of correlation time `time_s`.
 
         Args:
-            white: Standard normal numbers, shape (N,).
+            rng: Source of the process.
             rate_hz: Readings a second [Hz].
         """
-        return gauss_markov(white, self.time_s, rate_hz)
-
-    def decay(self, step_s: float) -> float:
-        """Share of u that is left after a step [s]."""
-        return math.exp(-step_s / self.time_s) if self.time_s > 0 else 0.0
+        return GaussMarkov(rng, self.time_s, rate_hz)

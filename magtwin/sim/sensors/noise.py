@@ -1,69 +1,66 @@
-"""Noise that remembers: first-order processes and random walks, of white noise drawn sample by sample.
+"""Noise with memory, drawn in pieces of any length: Gauss-Markov processes and random walks.
 
-A longer series begins with the same numbers as a shorter one, to the bit.
+Each function takes the state after the last piece and returns the state for the next one. So the bytes of a
+series do not depend on how it is cut into pieces.
 """
 
 import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.signal import lfilter
+
+from magtwin.sim.sensors.stateful import Stateful
 
 Array = NDArray[np.float64]
 
-_NOTHING = 1e-17
-"""A share of the past that no double precision sum feels."""
 
-
-def first_order(x: ArrayLike, decay: float) -> Array:
-    """y_k = decay y_{k-1} + x_k, along the first axis.
-
-    Done by doubling (Hillis and Steele 1986): after the pass of stride s, y_k holds the last 2 s terms. It
-    takes few passes over whole arrays, and is as exact for a short memory as for a long one.
-
-    Args:
-        x: What comes in, shape (N, ...).
-        decay: Share that is left of the last value, 0 to 1.
-
-    Returns:
-        y, the shape of `x`; y_0 = x_0.
-    """
-    y = np.array(x, float)
-    stride, share = 1, float(decay)
-    while stride < len(y) and share > _NOTHING:
-        y[stride:] += share * y[:-stride]
-        stride, share = 2 * stride, share * share
-    return y
-
-
-def gauss_markov(white: ArrayLike, time_s: float, rate_hz: float) -> Array:
+def gauss_markov(white: ArrayLike, start: ArrayLike, time_s: float, rate_hz: float) -> tuple[Array, Array]:
     """A stationary first-order Gauss-Markov process of standard deviation 1.
 
-    Its autocorrelation falls as exp(-|tau| / time_s).
+    x_0 = start and x_{k+1} = d x_k + sqrt(1 - d^2) white_k with d = exp(-1 / (time_s rate_hz)), so that the
+    autocorrelation falls as exp(-|tau| / time_s) if `start` is a standard normal number too.
 
     Args:
-        white: Standard normal numbers, a sample a row, shape (N, ...).
-        time_s: Correlation time [s]; 0 gives `white` back.
+        white: Standard normal numbers, one row a sample, shape (K, ...).
+        start: x_0, shape (...).
+        time_s: Correlation time [s]; 0 gives white noise.
         rate_hz: Samples a second [Hz].
 
     Returns:
-        The process, the shape of `white`.
+        x_0 to x_{K-1}, the shape of `white`; and x_K, to continue with.
     """
-    x = np.array(white, float)
-    decay = math.exp(-1.0 / (time_s * rate_hz)) if time_s > 0 else 0.0
-    x[1:] *= math.sqrt(1.0 - decay * decay)
-    return first_order(x, decay)
+    decay = correlation(time_s, rate_hz)
+    driven = math.sqrt(1.0 - decay * decay) * np.asarray(white, float)
+    series = lfilter([1.0], [1.0, -decay], np.concatenate([np.asarray(start, float)[None], driven]), axis=0)
+    return series[:-1], series[-1]
 
 
-def random_walk(white: ArrayLike, rate_hz: float) -> Array:
-    """A random walk from 0 whose variance grows by 1 a second.
+def correlation(time_s: float, rate_hz: float) -> float:
+    """Correlation of successive samples of a Gauss-Markov process, exp(-1 / (time_s rate_hz))."""
+    return math.exp(-1.0 / (time_s * rate_hz)) if time_s > 0 else 0.0
 
-    Args:
-        white: Standard normal numbers, a sample a row, shape (N, ...); the first row is not used.
-        rate_hz: Samples a second [Hz].
 
-    Returns:
-        The walk, the shape of `white`.
-    """
-    steps = np.array(white, float) / math.sqrt(rate_hz)
-    steps[:1] = 0.0
-    return np.cumsum(steps, axis=0)
+def random_walk(white: ArrayLike, start: ArrayLike, rate_hz: float) -> tuple[Array, Array]:
+    """A random walk whose variance grows by 1 per second; arguments and results as for `gauss_markov`."""
+    walk = accumulate(start, np.asarray(white, float) / math.sqrt(rate_hz))
+    return walk[:-1], walk[-1]
+
+
+def accumulate(start: ArrayLike, steps: ArrayLike) -> Array:
+    """Start and its sums with successive steps: shapes (...) and (K, ...) give (K + 1, ...)."""
+    return np.cumsum(np.concatenate([np.asarray(start, float)[None], steps]), axis=0)
+
+
+class GaussMarkov(Stateful):
+    """A Gauss-Markov process of standard deviation 1, continued from call to call; see `gauss_markov`."""
+
+    def __init__(self, rng: np.random.Generator, time_s: float, rate_hz: float) -> None:
+        super().__init__(rng, value=rng.standard_normal())
+        self._time_s, self._rate_hz = time_s, rate_hz
+
+    def next(self, count: int) -> Array:
+        """The next samples, shape (count,), or (count, R) for R robots."""
+        white = self.normal(count, 1)[..., 0]
+        series, self.state["value"] = gauss_markov(white, self.state["value"], self._time_s, self._rate_hz)
+        return series

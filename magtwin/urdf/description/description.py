@@ -1,7 +1,7 @@
-"""Description: a URDF that was read and checked, links and joints in the order of their tree.
+"""Description: a checked URDF, with links and joints in tree order.
 
-Links, joints and materials are values, see `model`; what is not of URDF's grammar (`<gazebo>` and the like)
-stays at hand in the XML.
+Links, joints and materials are values, see `model`; tags outside URDF's grammar, such as `<gazebo>`, stay in
+the XML.
 """
 
 import os
@@ -29,42 +29,42 @@ from magtwin.urdf.description.model import (
 from magtwin.urdf.source.source import Source, read_source
 
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating")
-"""Joints that can be converted."""
+"""Types of joints that can be converted."""
 
 AXIAL = JOINT_TYPES[1:5]
-"""Those with an axis; a planar joint's is the normal of its plane."""
+"""Types with an axis; a planar joint's is the normal of its plane."""
 
 MOVING = JOINT_TYPES[1:4]
-"""Those with one degree of freedom."""
+"""Types with one degree of freedom."""
 
 
 @dataclass(frozen=True)
 class Description:
-    """A robot as its URDF has it: a tree of links held by joints."""
+    """A robot as a tree of links and joints."""
 
     source: Source
-    """The file, with what lies around it."""
+    """The file, and the packages around it."""
 
     name: str
     """Name of the robot."""
 
     root: str
-    """Name of the link that no joint holds."""
+    """Name of the root link."""
 
     links: Mapping[str, Link]
     """Links by name, parents before children."""
 
     joints: Mapping[str, Joint]
-    """Joints by the name of the link that they hold, parents before children."""
+    """Joints by the name of their child link, parents before children."""
 
     materials: Mapping[str | None, Material] = field(default_factory=dict)
     """Robot-wide materials by name."""
 
     notes: list[str] = field(default_factory=list)
-    """What was repaired, guessed or left out on the way to USD: one line each, nothing silent."""
+    """Every repair, guess and omission of a conversion, one line each."""
 
     dropped: list[str] = field(default_factory=list)
-    """Those of the notes that tell of something lost."""
+    """The notes on losses."""
 
     @property
     def path(self) -> Path:
@@ -73,7 +73,7 @@ class Description:
 
     @property
     def xml(self) -> ElementTree.Element:
-        """The whole `<robot>`, for what `links` and `joints` do not hold."""
+        """The whole `<robot>`, with everything that `links` and `joints` lack."""
         return self.source.xml
 
     def where(self, element: ElementTree.Element | None) -> str:
@@ -81,11 +81,11 @@ class Description:
         return self.source.where(element)
 
     def find_file(self, filename: str, what: str) -> Path:
-        """The file that a `filename=` means, such as a mesh's: see `Source.find_file`.
+        """The file that a `filename=` refers to, see `Source.find_file`.
 
         Raises:
-            MissingFileError: It is not there.
-            InputError: It may not be read, or its package is not there.
+            MissingFileError: The file does not exist.
+            InputError: The file may not be read, or its package was not found.
         """
         named = (e for e in self.xml.iter() if e.get("filename") == filename)
         try:
@@ -94,11 +94,11 @@ class Description:
             self._take_notes()
 
     def note(self, text: str, *, lost: bool = False) -> None:
-        """Put down something that the user ought to know of the conversion, once.
+        """Add a note for the user, once.
 
         Args:
             text: What was repaired, guessed or left out, and where.
-            lost: Whether the stage has less than the description: `Options.strict` refuses that.
+            lost: Whether the stage lacks something of the description; `Options.strict` refuses that.
         """
         if text not in self.notes:
             self.notes.append(text)
@@ -106,12 +106,12 @@ class Description:
                 self.dropped.append(text)
 
     def refused(self, kind: str, name: str, text: str) -> InputError:
-        """A refusal that names the line of the link or joint called `name`."""
+        """An error with the line of the link or joint called `name`."""
         element = next((e for e in self.xml.findall(kind) if e.get("name") == name), None)
         return InputError(f"{self.source.where(element)}: {kind} {name!r} {text}")
 
     def _take_notes(self) -> None:
-        """Put down what was met while reading, which goes on as files are looked for."""
+        """Take over the notes of the source, which grow as files are searched."""
         for note in (*self.source.notes, *self.source.packages.notes):
             self.note(note)
 
@@ -124,7 +124,7 @@ class Description:
 
 
 def origin_of(part: Joint | Shape | Inertial) -> NDArray[np.float64]:
-    """Pose of a joint, visual, collision or inertial in its link, shape (4, 4); identity if none is given."""
+    """Pose of a joint, visual, collision or inertial in its link, shape (4, 4). Default: identity."""
     return np.eye(4) if part.origin is None else part.origin
 
 
@@ -132,11 +132,11 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
     """Read and check a URDF.
 
     Args:
-        source: What `read_source` gave, or a file for it to read without options.
+        source: The result of `read_source`, or a file to read without options.
 
     Raises:
-        InputError: See `read_source`; or a link or joint is not as the URDF grammar has it; or links and
-            joints are not one tree. File and line are given.
+        InputError: See `read_source`; or a link or joint violates URDF's grammar; or links and joints are
+            not one tree. The message gives file and line.
     """
     if not isinstance(source, Source):
         source = read_source(source)
@@ -164,9 +164,8 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
         first = joints[0].name
         raise description.refused("joint", first, "closes a circle: no link is the root; remove one joint")
     if len(roots) > 1:
-        raise description.refused(
-            "link", roots[1], f"hangs in the air: a robot has one root, this has {', '.join(roots)}"
-        )
+        text = f"is not connected: a robot has one root, this has {', '.join(roots)}"
+        raise description.refused("link", roots[1], text)
     order = _order(roots[0], joints)
     if len(order) < len(description.links):
         astray = next(name for name in description.links if name not in order)
@@ -180,7 +179,7 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
 
 
 def _check_names(source: Source) -> None:
-    """Every link and joint has a name, and no two have the same."""
+    """Check that every link and joint has a unique name."""
     xml, where = source.xml, source.where
     if not xml.get("name"):
         raise InputError(f"{where(xml)}: <robot> has no name")
@@ -194,7 +193,7 @@ def _check_names(source: Source) -> None:
                 file, line = source.places[seen[name]]
                 first = f"line {line}" if file == source.places[element][0] else f"{file}:{line}"
                 raise InputError(
-                    f"{where(element)}: {kind} {name!r} is there twice, first on {first}; rename one"
+                    f"{where(element)}: {kind} {name!r} exists twice, first on {first}; rename one"
                 )
             seen[name] = element
     if not xml.findall("link"):
@@ -207,7 +206,7 @@ def _check_names(source: Source) -> None:
 
 
 def _without_empty(link: Link, description: Description) -> Link:
-    """A link without its primitives of size 0, which are noted."""
+    """A link without primitives of size 0; they are noted."""
 
     def kept(shapes: Sequence[Shape], role: str) -> tuple[Shape, ...]:
         for shape in shapes:
@@ -220,67 +219,54 @@ def _without_empty(link: Link, description: Description) -> Link:
 
 
 def _check_joints(description: Description, joints: Sequence[Joint]) -> None:
-    """Each joint is of a known type, has an axis and a range, and holds a link that no other holds."""
+    """Check types, links, axes, limits and mimics of joints."""
     held: dict[str, str] = {}
     named = {joint.name: joint for joint in joints}
     for joint in joints:
-        if joint.type not in JOINT_TYPES:
-            raise description.refused(
-                "joint",
-                joint.name,
-                f"is of type {joint.type!r}; known: {', '.join(JOINT_TYPES)}",
-            )
-        for link in (joint.parent, joint.child):
-            if link not in description.links:
-                raise description.refused(
-                    "joint", joint.name, f"names no link {link!r}; {hint(link, description.links)}"
-                )
-        if joint.child in held:
-            raise description.refused(
-                "joint", joint.name, f"holds {joint.child!r}, which {held[joint.child]!r} holds already"
-            )
+        problem = _problem(joint, description, held)
+        if problem:
+            raise description.refused("joint", joint.name, problem)
         held[joint.child] = joint.name
-        if joint.type in AXIAL and not np.linalg.norm(joint.axis) > 0:
-            raise description.refused("joint", joint.name, "moves about an axis of length 0")
-        _check_limit(description, joint)
         if joint.mimic is not None:
             _check_mimic(description, joint, named)
 
 
-def _check_limit(description: Description, joint: Joint) -> None:
-    """The range of a joint does not stand on its head."""
+def _problem(joint: Joint, description: Description, held: Mapping[str, str]) -> str:
+    """The first problem of a joint; "" for none."""
     limit = joint.limit
-    if limit is None or limit.lower is None or limit.upper is None or joint.type in ("fixed", "continuous"):
-        return
-    if limit.lower > limit.upper:
-        raise description.refused(
-            "joint", joint.name, f"has its lower limit {limit.lower:g} above its upper {limit.upper:g}"
-        )
+    if joint.type not in JOINT_TYPES:
+        return f"is of type {joint.type!r}; known: {', '.join(JOINT_TYPES)}"
+    for link in (joint.parent, joint.child):
+        if link not in description.links:
+            return f"names no link {link!r}; {hint(link, description.links)}"
+    if joint.child in held:
+        return f"holds {joint.child!r}, which {held[joint.child]!r} holds already"
+    if joint.type in AXIAL and not np.linalg.norm(joint.axis) > 0:
+        return "moves about an axis of length 0"
+    ends = None if limit is None or joint.type in ("fixed", "continuous") else (limit.lower, limit.upper)
+    if ends and ends[0] is not None and ends[1] is not None and ends[0] > ends[1]:
+        return f"has its lower limit {ends[0]:g} above its upper {ends[1]:g}"
+    return ""
 
 
 def _check_mimic(description: Description, joint: Joint, named: Mapping[str, Joint]) -> None:
-    """What a joint mimics is there, moves, and does not mimic it in turn."""
+    """Check that the leader of a joint exists, moves, and does not follow it in turn."""
     chain = [joint.name]
     while (mimic := named[chain[-1]].mimic) is not None:
         if mimic.joint not in named:
-            raise description.refused(
-                "joint", chain[-1], f"mimics no joint {mimic.joint!r}; {hint(mimic.joint, named)}"
-            )
+            text = f"mimics no joint {mimic.joint!r}; {hint(mimic.joint, named)}"
+            raise description.refused("joint", chain[-1], text)
         if mimic.joint in chain:
-            raise description.refused(
-                "joint", joint.name, f"mimics itself: {' -> '.join([*chain, mimic.joint])}"
-            )
+            text = f"mimics itself: {' -> '.join([*chain, mimic.joint])}"
+            raise description.refused("joint", joint.name, text)
         chain.append(mimic.joint)
     if named[chain[-1]].type not in MOVING:
-        raise description.refused(
-            "joint",
-            joint.name,
-            f"mimics {chain[-1]!r}, which is {named[chain[-1]].type}; give one that moves",
-        )
+        text = f"mimics {chain[-1]!r}, which is {named[chain[-1]].type}; give one that moves"
+        raise description.refused("joint", joint.name, text)
 
 
 def _order(root: str, joints: Sequence[Joint]) -> list[str]:
-    """Links from the root outwards, depth first, each parent's joints in the order of the file."""
+    """Links from the root, depth first, with each parent's joints in file order."""
     below: dict[str, list[str]] = {}
     for joint in joints:
         below.setdefault(joint.parent, []).append(joint.child)

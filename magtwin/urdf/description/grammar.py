@@ -1,6 +1,6 @@
-"""Grammar: which elements and attributes a URDF's links and joints have, and what may stand in them.
+"""Grammar: the elements and attributes of a URDF's links and joints, and their allowed values.
 
-After the URDF XML specification (wiki.ros.org/urdf/XML), with the capsule of urdfdom 4.
+Follows the URDF XML specification (wiki.ros.org/urdf/XML), with the capsule of urdfdom 4.
 """
 
 import math
@@ -15,36 +15,36 @@ Element = ElementTree.Element
 
 
 class Note(Protocol):
-    """Takes a line that the user ought to see; `lost` where something was left out."""
+    """Receives a note for the user; `lost` if something was left out."""
 
     def __call__(self, text: str, *, lost: bool = False) -> None:
-        """Take it."""
+        """Add the note."""
 
 
 @dataclass(frozen=True)
 class Number:
-    """What an attribute's numbers must be."""
+    """Constraints on an attribute's numbers."""
 
     counts: tuple[int, ...] = (1,)
-    """How many there may be."""
+    """Allowed counts."""
 
     required: bool = False
 
     least: float = -math.inf
-    """Smaller ones are refused."""
+    """Smaller numbers are refused."""
 
     most: float = math.inf
-    """Greater ones are brought down to it."""
+    """Larger numbers are reduced to it."""
 
     endless: bool = False
-    """Whether they may be infinite."""
+    """Whether numbers may be infinite."""
 
     rest: str = ""
-    """What completes the least count to the greatest."""
+    """Value that completes the smallest count to the largest."""
 
 
 LARGEST = 1e30
-"""Numbers beyond count as infinite: USD's are of single precision, and volumes are cubes."""
+"""Larger numbers count as infinite: USD stores single precision, and volumes are cubes."""
 
 XYZ = Number(counts=(3,))
 SIZE = Number(required=True, least=0.0)
@@ -71,13 +71,10 @@ NUMBERS: Mapping[str, Mapping[str, Number]] = {
     "mimic": {"multiplier": Number(), "offset": Number()},
     "calibration": {"rising": Number(), "falling": Number()},
     "safety_controller": {
-        "soft_lower_limit": Number(),
-        "soft_upper_limit": Number(),
-        "k_position": Number(),
-        "k_velocity": Number(),
+        name: Number() for name in ("soft_lower_limit", "soft_upper_limit", "k_position", "k_velocity")
     },
 }
-"""Attributes that hold numbers, by element."""
+"""Numeric attributes by element."""
 
 SHAPES = ("box", "capsule", "cylinder", "mesh", "sphere")
 
@@ -89,43 +86,36 @@ CHILDREN: Mapping[str, tuple[str, ...]] = {
     "geometry": SHAPES,
     "material": ("color", "texture"),
     "joint": (
-        "origin",
-        "parent",
-        "child",
-        "axis",
-        "calibration",
-        "dynamics",
-        "limit",
-        "mimic",
+        *("origin", "parent", "child", "axis", "calibration", "dynamics", "limit", "mimic"),
         "safety_controller",
     ),
 }
-"""Elements that an element may hold."""
+"""Allowed children by element."""
 
 MANY = frozenset({"visual", "collision"})
-"""Elements of which there may be several side by side."""
+"""Elements that may occur several times."""
 
 NEEDED: Mapping[str, str] = {"visual": "geometry", "collision": "geometry"}
-"""Element that an element must hold."""
+"""Required child by element."""
 
 TEXTS: Mapping[str, str] = {"mesh": "filename", "texture": "filename", "mimic": "joint"}
-"""Attribute that an element must have, a text."""
+"""Required text attribute by element."""
 
 
 def check_grammar(part: Element, where: Callable[[Element], str], note: Note) -> Element:
-    """Check a link, joint or material; what is not of the grammar is left out with a note.
+    """Check a link, joint or material; anything outside the grammar is left out with a note.
 
     Args:
         part: The element.
-        where: File and line of an element, for refusals.
-        note: Takes what was repaired or left out.
+        where: File and line of an element, for error messages.
+        note: Receives notes of repairs and omissions.
 
     Returns:
-        `part` as the grammar has it: known elements and attributes, numbers apart by blanks.
+        `part` with known elements and attributes only, and numbers separated by blanks.
 
     Raises:
-        InputError: A number is missing, is none, is not finite or too small; there are too many or too
-            few of them; a geometry has no shape, several or an unknown one.
+        InputError: A number is missing, invalid, not finite or too small; there are too many or too few
+            numbers; or a geometry does not have exactly one known shape.
     """
     label = f"{part.tag} {part.get('name')!r}"
     clean = _clean(part, label, where, note)
@@ -135,7 +125,7 @@ def check_grammar(part: Element, where: Callable[[Element], str], note: Note) ->
 
 
 def _drop_zeros(link: Element, label: str, note: Note) -> None:
-    """Leave out a mass of 0 and a tensor of zeros: they fill a form, and no body has them."""
+    """Leave out a mass of 0 and an inertia of zeros: they are placeholders."""
     inertial = link.find("inertial")
     if inertial is None:
         return
@@ -151,19 +141,19 @@ def _drop_zeros(link: Element, label: str, note: Note) -> None:
 
 
 def _complete_limit(joint: Element, label: str, note: Note) -> None:
-    """Give the end of a range that is not told, which is 0 in URDF; leave out the range of what has none."""
+    """Set a missing end of a range to 0, URDF's default; ignore the range of a continuous joint."""
     limit, ends = joint.find("limit"), ("lower", "upper")
     if limit is None:
         return
-    told = {end: float(limit.attrib[end]) for end in ends if end in limit.attrib}
+    given = {end: float(limit.attrib[end]) for end in ends if end in limit.attrib}
     if joint.get("type") == "continuous":
-        if any(map(math.isfinite, told.values())):
-            words = ", ".join(f"{end} {value:g}" for end, value in told.items())
-            note(f"{label} is continuous, which has no range: {words} of its <limit> counts for nothing")
-    elif joint.get("type") in ("revolute", "prismatic") and len(told) == 1:
-        missing = next(end for end in ends if end not in told)
+        if any(map(math.isfinite, given.values())):
+            words = ", ".join(f"{end} {value:g}" for end, value in given.items())
+            note(f"{label} is continuous, which has no range: {words} of its <limit> is ignored")
+    elif joint.get("type") in ("revolute", "prismatic") and len(given) == 1:
+        missing = next(end for end in ends if end not in given)
         limit.set(missing, "0")
-        note(f"{label} gives no {missing} limit: 0, as URDF has it")
+        note(f"{label} gives no {missing} limit: 0, URDF's default")
 
 
 def _clean(element: Element, label: str, where: Callable[[Element], str], note: Note) -> Element:
@@ -200,7 +190,7 @@ def _clean(element: Element, label: str, where: Callable[[Element], str], note: 
 
 
 def _attributes(element: Element, place: str, label: str, note: Note) -> dict[str, str]:
-    """An element's attributes, its numbers checked."""
+    """Attributes of an element, with numbers checked."""
     start = f"{place}: {label}"
     numbers = NUMBERS.get(element.tag, {})
     made = {name: value for name, value in element.items() if name not in numbers and ":" not in name}
@@ -219,7 +209,7 @@ def _attributes(element: Element, place: str, label: str, note: Note) -> dict[st
 
 
 def _numbers(given: str, kind: Number, place: str, label: str, note: Note) -> str:
-    """Numbers of an attribute, apart by blanks; refused where they are not what they must be."""
+    """Numbers of an attribute, separated by blanks; refuses invalid ones."""
     start = f"{place}: {label}"
     words = given.replace(",", " ").split()
     counts = " or ".join(map(str, kind.counts))
@@ -236,7 +226,7 @@ def _numbers(given: str, kind: Number, place: str, label: str, note: Note) -> st
     if len(words) not in kind.counts:
         raise InputError(f"{start} must be {wanted}, got {given!r}")
     if any(float(word) > kind.most for word in words):
-        note(f"{label} is above {kind.most:g} in {given!r}: brought down to it")
+        note(f"{label} is above {kind.most:g} in {given!r}: reduced to it")
         words = [word if float(word) <= kind.most else f"{kind.most:g}" for word in words]
     if len(words) < max(kind.counts) and kind.rest:
         note(f"{label} has {len(words)} numbers in {given!r}: completed by {kind.rest}")

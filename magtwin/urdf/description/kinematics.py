@@ -1,4 +1,4 @@
-"""Kinematics: where a description's links stand, by yourdfpy, with nothing of a conversion's own."""
+"""Kinematics: link poses of a description by yourdfpy, independent of the conversion."""
 
 import io
 import os
@@ -23,11 +23,11 @@ def link_poses(
     packages: Mapping[str, Path] = MappingProxyType({}),
     arguments: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, NDArray[np.float64]]:
-    """Forward kinematics of a URDF or xacro, to hold a converted stage or a sensor's mount against.
+    """Forward kinematics of a URDF or xacro, to check a converted stage or a sensor's mount.
 
     Args:
         urdf: The description.
-        positions: Positions of joints by name [rad or m], 0 for others. Those that mimic follow.
+        positions: Positions of joints by name [rad or m]. Default: 0. Mimicking joints follow.
         packages: Folders of packages by name, for a xacro.
         arguments: Arguments of a xacro.
 
@@ -35,10 +35,10 @@ def link_poses(
         T_root_link of each link, shape (4, 4), parents before children.
 
     Raises:
-        InputError: The description cannot be used; or a joint is not there, follows another, or has no
-            one position.
+        InputError: The description cannot be used; or a joint is unknown, follows another, or does not have
+            a single position.
     """
-    import yourdfpy  # here, for it brings trimesh, and takes longer to import than most robots to convert
+    import yourdfpy  # takes longer to import than most robots to convert
 
     description = read_description(read_source(urdf, packages=packages, arguments=arguments))
     values = _values(description, positions)
@@ -48,18 +48,18 @@ def link_poses(
             ElementTree.SubElement(bare, "link", name=part.attrib["name"])
         elif part.tag == "joint":
             bare.append(check_grammar(part, description.where, description.note))
-            for mimic in bare[-1].findall("mimic"):  # yourdfpy knows no mimic of a mimic
+            for mimic in bare[-1].findall("mimic"):  # yourdfpy does not support a mimic of a mimic
                 bare[-1].remove(mimic)
     model = yourdfpy.URDF.load(io.BytesIO(ElementTree.tostring(bare)), load_meshes=False)
     for joint in description.joints.values():
-        if joint.type == "prismatic":  # yourdfpy slides by the axis as it is written, however long
+        if joint.type == "prismatic":  # yourdfpy does not normalise the axis
             values[joint.name] /= float(np.linalg.norm(joint.axis))
     model.update_cfg(values)
     return {link: model.get_transform(link, description.root) for link in description.links}
 
 
 def _values(description: Description, positions: Mapping[str, float]) -> dict[str, float]:
-    """Positions of all joints that have one, followers' by their leaders'."""
+    """Positions of all joints with one degree of freedom, including those that follow others."""
     joints = {joint.name: joint for joint in description.joints.values() if joint.type in MOVING}
     for name in positions:
         mimic = find("joint with one position", name, joints).mimic

@@ -1,7 +1,7 @@
-"""Model: links, joints and materials of a URDF as values, with yourdfpy's names for them.
+"""Model: links, joints and materials of a URDF as values, with yourdfpy's names.
 
-Read here, from elements that the grammar has checked: yourdfpy reads the same, and the tests hold every
-link and joint against its, but `import yourdfpy` takes longer than a whole conversion.
+They are read here and not by yourdfpy, whose import takes longer than a whole conversion; the tests compare
+every link and joint with yourdfpy's.
 """
 
 from dataclasses import dataclass
@@ -32,13 +32,13 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Capsule:
-    """A `<capsule>`, which yourdfpy does not know."""
+    """A `<capsule>`; yourdfpy has none."""
 
     radius: float
     """Radius of the cylinder and of its round ends [m]."""
 
     length: float
-    """Length along z, without the ends [m]."""
+    """Length along z without the ends [m]."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Geometry:
-    """A `<geometry>`: one of these, the others none."""
+    """A `<geometry>`: exactly one field is not None."""
 
     box: Box | None = None
     capsule: Capsule | None = None
@@ -70,15 +70,44 @@ class Geometry:
 
     @property
     def kind(self) -> str:
-        """Tag of the one that it is."""
+        """Its tag."""
         return next(name for name, form in vars(self).items() if form is not None)
 
     @property
     def empty(self) -> bool:
-        """Whether it is a primitive without any size; a capsule may be a ball."""
+        """Whether it is a primitive of size 0; a capsule of length 0 is a ball."""
         sizes = [] if self.box is None else [*self.box.size]
         sizes += [form.radius for form in (self.capsule, self.cylinder, self.sphere) if form]
         return 0 in sizes or (self.cylinder is not None and self.cylinder.length == 0)
+
+    @property
+    def volume(self) -> float:
+        """Volume of a primitive [m3]."""
+        if self.box is not None:
+            return float(np.prod(self.box.size))
+        form = self.sphere or self.cylinder or self.capsule
+        assert form is not None
+        ball = 0.0 if self.cylinder else 4 / 3 * np.pi * form.radius**3
+        return ball + np.pi * form.radius**2 * getattr(form, "length", 0.0)
+
+    def half_extents(self, R: Array) -> Array:
+        """Half the edges of the axis-aligned box around a primitive at the origin [m], shape (3,).
+
+        A disc of radius r with normal n reaches r sqrt(1 - n_i^2) along axis i.
+
+        Args:
+            R: Rotation of the primitive, shape (3, 3).
+        """
+        if self.box is not None:
+            return np.abs(R) @ (self.box.size / 2)
+        if self.sphere is not None:
+            return np.full(3, self.sphere.radius)
+        n = R[:, 2]
+        if self.cylinder is not None:
+            rim = self.cylinder.radius * np.sqrt(np.clip(1 - n**2, 0, 1))
+            return rim + np.abs(n) * self.cylinder.length / 2
+        assert self.capsule is not None
+        return self.capsule.radius + np.abs(n) * self.capsule.length / 2
 
 
 @dataclass(frozen=True)
@@ -86,7 +115,7 @@ class Color:
     """A `<color>`."""
 
     rgba: Array
-    """Red, green, blue, opacity as screens show them, 0 to 1, shape (4,)."""
+    """Red, green, blue (sRGB) and opacity, 0 to 1, shape (4,)."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +127,7 @@ class Texture:
 
 @dataclass(frozen=True)
 class Material:
-    """A `<material>`: a visual's own, or one of the robot's."""
+    """A `<material>` of a visual or of the robot."""
 
     name: str | None
     color: Color | None
@@ -142,7 +171,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Limit:
-    """A `<limit>`: efforts in N m or N, speeds in rad/s or m/s, ends in rad or m."""
+    """A `<limit>`: effort [N m or N], velocity [rad/s or m/s], lower and upper [rad or m]."""
 
     effort: float | None
     velocity: float | None
@@ -203,6 +232,8 @@ def read_joint(element: Element) -> Joint:
     axis, limit, dynamics, mimic = (element.find(t) for t in ("axis", "limit", "dynamics", "mimic"))
     assert parent is not None  # the names were checked
     assert child is not None
+    dynamics_values = None if dynamics is None else [_number(dynamics, n) for n in ("damping", "friction")]
+    limits = None if limit is None else [_number(limit, n) for n in ("effort", "velocity", "lower", "upper")]
     return Joint(
         name=element.attrib["name"],
         type=element.get("type", ""),
@@ -210,18 +241,15 @@ def read_joint(element: Element) -> Joint:
         child=child.attrib["link"],
         origin=_origin(element.find("origin")),
         axis=np.array([1.0, 0.0, 0.0]) if axis is None else _numbers(axis, "xyz", "1 0 0"),
-        limit=None
-        if limit is None
-        else Limit(*(_number(limit, name) for name in ("effort", "velocity", "lower", "upper"))),
-        dynamics=None
-        if dynamics is None
-        else Dynamics(_number(dynamics, "damping"), _number(dynamics, "friction")),
-        mimic=None
-        if mimic is None
-        else Mimic(
-            mimic.attrib["joint"], float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))
-        ),
+        limit=None if limits is None else Limit(*limits),
+        dynamics=None if dynamics_values is None else Dynamics(*dynamics_values),
+        mimic=None if mimic is None else _mimic(mimic),
     )
+
+
+def _mimic(element: Element) -> Mimic:
+    factor, offset = float(element.get("multiplier", 1.0)), float(element.get("offset", 0.0))
+    return Mimic(element.attrib["joint"], factor, offset)
 
 
 def read_material(element: Element) -> Material:
@@ -236,7 +264,7 @@ def read_material(element: Element) -> Material:
 
 def _shape(element: Element) -> Shape:
     geometry, material = element.find("geometry"), element.find("material")
-    assert geometry is not None  # the grammar saw to it, and to the one shape in it
+    assert geometry is not None  # the grammar checked it, and that it has one shape
     return Shape(
         geometry=_geometry(geometry[0]),
         name=element.get("name"),
@@ -259,7 +287,7 @@ def _geometry(form: Element) -> Geometry:
 
 
 def _inertial(element: Element | None) -> Inertial | None:
-    """Where `<inertia>` leaves out a moment it is 1, as for yourdfpy, and a product 0."""
+    """Defaults of `<inertia>`: moments 1, as in yourdfpy, and products 0."""
     if element is None:
         return None
     mass, inertia = element.find("mass"), element.find("inertia")

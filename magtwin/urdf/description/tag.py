@@ -1,5 +1,6 @@
-"""Tag: elements that URDF itself gives no meaning, which of them were understood, and what is left."""
+"""Tag: elements outside URDF's grammar; those that are not used are kept as text."""
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from xml.etree import ElementTree
@@ -14,17 +15,17 @@ from magtwin.urdf.description.grammar import CHILDREN
 Element = ElementTree.Element
 
 KEPT = "magtwin:unconverted"
-"""Key of a prim's customData under which tags without a meaning here are kept, each as text."""
+"""Key of a prim's customData: unused tags, each as text."""
 
 BEYOND = ("calibration", "safety_controller")
-"""Elements of URDF's own grammar that say nothing of the body: they are read as tags."""
+"""Elements of URDF's grammar that do not describe the body; they are read as tags."""
 
 
 class Tags:
-    """The tags of a description: `<gazebo>`, `<ros2_control>`, `<transmission>` and whatever else is there.
+    """The tags of a description: `<gazebo>`, `<ros2_control>`, `<transmission>` and others.
 
-    Whoever understands an element says so by reading it through the functions below. What nobody read is
-    kept as text on the prim that it is about, and counted.
+    The methods below mark the elements that they read. `keep` stores all others as text on the prim to which
+    they refer, and counts them.
     """
 
     def __init__(self, description: Description) -> None:
@@ -32,13 +33,13 @@ class Tags:
         self._read: set[Element] = set()
 
     def blocks(self, tag: str) -> list[Element]:
-        """Elements called `tag` right below `<robot>`; having looked at one, read its parts."""
+        """Elements called `tag` directly below `<robot>`; marks them, but not their children."""
         found = self.description.xml.findall(tag)
         self._read.update(found)
         return found
 
     def find(self, element: Element | None, *paths: str) -> Element | None:
-        """The first element at one of the paths below another, if any, and with it the way there."""
+        """The first element at one of the paths below another, or None; marks it and its parents."""
         for path in paths:
             here, way = element, list[Element]()
             for step in path.split("/"):
@@ -51,25 +52,25 @@ class Tags:
         return None
 
     def findall(self, element: Element, tag: str) -> list[Element]:
-        """The children of an element called `tag`."""
+        """The children of an element called `tag`; marks them."""
         found = element.findall(tag)
         self._read.update(found)
         return found
 
     def read(self, element: Element) -> Element:
-        """An element that is understood; read its parts too."""
+        """Mark an element, but not its children."""
         self._read.add(element)
         return element
 
     def take(self, element: Element) -> Element:
-        """An element that is understood with all that is in it."""
+        """Mark an element and everything in it."""
         self._read.update(element.iter())
         return element
 
     def text(self, element: Element | None, *paths: str) -> str:
-        """Text of the first element at one of the paths; "" where there is none."""
+        """Text of the first element at one of the paths; "" if there is none."""
         found = self.find(element, *paths)
-        return "" if found is None else _said(found)
+        return "" if found is None else _text_of(found)
 
     def number(
         self,
@@ -78,16 +79,16 @@ class Tags:
         least: float = -np.inf,
         above: float = -np.inf,
     ) -> float | None:
-        """A finite number at one of the paths; None where there is none.
+        """A finite number at one of the paths; None if there is none.
 
         Raises:
-            InputError: It is not a number, below `least` or not above `above`; the line is given.
+            InputError: It is not a number, below `least` or not above `above`; the message gives the line.
         """
         found = self.find(element, *paths)
         if found is None:
             return None
         try:
-            value = float(_said(found))
+            value = float(_text_of(found))
         except ValueError:
             value = np.nan
         if not np.isfinite(value) or value < least or not (value > above or above == -np.inf):
@@ -95,40 +96,41 @@ class Tags:
             want = want if max(least, above) > -np.inf else ""
             raise InputError(
                 f"{self.description.where(found)}: {found.tag} must be a finite number{want}, "
-                f"got {_said(found)!r}"
+                f"got {_text_of(found)!r}"
             )
         return value
 
     def nothing(self, element: Element | None, *paths: str) -> None:
-        """Read those of the numbers that are 0, which say nothing; others stay unread."""
+        """Mark numbers that are 0, which have no effect; others stay unmarked."""
         for path in paths:
-            found = None if element is None else element.find(path)
-            if found is not None and _is_zero(found.text):
-                self.find(element, path)
+            text = None if element is None else element.findtext(path)
+            with contextlib.suppress(ValueError):
+                if float(text or "") == 0:
+                    self.find(element, path)
 
     def flag(self, element: Element | None, *paths: str) -> bool | None:
-        """A true or false at one of the paths; None where there is none.
+        """A boolean at one of the paths; None if there is none.
 
         Raises:
-            InputError: It is neither; the line is given.
+            InputError: It is not a boolean; the message gives the line.
         """
         found = self.find(element, *paths)
         if found is None:
             return None
-        word = _said(found).lower()
+        word = _text_of(found).lower()
         if word not in ("true", "false", "1", "0"):
             where = self.description.where(found)
             raise InputError(f"{where}: {found.tag} must be true or false, got {word!r}")
         return word in ("true", "1")
 
     def keep(self, prim_of: Callable[[str], Usd.Prim]) -> dict[str, int]:
-        """Keep what nobody read as text on the prims that it is about.
+        """Keep unmarked elements as text on the prims to which they refer.
 
         Args:
-            prim_of: Gives the prim of a link or joint by its name, the robot's for any other.
+            prim_of: Returns the prim of a link or joint by its name, and the robot's for other names.
 
         Returns:
-            How often each path of tags was left, `gazebo/sensor/visualize`.
+            Number of unmarked elements by path, such as `gazebo/sensor/visualize`.
         """
         texts: dict[str, list[str]] = {}
         counts: Counter[str] = Counter()
@@ -144,7 +146,7 @@ class Tags:
         return dict(sorted(counts.items()))
 
     def _foreign(self) -> Iterator[tuple[str, Element]]:
-        """Elements outside of URDF's grammar, with the name of what they are about."""
+        """Elements outside URDF's grammar, with the name of the link or joint to which they refer."""
         for element in self.description.xml:
             if element.tag not in ("link", "joint", "material"):
                 yield element.get("reference", ""), element
@@ -157,7 +159,7 @@ class Tags:
     def _unread(
         self, element: Element, way: tuple[Element, ...]
     ) -> Iterator[tuple[tuple[Element, ...], Element]]:
-        """The outermost elements that nobody read, with those around them."""
+        """The outermost unmarked elements, with their parents."""
         if element not in self._read:
             yield way, element
             return
@@ -165,25 +167,18 @@ class Tags:
             yield from self._unread(child, (*way, element))
 
 
-def _said(element: Element) -> str:
-    """What an element says: its text, or its `value`, as `<mu1 value="1"/>` and SDFormat have it."""
+def _text_of(element: Element) -> str:
+    """Text of an element, or its attribute `value`, as in `<mu1 value="1"/>`."""
     return (element.text or "").strip() or element.get("value", "").strip()
 
 
-def _is_zero(text: str | None) -> bool:
-    try:
-        return float(text or "") == 0
-    except ValueError:
-        return False
-
-
 def _label(element: Element) -> str:
-    """An element's tag, with its name where it has one."""
+    """Tag of an element, with its name if it has one."""
     name = element.get("name")
     return f"{element.tag}({name})" if name else element.tag
 
 
 def _plain(element: Element) -> str:
-    """An element as text on one line, its attributes in order."""
+    """An element as text on one line, with sorted attributes."""
     text = ElementTree.canonicalize(ElementTree.tostring(element, encoding="unicode"), strip_text=True)
     return " ".join(text.split())

@@ -1,7 +1,7 @@
-"""COLLADA: triangles of a .dae, its nested transforms, unit, colours, textures and normals.
+"""COLLADA: reader of .dae files, versions 1.4 and 1.5.
 
-Read here rather than by pycollada, which drops a geometry whose material it cannot read, and reads
-every array whether it is shown or not. Versions 1.4 and 1.5.
+pycollada is not used, because it loses meshes: it drops a geometry whose material has a malformed colour (all
+5,282 triangles of the real TurtleBot 4's LiDAR), and does not read strips and fans.
 """
 
 import re
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.urdf.meshes.mesh import Paint, Piece, Rgba
-from magtwin.urdf.meshes.polygon import cut_polygons
+from magtwin.urdf.meshes.mesh import GREY, Paint, Piece, Rgba
+from magtwin.urdf.meshes.polygon import cut_polygons, strips
 from magtwin.urdf.meshes.reading import Reading, numbers
 from magtwin.urdf.meshes.texture import Image, read_image
 from magtwin.urdf.source.markup import parse_markup
@@ -23,29 +23,26 @@ from magtwin.usd.geometry import linear_from_srgb
 
 Element = ElementTree.Element
 
-GREY: Rgba = (0.5, 0.5, 0.5, 1.0)
-"""What a colour that cannot be read is taken for."""
-
 SHADERS = ("phong", "lambert", "blinn", "constant")
 
 POLYGONS = ("triangles", "polylist", "polygons", "tristrips", "trifans")
-"""Primitives that have faces; lines have none."""
+"""Primitives with faces."""
 
 NODES = 50_000
-"""Nodes that a scene may show, each as often as it is: nodes of two nodes of two nodes grow without end."""
+"""Most nodes of a scene, counting instances: nodes that instance each other twice grow exponentially."""
 
 LUMINANCE = (0.212671, 0.715160, 0.072169)
-"""Of linear red, green and blue, as COLLADA has it."""
+"""Weights of linear red, green and blue, from the specification."""
 
 
 def read_collada(reading: Reading) -> list[Piece]:
-    """The triangles of a COLLADA file, as `read_mesh` has it."""
+    """The triangles of a COLLADA file, for `read_mesh`."""
     return _Collada(reading).pieces()
 
 
 @dataclass(frozen=True)
 class _Input:
-    """Where a primitive's corners take some of their values from."""
+    """An `<input>` of a primitive."""
 
     semantic: str
     source: str
@@ -54,26 +51,28 @@ class _Input:
 
 
 class _Collada:
-    """A COLLADA file and what has been read of it."""
+    """A COLLADA file."""
 
     def __init__(self, reading: Reading) -> None:
         self._reading = reading
         text = reading.path.read_bytes()
-        if re.match(rb"\s*<\?xml[^>]*encoding", text) is None:  # names in another encoding do no harm
+        if re.match(rb"\s*<\?xml[^>]*encoding", text) is None:  # names in other encodings are harmless
             text = text.decode("utf-8", errors="replace").encode()
         markup = parse_markup(text, reading.path)
         self._root, self._lines = markup.root, markup.lines
         for element in markup.lines:
             element.tag = element.tag.rpartition(":")[2]
         if self._root.tag != "COLLADA":
-            raise InputError(f"{reading.path}: begins with <{self._root.tag}>, a COLLADA file with <COLLADA>")
+            raise InputError(
+                f"{reading.path}: begins with <{self._root.tag}>; a COLLADA file begins with <COLLADA>"
+            )
         self._ids = {e.get("id"): e for e in markup.lines if e.get("id")}
         self._visited = 0
         self._sources: dict[str, NDArray] = {}
         self._paints: dict[Element, Paint | None] = {}
 
     def pieces(self) -> list[Piece]:
-        """All that the file's scene shows, in metres."""
+        """The pieces of the file's scene, in metres."""
         axis = self._root.findtext("asset/up_axis", "Z_UP").strip()
         if axis != "Z_UP":
             self._reading.note(f"its up axis {axis} is not applied, as in RViz; turn the visual instead")
@@ -99,7 +98,7 @@ class _Collada:
     def _walk(
         self, node: Element, T: NDArray, above: tuple[Element, ...]
     ) -> Iterator[tuple[Element, Element, NDArray]]:
-        """Geometries below a node, the elements that place them, and the transforms to metres in the file."""
+        """Geometries below a node, with their instance elements and their transforms to metres."""
         self._visited += 1
         if self._visited > NODES:
             raise self._refused(node, f"shows over {NODES} nodes")
@@ -125,7 +124,7 @@ class _Collada:
                 yield from self._skinned(child, T)
 
     def _skinned(self, instance: Element, T: NDArray) -> Iterator[tuple[Element, Element, NDArray]]:
-        """The geometry of a skin, as it stands before its bones move it."""
+        """The geometry of a skin in its bind pose."""
         controller = self._target(instance)
         skin = None if controller is None else controller.find("skin")
         geometry = None if skin is None else self._ids.get(skin.get("source", "").removeprefix("#"))
@@ -137,7 +136,7 @@ class _Collada:
         yield geometry, instance, T if bind is None else T @ self._floats(bind, 16).reshape(4, 4)
 
     def _transform(self, node: Element) -> NDArray:
-        """Product of a node's transforms in the order of the file, shape (4, 4)."""
+        """Product of a node's transforms in file order, shape (4, 4)."""
         T = np.eye(4)
         for child in node:
             if child.tag == "matrix":
@@ -154,7 +153,7 @@ class _Collada:
         return T
 
     def _geometry(self, geometry: Element, instance: Element, shown: set[Element]) -> Iterator[Piece]:
-        """Triangles of a geometry in its own frame."""
+        """Pieces of a geometry in its own frame."""
         shown.add(geometry)
         mesh = geometry.find("mesh")
         if mesh is None:
@@ -178,41 +177,37 @@ class _Collada:
         if len(corners) and not 0 <= corners.min() <= corners.max() < len(points):
             raise self._refused(primitive, f"a face names vertex {corners.max()} of {len(points)}")
         if primitive.tag in ("tristrips", "trifans"):
-            triangles = _strips(counts, primitive.tag)
+            triangles = strips(counts, fans=primitive.tag == "trifans")
         else:
             triangles = cut_polygons(points, corners, counts)
         binding = bound.get(primitive.get("material"))
-        paint = self._paint(primitive, binding)
+        paint, uvs, colours = self._paint(primitive, binding), None, None
+        if paint is None or paint.image is not None:
+            uvs = self._picked(inputs, "TEXCOORD", 2, index, triangles, self._uv_set(binding))
+        if paint is None:
+            colours = self._picked(inputs, "COLOR", 3, index, triangles)
         return Piece(
             points=points,
             faces=corners[triangles],
             paint=paint,
             normals=self._picked(inputs, "NORMAL", 3, index, triangles),
-            uvs=None
-            if paint is not None and paint.image is None
-            else self._picked(inputs, "TEXCOORD", 2, index, triangles, self._uv_set(binding)),
-            colours=None
-            if paint is not None or (c := self._picked(inputs, "COLOR", 3, index, triangles)) is None
-            else linear_from_srgb(c),
+            uvs=uvs,
+            colours=None if colours is None else linear_from_srgb(colours),
         )
 
     def _inputs(self, primitive: Element, mesh: Element) -> list[_Input]:
-        """A primitive's inputs, its VERTEX replaced by those of the mesh's vertices."""
+        """Inputs of a primitive, with VERTEX replaced by the inputs of the mesh's vertices."""
         inputs = []
         for element in primitive.findall("input"):
-            offset, number = int(element.get("offset", 0)), int(element.get("set", 0))
-            if element.get("semantic") != "VERTEX":
-                inputs.append(
-                    _Input(element.get("semantic", ""), element.get("source", "")[1:], offset, number)
-                )
-                continue
-            for vertex in mesh.findall("vertices/input"):
-                semantic, source = vertex.get("semantic", ""), vertex.get("source", "")[1:]
-                inputs.append(_Input(semantic, source, offset, int(vertex.get("set", 0))))
+            is_vertex = element.get("semantic") == "VERTEX"
+            for each in mesh.findall("vertices/input") if is_vertex else (element,):
+                semantic, source = each.get("semantic", ""), each.get("source", "")[1:]
+                offset = int(element.get("offset", 0))
+                inputs.append(_Input(semantic, source, offset, int(each.get("set", 0))))
         return inputs
 
     def _index(self, primitive: Element, stride: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Indices at a primitive's corners, shape (C, inputs), and corners of its polygons, shape (P,)."""
+        """Indices at a primitive's corners, shape (C, inputs), and corners of each polygon, shape (P,)."""
         lists = [numbers(p.text or "", np.int64) for p in primitive.findall("p")]
         wanted = 3 * stride * int(primitive.get("count", 0)) if primitive.tag == "triangles" else -1
         for p, values in zip(primitive.findall("p"), lists, strict=True):
@@ -241,7 +236,7 @@ class _Collada:
         triangles: NDArray,
         number: int = -1,
     ) -> NDArray | None:
-        """Values at the triangles' corners, shape (F, 3, width); none where the file gives none that fit."""
+        """Values at the triangles' corners, shape (F, 3, width); None if the file gives none that fit."""
         found = [i for i in inputs if i.semantic == semantic]
         chosen = next((i for i in found if i.set == number), found[0] if found else None)
         if chosen is None:
@@ -273,20 +268,18 @@ class _Collada:
         return self._sources[given.source][:, :width]
 
     def _uv_set(self, binding: Element | None) -> int:
-        """The set of texture coordinates that a material is bound to; -1 leaves it open."""
+        """The set of texture coordinates bound to a material; -1 if unspecified."""
         for bind in () if binding is None else binding.findall("bind_vertex_input"):
             if bind.get("input_semantic") == "TEXCOORD":
                 return int(bind.get("input_set", 0))
         return -1
 
     def _paint(self, primitive: Element, binding: Element | None) -> Paint | None:
-        """The paint of a primitive's material; none where it has none, or none that says its colour."""
+        """The paint of a primitive's material; None if it has no material or no colour."""
         symbol = primitive.get("material")
         if symbol is None:
             return None
-        name = (
-            symbol if binding is None else binding.get("target", "")[1:]
-        )  # unbound, it may be the id itself
+        name = symbol if binding is None else binding.get("target", "")[1:]  # unbound, it may be the id
         material = self._ids.get(name)
         if material is None or material.tag != "material":
             self._reading.lose(f"material {name!r} is not there; shown without it")
@@ -296,10 +289,8 @@ class _Collada:
         return self._paints[material]
 
     def _make(self, material: Element) -> Paint | None:
-        effect, name = (
-            self._target(material.find("instance_effect")),
-            material.get("name") or material.get("id") or "",
-        )
+        effect = self._target(material.find("instance_effect"))
+        name = material.get("name") or material.get("id") or ""
         profile = None if effect is None else effect.find("profile_COMMON")
         shader = None if profile is None else next((e for e in profile.iter() if e.tag in SHADERS), None)
         if effect is None or profile is None or shader is None:
@@ -310,7 +301,7 @@ class _Collada:
             diffuse = shader.find("emission") if shader.tag == "constant" else None
         if diffuse is None or not len(diffuse):
             return None
-        for given in shader:  # of those that are not read, too, whoever made the file ought to know
+        for given in shader:  # also those not used, for notes on malformed colours
             if given.find("color") is not None:
                 self._colour(given, profile)
         opacity = self._opacity(shader, profile, name)
@@ -323,22 +314,16 @@ class _Collada:
         return Paint(name, (r, g, b, opacity), double_sided=double_sided)
 
     def _image(self, texture: Element, profile: Element) -> Image | None:
-        """The picture of a `<texture>`: by sampler and surface, by sampler alone (1.5), or itself."""
+        """The image of a `<texture>`: through sampler and surface, through a sampler (1.5), or directly."""
         parameters = {p.get("sid"): p for p in profile.iter("newparam")}
         name = texture.get("texture", "")
         for _ in range(2):  # a sampler names a surface, a surface an image
             parameter = parameters.get(name)
             if parameter is not None:
                 url = parameter.find("sampler2D/instance_image")
-                name = (
-                    url.get("url", "")[1:]
-                    if url is not None
-                    else (
-                        parameter.findtext("sampler2D/source")
-                        or parameter.findtext("surface/init_from")
-                        or ""
-                    ).strip()
-                )
+                paths = ("sampler2D/source", "surface/init_from")
+                text = next(filter(None, map(parameter.findtext, paths)), "")
+                name = text.strip() if url is None else url.get("url", "")[1:]
         image = self._ids.get(name)
         file = "" if image is None else (image.findtext("init_from/ref") or image.findtext("init_from") or "")
         if not file.strip():
@@ -350,8 +335,7 @@ class _Collada:
         """Opacity of a shader (COLLADA 1.4.1, chapter 7, "Determining Transparency").
 
         A_ONE: a t. RGB_ZERO: 1 - luminance(r, g, b) t, with the colour (r, g, b, a) of `<transparent>` and
-        t of `<transparency>`. Exporters that mix the two up make surfaces that nobody could see: taken as
-        opaque, with a note.
+        t of `<transparency>`. Exporters that confuse the two make surfaces invisible; those become opaque.
         """
         transparent, strength = shader.find("transparent"), shader.find("transparency")
         number = None if strength is None else numbers(strength.findtext("float", ""), float)
@@ -363,12 +347,12 @@ class _Collada:
             rgb_zero = transparent.get("opaque", "A_ONE") == "RGB_ZERO"
             opacity = 1 - float(np.dot((r, g, b), LUMINANCE)) * t if rgb_zero else a * t
         if not opacity > 0:
-            self._reading.note(f"material {name!r} would be invisible; taken as opaque")
+            self._reading.note(f"material {name!r} would be invisible; made opaque")
             return 1.0
         return min(opacity, 1.0)
 
     def _colour(self, element: Element, profile: Element) -> Rgba:
-        """The `<color>` of an element, or of the parameter that it names, 0 to 1; mended where malformed."""
+        """The `<color>` of an element or of its parameter, 0 to 1, repaired if malformed."""
         parameter = element.find("param")
         if parameter is not None:
             named = {p.get("sid"): p for p in profile.iter("newparam")}.get(parameter.get("ref"))
@@ -391,7 +375,7 @@ class _Collada:
         return values
 
     def _target(self, element: Element | None) -> Element | None:
-        """What an element's `url` names in this file."""
+        """The element that a `url` refers to."""
         return None if element is None else self._ids.get(element.get("url", "").removeprefix("#"))
 
     def _refused(self, element: Any, text: str) -> InputError:
@@ -399,13 +383,13 @@ class _Collada:
 
 
 def _part(word: str) -> list[str]:
-    """Two numbers that were written without a space: "0.01.0" is 0.0 and 1.0."""
+    """Split two numbers written without a space: "0.01.0" is 0.0 and 1.0."""
     fused = re.fullmatch(r"(\d+\.\d+?)(\d\.\d+)", word)
     return [fused[1], fused[2]] if fused else [word]
 
 
 def _affine(A: NDArray | None = None, p: NDArray | None = None) -> NDArray:
-    """A map of linear part A, shape (3, 3), and origin p, shape (3,); shape (4, 4)."""
+    """An affine map with linear part A, shape (3, 3), and translation p, shape (3,); shape (4, 4)."""
     T = np.eye(4)
     T[:3, :3] = np.eye(3) if A is None else A
     T[:3, 3] = 0 if p is None else p
@@ -418,14 +402,3 @@ def _rotation(axis: NDArray, angle: float) -> NDArray:
     x, y, z = axis / length if length > 0 else axis
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
-
-
-def _strips(counts: NDArray, tag: str) -> NDArray:
-    """Triangles of strips or fans of so many corners each, as indices of corners, shape (F, 3)."""
-    made, start = [], 0
-    for count in counts:
-        i = np.arange(count - 2)
-        rows = (np.zeros_like(i), i + 1, i + 2) if tag == "trifans" else (i, i + 1 + i % 2, i + 2 - i % 2)
-        made.append(start + np.column_stack(rows))
-        start += count
-    return np.concatenate(made)

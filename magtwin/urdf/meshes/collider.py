@@ -1,4 +1,4 @@
-"""Collider: what a mesh collides as: its convex hull, convex parts of it, or itself."""
+"""Collider: the solids of a mesh collider: its convex hull, convex parts, or the mesh itself."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from magtwin.urdf.options import Collision
 EXTRA = 'pip install "magtwin[decomposition]"'
 
 CONCAVITY = 0.05
-"""Depth of hollows, against the mesh's size, that a convex part may bridge (coacd's threshold)."""
+"""Largest depth of a hollow, relative to the mesh, that a convex part may fill (coacd's threshold)."""
 
 
 @dataclass(frozen=True)
 class Solid:
-    """Triangles that collide."""
+    """Triangles of a collider."""
 
     points: NDArray[np.float32]
     """Vertices [m], shape (V, 3)."""
@@ -27,7 +27,7 @@ class Solid:
 
 
 def solids_of(mesh: Mesh, collision: Collision) -> tuple[Solid, ...]:
-    """What a mesh collides as: one solid, or the parts of a convex decomposition.
+    """The solids of a mesh: one, or the parts of a convex decomposition.
 
     Raises:
         InputError: The mesh is flat and has no hull; or coacd is not installed.
@@ -39,30 +39,35 @@ def solids_of(mesh: Mesh, collision: Collision) -> tuple[Solid, ...]:
     return (_hull(mesh),)
 
 
-def _hull(mesh: Mesh) -> Solid:
-    """The convex hull of all points."""
+def hull_faces(points: NDArray) -> NDArray[np.int64] | None:
+    """Triangles of the convex hull, counter-clockwise from outside, shape (F, 3); None if it is flat."""
     from scipy.spatial import ConvexHull, QhullError
 
-    points = mesh.points.astype(float)
     try:
         hull = ConvexHull(points)
-    except QhullError as error:
-        raise InputError(
-            f"{mesh.path}: is flat and has no convex hull to collide with; use a box instead"
-        ) from error
-    faces, normals = hull.simplices.astype(np.int64), hull.equations[:, :3]
+    except QhullError:
+        return None
+    faces = hull.simplices.astype(np.int64)
     a, b, c = (points[faces[:, i]] for i in range(3))
-    inwards = np.sum(np.cross(b - a, c - a) * normals, axis=1) < 0
-    faces = np.where(inwards[:, None], faces[:, ::-1], faces)
-    first = np.argmin(faces, axis=1)[:, None]  # each from its least corner, then in order of corners
+    inwards = np.sum(np.cross(b - a, c - a) * hull.equations[:, :3], axis=1) < 0
+    return np.where(inwards[:, None], faces[:, ::-1], faces)
+
+
+def _hull(mesh: Mesh) -> Solid:
+    """The convex hull, its faces in a fixed order and without those that have no area."""
+    faces = hull_faces(mesh.points.astype(float))
+    if faces is None:
+        raise InputError(f"{mesh.path}: is flat and has no convex hull to collide with; use a box instead")
+    first = np.argmin(faces, axis=1)[:, None]
     faces = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
-    return _used(mesh.points, faces[np.lexsort(faces.T[::-1])])
+    faces = faces[np.lexsort(faces.T[::-1])]
+    faces = faces[has_area(mesh.points, faces)]
+    used, index = np.unique(faces, return_inverse=True)
+    return Solid(mesh.points[used], index.reshape(-1, 3))
 
 
 def _decomposition(mesh: Mesh) -> tuple[Solid, ...]:
-    """Convex parts by coacd (Wei et al. 2022, "Approximate convex decomposition for 3D meshes with
-    collision-aware concavity and tree search").
-    """
+    """Convex parts by coacd (Wei et al. 2022, doi:10.1145/3528223.3530103)."""
     try:
         import coacd
     except ImportError as error:
@@ -74,10 +79,3 @@ def _decomposition(mesh: Mesh) -> tuple[Solid, ...]:
     if not parts:
         raise InputError(f"{mesh.path}: coacd finds no convex parts in it; use --collision hull")
     return tuple(Solid(np.asarray(v, np.float32), np.asarray(f, np.int64)) for v, f in parts)
-
-
-def _used(points: NDArray, faces: NDArray) -> Solid:
-    """The faces that have an area, and the points that they name."""
-    faces = faces[has_area(points, faces)]
-    used, index = np.unique(faces, return_inverse=True)
-    return Solid(points[used], index.reshape(-1, 3))

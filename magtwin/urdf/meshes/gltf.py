@@ -1,7 +1,7 @@
-"""glTF: triangles of a .gltf or .glb (version 2.0), its nodes, materials and textures.
+"""glTF: reader of .gltf and .glb files, version 2.0.
 
-Read here rather than by trimesh, for three things that it does otherwise: a texture's file is kept as it
-is, colours are taken as linear (section 3.9.2), and what cannot be read is said.
+trimesh is not used for three reasons: it decodes textures instead of keeping their files, rounds linear
+colour factors (section 3.9.2) to 8 bits, and drops unsupported contents without a message.
 """
 
 import base64
@@ -19,42 +19,43 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat
 from magtwin.urdf.meshes.mesh import Paint, Piece
+from magtwin.urdf.meshes.polygon import strips
 from magtwin.urdf.meshes.reading import Reading
 from magtwin.urdf.meshes.texture import Image, image_of, read_image
 from magtwin.usd.geometry import linear_from_srgb, srgb_from_linear
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Turns glTF's Y up to Z up, x staying: (x, y, z) -> (x, -z, y)."""
+"""Turns glTF's Y up to Z up: (x, y, z) -> (x, -z, y)."""
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
-"""Modes of primitives that have faces."""
+"""Modes of primitives with faces."""
 
 SUPPORTED = ("KHR_materials_unlit", "KHR_mesh_quantization", "KHR_materials_emissive_strength")
-"""Extensions without which a file would be read wrongly, and that are understood or change no shape."""
+"""Required extensions that are supported or do not change the shape."""
 
 EMPTY = 2**22
-"""Zeros that a file may have without a buffer that holds them."""
+"""Most zeros of an accessor without a buffer."""
 
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
 def read_gltf(reading: Reading) -> list[Piece]:
-    """The triangles of a glTF file, turned to Z up, as `read_mesh` has it."""
+    """The triangles of a glTF file, turned to Z up, for `read_mesh`."""
     return _Gltf(reading).pieces()
 
 
 class _Gltf:
-    """A glTF file: its JSON, and the buffers that it points into."""
+    """A glTF file: its JSON and its buffers."""
 
     def __init__(self, reading: Reading) -> None:
         self._reading, path = reading, reading.path
         self._json, self._chunk = _parse(path)
         version = str(self._json.get("asset", {}).get("version", "none"))
         if not version.startswith("2."):
-            raise InputError(f"{path}: is glTF of version {version}; only 2.0 is read, export it again")
+            raise InputError(f"{path}: is glTF version {version}; only 2.0 is read, export it again")
         unknown = [e for e in self._json.get("extensionsRequired", ()) if e not in SUPPORTED]
         if unknown:
             raise InputError(
@@ -64,7 +65,7 @@ class _Gltf:
         self._paints: dict[int, Paint] = {}
 
     def pieces(self) -> list[Piece]:
-        """All that the file's scene shows, in node order."""
+        """The pieces of the file's scene, in node order."""
         scenes, nodes = self._json.get("scenes", []), self._json.get("nodes", [])
         if scenes:
             roots = scenes[self._json.get("scene", 0)].get("nodes", [])
@@ -78,7 +79,7 @@ class _Gltf:
         return pieces
 
     def _walk(self, roots: list[int]) -> Iterator[tuple[dict[str, Any], NDArray]]:
-        """Nodes with the transform from each to the mesh's frame; nodes in a circle are refused."""
+        """Nodes with their transforms to the mesh's frame; refuses circles."""
         pending = [(root, Z_UP) for root in reversed(roots)]
         seen: set[int] = set()
         while pending:
@@ -133,7 +134,7 @@ class _Gltf:
             )
 
     def _paint(self, index: int) -> Paint:
-        """A material's paint. Colour factors are linear, and multiply the texture and vertex colours."""
+        """The paint of a material. Colour factors are linear and multiply texture and vertex colours."""
         if index not in self._paints:
             material = self._json["materials"][index]
             surface = material.get("pbrMetallicRoughness", {})
@@ -141,10 +142,11 @@ class _Gltf:
             image = None
             if "baseColorTexture" in surface:
                 texture = surface["baseColorTexture"]
-                if texture.get("texCoord", 0) != 0 or "KHR_texture_transform" in texture.get(
-                    "extensions", {}
-                ):
-                    self._reading.lose(f"material {index}'s texture lies on other coordinates than its first")
+                moved = "KHR_texture_transform" in texture.get("extensions", {})
+                if texture.get("texCoord", 0) != 0 or moved:
+                    self._reading.lose(
+                        f"material {index}'s texture uses other coordinates than the first set"
+                    )
                 image = self._image(self._json["textures"][texture["index"]])
             for other in ("normalTexture", "occlusionTexture", "emissiveTexture"):
                 if other in material:
@@ -166,7 +168,7 @@ class _Gltf:
         return self._paints[index]
 
     def _image(self, texture: dict[str, Any]) -> Image | None:
-        """The picture of a texture: in a file, in the text, or in a buffer."""
+        """The image of a texture: in a file, inline, or in a buffer."""
         if "source" not in texture:
             self._reading.lose("a texture of an unknown format is left out")
             return None
@@ -179,7 +181,7 @@ class _Gltf:
         return read_image(image["uri"], self._reading)
 
     def _numbers(self, index: int) -> NDArray:
-        """An accessor's values, shape (N, width), as floats or whole numbers (section 3.6.2)."""
+        """Values of an accessor, shape (N, width), as floats or integers (section 3.6.2)."""
         accessor = self._json["accessors"][index]
         dtype, width = np.dtype(COMPONENTS[accessor["componentType"]]), WIDTHS[accessor["type"]]
         count = accessor["count"]
@@ -189,13 +191,13 @@ class _Gltf:
             stride = view.get("byteStride", dtype.itemsize * width)
             if count and len(data) < stride * (count - 1) + dtype.itemsize * width:
                 raise InputError(
-                    f"{self._reading.path}: accessor {index} reaches over its buffer; export it again"
+                    f"{self._reading.path}: accessor {index} is longer than its buffer; export it again"
                 )
             values = np.ndarray((count, width), dtype, data, 0, (stride, dtype.itemsize))
         else:
             if count > EMPTY:
                 raise InputError(
-                    f"{self._reading.path}: accessor {index} is of {count} zeros, over {EMPTY}; export anew"
+                    f"{self._reading.path}: accessor {index} has {count} zeros, over {EMPTY}; export it again"
                 )
             values = np.zeros((count, width), dtype)
         if "sparse" in accessor:
@@ -205,18 +207,12 @@ class _Gltf:
         return values.astype(float) if dtype.kind == "f" else values.astype(np.int64)
 
     def _replaced(self, values: NDArray, sparse: dict[str, Any]) -> NDArray:
-        """Values with those rows replaced that a sparse accessor lists."""
+        """Values with the rows of a sparse accessor replaced."""
         count, where, what = sparse["count"], sparse["indices"], sparse["values"]
-        rows = np.frombuffer(
-            self._view(where["bufferView"]),
-            COMPONENTS[where["componentType"]],
-            count,
-            where.get("byteOffset", 0),
-        )
-        new = np.frombuffer(
-            self._view(what["bufferView"]), values.dtype, count * values.shape[1], what.get("byteOffset", 0)
-        )
-        values[rows] = new.reshape(count, -1)
+        kind = COMPONENTS[where["componentType"]]
+        rows = np.frombuffer(self._view(where["bufferView"]), kind, count, where.get("byteOffset", 0))
+        new, start = self._view(what["bufferView"]), what.get("byteOffset", 0)
+        values[rows] = np.frombuffer(new, values.dtype, count * values.shape[1], start).reshape(count, -1)
         return values
 
     def _view(self, index: int) -> bytes:
@@ -279,10 +275,8 @@ def _local(node: dict[str, Any]) -> NDArray:
 
 
 def _triangles(order: NDArray, mode: int) -> NDArray:
-    """Corners of the triangles of a list, a strip or a fan of vertices, shape (F, 3)."""
+    """Vertices of the triangles of a list, strip or fan of vertices, shape (F, 3)."""
     if mode == TRIANGLES:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
-    i = np.arange(max(len(order) - 2, 0))
-    if mode == FAN:
-        return order[np.column_stack([i + 1, i + 2, np.zeros_like(i)])]
-    return order[np.column_stack([i, i + 1 + i % 2, i + 2 - i % 2])]
+    triangles = strips(np.array([len(order)]), fans=mode == FAN)
+    return order[np.roll(triangles, -1, axis=1) if mode == FAN else triangles]  # its order of a fan's corners

@@ -1,4 +1,4 @@
-"""Mesh: the triangles of a mesh file with all that lies on them, in metres."""
+"""Mesh: triangles of a mesh file with their normals, colours and textures, in metres."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,25 +16,28 @@ SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
 
 Rgba = tuple[float, float, float, float]
 
+GREY: Rgba = (0.5, 0.5, 0.5, 1.0)
+"""Colour of a surface without a material (sRGB)."""
+
 CREASE = np.radians(35)
 """Faces that meet at a smaller angle than this are shaded as one smooth surface [rad]."""
 
 FAN = 64
-"""Where more faces than this meet, at tips and in the middle of discs, each keeps its own normal."""
+"""Where more faces than this meet, as at tips and in the middle of discs, each keeps its own normal."""
 
 
 @dataclass(frozen=True)
 class Paint:
-    """How a mesh file says that some of its triangles look."""
+    """A material of a mesh file."""
 
     name: str = ""
     """Its name in the file."""
 
     rgba: Rgba = (1.0, 1.0, 1.0, 1.0)
-    """Colour and opacity as screens show them (sRGB), 0 to 1; of a textured surface, what multiplies it."""
+    """Colour (sRGB) and opacity, 0 to 1; with a texture, the factor that multiplies it."""
 
     image: Image | None = None
-    """Texture of the colour."""
+    """Colour texture."""
 
     roughness: float = 0.5
     """0 is a mirror, 1 is chalk."""
@@ -43,21 +46,21 @@ class Paint:
     """0 is an insulator, 1 is metal."""
 
     see_through: bool = False
-    """Whether the texture's opacity counts."""
+    """Whether the texture's opacity is used."""
 
     cutoff: float = 0.0
-    """Opacity below which nothing is shown, and above which all is; 0 blends."""
+    """Opacity threshold between invisible and opaque; 0 blends."""
 
     double_sided: bool = False
-    """Whether it is seen from behind."""
+    """Whether it is visible from behind."""
 
     by_vertex: bool = False
-    """Whether the colours at the corners are shown in place of `rgba`."""
+    """Whether the colours at the corners replace `rgba`."""
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Triangles of one paint, as a reader finds them. What a file does not give is none."""
+    """Triangles with one paint, from a reader. Missing values are None."""
 
     points: NDArray
     """Vertices [m], shape (V, 3)."""
@@ -77,10 +80,9 @@ class Piece:
     """Linear red, green, blue at each corner, 0 to 1, shape (F, 3, 3)."""
 
     def moved(self, T: NDArray) -> "Piece":
-        """The piece under an affine map T, shape (4, 4), still facing outwards where that mirrors.
+        """The piece under an affine map T, shape (4, 4); faces stay outwards under a reflection.
 
-        Normals turn by the inverse transpose of the linear part A, n' ~ A^-T n, times det A's sign so
-        that they still point outwards.
+        Normals transform by the inverse transpose of the linear part A, n' ~ A^-T n, times the sign of det A.
         """
         if np.array_equal(T, np.eye(4)):
             return self
@@ -94,7 +96,7 @@ class Piece:
         return made.flipped() if det < 0 else made
 
     def flipped(self) -> "Piece":
-        """The piece with its faces wound the other way, their normals as they are."""
+        """The piece with its faces wound the other way and the same normals."""
         normals, uvs, colours = (
             None if values is None else values[:, ::-1] for values in (self.normals, self.uvs, self.colours)
         )
@@ -103,18 +105,18 @@ class Piece:
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh file. Values at corners are none where no piece gives them, nan at pieces that do not."""
+    """A mesh file. Values at corners are None if no piece has them, and nan for pieces without them."""
 
     path: Path
 
     points: NDArray[np.float32]
-    """Vertices, no two alike [m], shape (V, 3)."""
+    """Distinct vertices [m], shape (V, 3)."""
 
     faces: NDArray[np.int64]
     """Corners of the triangles, counter-clockwise from outside, shape (F, 3)."""
 
     paints: tuple[Paint | None, ...]
-    """Looks that the file gives; none stands for triangles to which it gives no look."""
+    """Materials; None stands for triangles without one."""
 
     paint: NDArray[np.int64]
     """Index of each triangle's paint, shape (F,)."""
@@ -129,15 +131,17 @@ class Mesh:
     """Linear colours at the corners, shape (F, 3, 3)."""
 
     notes: tuple[Note, ...] = ()
-    """What was repaired, guessed or left out."""
+    """Repairs, guesses and omissions."""
 
     def shaded(self) -> NDArray[np.float32]:
-        """Unit normals at the corners, the file's where it has them, else from the faces; shape (F, 3, 3)."""
+        """Unit normals at the corners, from the file or computed from the faces; shape (F, 3, 3)."""
         if self.normals is not None and np.isfinite(self.normals).all():
             return self.normals
         computed = corner_normals(self.points, self.faces)
         return (
-            computed if self.normals is None else np.where(np.isfinite(self.normals), self.normals, computed)
+            np.where(np.isfinite(self.normals), self.normals, computed)
+            if self.normals is not None
+            else computed
         )
 
 
@@ -147,16 +151,16 @@ Reader = Callable[[Reading], list[Piece]]
 def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mesh:
     """Read a mesh file.
 
-    COLLADA's unit is applied and its up axis is not; glTF is turned from Y up to Z up: both as RViz
-    does it (rviz_rendering, assimp_loader.cpp).
+    As in RViz (rviz_rendering, assimp_loader.cpp), COLLADA's unit is applied but not its up axis, and glTF is
+    turned from Y up to Z up.
 
     Args:
-        path: The file; its suffix says its format.
-        may_read: Whether a file that this one names (a material library, a texture, a buffer) may be
-            read; by default those in its own folder and below.
+        path: The file; its suffix determines the format.
+        may_read: Whether a referenced file (material library, texture, buffer) may be read. Default: files
+            in the folder of the mesh and below.
 
     Raises:
-        InputError: The file cannot be read, holds no triangle, or points that are no numbers.
+        InputError: The file cannot be read, has no triangle, or has vertices that are not finite.
     """
     folder = path.resolve().parent
     allowed = may_read or (lambda other: other.resolve().is_relative_to(folder))
@@ -165,36 +169,30 @@ def read_mesh(path: Path, may_read: Callable[[Path], bool] | None = None) -> Mes
         pieces = _reader(path)(reading)
     except InputError:
         raise
-    except Exception as error:  # readers raise whatever they stumble upon in a damaged file
+    except Exception as error:  # readers raise many types on a damaged file
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(f"{path}: cannot be read as a mesh: {reason[0]}; export it again") from error
     return _join(reading, pieces)
 
 
 def _reader(path: Path) -> Reader:
-    """The reader of a format, imported when it is first needed."""
-    suffix = path.suffix.lower()
-    if suffix == ".dae":
-        from magtwin.urdf.meshes.collada import read_collada
-
-        return read_collada
-    if suffix in (".glb", ".gltf"):
-        from magtwin.urdf.meshes.gltf import read_gltf
-
-        return read_gltf
-    if suffix == ".obj":
-        from magtwin.urdf.meshes.wavefront import read_wavefront
-
-        return read_wavefront
-    if suffix in (".stl", ".ply"):
-        from magtwin.urdf.meshes.scan import read_scan
-
-        return read_scan
-    raise InputError(f"{path}: is of no known mesh format ({', '.join(SUFFIXES)})")
+    """The reader of a format, imported when first needed."""
+    match path.suffix.lower():
+        case ".dae":
+            from magtwin.urdf.meshes.collada import read_collada as reader
+        case ".glb" | ".gltf":
+            from magtwin.urdf.meshes.gltf import read_gltf as reader
+        case ".obj":
+            from magtwin.urdf.meshes.wavefront import read_wavefront as reader
+        case ".stl" | ".ply":
+            from magtwin.urdf.meshes.scan import read_scan as reader
+        case _:
+            raise InputError(f"{path}: is of no known mesh format ({', '.join(SUFFIXES)})")
+    return reader
 
 
 def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
-    """All pieces as one mesh: like points made one, triangles without an area left out."""
+    """All pieces as one mesh, with equal points merged and triangles without an area removed."""
     path, pieces = reading.path, [piece for piece in pieces if len(piece.faces)]
     if not pieces:
         raise InputError(f"{path}: holds no triangle; export it again, or use a primitive")
@@ -237,7 +235,7 @@ def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:
 
 
 def _coloured(piece: Piece, reading: Reading) -> Piece:
-    """A piece whose colours at corners are its look, where it has no other, or are left out."""
+    """A piece with colours at corners only if it has no other look."""
     if piece.colours is None or (piece.paint is not None and piece.paint.by_vertex):
         return piece
     if piece.paint is None:
@@ -249,7 +247,7 @@ def _coloured(piece: Piece, reading: Reading) -> Piece:
 def _at_corners(
     values: Sequence[NDArray | None], pieces: Sequence[Piece], width: int, kept: NDArray
 ) -> NDArray | None:
-    """Values at the corners of all pieces, nan where one has none; none where all have none."""
+    """Values at the corners of all pieces, nan for pieces without them; None if no piece has them."""
     if all(value is None for value in values):
         return None
     filled = [
@@ -260,7 +258,7 @@ def _at_corners(
 
 
 def _unit(normals: NDArray | None) -> NDArray | None:
-    """Normals of length 1; nan at those that have no direction."""
+    """Normals of length 1; nan for zero vectors."""
     if normals is None:
         return None
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -269,7 +267,7 @@ def _unit(normals: NDArray | None) -> NDArray | None:
 
 
 def has_area(points: NDArray, faces: NDArray) -> NDArray[np.bool_]:
-    """Whether each triangle has an area, against the square of its longest edge."""
+    """Whether each triangle has an area, relative to the square of its longest edge."""
     x, y, z = points.astype(float).T
     a, b, c = faces.T
     u, v, w = ((p[b] - p[a], p[c] - p[a], p[c] - p[b]) for p in (x, y, z))
@@ -279,22 +277,22 @@ def has_area(points: NDArray, faces: NDArray) -> NDArray[np.bool_]:
 
 
 def bounds(points: NDArray) -> tuple[NDArray, NDArray]:
-    """Least and greatest corner of the box around points (N, 3); columns are quicker to go through."""
+    """Lower and upper corner of the box around points (N, 3); column by column, which is faster."""
     columns = np.ascontiguousarray(points.T)
     return columns.min(1), columns.max(1)
 
 
 def distinct(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The distinct rows of an array of floats, in the order in which they first appear.
+    """The distinct rows of an array of floats, in the order of first occurrence.
 
-    One sort of a 64-bit word a row, its hash above its index, is many times quicker than sorting rows;
-    should two rows that differ have one hash, rows are sorted after all.
+    Sorting one 64-bit word per row, its hash and its index, is many times faster than sorting rows. If two
+    different rows have the same hash, rows are sorted instead.
 
     Args:
         rows: Taken in single precision, shape (N, K).
 
     Returns:
-        Index of the first row of each kind, shape (D,), and which kind each row is, shape (N,).
+        Index of the first row of each kind, shape (D,), and the kind of each row, shape (N,).
     """
     words = np.ascontiguousarray(rows + np.float32(0), np.float32).view(np.uint32)  # + 0 makes -0 into 0
     hashed, here = np.zeros(len(words), np.uint64), np.arange(len(words))
@@ -324,8 +322,8 @@ def face_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
 def corner_normals(points: NDArray, faces: NDArray) -> NDArray[np.float32]:
     """Unit normals of each triangle's corners: smooth across shallow edges, sharp across creases.
 
-    A corner's normal is the mean, weighted by area, of the faces around its point that turn from its
-    own by less than CREASE; where more than FAN faces meet it is its own face's.
+    A corner's normal is the area-weighted mean of the faces around its point whose angle to its own face is
+    below CREASE; where more than FAN faces meet, it is that of its own face.
 
     Args:
         points: Vertices [m], shape (V, 3).

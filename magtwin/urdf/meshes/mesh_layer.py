@@ -1,6 +1,6 @@
-"""Meshes: the big arrays of a robot, each mesh file once, in a layer of its own (.usdc).
+"""Mesh layer: the arrays of a robot's mesh files, each file once, in a separate layer (.usdc).
 
-The readable root layer references them; arrays of more than 64 elements do not belong in text.
+The readable root layer references it, since large arrays do not belong in text.
 """
 
 from collections.abc import Callable
@@ -15,9 +15,8 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.model import Mesh as UrdfMesh
-from magtwin.urdf.material import GREY
 from magtwin.urdf.meshes.collider import Solid, solids_of
-from magtwin.urdf.meshes.mesh import SUFFIXES, Mesh, Paint, distinct, face_normals, read_mesh
+from magtwin.urdf.meshes.mesh import GREY, SUFFIXES, Mesh, Paint, distinct, face_normals, read_mesh
 from magtwin.urdf.meshes.texture import Textures
 from magtwin.urdf.options import DEFAULTS, Collision, Options
 from magtwin.urdf.source.source import MissingFileError
@@ -27,6 +26,9 @@ from magtwin.usd.layers import describe_stage
 T = TypeVar("T")
 
 ROOT = Sdf.Path("/Meshes")
+
+FORMS: dict[Collision, str] = {"hull": "hull", "decomposition": "part", "mesh": "exact"}
+"""Suffix of a collider's prim by type."""
 
 MESH = "mesh"
 """Name of the mesh below a visual's prim."""
@@ -39,27 +41,27 @@ class Entry:
     path: Sdf.Path
 
     paints: tuple[Paint | None, ...]
-    """Looks that the file gives; none stands for triangles to which it gives no look."""
+    """Materials of the file; None stands for triangles without one."""
 
     subsets: tuple[str, ...]
-    """Names of the GeomSubsets below the mesh, one a paint; none where one paint covers all."""
+    """Names of the GeomSubsets below the mesh, one for each paint; empty if one paint covers all."""
 
     textured: bool
     """Whether the mesh has texture coordinates."""
 
 
 class MeshLayer:
-    """A layer of meshes, shared by every visual and collider that shows the same file at the same scale."""
+    """A layer of meshes; visuals and colliders with the same file and scale share one."""
 
     def __init__(
         self, description: Description, options: Options = DEFAULTS, textures: str = "./textures"
     ) -> None:
-        """Start without a mesh.
+        """Create an empty layer.
 
         Args:
-            description: Whose meshes they are; takes notes.
-            options: What meshes collide as, and what is done about missing ones.
-            textures: Asset path of the folder for textures, as the robot's layer sees it.
+            description: The description, which receives notes.
+            options: Type of mesh colliders, and treatment of missing meshes.
+            textures: Asset path of the folder for textures, relative to the robot's layer.
         """
         self.textures = Textures(textures)
         self._description, self._options = description, options
@@ -75,21 +77,18 @@ class MeshLayer:
 
     @property
     def collision(self) -> Collision:
-        """What meshes collide as."""
+        """Type of mesh colliders."""
         return self._options.collision
 
     def __len__(self) -> int:
         return len(self._visuals) + len(self._colliders)
 
     def visual(self, mesh: UrdfMesh) -> Entry:
-        """The prim that shows a URDF `<mesh>`.
-
-        Args:
-            mesh: As the URDF names it.
+        """The prim of a URDF `<mesh>` as a visual.
 
         Raises:
-            MissingFileError: The file is not there.
-            InputError: It is out of bounds, unreadable or empty, or the scale is none.
+            MissingFileError: The file does not exist.
+            InputError: The file may not be read, is unreadable or empty, or the scale is invalid.
         """
         path, scale = self._file(mesh)
         key = (path, scale)
@@ -98,9 +97,9 @@ class MeshLayer:
         return self._visuals[key]
 
     def collider(self, mesh: UrdfMesh) -> tuple[Sdf.Path, ...]:
-        """The mesh prims that a URDF `<mesh>` collides as: one, or several of a convex decomposition.
+        """The prims of a URDF `<mesh>` as a collider, several for a convex decomposition.
 
-        Args and refusals as for `visual`.
+        Raises as `visual` does.
         """
         path, scale = self._file(mesh)
         key = (path, scale)
@@ -108,18 +107,18 @@ class MeshLayer:
             if path not in self._solids:
                 self._solids[path] = solids_of(self._read(path), self._options.collision)
             self._colliders[key] = tuple(
-                self._define_solid(solid, np.array(scale), f"{path.stem}_{_form(self._options.collision)}")
+                self._define_solid(solid, np.array(scale), f"{path.stem}_{FORMS[self.collision]}")
                 for solid in self._solids[path]
             )
         return self._colliders[key]
 
     def try_add(self, mesh: UrdfMesh, add: Callable[[UrdfMesh], T], label: str = "") -> T | None:
-        """What `visual` or `collider` gives; none, with a note, where the file is missing and that will do.
+        """The result of `visual` or `collider`; None if the file is missing and the options allow that.
 
         Args:
-            mesh: As the URDF names it.
+            mesh: The mesh.
             add: `visual` or `collider`.
-            label: Whose mesh it is, for the note; "" makes none.
+            label: Owner of the mesh, for the note; "" for no note.
         """
         try:
             return add(mesh)
@@ -132,7 +131,7 @@ class MeshLayer:
             return None
 
     def vertices(self, mesh: UrdfMesh) -> NDArray[np.float64]:
-        """Vertices of a URDF `<mesh>` that was added, as its file has them, scaled [m], shape (V, 3)."""
+        """Vertices of the file of an added `<mesh>`, scaled [m], shape (V, 3)."""
         path, scale = self._file(mesh)
         return self._files[path].points.astype(float) * scale
 
@@ -149,7 +148,7 @@ class MeshLayer:
             self._found[name] = self._description.find_file(name, "mesh")
         if not mesh.scale.all():
             raise InputError(
-                f"{urdf}: mesh {name!r} has scale {mesh.scale.tolist()}; give three numbers but 0"
+                f"{urdf}: mesh {name!r} has scale {mesh.scale.tolist()}; give numbers other than 0"
             )
         return self._found[name], tuple(float(f) for f in np.broadcast_to(mesh.scale, 3))
 
@@ -172,16 +171,14 @@ class MeshLayer:
             mesh.CreateDoubleSidedAttr(True)
         if file.uvs is not None:
             _primvar(mesh, "st", Sdf.ValueTypeNames.TexCoord2fArray, np.nan_to_num(file.uvs[:, corners]))
-        subsets: list[str] = []
-        if len(file.paints) > 1:
-            subsets = _subsets(mesh, file)
+        subsets = _subsets(mesh, file) if len(file.paints) > 1 else []
         self._define_colours(mesh, file, corners)
         return Entry(xform.GetPath(), file.paints, tuple(subsets), file.uvs is not None)
 
     def _define_colours(self, mesh: UsdGeom.Mesh, file: Mesh, corners: slice) -> None:
-        """Colours for viewers without materials, and those of corners, which materials show too.
+        """Author colours at corners, and colours of paints for viewers without materials.
 
-        A mesh of one colour has none: its visual says it.
+        A mesh of one colour has none here, since its visual has it.
         """
         kind, tokens = Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens
         by_paint = np.array([display_colour(paint) for paint in file.paints], np.float32)
@@ -210,15 +207,15 @@ class MeshLayer:
         return mesh
 
     def _free(self, name: str) -> Sdf.Path:
-        """Path of a prim that is not there yet, called `name` if that is free."""
+        """A free path, called `name` if possible."""
         return ROOT.AppendChild(free_name(Tf.MakeValidIdentifier(name), self._names))
 
 
 def gather(description: Description, options: Options, textures: str) -> MeshLayer:
-    """Every mesh that a link shows or touches with; other args as for `MeshLayer`.
+    """The layer of all meshes of a description; arguments as for `MeshLayer`.
 
     Raises:
-        InputError: One cannot be read; or is missing, and `options` do not say that a note will do.
+        InputError: A mesh cannot be read, or is missing and `options` do not allow that.
     """
     meshes = MeshLayer(description, options, textures)
     colliding = False
@@ -232,19 +229,13 @@ def gather(description: Description, options: Options, textures: str) -> MeshLay
                 colliding = True
     if options.collision == "mesh" and colliding:
         description.note(
-            "meshes collide as they are; PhysX allows that for bodies that stand still, and takes the convex "
-            "hulls of those that move"
+            "meshes collide as they are; PhysX does this for static bodies only, and uses convex hulls for others"
         )
     return meshes
 
 
-def _form(collision: Collision) -> str:
-    """What a collider's prim is called after its file."""
-    return {"hull": "hull", "decomposition": "part", "mesh": "exact"}[collision]
-
-
 def free_name(name: str, taken: set[str]) -> str:
-    """A name that is not taken, and is from now on: `name`, or `name_2` and so on."""
+    """A name that is not in `taken`, to which it is added: `name`, or `name_2` and so on."""
     unique, number = name, 1
     while unique in taken:
         number += 1
@@ -254,7 +245,7 @@ def free_name(name: str, taken: set[str]) -> str:
 
 
 def display_colour(paint: Paint | None) -> tuple[float, float, float]:
-    """Linear colour by which a viewer without materials shows a paint."""
+    """Linear colour of a paint for viewers without materials."""
     if paint is None:
         r, g, b = linear_from_srgb(GREY[:3])
     else:
@@ -264,7 +255,7 @@ def display_colour(paint: Paint | None) -> tuple[float, float, float]:
 
 
 def _scaled(points: NDArray, faces: NDArray, scale: NDArray) -> tuple[NDArray[np.float32], NDArray]:
-    """Points and faces at a scale, facing outwards still where that mirrors."""
+    """Points and faces at a scale; faces stay outwards under a reflection."""
     scaled = (points * scale).astype(np.float32)
     return scaled, faces[:, ::-1] if np.prod(scale) < 0 else faces
 
@@ -276,7 +267,9 @@ def _primvar(
     values: NDArray,
     interpolation: str = UsdGeom.Tokens.faceVarying,
 ) -> None:
-    """A primvar of values at corners, shape (F, 3, K), or of another interpolation; each value once."""
+    """Author a primvar, by default of values at corners, shape (F, 3, K), with an index of distinct
+    values.
+    """
     rows = values.reshape(-1, values.shape[-1]).astype(np.float32) + np.float32(0)
     first, index = distinct(rows)
     arrays = {2: Vt.Vec2fArray, 3: Vt.Vec3fArray}
@@ -286,7 +279,7 @@ def _primvar(
 
 
 def _subsets(mesh: UsdGeom.Mesh, file: Mesh) -> list[str]:
-    """A GeomSubset a paint, named after it."""
+    """One GeomSubset for each paint, with its name."""
     api = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
     taken: set[str] = set()
     names: list[str] = []

@@ -1,18 +1,18 @@
-"""Polygon: faces of any number of corners, cut into triangles."""
+"""Polygon: polygons, strips and fans cut into triangles."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 
 def cut_polygons(points: NDArray, corners: NDArray, counts: NDArray) -> NDArray[np.int64]:
-    """Triangles of polygons, wound as they are: fans, and ears cut off where a fan would fold over.
+    """Triangles of polygons with the same winding: fans, or ears where a fan would fold over.
 
-    A fan from a polygon's first corner is right where every triangle of it turns as the whole polygon
-    does, whose normal is Newell's, the sum of p_i x p_i+1 over its edges; convex ones always are.
+    A fan from the first corner is correct if all its triangles turn the same way as the polygon, whose normal
+    is Newell's, the sum of p_i x p_i+1 over its edges. This holds for all convex polygons.
 
     Args:
         points: Vertices, shape (V, 3).
-        corners: Vertex at each corner of all polygons, one after the other, shape (C,).
+        corners: Vertex at each corner of all polygons in sequence, shape (C,).
         counts: Number of corners of each polygon, 3 or more, shape (P,).
 
     Returns:
@@ -36,14 +36,20 @@ def cut_polygons(points: NDArray, corners: NDArray, counts: NDArray) -> NDArray[
     return triangles
 
 
-def _ears(points: NDArray, normal: NDArray) -> NDArray[np.int64]:
-    """Triangles of one polygon by cutting ears off (Meisters 1975, "Polygons have ears"), shape (N - 2, 3).
+def strips(counts: NDArray, *, fans: bool = False) -> NDArray[np.int64]:
+    """Triangles of strips or fans with so many corners each, as indices of corners, shape (F, 3)."""
+    made, start = [np.empty((0, 3), np.int64)], 0
+    for count in counts:
+        i = np.arange(max(count - 2, 0))
+        rows = (np.zeros_like(i), i + 1, i + 2) if fans else (i, i + 1 + i % 2, i + 2 - i % 2)
+        made.append(start + np.column_stack(rows))
+        start += count
+    return np.concatenate(made)
 
-    Args:
-        points: Corners in their order, shape (N, 3).
-        normal: Its normal, of any length, shape (3,).
-    """
-    drop = int(np.argmax(np.abs(normal)))  # seen along the axis that it faces most
+
+def _ears(points: NDArray, normal: NDArray) -> NDArray[np.int64]:
+    """Triangles of one polygon with N corners by ear clipping (Meisters 1975), shape (N - 2, 3)."""
+    drop = int(np.argmax(np.abs(normal)))  # project along the axis nearest to the normal
     flat = np.delete(points, drop, axis=1) * ((1, 1) if (normal[drop] > 0) == (drop != 1) else (-1, 1))
     left, triangles = list(range(len(points))), []
     while len(left) > 3:
@@ -54,7 +60,7 @@ def _ears(points: NDArray, normal: NDArray) -> NDArray[np.int64]:
 
 
 def _is_ear(flat: NDArray, left: list[int], i: int) -> bool:
-    """Whether the corner sticks out, and no other lies in its triangle; counter-clockwise, shape (N, 2)."""
+    """Whether a corner is convex and no other lies in its triangle; counter-clockwise, shape (N, 2)."""
     a, b, c = (flat[left[(i + k) % len(left)]] for k in (-1, 0, 1))
     if _turn(a, b, c) <= 0:
         return False

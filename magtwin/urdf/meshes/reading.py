@@ -1,4 +1,4 @@
-"""Reading: a mesh file while it is read, what it may name, and what was found wrong with it."""
+"""Reading: state of reading a mesh file: the files that it may reference, and its notes."""
 
 import warnings
 from collections.abc import Callable
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Note:
-    """Something that a user ought to know of a file."""
+    """A note for the user on a file."""
 
     text: str
 
     lost: bool = False
-    """Whether less arrives than the file holds."""
+    """Whether something of the file was left out."""
 
 
 @dataclass(frozen=True)
@@ -26,26 +26,26 @@ class Reading:
     path: Path
 
     may_read: Callable[[Path], bool]
-    """Whether a file that this one names (a material library, a texture, a buffer) may be read."""
+    """Whether a referenced file (material library, texture, buffer) may be read."""
 
     notes: list[Note] = field(default_factory=list)
-    """What was repaired, guessed or left out, each once."""
+    """Repairs, guesses and omissions, each once."""
 
     def note(self, text: str, *, lost: bool = False) -> None:
-        """Put down what was repaired or guessed, or, where `lost`, left out."""
+        """Add a note on a repair or guess, or an omission if `lost`."""
         note = Note(f"{self.path.name}: {text}", lost)
         if note not in self.notes:
             self.notes.append(note)
 
     def lose(self, text: str) -> None:
-        """Put down what was left out."""
+        """Add a note on an omission."""
         self.note(text, lost=True)
 
 
 def numbers(text: str, dtype: type) -> NDArray:
-    """Numbers apart by blanks, up to the first word that is none, shape (N,): quicker than one by one."""
+    """Numbers separated by blanks, up to the first invalid word, shape (N,)."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of a word that is none
+        warnings.simplefilter("ignore", DeprecationWarning)  # for an invalid word
         try:
             return np.fromstring(text, dtype, sep=" ")
         except ValueError:

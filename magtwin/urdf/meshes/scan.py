@@ -13,10 +13,10 @@ from magtwin.usd.geometry import linear_from_srgb
 
 
 def read_scan(file: Reading) -> list[Piece]:
-    """The triangles of an STL or PLY file, as `read_mesh` has it.
+    """The triangles of an STL or PLY file, for `read_mesh`.
 
-    An STL's normals are not read: they are its faces' own, and smooth ones are made from those. A PLY's
-    texture coordinates are not either: the format names no picture that they could belong to.
+    Normals of an STL are ignored: they are those of the faces, from which smooth ones are computed. Texture
+    coordinates of a PLY are ignored, since the format references no image.
     """
     with file.path.open("rb") as stream:
         if file.path.suffix.lower() == ".stl":
@@ -34,7 +34,7 @@ def read_scan(file: Reading) -> list[Piece]:
 
 
 def _why_empty(path: Path) -> str:
-    """Why an STL gave no triangle: a binary one has a header of 84 bytes, and 50 for each."""
+    """Why an STL has no triangle; a binary one has a header of 84 bytes and 50 bytes a triangle."""
     size = path.stat().st_size
     with path.open("rb") as stream:
         head = stream.read(84)
@@ -42,14 +42,14 @@ def _why_empty(path: Path) -> str:
         return "holds no triangle, or is cut short"
     count = int.from_bytes(head[80:], "little")
     return (
-        f"is of {size} bytes, though its {count} triangles need {84 + 50 * count}"
+        f"has {size} bytes, though its {count} triangles need {84 + 50 * count}"
         if count
         else "holds no triangle"
     )
 
 
 def _parts(read: dict[str, Any]) -> list[dict[str, Any]]:
-    """What trimesh's readers return: one mesh, or several by name, as an ASCII STL of several solids is."""
+    """The meshes that trimesh returns; an ASCII STL may have several."""
     parts = list(read["geometry"].values()) if "geometry" in read else [read]
     return [part for part in parts if part.get("faces") is not None and len(part["faces"])]
 
@@ -73,6 +73,6 @@ def _piece(part: dict[str, Any]) -> Piece:
 
 
 def _linear(colours: NDArray) -> NDArray:
-    """Linear red, green, blue of colours in bytes or in 0 to 1, shape (N, 3)."""
+    """Linear red, green, blue of sRGB colours in bytes or from 0 to 1, shape (N, 3)."""
     colours = np.asarray(colours)
     return linear_from_srgb(colours[:, :3] / (255 if colours.dtype.kind in "iu" else 1))

@@ -1,4 +1,4 @@
-"""Texture: the pictures that a robot wears, copied beside its asset and named relative to it."""
+"""Texture: images of a robot, copied beside its asset."""
 
 import io
 import re
@@ -10,35 +10,35 @@ from magtwin.errors import InputError
 from magtwin.urdf.meshes.reading import Reading
 
 TEXTURES = "textures"
-"""Folder of the copies beside the layers of an asset."""
+"""Folder of the copies beside an asset's layers."""
 
 KEPT = {"JPEG": ".jpg", "PNG": ".png"}
-"""Formats that every USD viewer reads, by Pillow's names; others become PNG."""
+"""Formats that every USD viewer reads, by Pillow's names; others are converted to PNG."""
 
 MAX_PIXELS = 2**27
-"""Largest picture that is opened."""
+"""Largest image that is opened."""
 
 
 @dataclass(frozen=True)
 class Image:
-    """A picture as its file holds it."""
+    """An image with the bytes of its file."""
 
     name: str
-    """Name of the file, with the suffix of what it holds."""
+    """File name with the suffix of its format."""
 
     data: bytes
 
     mean: tuple[float, float, float]
-    """Mean colour (sRGB), 0 to 1: what a viewer without textures shows."""
+    """Mean colour (sRGB), 0 to 1, for viewers without textures."""
 
 
 def read_image(name: str, reading: Reading, folder: Path | None = None) -> Image | None:
-    """The picture that a mesh file names; none, with a note, where there is none to be had.
+    """The image that a mesh file references; None with a note if it cannot be read.
 
     Args:
-        name: As the file has it: a relative path, perhaps percent-encoded or a `file:` URI.
+        name: Relative path in the file; may be percent-encoded or a `file:` URI.
         reading: The mesh file.
-        folder: Folder that the name is relative to; by default the mesh file's.
+        folder: Folder to which the name is relative. Default: that of the mesh file.
     """
     text = re.sub(r"^file:/+(?=[A-Za-z]:|/)|^file:(//)?", "", unquote(name.strip()).replace("\\", "/"))
     path = (folder or reading.path.parent) / text
@@ -50,19 +50,19 @@ def read_image(name: str, reading: Reading, folder: Path | None = None) -> Image
             reading.lose(f"texture {name!r} is missing and is left out; looked for {path}")
             return None
         data = path.read_bytes()
-    except (OSError, ValueError) as error:  # a name that is too long, or holds a null byte
+    except (OSError, ValueError) as error:  # the name is too long, or contains a null byte
         reading.lose(f"texture {name!r} cannot be read and is left out ({error})")
         return None
     return image_of(data, path.name, reading)
 
 
 def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
-    """A picture from its bytes; one of another format than KEPT becomes PNG, with a note.
+    """An image from the bytes of its file; formats not in KEPT are converted to PNG with a note.
 
     Args:
-        data: The file's bytes.
-        name: Its name, for notes and for the copy.
-        reading: The mesh file that shows it.
+        data: Bytes of the file.
+        name: Name for notes and for the copy.
+        reading: The mesh file.
     """
     from PIL import Image as Pillow
 
@@ -74,8 +74,8 @@ def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
                 raise InputError(f"{width} x {height} pixels are too many")
             rgba = picture.convert("RGBA")
     except (OSError, InputError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
-        reason = str(error).partition(" <")[0]  # without the address of what could not be read
-        reading.lose(f"texture {name!r} is no picture that can be read and is left out ({reason})")
+        reason = str(error).partition(" <")[0]  # without the object's address
+        reading.lose(f"texture {name!r} is not a readable image and is left out ({reason})")
         return None
     r, g, b = (c / 255 for c in rgba.convert("RGB").resize((1, 1), Pillow.Resampling.BOX).tobytes())
     if kind not in KEPT:
@@ -87,13 +87,13 @@ def image_of(data: bytes, name: str, reading: Reading) -> Image | None:
 
 
 class Textures:
-    """The pictures of one robot: each once, under a name of its own."""
+    """The distinct images of a robot, with unique names."""
 
     def __init__(self, folder: str) -> None:
-        """Start without one.
+        """Create an empty set.
 
         Args:
-            folder: Asset path of the folder that the copies will lie in, as the robot's layer sees it.
+            folder: Asset path of the folder for the copies, relative to the robot's layer.
         """
         self.folder = folder
         self._names: dict[bytes, str] = {}
@@ -102,18 +102,18 @@ class Textures:
         return len(self._names)
 
     def add(self, image: Image) -> str:
-        """Asset path of a picture's copy."""
+        """Asset path of an image's copy."""
         if image.data not in self._names:
             stem, _, suffix = image.name.rpartition(".")
             taken, name, number = {n.lower() for n in self._names.values()}, image.name, 1
-            while name.lower() in taken:  # some file systems take A and a for one
+            while name.lower() in taken:  # some file systems ignore case
                 number += 1
                 name = f"{stem}_{number}.{suffix}"
             self._names[image.data] = name
         return f"{self.folder}/{self._names[image.data]}"
 
     def export(self, folder: Path) -> None:
-        """Write the copies into a folder that is made for them."""
+        """Write the copies to a new folder."""
         folder.mkdir(parents=True)
         for data, name in self._names.items():
             (folder / name).write_bytes(data)

@@ -1,4 +1,8 @@
-"""Wavefront: triangles of an .obj with the materials of its .mtl."""
+"""Wavefront: reader of .obj files with the materials of their .mtl.
+
+tinyobjloader is not used: its only wheels are pre-releases, a malformed face makes it drop the whole file, and a
+malformed colour becomes black without a warning.
+"""
 
 import re
 from collections.abc import Iterator
@@ -16,10 +20,10 @@ from magtwin.urdf.meshes.texture import read_image
 from magtwin.usd.geometry import linear_from_srgb
 
 UNREAD = ("curv", "curv2", "surf", "l", "p")
-"""Statements that draw something which is no polygon."""
+"""Statements that draw lines, points or curves."""
 
 MAP_ARGUMENTS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
-"""Numbers that may follow an option of a texture; every other option has one word."""
+"""Most numbers after an option of a texture; other options have one word."""
 
 
 @dataclass
@@ -28,7 +32,7 @@ class _Group:
 
     material: str
     words: list[str] = field(default_factory=list)
-    """Corners of all polygons as the file has them: `v`, `v/vt`, `v//vn` or `v/vt/vn`, from 1."""
+    """Corners of all polygons: `v`, `v/vt`, `v//vn` or `v/vt/vn`, from 1."""
     counts: list[int] = field(default_factory=list)
     """Number of corners of each polygon."""
     lines: list[int] = field(default_factory=list)
@@ -36,9 +40,8 @@ class _Group:
 
 
 def read_wavefront(reading: Reading) -> list[Piece]:
-    """The triangles of a Wavefront OBJ, as `read_mesh` has it.
-
-    A colour after a vertex's coordinates is read (as MeshLab writes it).
+    """The triangles of a Wavefront OBJ, for `read_mesh`; vertices may have colours, as MeshLab writes
+    them.
     """
     path = reading.path
     rows: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}
@@ -74,7 +77,7 @@ def read_wavefront(reading: Reading) -> list[Piece]:
 
 
 def _statements(path: Path) -> Iterator[tuple[int, str, str]]:
-    """Line, keyword and the rest of each statement; a backslash at the end of a line joins the next."""
+    """Line, keyword and the rest of each statement; a backslash continues a line."""
     held = ""
     with path.open(encoding="utf-8", errors="replace") as file:
         for number, text in enumerate(file, 1):
@@ -89,7 +92,7 @@ def _statements(path: Path) -> Iterator[tuple[int, str, str]]:
 
 
 def _absolute(word: str, rows: dict[str, list[str]]) -> str:
-    """A corner whose negative numbers, which count back from the newest, count from the first."""
+    """A corner whose negative numbers, which count back from the last row, become positive."""
     parts = word.split("/")
     for i, (part, kind) in enumerate(zip(parts, ("v", "vt", "vn"), strict=False)):
         if part.startswith("-") and part[1:].isdecimal():
@@ -98,7 +101,7 @@ def _absolute(word: str, rows: dict[str, list[str]]) -> str:
 
 
 def _corners(group: _Group, path: Path) -> NDArray[np.int64]:
-    """Vertex, texture coordinate and normal of each corner, from 0; -1 is none; shape (N, 3)."""
+    """Vertex, texture coordinate and normal of each corner, from 0; -1 if missing; shape (N, 3)."""
     words = group.words
     corners = np.zeros((len(words), 3), np.int64)
     slashes = {word.count("/") for word in words}
@@ -110,7 +113,7 @@ def _corners(group: _Group, path: Path) -> NDArray[np.int64]:
             corners[:, columns] = values.reshape(len(words), len(columns))
             if (corners[:, columns] > 0).all():
                 return corners - 1
-    first = 0  # corners of several kinds, or malformed ones: one by one
+    first = 0  # corners of several kinds, or malformed ones
     for number, count in zip(group.lines, group.counts, strict=True):
         for i in range(first, first + count):
             parts = words[i].split("/")
@@ -126,7 +129,7 @@ def _corners(group: _Group, path: Path) -> NDArray[np.int64]:
 
 
 def _table(rows: list[str], kind: str, least: int, path: Path) -> NDArray:
-    """Numbers of all `v`, `vt` or `vn`, one row each: as many as the first has, or the least."""
+    """Numbers of all `v`, `vt` or `vn`, one row each, with the width of the first row or the least."""
     if not rows:
         return np.empty((0, least))
     width = len(rows[0].split())
@@ -159,17 +162,17 @@ def _piece(group: _Group, paint: Paint | None, v: NDArray, vt: NDArray, vn: NDAr
 
 
 def _picked(table: NDArray, index: NDArray) -> NDArray | None:
-    """Rows of a table; nan at corners that name none (-1), none where all do."""
+    """Rows of a table; nan at corners without one (-1), None if no corner has one."""
     if (index < 0).all():
         return None
     return np.where((index < 0)[..., None], np.nan, table[index])
 
 
 def _read_library(name: str, reading: Reading) -> dict[str, Paint]:
-    """Materials of an .mtl by name; none, with a note, where it cannot be read.
+    """Materials of an .mtl by name; empty with a note if it cannot be read.
 
-    `Kd` is the colour and `d` (or 1 - `Tr`) the opacity; of a surface with `map_Kd` the picture is the
-    colour, since exporters write any `Kd` beside one.
+    `Kd` is the colour and `d` (or 1 - `Tr`) the opacity. With `map_Kd`, the image replaces `Kd`, in which
+    exporters write arbitrary values.
     """
     library = reading.path.parent / name.replace("\\", "/")
     if not reading.may_read(library):
@@ -190,32 +193,30 @@ def _read_library(name: str, reading: Reading) -> dict[str, Paint]:
 
 def _paint(name: str, table: dict[str, list[str]], folder: Path, reading: Reading) -> Paint:
     try:
-        r, g, b = (
-            float(np.clip(float(word), 0, 1)) for word in (table.get("kd") or ["0.5", "0.5", "0.5"])[:3]
-        )
+        words = (table.get("kd") or ["0.5", "0.5", "0.5"])[:3]
+        r, g, b = (float(np.clip(float(word), 0, 1)) for word in words)
         if "d" in table:
             opacity = float(table["d"][-1])
         else:
             opacity = 1 - float(table["tr"][-1]) if "tr" in table else 1.0
     except (ValueError, IndexError):
-        reading.note(f"material {name!r} has a malformed colour; taken as grey")
+        reading.note(f"material {name!r} has a malformed colour; grey is used")
         r, g, b, opacity = 0.5, 0.5, 0.5, 1.0
     if not opacity > 0:
-        reading.note(f"material {name!r} would be invisible; taken as opaque")
+        reading.note(f"material {name!r} would be invisible; made opaque")
     opacity = min(opacity, 1.0) if opacity > 0 else 1.0
     image = read_image(_file_of(table["map_kd"]), reading, folder) if table.get("map_kd") else None
     return Paint(name, (r, g, b, opacity) if image is None else (1.0, 1.0, 1.0, opacity), image)
 
 
 def _file_of(words: list[str]) -> str:
-    """The file name after a texture's options; it may hold spaces."""
+    """The file name after a texture's options; it may contain spaces."""
     at = 0
     while at < len(words) and re.fullmatch(r"-[a-z]+", words[at]):
         numbers = MAP_ARGUMENTS.get(words[at], 1)
         at += 1
-        taken = 0
-        while (
-            taken < numbers and at < len(words) - 1 and (taken == 0 or re.fullmatch(r"[-+.\deE]+", words[at]))
-        ):
-            at, taken = at + 1, taken + 1
+        for taken in range(min(numbers, len(words) - 1 - at)):
+            if taken and not re.fullmatch(r"[-+.\deE]+", words[at]):
+                break
+            at += 1
     return " ".join(words[at:])

@@ -1,4 +1,4 @@
-"""Markup: XML read with the line of each element, and with nothing in it that reaches out or blows up."""
+"""Markup: XML with the line of each element, without external references or entities."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +9,12 @@ from xml.parsers import expat
 from magtwin.errors import InputError
 
 MAX_DEPTH = 200
-"""Elements within elements; no description comes near it, and deeper ones exhaust the stack."""
+"""Most levels of nested elements; deeper nesting would exhaust the stack."""
 
 
 @dataclass(frozen=True)
 class Markup:
-    """An XML file: its elements, comments left out, and the line that each starts on."""
+    """Elements of an XML file without comments, and the line on which each starts."""
 
     root: ElementTree.Element
 
@@ -27,21 +27,21 @@ def read_markup(path: Path, what: str) -> Markup:
 
     Args:
         path: The file.
-        what: What it is, for refusals ("URDF file").
+        what: Kind of file, for error messages ("URDF file").
 
     Raises:
-        InputError: The file cannot be read or decoded; is not XML (the line is given); has a DOCTYPE,
-            through which entities could reach other files or fill the memory; or nests too deep.
+        InputError: The file cannot be read or decoded, is not XML, nests too deep, or has a DOCTYPE, whose
+            entities could read other files or fill the memory. The message gives the line.
     """
     try:
         text = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); a {what} is wanted") from error
+        raise InputError(f"{path}: cannot be read ({error.strerror}); expected a {what}") from error
     return parse_markup(text, path)
 
 
 def parse_markup(text: bytes, path: Path) -> Markup:
-    """The elements of an XML text; `path` and the rest as for `read_markup`."""
+    """Elements of an XML text read from `path`; errors as for `read_markup`."""
     builder, lines, depth = ElementTree.TreeBuilder(), {}, 0
     parser = expat.ParserCreate()
 
@@ -60,7 +60,7 @@ def parse_markup(text: bytes, path: Path) -> Markup:
     def doctype(*_: Any) -> None:
         raise InputError(
             f"{path}:{parser.CurrentLineNumber}: has a DOCTYPE, whose entities are not followed; "
-            "remove it and write values out"
+            "remove it and write the values in full"
         )
 
     parser.StartElementHandler = start
@@ -75,7 +75,7 @@ def parse_markup(text: bytes, path: Path) -> Markup:
         raise InputError(
             f"{path}:{error.lineno}: not XML: {bad or reason} (column {error.offset})"
         ) from error
-    except (LookupError, ValueError) as error:  # an encoding that Python does not know, or not as expat needs
+    except (LookupError, ValueError) as error:  # an encoding unknown to Python, or unusable for expat
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}:1: not XML: {error}; save the file as UTF-8") from error
@@ -83,11 +83,10 @@ def parse_markup(text: bytes, path: Path) -> Markup:
 
 
 def _undecodable(text: bytes, line: int) -> str:
-    """What to say of a line that is not the UTF-8 that it is taken for; "" if it is."""
+    """The reason why a line is not UTF-8; "" if it is."""
     try:
-        text.split(b"\n")[line - 1].decode("utf-8")
-    except (UnicodeDecodeError, IndexError) as error:
-        if isinstance(error, UnicodeDecodeError):
-            byte = error.object[error.start]
-            return f"byte 0x{byte:02x} is not UTF-8; save the file as UTF-8, or declare its encoding"
+        b"".join(text.split(b"\n")[line - 1 : line]).decode("utf-8")
+    except UnicodeDecodeError as error:
+        byte = error.object[error.start]
+        return f"byte 0x{byte:02x} is not UTF-8; save the file as UTF-8, or declare its encoding"
     return ""

@@ -1,13 +1,22 @@
-"""Settings: YAML files beside a description, read as plain data that cannot grow without end."""
+"""Settings: YAML files beside a description, read as plain data of limited size."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import yaml
 
+from magtwin.errors import InputError
+
 ENTRIES = 10_000
-"""Entries of one table, those that it merges from others among them."""
+"""Most entries of a table, including those merged from others."""
+
+SIZE, NODES = 1_000_000, 10_000
+"""Most bytes and tables of a file."""
 
 
 class Loader(yaml.SafeLoader):
-    """YAML's safe types. A table that merges one twice, which merges one twice, and so on, is refused."""
+    """YAML's safe types. Refuses tables that grow exponentially by merging each other."""
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         """Merge the tables of `<<` into one."""
@@ -16,3 +25,35 @@ class Loader(yaml.SafeLoader):
             raise yaml.constructor.ConstructorError(
                 None, None, f"a table of over {ENTRIES} entries", node.start_mark
             )
+
+
+def read_settings(path: Path) -> Iterator[dict[str, Any]]:
+    """Every table of a YAML file, at any depth, with the tables below it flattened to dotted keys.
+
+    Raises:
+        InputError: The file is too big or is not YAML.
+    """
+    if path.stat().st_size > SIZE:
+        raise InputError(f"{path}: over {SIZE} bytes, too big for settings")
+    try:
+        pending = [yaml.load(path.read_text(encoding="utf-8"), Loader)]
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # an impossible date is a ValueError
+        mark = getattr(error, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark is not None else ""
+        reason = getattr(error, "problem", None) or str(error).partition(";")[0] or "cannot be read"
+        raise InputError(f"{path}{line}: not YAML: {reason}") from error
+    for _ in range(NODES):  # aliases of aliases could go on without end
+        if not pending:
+            return
+        node = pending.pop()
+        if isinstance(node, dict):
+            pending += node.values()
+            yield dict(_dotted(node, "", 0))
+
+
+def _dotted(table: dict[Any, Any], prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
+    for key, value in table.items():
+        if isinstance(value, dict) and depth < 3:
+            yield from _dotted(value, f"{prefix}{key}.", depth + 1)
+        else:
+            yield f"{prefix}{key}", value

@@ -1,4 +1,4 @@
-"""Source: the text of a robot's description, with the files and packages around it."""
+"""Source: a robot description as plain URDF, with the files and packages around it."""
 
 import difflib
 import os
@@ -16,27 +16,27 @@ from magtwin.urdf.source.xacro import expand
 
 
 class MissingFileError(InputError):
-    """A file that a description names is not there; whoever can do without it may go on."""
+    """A file named in a description is missing; the caller may be able to continue without it."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A description as plain URDF, its macros expanded."""
+    """A description as plain URDF, with its macros expanded."""
 
     path: Path
-    """The file that was given."""
+    """The file that the user gave."""
 
     xml: ElementTree.Element
     """Its `<robot>`."""
 
     places: Mapping[ElementTree.Element, tuple[Path, int]]
-    """File and line that each element stands on, in a xacro those of the macro's text."""
+    """File and line of each element; for a xacro, those of the macro's text."""
 
     packages: Packages
-    """Where `package://` leads."""
+    """Finds the folders of `package://`."""
 
     notes: tuple[str, ...] = ()
-    """What happened on the way to plain URDF, one line each."""
+    """Notes on the expansion, one line each."""
 
     @property
     def text(self) -> str:
@@ -51,32 +51,32 @@ class Source:
         return f"{file}:{line}"
 
     def find_file(self, filename: str, what: str, element: ElementTree.Element | None = None) -> Path:
-        """The file that a `filename=` means.
+        """The file that a `filename=` refers to.
 
-        `package://NAME/rest` and `model://NAME/rest` lie in that package. All else is relative to the
-        description's folder and may reach to the package that holds it, and into other packages.
+        `package://NAME/rest` and `model://NAME/rest` lie in that package. Any other name is relative to the
+        folder of the description, and may lie in its package or in other packages.
 
         Args:
-            filename: As it is written in the description.
-            what: What is looked for ("mesh", "texture"), for refusals.
-            element: Where it is written, for refusals.
+            filename: Name in the description.
+            what: Kind of file ("mesh", "texture"), for error messages.
+            element: Element with the name, for error messages.
 
         Raises:
-            MissingFileError: The file is not there; the text says which name is near.
-            InputError: Its package is not there, or it lies outside of where the description may read.
+            MissingFileError: The file does not exist; the message suggests a near name.
+            InputError: Its package was not found, or the description may not read the file.
         """
         start = f"{self.where(element)}: {what} {filename!r}"
         try:
-            return self._found(filename, what, start)
-        except (OSError, RuntimeError) as error:  # a name that is too long, links in a circle
+            return self._locate(filename, what, start)
+        except (OSError, RuntimeError) as error:  # the name is too long, or links form a circle
             reason = getattr(error, "strerror", None) or error
             raise InputError(f"{start} cannot be looked for ({reason})") from error
 
-    def _found(self, filename: str, what: str, start: str) -> Path:
-        """The file of `find_file`; `start` begins its refusals."""
+    def _locate(self, filename: str, what: str, start: str) -> Path:
+        """The file of `find_file`; `start` begins its error messages."""
         scheme, separator, rest = filename.partition("://")
         if separator and scheme not in ("package", "model", "file"):
-            raise InputError(f"{start} is of scheme {scheme!r}; known: file, model, package")
+            raise InputError(f"{start} has scheme {scheme!r}; known: file, model, package")
         if scheme in ("package", "model") and separator:
             name, _, rest = rest.partition("/")
             try:
@@ -98,7 +98,7 @@ class Source:
             near = difflib.get_close_matches(path.name, siblings, n=1)
             advice = f"; did you mean {near[0]!r}?" if near else ""
             if what == "mesh":
-                advice += "; --missing-meshes note does without it"
+                advice += "; --missing-meshes note leaves it out"
             raise MissingFileError(f"{start} is missing; looked for {path}{advice}")
         return path
 
@@ -112,13 +112,13 @@ def read_source(
     """Read a URDF, or a xacro with its macros expanded.
 
     Args:
-        path: The file; a xacro by its suffix, or by its namespace in a file of another suffix.
-        packages: Folders of packages by name, before those that are found.
+        path: The file; it is a xacro if its suffix is .xacro or it has elements `xacro:`.
+        packages: Folders of packages by name; they override packages that are found.
         arguments: Values of a xacro's `<xacro:arg>`.
 
     Raises:
-        InputError: The file is missing, is not XML (the line is given), has a DOCTYPE or is no
-            `<robot>`; or its macros cannot be expanded.
+        InputError: The file is missing, is not XML, has a DOCTYPE, is not a `<robot>`, or has macros that
+            cannot be expanded. The message gives the line.
     """
     path = existing(path, "URDF file")
     markup = read_markup(path, "URDF file")
@@ -130,7 +130,7 @@ def read_source(
         xml, places, notes = expand(path, around, arguments)
         return Source(path, xml, MappingProxyType(places), around, notes)
     if arguments:
-        raise InputError(f"{path}: is no xacro and takes no arguments; leave out {', '.join(arguments)}")
+        raise InputError(f"{path}: is not a xacro and takes no arguments; leave out {', '.join(arguments)}")
     return Source(
         path, markup.root, MappingProxyType({e: (path, n) for e, n in markup.lines.items()}), around
     )

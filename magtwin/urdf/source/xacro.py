@@ -1,10 +1,9 @@
-"""Xacro: macros expanded to plain URDF, by the xacro library with every reach to the outside replaced.
+"""Xacro: macros expanded to plain URDF by the xacro library, with its access to the outside replaced.
 
-The library's own `${...}` and `$(eval ...)` run Python with ways around their guard, `load_yaml` and
-`<xacro:include>` read any file and `$(env)` any variable. Here texts are evaluated by `expression`; files
-are read from the description's folder and from packages only; environment variables are not read (what
-`$(env)` and `$(optenv)` ask for is given as an argument). The library keeps macros, scopes, blocks,
-conditions and lazy properties.
+The library evaluates `${...}` and `$(eval ...)` as Python, `load_yaml` and `<xacro:include>` read any file,
+and `$(env)` reads any variable. Here, `expression` evaluates the text, files are read from the folder of the
+description and from packages only, and environment variables are not read: `$(env)` and `$(optenv)` take
+arguments instead. The library still handles macros, scopes, blocks, conditions and lazy properties.
 """
 
 import glob
@@ -24,15 +23,25 @@ from magtwin.urdf.source.markup import parse_markup
 from magtwin.urdf.source.package import Packages
 
 UNITS, ELEMENT = 20_000_000, 100
-"""What an expansion may cost, see `Budget`, and the part of it that each element costs."""
+"""Budget of an expansion, and the cost of each element."""
 
 PLACE = "magtwin.place"
-"""Key of the file and line that a node carries, through copies too."""
+"""Key of a node's user data: its file and line."""
+
+UNIT_TAGS: Mapping[str, float] = {
+    "!radians": 1.0,
+    "!degrees": 0.017453292519943295,
+    "!meters": 1.0,
+    "!millimeters": 0.001,
+    "!foot": 0.3048,
+    "!inches": 0.0254,
+}
+"""Factors to radians and metres by YAML tag, with xacro's names."""
 
 _PIECES = re.compile(
     r"(?P<escaped>\$\$+[{(])|\$\{(?P<expression>[^}]*)\}|\$\((?P<command>[^)]*)\)|(?P<text>[^$]+|\$[^{($]+|\$$)"
 )
-"""Lexemes of a text, as xacro has them."""
+"""Tokens of a text, as xacro defines them."""
 
 Place = tuple[Path, int]
 
@@ -40,36 +49,34 @@ Place = tuple[Path, int]
 def expand(
     path: Path, packages: Packages, arguments: Mapping[str, str]
 ) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place], tuple[str, ...]]:
-    """The URDF that a xacro stands for.
+    """Expand a xacro to URDF.
 
     Args:
         path: The xacro.
-        packages: Where `$(find)` leads, and what may be included.
-        arguments: Values of `<xacro:arg>`, before their defaults.
+        packages: Packages for `$(find)`, and the folders from which files may be included.
+        arguments: Values of `<xacro:arg>`; they override its defaults.
 
     Returns:
-        `<robot>`; file and line of each element; and what the user ought to know, one line each.
+        `<robot>`; file and line of each element; and notes for the user, one line each.
 
     Raises:
-        InputError: It is not XML, reaches out of the packages, has an expression that is not of the
-            language, or does not end; file and line are given.
+        InputError: The file is not XML, reads outside the packages, has an expression outside the language,
+            or expands without end; the message gives file and line.
     """
     return _Expansion(path, packages, arguments).run()
 
 
 class _Expansion:
-    """One expansion, on an instance of the library's module of its own: it keeps its state in globals."""
+    """One expansion, on a fresh instance of the library's module, because the library keeps global state."""
 
     def __init__(self, path: Path, packages: Packages, arguments: Mapping[str, str]) -> None:
-        self._path = path
-        self._packages = packages
-        self._arguments = dict(arguments)
+        self._path, self._packages, self._arguments = path, packages, dict(arguments)
         self._asked: set[str] = set()
         self._budget = Budget(UNITS)
         self._at: Place = (path, 1)
         self._notes: list[str] = []
         self._library = _library()
-        self._replace_reaches()
+        self._replace_access()
 
     def run(self) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place], tuple[str, ...]]:
         library = self._library
@@ -86,12 +93,12 @@ class _Expansion:
         except InputError:
             raise
         except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
-            raise self._refused(f"cannot be expanded: {error}") from error  # the library's way to say no
+            raise self._refused(f"cannot be expanded: {error}") from error
         unknown = [name for name in self._arguments if name not in self._asked]
         if unknown:
             known = hint(unknown[0], self._asked) if self._asked else "it has none"
             raise InputError(f"{self._path}: no xacro argument {unknown[0]!r}; {known}")
-        assert document.documentElement is not None  # it was parsed
+        assert document.documentElement is not None
         root, places = _to_tree(document.documentElement, (self._path, 1))
         return root, places, tuple(self._notes)
 
@@ -99,20 +106,16 @@ class _Expansion:
         file, line = self._at
         return InputError(f"{file}:{line}: {text}")
 
-    def _replace_reaches(self) -> None:
-        """Put our own in place of whatever of the library evaluates, reads, or prints."""
+    def _replace_access(self) -> None:
+        """Replace every function of the library that evaluates, reads or prints."""
         library = self._library
         ours: dict[str, Callable[..., Any]] = {
+            **dict.fromkeys(("safe_eval", "eval_extension", "load_yaml"), _forbidden),
+            **dict.fromkeys(("warning", "message", "error"), self._note),
             "eval_text": self._text,
-            "safe_eval": _forbidden,
-            "eval_extension": _forbidden,
-            "load_yaml": _forbidden,
             "parse": self._parse,
             "get_include_files": self._included,
             "print_location": lambda: None,
-            "warning": self._note,
-            "message": self._note,
-            "error": self._note,
         }
         for name in ("check_attrs", "eval_all", "handle_macro_call", "reqd_attrs"):
             ours[name] = self._followed(getattr(library, name))
@@ -121,21 +124,19 @@ class _Expansion:
                 raise InputError(f"xacro: this version has no {name}; install xacro 2.1")
             setattr(library, name, replacement)
         xacro = {
+            **dict.fromkeys(("warning", "message", "error"), self._note),
             "abs_filename": library.abs_filename_spec,
             "arg": self._argument,
             "dotify": dict,
-            "error": self._note,
             "fatal": self._fatal,
             "load_yaml": self._yaml,
-            "message": self._note,
             "tokenize": _tokenize,
-            "warning": self._note,
         }
         shown = {name: xacro[name] for name in ("abs_filename", "dotify", "load_yaml")}
         vars(library)["_global_symbols"] = {**GLOBALS, **shown, "xacro": xacro}
 
     def _followed(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The library's function, with the node that it works on kept in mind and paid for."""
+        """The library's function; records the current node and pays for it."""
 
         def follow(node: minidom.Element, *arguments: Any) -> Any:
             self._budget.spend(ELEMENT)
@@ -147,34 +148,32 @@ class _Expansion:
         return follow
 
     def _text(self, text: str, symbols: Mapping[str, Any]) -> Any:
-        """The value of a text: that of its one expression, or all joined to a text."""
+        """The value of a text: that of a single expression, or all parts joined to a string."""
         values: list[Any] = []
-        end = size = 0
+        end = 0
         for piece in _PIECES.finditer(text):
             if piece.start() != end:
                 break
             end = piece.end()
-            kind = piece.lastgroup
-            content = piece[kind or 0]
-            if kind == "escaped":
+            content = piece[piece.lastgroup or 0]
+            if piece.lastgroup == "escaped":
                 content = content[1:]
-            elif kind == "expression":
+            elif piece.lastgroup == "expression":
                 value = evaluate(str(self._text(content, symbols)), symbols, self._budget)
                 content = check_size(value, self._budget, plain=True)
-            elif kind == "command":
+            elif piece.lastgroup == "command":
                 content = self._command(str(self._text(content, symbols)))
             values.append(content)
         if end != len(text):
             raise ExpressionError(f"not closed: {text[end : end + 40]!r}")
         if len(values) == 1:
             return values[0]
-        words = []
+        joined = ""
         for value in values:
-            words.append(str(check_size(value, self._budget)))
-            size += len(words[-1])
-            if size > 16 * LARGEST:
+            joined += str(check_size(value, self._budget))
+            if len(joined) > 16 * LARGEST:
                 raise ExpressionError(f"a text of over {16 * LARGEST} characters")
-        return "".join(words)
+        return joined
 
     def _command(self, text: str) -> str:
         """The value of `$(...)`."""
@@ -189,7 +188,7 @@ class _Expansion:
         if command == "arg":
             return str(self._argument(words[0]))
         if command == "env":
-            return self._variable(words[0], None)
+            return self._variable(words[0])
         if command == "optenv" and words:
             return self._variable(words[0], " ".join(words[1:]))
         if command == "dirname":
@@ -209,7 +208,7 @@ class _Expansion:
             raise ExpressionError(f"no argument {name!r}; give --arg {name}=VALUE")
         return table[name]
 
-    def _variable(self, name: str, default: str | None) -> str:
+    def _variable(self, name: str, default: str | None = None) -> str:
         self._asked.add(name)
         if name in self._arguments:
             return self._arguments[name]
@@ -226,7 +225,7 @@ class _Expansion:
             self._check_inside(os.path.dirname(wanted[: pattern.start()]), "include")  # noqa: PTH120
             files = sorted(glob.glob(wanted))  # noqa: PTH207 - the pattern may be absolute
         if not files:
-            self._note(f"include {filename!r} names no file that is there")
+            self._note(f"include {filename!r} matches no file")
         for file in files:
             self._check_inside(file, "include")
             yield file
@@ -241,7 +240,7 @@ class _Expansion:
         return path
 
     def _parse(self, text: None, filename: str) -> minidom.Document:
-        """The DOM of a file; each element carries its place."""
+        """The DOM of a file; each element carries its file and line."""
         path = Path(os.path.normpath(filename))
         try:
             content = path.read_bytes()
@@ -259,7 +258,7 @@ class _Expansion:
         return document
 
     def _yaml(self, filename: str) -> Any:
-        """Data of a YAML file, with angles and lengths in the units that their tags name."""
+        """Data of a YAML file, with angles and lengths converted by their unit tags."""
         import yaml
 
         from magtwin.urdf.source.settings import Loader
@@ -267,7 +266,7 @@ class _Expansion:
         path = self._check_inside(self._library.abs_filename_spec(str(filename)), "load_yaml")
 
         class UnitLoader(Loader):
-            """YAML's safe types, and our units."""
+            """YAML's safe types, and units."""
 
         def number(factor: float) -> Callable[[Any, Any], float]:
             return lambda loader, node: (
@@ -297,49 +296,30 @@ class _Expansion:
         raise ExpressionError(" ".join(map(str, words)))
 
 
-UNIT_TAGS: Mapping[str, float] = {
-    "!radians": 1.0,
-    "!degrees": 0.017453292519943295,
-    "!meters": 1.0,
-    "!millimeters": 0.001,
-    "!foot": 0.3048,
-    "!inches": 0.0254,
-}
-"""Factors to radians and metres of YAML's tags, as xacro names them."""
-
-
-class _Arguments(Mapping[str, Any]):
-    """Names of `$(eval ...)`: arguments as numbers where they are numbers, and a few functions."""
+class _Arguments(dict[str, Any]):
+    """Names in `$(eval ...)`: a few functions, and arguments, as numbers where they are numbers."""
 
     def __init__(self, expansion: _Expansion) -> None:
-        self._functions = {
-            **GLOBALS,
-            "true": True,
-            "false": False,
-            "arg": lambda name: _typed(str(expansion._argument(name))),
-            "find": expansion._find,
-            "env": lambda name: expansion._variable(name, None),
-            "optenv": lambda name, default="": expansion._variable(name, default),
-            "dirname": lambda: expansion._command("dirname"),
-        }
+        super().__init__(
+            GLOBALS,
+            true=True,
+            false=False,
+            arg=lambda name: _typed(str(expansion._argument(name))),
+            find=expansion._find,
+            env=lambda name: expansion._variable(name),
+            optenv=lambda name, default="": expansion._variable(name, default),
+            dirname=lambda: expansion._command("dirname"),
+        )
         self._expansion = expansion
 
-    def __getitem__(self, name: str) -> Any:
-        if name in self._functions:
-            return self._functions[name]
+    def __missing__(self, name: str) -> Any:
         if name in self._expansion._library.substitution_args_context["arg"]:
             return _typed(str(self._expansion._argument(name)))
         raise KeyError(name)
 
-    def __iter__(self) -> Iterator[str]:
-        return iter([*self._functions, *self._expansion._library.substitution_args_context["arg"]])
-
-    def __len__(self) -> int:
-        return len(list(iter(self)))
-
 
 class _Keep:
-    """Carries a node's place over to its copies (DOM level 3, UserDataHandler)."""
+    """Copies the place of a node to its copies (DOM level 3, UserDataHandler)."""
 
     def handle(self, operation: int, key: str, data: Any, src: Any, dst: Any) -> None:
         if dst is not None:
@@ -353,14 +333,14 @@ def _library() -> ModuleType:
     """A fresh instance of the xacro library's module."""
     spec = importlib.util.find_spec("xacro")
     if spec is None or spec.loader is None:
-        raise InputError("xacro files are read with the package xacro; install it: pip install xacro")
+        raise InputError("reading xacro files needs the package xacro; install it: pip install xacro")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
 def _forbidden(*_: Any, **__: Any) -> Any:
-    raise ExpressionError("this version of xacro evaluates in a way that is not guarded; install xacro 2.1")
+    raise ExpressionError("this version of xacro evaluates text without a guard; install xacro 2.1")
 
 
 def _tokenize(text: str, sep: str = ",; ", skip_empty: bool = True) -> list[str]:
@@ -370,7 +350,7 @@ def _tokenize(text: str, sep: str = ",; ", skip_empty: bool = True) -> list[str]
 
 
 def _typed(text: str) -> Any:
-    """An argument as a number or truth value where it reads as one."""
+    """An argument as a number or boolean if it reads as one."""
     for kind in (int, float):
         try:
             return kind(text)
@@ -382,7 +362,7 @@ def _typed(text: str) -> Any:
 def _to_tree(
     node: minidom.Element, place: Place
 ) -> tuple[ElementTree.Element, dict[ElementTree.Element, Place]]:
-    """A DOM element as ElementTree's, and the places of all in it."""
+    """A DOM element as an ElementTree, and the place of each element in it."""
     places: dict[ElementTree.Element, Place] = {}
     builder = ElementTree.TreeBuilder()
 

@@ -43,7 +43,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("speed", default_value="0.2", description="forward speed [m/s]"),
             Node(
                 executable="sim",
-                parameters=[{"scene": words["scene"], "magnetometer": False}],
+                parameters=[{"scene": words["scene"], "magnetometer": "none"}],
                 condition=IfCondition(value["sim"]),
                 **nodes,
             ),

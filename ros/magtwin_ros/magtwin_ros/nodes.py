@@ -19,7 +19,7 @@ FIRST = {
 }
 """Executables, and the parameter of each that its command takes without a name."""
 
-OPTIONS = {"magnetometer": ("net", "duration")}
+OPTIONS = {"magnetometer": ("network", "duration_s")}
 """Parameters that are options of a node whose others are settings, name:=value."""
 
 UNTIMED = ("sim", "replay")
@@ -61,10 +61,10 @@ def arguments(node: str, given: list[str]) -> list[str]:
         if flag in ("-p", "--param"):
             told[left] = right
         elif left in ("__ns", "__node", "__name"):
-            options["namespace" if left == "__ns" else "name"] = right.strip("/")
+            options["namespace" if left == "__ns" else "node-name"] = right.strip("/")
         else:
             remaps += ["--remap", f"{left}:={right}"]
-    whole = f"{options.get('namespace', 'robot')}/{options.get('name', f'magtwin_{node}')}".strip("/")
+    whole = f"{options.get('namespace', 'robot')}/{options.get('node-name', f'magtwin_{node}')}".strip("/")
     parameters = {name: value for file in files for name, value in _read(file, whole).items()} | told
     for name, value in parameters.items():
         if name == FIRST[node]:

@@ -7,8 +7,8 @@ from test_gp import survey
 
 from magtwin.errors import InputError
 from magtwin.field.fit.check import check
-from magtwin.field.fit.fit import METHODS
 from magtwin.field.fit.interpolation import fit_trilinear
+from magtwin.field.fit.methods import METHODS
 from magtwin.field.survey.readings import Readings
 
 
@@ -34,14 +34,14 @@ def flat(spread=10.0):
 
 
 def test_errors_coverage_and_score_are_those_of_a_method_whose_errors_are_known(monkeypatch):
-    monkeypatch.setitem(METHODS, "told", lambda readings: Told(readings, 100.0))
+    monkeypatch.setitem(METHODS._loaded, "told", lambda readings: Told(readings, 100.0))
     found = figures(check(flat(), ["told"], split="checkerboard"))
     assert abs(found["told RMSE"] - 100.5) < 1  # sqrt(100^2 + 10^2)
     assert abs(found["told MAE"] - 100) < 2
     assert found["told coverage"] == 100  # 100 lies in 1.645 x 100
     assert abs(found["told log score"] - (-0.5 * np.log(2 * np.pi * 100**2) - 0.505)) < 0.02
     assert found["told predicted"] == 100
-    monkeypatch.setitem(METHODS, "told", lambda readings: Told(readings, 50.0))
+    monkeypatch.setitem(METHODS._loaded, "told", lambda readings: Told(readings, 50.0))
     assert figures(check(flat(), ["told"]))["told coverage"] < 5
 
 
@@ -59,7 +59,7 @@ def test_a_checkerboard_leaves_nodes_out_at_all_headings_and_predicts_each_once(
         seen.append(readings)
         return fit_trilinear(readings, fill=fill)
 
-    monkeypatch.setitem(METHODS, "trilinear", spy)
+    monkeypatch.setitem(METHODS._loaded, "trilinear", spy)
     readings = survey()
     report = check(readings, ["trilinear"], split="checkerboard")
     parity = [np.unique(part.node[:, 1:].sum(axis=1) % 2).tolist() for part in seen]
@@ -96,7 +96,7 @@ def test_a_heading_is_left_out_whole_and_told_by_the_others(monkeypatch):
         seen.append(readings)
         return fit_trilinear(readings, fill=fill)
 
-    monkeypatch.setitem(METHODS, "trilinear", spy)
+    monkeypatch.setitem(METHODS._loaded, "trilinear", spy)
     readings = survey(rows=4, columns=4)
     found = figures(check(readings, ["trilinear"], split="heading"))
     assert [np.degrees(part.grid.headings_rad).round().tolist() for part in seen] == [
@@ -137,11 +137,11 @@ def test_the_same_survey_gets_the_same_report():
 
 @pytest.fixture(scope="module")
 def real_survey(real_data):
-    from magtwin.field.survey.gridded import read_grid
+    from magtwin.field.survey.folder import read_grid
 
     readings = read_grid(real_data / "aprilab" / "maps")
-    latched = (readings.b_nt > 35_544) & (readings.b_nt < 35_751)  # the level that FACTS reads off the files
-    return readings.with_(good=~latched)
+    stuck = (readings.b_nt > 35_544) & (readings.b_nt < 35_751)  # the level that FACTS reads off the files
+    return readings.with_(good=~stuck)
 
 
 def test_on_the_real_survey_a_gp_errs_a_quarter_of_what_trilinear_does(real_survey):

@@ -6,7 +6,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_gp import survey, truth
 
 from magtwin.errors import InputError
-from magtwin.field.fit.fit import METHODS, fit, grid_report, raster
+from magtwin.field.fit.fit import fit, grid_report, raster
+from magtwin.field.fit.methods import METHODS
 from magtwin.field.survey.readings import Readings
 
 QUICK = ("trilinear", "cubic", "gp")
@@ -138,12 +139,12 @@ def test_a_map_has_its_surveys_frame_and_datum_and_a_height_only_where_the_surve
         assert (field.frame, field.datum, field.height_m) == ("world: x east", "the door", None)
 
 
-def test_a_latched_hole_is_masked_at_every_heading_and_a_node_read_at_one_is_not():
+def test_a_stuck_hole_is_masked_at_every_heading_and_a_node_read_at_one_is_not():
     readings = survey()
     node = readings.node
     hole = (node[:, 1] >= 2) & (node[:, 1] <= 4) & (node[:, 2] >= 3) & (node[:, 2] <= 5)
-    latched = hole | ((node[:, 0] > 0) & (node[:, 1] == 5) & (node[:, 2] == 1))
-    readings = readings.with_(good=~latched)
+    stuck = hole | ((node[:, 0] > 0) & (node[:, 1] == 5) & (node[:, 2] == 1))
+    readings = readings.with_(good=~stuck)
     field = raster(
         fit(readings, "gp"), readings, spacing_m=0.125, headings_rad=np.radians(np.arange(0, 360, 15))
     )

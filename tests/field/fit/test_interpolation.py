@@ -76,7 +76,7 @@ def test_cubic_reproduces_a_bicubic_field_between_nodes():
 
 
 def test_trilinear_agrees_with_the_maps_own_lookup():
-    from magtwin.field.survey.gridded import node_map
+    from magtwin.field.survey.folder import node_map
 
     readings = grid_survey(lambda x, y, yaw: cubic(x, y, yaw) + 300 * np.cos(yaw))
     p, yaw = points()
@@ -176,7 +176,7 @@ def test_bins_are_means_of_what_lies_together():
 @pytest.mark.parametrize(
     ("rows", "said"),
     [
-        ({"good": np.arange(12) < 3}, "3 good readings of 12 in made; all others are latched or stuck"),
+        ({"good": np.arange(12) < 3}, "3 good readings of 12 in made; all others are stuck"),
         ({"good": np.zeros(12, bool)}, "0 good readings"),
         ({"b_nt": np.full(12, 42_000.0)}, "are 42000 nT: a stuck sensor"),
         ({"p_xy": np.column_stack([np.arange(12.0), 2 * np.arange(12.0)])}, "lie on one line"),

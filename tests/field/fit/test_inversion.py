@@ -8,10 +8,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.field.fit.harmonic.inversion import fit_harmonic
+from magtwin.field.fit.harmonic.model import surveyed
 from magtwin.field.fit.interpolation import fit_trilinear
 from magtwin.field.grid import Grid
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.field.survey.headings import surveyed
 from magtwin.field.survey.readings import Readings
 
 EARTH = (-2_745.6, 24_067.1, -38_418.4)
@@ -301,12 +301,12 @@ def test_a_drive_with_headings_all_around_has_no_gaps_between_them():
 
 @pytest.mark.slow
 def test_in_the_default_lab_it_is_four_times_nearer_to_the_exact_field_than_trilinear(lab_scene):
-    from magtwin.author.scene import read_scene
-    from magtwin.field.survey.stuck import mask_latched
+    from magtwin.field.survey.stuck import mask_stuck
     from magtwin.sim.survey import field_at_rest_nt, survey_readings
+    from magtwin.usd.scene import read_scene
 
     scene = read_scene(lab_scene)
-    readings, _ = mask_latched(survey_readings(scene, rng=np.random.default_rng(0)))
+    readings, _ = mask_stuck(survey_readings(scene, rng=np.random.default_rng(0)))
     model = fit_harmonic(readings, earth_nt=scene.earth.b_world_nt)
     p = np.random.default_rng(1).uniform((-2.7, -1.5), (2.7, 1.5), (500, 2))
     yaw = np.random.default_rng(2).choice(QUARTERS, 500)
@@ -319,15 +319,15 @@ def test_in_the_default_lab_it_is_four_times_nearer_to_the_exact_field_than_tril
 
 
 def test_the_real_survey_is_told_to_190_nt_at_nodes_left_out_at_all_headings(real_data):
-    from magtwin.field.survey.gridded import read_grid
+    from magtwin.field.survey.folder import read_grid
 
     readings = read_grid(real_data / "aprilab" / "maps")
-    latched = (readings.b_nt > 35_544) & (readings.b_nt < 35_751)
-    assert latched.sum() == 17 + 17 + 26 + 20
+    stuck = (readings.b_nt > 35_544) & (readings.b_nt < 35_751)
+    assert stuck.sum() == 17 + 17 + 26 + 20
     parity = (readings.node[:, 1] + readings.node[:, 2]) % 2
     off, doubt = [], []
     for kept in (0, 1):
-        shown, rest = (readings.take(~latched & (parity == side)) for side in (kept, 1 - kept))
+        shown, rest = (readings.take(~stuck & (parity == side)) for side in (kept, 1 - kept))
         model = fit_harmonic(shown, earth_nt=(-2_700.0, 24_000.0, -38_400.0))
         value, variance = model.predict(rest.p_xy, rest.yaw)
         off.append(rest.b_nt - value)

@@ -163,7 +163,7 @@ def test_no_variance_stays_unknown_and_a_harmonic_field_far_below_has_none():
 
 def test_dipoles_of_a_survey_whose_height_is_unknown_are_not_taken_to_a_height_above_the_floor():
     sheet = a_sheet(0.0)
-    with pytest.raises(InputError, match=r"height of map 'sheet' is unknown.*\(--height\)"):
+    with pytest.raises(InputError, match=r"height of map 'sheet' is unknown.*\(--height-m\)"):
         at_height(a_map(sheet, harmonic=sheet, height_m=None), 0.5)
 
 

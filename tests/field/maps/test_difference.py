@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.errors import InputError
 from magtwin.field.maps.difference import FALSE_SHARE, difference
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.field.sources.dipoles import dipole_field_nt
 
 FOUR = np.radians([0.0, 90.0, 180.0, 270.0])
 NOISE_NT = 20.0
@@ -174,7 +174,7 @@ def test_surveys_on_other_grids_meet_on_the_coarser_one_in_the_fewer_headings():
         ({"valid": np.zeros((4, 15, 25), bool)}, "no valid node in common"),
         ({"frame": "map"}, "map 'a' has the frame 'world' and 'a' 'map', so that one x and y are two places"),
         ({"datum": "the door"}, "has the datum 'the wall' and 'a' 'the door', .* with one --datum"),
-        ({"height_m": 0.5}, r"'a' is of 0\.35 m above the floor and 'a' of 0\.5 m; .*magtwin map continue"),
+        ({"height_m": 0.5}, r"'a' is of 0\.35 m above the floor and 'a' of 0\.5 m; .*magtwin map upward"),
     ],
 )
 def test_surveys_that_cannot_be_compared_are_refused(change, said):

@@ -11,7 +11,7 @@ from magtwin.field.maps import lookup, plane
 from magtwin.field.maps.lookup import LOOPS
 from magtwin.field.maps.plane import CLEAR_M, ERROR, HALF_M, SLOPE_ERROR, Plane
 from magtwin.field.sources.bodies import CELL_M, Bodies, Body
-from magtwin.field.sources.dipole_sums import dipole_field_and_gradient_nt
+from magtwin.field.sources.compiled_dipoles import dipole_field_and_gradient_nt
 
 HEIGHT_M = 0.41
 

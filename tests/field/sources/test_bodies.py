@@ -19,7 +19,7 @@ from magtwin.field.sources.bodies import (
     induced_magnetization,
     mesh_moments,
 )
-from magtwin.field.sources.point_dipoles import dipole_field_nt
+from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.frames import quat_from_rpy, rotate
 from magtwin.spec.mesh import check_mesh
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from magtwin.errors import InputError
+from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.field.sources.harmonic import HarmonicField
-from magtwin.field.sources.point_dipoles import dipole_field_nt
 
 
 def field(**parts):

@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
-from magtwin.field.sources import point_dipoles as sources
-from magtwin.field.sources.point_dipoles import dipole_field_and_rate_nt, dipole_field_nt
+from magtwin.field.sources import dipoles as sources
+from magtwin.field.sources.dipoles import dipole_field_and_rate_nt, dipole_field_nt
 
 ORIGIN = np.zeros((1, 3))
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from magtwin.field.grid import Grid
-from magtwin.field.survey.reading_errors import PLACE_M, node_errors
+from magtwin.field.survey.node_errors import PLACE_M, node_errors
 from magtwin.field.survey.readings import Readings
 
 FOUR = (0.0, 90.0, 180.0, 270.0)
@@ -112,10 +112,10 @@ def test_nodes_without_a_reading_have_the_mean_and_spoil_no_other():
 
 
 def test_the_real_survey_stood_within_a_centimetre(real_data):
-    from magtwin.field.survey.gridded import node_map, read_grid
-    from magtwin.field.survey.stuck import mask_latched
+    from magtwin.field.survey.folder import node_map, read_grid
+    from magtwin.field.survey.stuck import mask_stuck
 
-    readings, _ = mask_latched(read_grid(real_data / "aprilab" / "maps"))
+    readings, _ = mask_stuck(read_grid(real_data / "aprilab" / "maps"))
     field_map = node_map(readings)
     found = told(readings, np.where(field_map.valid, field_map.values_nt, np.nan))
     assert 0.003 < found.place_m < 0.01

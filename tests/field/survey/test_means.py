@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.testing import assert_array_equal
 
-from magtwin.field.survey.means import BIN, MOST_BINS, MOST_MEANS, means
+from magtwin.field.survey.bins import BIN, MOST_BINS, MOST_MEANS, means
 from magtwin.field.survey.readings import Readings
 
 DEPTH_M = 0.3

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
-from magtwin.field.survey import gridded as survey
-from magtwin.field.survey.gridded import import_survey, node_map, read_grid, read_survey
+from magtwin.field.survey import folder as survey
+from magtwin.field.survey.folder import node_map, read_grid, read_survey
 from magtwin.field.survey.readings import Readings
 from magtwin.files import sha256
 
@@ -40,7 +40,7 @@ def figures(report):
 
 def test_a_survey_becomes_a_map_with_the_files_as_its_source(tmp_path):
     folder = write_survey(tmp_path / "hall")
-    field = import_survey(folder, licence="CC0-1.0")
+    field = read_survey(folder, licence="CC0-1.0")[0]
     assert field.values_nt.shape == (4, 2, 2)
     assert_array_equal(field.values_nt[1], [[41_000, 41_200], [40_900, 41_100]])
     assert_allclose(field.headings_rad, np.radians([0, 90, 180, 270]), atol=0)
@@ -54,32 +54,32 @@ def test_a_survey_becomes_a_map_with_the_files_as_its_source(tmp_path):
 def test_rows_may_come_in_any_order(tmp_path):
     lines = layer_text(90).splitlines(keepends=True)
     shuffled = lines[0] + "".join(lines[i] for i in (4, 2, 1, 3)) + "\n"
-    plain = import_survey(write_survey(tmp_path / "plain"))
-    mixed = import_survey(write_survey(tmp_path / "mixed", h90=shuffled))
+    plain = read_survey(write_survey(tmp_path / "plain"))[0]
+    mixed = read_survey(write_survey(tmp_path / "mixed", h90=shuffled))[0]
     assert_array_equal(plain.values_nt, mixed.values_nt)
 
 
 def test_coordinates_with_rounding_are_one_grid(tmp_path):
-    field = import_survey(write_survey(tmp_path, h90=layer_text(90).replace("0.5,", "0.50000000000000004,")))
+    field = read_survey(write_survey(tmp_path, h90=layer_text(90).replace("0.5,", "0.50000000000000004,")))[0]
     assert field.cell_m == (0.5, 0.5)
 
 
 def test_a_spreadsheets_byte_order_mark_is_no_obstacle(tmp_path):
-    import_survey(write_survey(tmp_path, h0=b"\xef\xbb\xbf" + layer_text(0).encode()))
+    read_survey(write_survey(tmp_path, h0=b"\xef\xbb\xbf" + layer_text(0).encode()))
 
 
 def test_headings_need_not_be_four_when_they_are_even_or_named(tmp_path):
     eight = write_survey(tmp_path / "eight", headings=[45 * k for k in range(8)])
-    assert len(import_survey(eight).headings_rad) == 8
+    assert len(read_survey(eight)[0].headings_rad) == 8
     two = write_survey(tmp_path / "two", headings=(0, 180))
-    assert len(import_survey(two, headings_deg=(0, 180)).headings_rad) == 2
+    assert len(read_survey(two, headings_deg=(0, 180))[0].headings_rad) == 2
     with pytest.raises(InputError, match="heading 90, 270 deg missing, found 0, 180"):
-        import_survey(two)
+        read_survey(two)[0]
 
 
 def test_the_report_tells_the_worst_heading_and_repeated_readings(tmp_path):
-    latched = layer_text(90, (35_600, 35_600, 40_000, 41_000))
-    lines = latched.splitlines(keepends=True)
+    stuck = layer_text(90, (35_600, 35_600, 40_000, 41_000))
+    lines = stuck.splitlines(keepends=True)
     lines[3] = f"0.0,0.5,{np.radians(90 - 20)},40000\n"
     got = figures(read_survey(write_survey(tmp_path, h90="".join(lines)))[1])
     assert got["largest heading deviation"].value == pytest.approx(20, abs=1e-3)
@@ -96,7 +96,7 @@ def test_map_and_report_come_from_one_reading_of_the_files(tmp_path, monkeypatch
     assert len(read) == 4
     assert report.title == f"survey {folder}"
     assert figures(report).items() >= figures(field.report()).items()
-    assert_array_equal(import_survey(folder, name="a").values_nt, field.values_nt)
+    assert_array_equal(read_survey(folder, name="a")[0].values_nt, field.values_nt)
 
 
 def test_recorded_headings_are_compared_on_the_circle(tmp_path):
@@ -107,7 +107,7 @@ def test_recorded_headings_are_compared_on_the_circle(tmp_path):
 
 def test_the_real_survey_has_the_published_figures(real_data):
     folder = real_data / "aprilab/maps"
-    field, report = read_survey(folder, name="aprilab", licence="MIT", keep_latched=True)
+    field, report = read_survey(folder, name="aprilab", licence="MIT", keep_stuck=True)
     assert field.valid.all()
     assert field.values_nt.shape == (4, 15, 25)
     assert field.extent == (-3.0, 3.0, -1.75, 1.75)
@@ -127,15 +127,15 @@ def test_the_real_survey_has_the_published_figures(real_data):
     assert got["repeated readings"].value > 10
 
 
-def test_a_surveys_latched_nodes_are_not_valid_unless_they_are_to_be_kept(real_data):
+def test_a_surveys_stuck_nodes_are_not_valid_unless_they_are_to_be_kept(real_data):
     folder = real_data / "aprilab/maps"
     field, report = read_survey(folder)
     assert np.count_nonzero(~field.valid.any(axis=0)) == 17
     assert np.isnan(field.lookup([-1.25, 1.5], [0, np.pi / 2, np.pi])).all()
-    kept, again = read_survey(folder, keep_latched=True)
+    kept, again = read_survey(folder, keep_stuck=True)
     assert kept.valid.all()
     assert_array_equal(kept.values_nt, field.values_nt)
-    assert figures(report)["latched readings"] == figures(again)["latched readings"]
+    assert figures(report)["stuck readings"] == figures(again)["stuck readings"]
 
 
 def test_readings_of_a_grid_stand_on_its_nodes_with_recorded_headings_one_run_a_file(tmp_path):
@@ -289,11 +289,11 @@ def test_a_survey_is_refused_in_one_line_that_says_where(tmp_path, case):
 
 def test_a_heading_that_was_not_asked_for_is_refused(tmp_path):
     with pytest.raises(InputError, match="heading 90, 270 deg is not among the expected 0, 180"):
-        import_survey(write_survey(tmp_path), headings_deg=(0, 180))
+        read_survey(write_survey(tmp_path), headings_deg=(0, 180))[0]
 
 
 def test_the_real_survey_is_known_to_its_headings_places_and_noise(real_data):
-    field = import_survey(real_data / "aprilab" / "maps")
+    field = read_survey(real_data / "aprilab" / "maps")[0]
     sd = np.sqrt(field.variance_nt2[field.valid])
     assert 40 < np.median(sd) < 100
     assert np.sqrt(np.mean(sd**2)) == pytest.approx(85, abs=10)

@@ -4,7 +4,7 @@ from numpy.testing import assert_allclose
 from scipy.stats import spearmanr
 
 from magtwin.errors import InputError
-from magtwin.figures.correlations import plot_correlations
+from magtwin.figures.training import plot_correlations
 from magtwin.learn.data.correlation import correlations
 
 

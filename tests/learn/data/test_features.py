@@ -3,6 +3,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
+from magtwin.learn.compensation.tolles_lawson import design_matrix
 from magtwin.learn.data.features import (
     EDDY,
     FEATURES,
@@ -13,7 +14,6 @@ from magtwin.learn.data.features import (
     feature_names,
     features,
 )
-from magtwin.learn.tolles_lawson import design_matrix
 from magtwin.run.run import COLUMNS, Run
 
 

@@ -328,14 +328,14 @@ def test_convert_makes_a_table_of_a_robots_own_bag(tmp_path, capsys):
     from magtwin.io.formats import read_run
 
     bag, out = record(tmp_path / "bag", {MAG: readings(), "/vrpn/pose": poses()}), tmp_path / "run.parquet"
-    main(["convert", str(bag), str(out), "--topic", f"{POSE}=/vrpn/pose", "--field-unit", "nT"])
+    main(["convert", str(bag), str(out), "--remap", f"{POSE}:=/vrpn/pose", "--unit", "nT"])
     assert "p_world_base" in read_run(out)
     for topic, text in {
-        "/vrpn/pose": "--topic takes NAME=THEIRS, such as /robot/enu/pose=/vrpn/pose, got '/vrpn/pose'",
+        "/vrpn/pose": "--remap takes OURS:=THEIRS, such as /robot/enu/pose:=/vrpn/pose, got '/vrpn/pose'",
         f"{POSE}=/vrnp/pose": "no topic /vrnp/pose; did you mean '/vrpn/pose'",
     }.items():
         with pytest.raises(SystemExit, match="1"):
-            main(["convert", str(bag), str(out), "--force", "--topic", topic])
+            main(["convert", str(bag), str(out), "--force", "--remap", topic])
         assert text in capsys.readouterr().err
     with pytest.raises(InputError, match=r"Parquet has no option .unit.; drop it"):
         read_run(out, unit="T")

@@ -34,7 +34,7 @@ def twin(lab_scene):
 
 @pytest.fixture(scope="module")
 def drives(twin):
-    """Short drives of two sessions, as `magtwin runs` deals them."""
+    """Short drives of two sessions, as `magtwin sweep` deals them."""
 
     def drive(day, path):
         metadata = {"session_seed": SEED, "session": day}

@@ -7,7 +7,7 @@ from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
-from magtwin.learn.training.fitters import Choice
+from magtwin.learn.models.predictor import Choice
 
 NAMES = ("odom_v_x", "imu_w_z")
 

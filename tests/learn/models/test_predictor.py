@@ -15,21 +15,20 @@ from test_network import RELEASED, a_net
 from magtwin.errors import InputError
 from magtwin.learn.data.features import SETS, features
 from magtwin.learn.data.inputs import inputs_of
-from magtwin.learn.magnetometer import NeuralMagnetometer
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.models.calibration import Spread
-from magtwin.learn.models.ensemble import Ensemble, Members
 from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
 from magtwin.learn.models.network import load_net
-from magtwin.learn.models.predictor import load_predictor
-from magtwin.learn.models.temporal import Convolutions, Temporal
+from magtwin.learn.models.predictor import PREDICTORS, load_predictor
+from magtwin.learn.models.weights import write_weights
 from magtwin.twin import open_twin, simulate, sweep
 
 NAMES = SETS["gradient"]
-KINDS = ("mlp", "linear", "hybrid", "base alone", "ensemble", "tcn")
+KINDS = ("mlp", "linear", "hybrid", "base alone")
 
 
-def a_predictor(kind, names=NAMES, step_s=1 / 135):
+def a_predictor(kind, names=NAMES):
     """A small one of a kind, with figures that are all different."""
     rng = np.random.default_rng(0)
     of = inputs_of(rng.normal(0, 30, (100, len(names))), names)
@@ -38,17 +37,11 @@ def a_predictor(kind, names=NAMES, step_s=1 / 135):
     base = Linear(
         inputs=of, constant_nt=333.0, coefficients_nt=coefficients, spread=spread, penalty=0.01, weighted=True
     )
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        members, net = Members(len(names), (6, 5), 3), Convolutions(len(names), (6, 6), 3)
-    heads = {"inputs": of, "y_mean_nt": 300.0, "y_scale_nt": 500.0, "sd_factor": 1.25}
     found = {
         "mlp": lambda: a_net(names, (6, 5), residual_sd_nt=44.0),
         "linear": lambda: base,
         "hybrid": lambda: Hybrid(base=base, net=a_net(names, (6, 5), dropout=0.2), sd_factor=1.5),
         "base alone": lambda: Hybrid(base=base, net=None, sd_factor=1.5),
-        "ensemble": lambda: Ensemble(net=members.eval(), **heads),
-        "tcn": lambda: Temporal(net=net.eval(), step_s=step_s, **heads),
     }[kind]()
     found.residual_sd_nt = 44.0
     found.metadata.update(source="here", rows=7)
@@ -114,41 +107,17 @@ def test_a_released_checkpoint_is_a_predictor(real_data):
     assert load_predictor(real_data / RELEASED).kind == "mlp"
 
 
-def test_one_look_back_lasts_as_long_at_twice_the_rate():
-    magnetometer = NeuralMagnetometer(a_predictor("tcn", step_s=0.1))
-    run = a_run(50)
-    slow = run.with_columns(t=np.arange(50) / 10)
-    twice = type(run)({name: np.repeat(values, 2, axis=0) for name, values in run.items()}, run.metadata)
-    twice = twice.with_columns(t=np.arange(100) / 20)
-    found, peer = magnetometer.disturbance_nt(twice), magnetometer.disturbance_nt(slow)
-    assert_array_equal(found[::2], peer)
-    assert_array_equal(found[1::2], peer)
-    for rate in (5, 14):
-        with pytest.raises(InputError, match=r"looks back over rows 0\.1 s apart, the run has them"):
-            magnetometer.disturbance_nt(run.with_columns(t=np.arange(50) / rate))
-
-
-@pytest.mark.parametrize("kind", ["hybrid", "tcn"])
-def test_a_simulation_is_read_by_any_kind_and_many_as_one(lab_scene, tmp_path, kind):
-    a_predictor(kind).save(tmp_path / "n.safetensors")
+def test_a_simulation_is_read_by_any_kind_and_many_as_one(lab_scene, tmp_path):
+    a_predictor("hybrid").save(tmp_path / "n.safetensors")
     twin = open_twin(lab_scene, network=tmp_path / "n.safetensors")
     one = simulate(twin, seed=3, duration_s=1.0)
-    assert one.metadata["network_kind"] == kind
+    assert one.metadata["network_kind"] == "hybrid"
     x = features(one, NAMES)
     noise = twin.scene.robot.magnetometer.noise_density_nt * math.sqrt(135 / 2)
     assert_allclose(one["b_sd_nt"], np.hypot(twin.magnetometer.net.predict(x)[1], noise))
     both = sweep(twin, ["figure8", "figure8"], [8, 3], duration_s=1.0)
     for name in ("b_disturbance_nt", "b_sd_nt", "b_measured_nt", "flag_out_of_distribution"):
         assert_array_equal(both[1][name], one[name])
-
-
-def test_robots_that_step_together_have_no_network_that_looks_back(lab_scene, tmp_path):
-    pytest.importorskip("gymnasium")
-    from magtwin.gym import MagNavEnv
-
-    a_predictor("tcn").save(tmp_path / "n.safetensors")
-    with pytest.raises(InputError, match=r"n\.safetensors: a tcn looks at 6 earlier readings"):
-        MagNavEnv(scene=lab_scene, network=tmp_path / "n.safetensors")
 
 
 @pytest.mark.parametrize("inputs", SETS)
@@ -184,8 +153,12 @@ def changed(tmp_path, kind, *, about=None, drop=None, **tensors):
 @pytest.mark.parametrize(
     ("kind", "change", "text"),
     [
-        ("mlp", {"about": {"kind": "oracle"}}, "holds a 'oracle', this magtwin reads mlp, linear, hybrid"),
-        ("mlp", {"about": {"kind": ["mlp"]}}, "holds a ['mlp'], this magtwin reads"),
+        (
+            "mlp",
+            {"about": {"kind": "oracle", "format_version": 2}},
+            "no predictor kind 'oracle'; known: hybrid, linear, mlp; update magtwin, or install",
+        ),
+        ("mlp", {"about": {"kind": ["mlp"]}}, "'kind' of its metadata must be text, got ['mlp']"),
         (
             "linear",
             {"about": {"format_version": 1}},
@@ -199,30 +172,6 @@ def changed(tmp_path, kind, *, about=None, drop=None, **tensors):
         ("hybrid", {"drop": "net.layers.1.weight"}, "tensor 'layers.1.weight' is missing; train or convert"),
         ("hybrid", {"drop": "base.constant_nt"}, "tensor 'constant_nt' is missing; train the hybrid again"),
         ("hybrid", {"spare": torch.ones(1)}, "tensor 'spare' belongs to no layer of a hybrid"),
-        ("ensemble", {"about": {"members": 0}}, "has 0 members; 1 to 1000 are read"),
-        ("ensemble", {"about": {"members": 2}}, "tensor 'weights.0' is float32 (3, 6, 2), the 2 features"),
-        ("ensemble", {"about": {"hidden": []}}, "'hidden' of its metadata must be widths of layers, got []"),
-        ("ensemble", {"about": {"hidden": [10**12]}}, "must be widths of layers, got [1000000000000]"),
-        (
-            "ensemble",
-            {"about": {"hidden": [99, 99]}},
-            "its metadata ask for 30,591 weights, its tensors hold",
-        ),
-        (
-            "ensemble",
-            {"about": {"y_scale_nt": -1}},
-            "'y_scale_nt' of its metadata must be above 0 and finite",
-        ),
-        ("ensemble", {"weights__1": torch.full((3, 5, 6), math.inf)}, "'weights.1' has numbers that are nan"),
-        (
-            "tcn",
-            {"about": {"kernel": 1}},
-            "2 layers with a kernel of 1 rows; at most 100,000 rows are looked",
-        ),
-        ("tcn", {"about": {"kernel": 99_999}}, "2 layers with a kernel of 99999 rows"),
-        ("tcn", {"about": {"channels": [1] * 60}}, "60 layers with a kernel of 3 rows"),
-        ("tcn", {"about": {"step_s": 0}}, "'step_s' of its metadata must be above 0 and finite, got 0"),
-        ("tcn", {"last__bias": torch.zeros(3)}, "tensor 'last.bias' is float32 (3,), the 2 features"),
     ],
 )
 def test_a_file_that_does_not_hold_together_is_refused(tmp_path, kind, change, text):
@@ -231,6 +180,23 @@ def test_a_file_that_does_not_hold_together_is_refused(tmp_path, kind, change, t
         load_predictor(path)
     assert str(refused.value).startswith(f"{path}: ")
     assert text in str(refused.value)
+
+
+def test_a_registered_kind_is_loaded_like_a_built_in_one(tmp_path):
+    @PREDICTORS.register("constant")
+    class Constants:
+        load = staticmethod(lambda weights: (weights.kind, weights.features))
+
+    write_weights(
+        tmp_path / "c.safetensors",
+        "constant",
+        {"mean": torch.zeros(1)},
+        features=("yaw_sin",),
+        residual_sd_nt=1.0,
+        metadata={},
+    )
+    assert load_predictor(tmp_path / "c.safetensors") == ("constant", ("yaw_sin",))
+    PREDICTORS._loaded.pop("constant")
 
 
 def test_what_wants_a_perceptron_refuses_a_hybrid(tmp_path):

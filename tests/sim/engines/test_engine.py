@@ -19,7 +19,7 @@ from magtwin.sim.motion.commands import Commands, read_commands, write_commands
 from magtwin.sim.motion.controllers import guide_by_commands
 from magtwin.sim.motion.driver import Driver
 from magtwin.sim.motion.engine import Kinematic
-from magtwin.sim.motion.follow import course_along, follow, play
+from magtwin.sim.motion.follow import follow, loop_along, play
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.twin import open_twin, simulate
@@ -53,7 +53,9 @@ def test_a_run_without_commands_is_not_replayed_for_a_network_that_reads_them(la
     t = np.arange(200) / 20.0
     p = np.column_stack([0.2 * t - 1, 0 * t, 0.05 + 0 * t])
     told = Run({"t": t, "p_world_base": p, "yaw": 0 * t})
-    with pytest.raises(InputError, match=r"has no 'v_cmd', and the network turtlebot4_hybrid\.safetensors"):
+    with pytest.raises(
+        InputError, match=r"has no column 'v_cmd', which the network turtlebot4_hybrid\.safetensors"
+    ):
         simulate(neural, told)
     paper = open_twin(lab_scene, network=shipped("weights", "turtlebot4_paper.safetensors"))
     assert np.isfinite(simulate(paper, told)["b_total_nt"]).all()
@@ -221,14 +223,14 @@ def test_a_driver_without_room_is_refused():
 
 
 def test_run_drives_at_random_by_commands_and_by_replay(lab_scene, tmp_path, capsys):
-    arguments = ["run", str(lab_scene), "--net", "none", "--json"]
+    arguments = ["run", str(lab_scene), "--network", "none", "--json"]
     once, again = tmp_path / "a.parquet", tmp_path / "b.parquet"
-    main([*arguments, "--path", "random", "--duration", "5", "--parquet", str(once)])
-    main([*arguments, "--engine", "replay", "--replay", str(once), "--parquet", str(again)])
+    main([*arguments, "--path", "random", "--duration-s", "5", "--out", str(once)])
+    main([*arguments, "--replay", str(once), "--out", str(again)])
     assert_array_equal(read_parquet(once)["p_world_base"], read_parquet(again)["p_world_base"])
     (tmp_path / "c.csv").write_text("t,v,w\n0,0.5,0\n0.4,0,0\n")
     capsys.readouterr()
-    main([*arguments, "--commands", str(tmp_path / "c.csv"), "--parquet", str(tmp_path / "c.parquet")])
+    main([*arguments, "--commands", str(tmp_path / "c.csv"), "--out", str(tmp_path / "c.parquet")])
     assert "|v| above 0.306 m/s" in capsys.readouterr().err
     run = read_parquet(tmp_path / "c.parquet")
     assert 0.05 < run["p_world_base"][-1, 0] - run["p_world_base"][0, 0] < 0.2
@@ -276,7 +278,7 @@ def physics(test):
 def by_equal_commands(twin, path, wheel_errors=(0.0, 0.0)):
     """What both engines make of the commands of a drive without slip, at the same times."""
     drive = replace(twin.scene.robot.drive, slip_s2_m=0.0, yaw_slip=0.0)
-    course = replace(course_along(path, drive, speed=0.2), wheel_errors=wheel_errors)
+    course = replace(loop_along(path, drive, speed=0.2), wheel_errors=wheel_errors)
     want = Kinematic().drive(course, None, None)
     rows = np.column_stack([np.arange(len(want.v)) * course.dt, want.v_cmd, want.w_cmd])
     scripted = replace(course, guide=guide_by_commands(rows, drive), steps=len(want.v))

@@ -11,11 +11,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.path import Path, path_named
-from magtwin.sim.motion import course as courses
+from magtwin.sim.motion import closed_loop as courses
+from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop, run_loops
 from magtwin.sim.motion.controllers import CONTROLLERS, guide_by_commands
-from magtwin.sim.motion.course import Chassis, Course, run_courses
 from magtwin.sim.motion.drive import Motion, draw_wheel_errors
-from magtwin.sim.motion.follow import course_along, follow, play
+from magtwin.sim.motion.follow import follow, loop_along, play
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 
@@ -50,9 +50,9 @@ ROOM = Obstacles(
 
 @pytest.fixture(params=["plain", "compiled"])
 def way(request, monkeypatch):
-    """Each way of running the loop."""
-    monkeypatch.setattr(courses._Loop, "compiled", None)
-    monkeypatch.setattr(courses, "PAYS", math.inf)
+    """Plain and compiled."""
+    monkeypatch.setattr(courses.LOOPS, "code", None)
+    monkeypatch.setattr(courses.LOOPS, "pays", math.inf)
     if request.param == "compiled":
         courses.warm_up()
     return request.param
@@ -62,12 +62,14 @@ def way(request, monkeypatch):
 def both(monkeypatch):
     """A function that runs courses in both ways."""
 
-    def run(chosen: list[Course], obstacles: Obstacles | None = None) -> tuple[list[Motion], list[Motion]]:
-        monkeypatch.setattr(courses, "PAYS", math.inf)
-        monkeypatch.setattr(courses._Loop, "compiled", None)
-        plain = run_courses(chosen, obstacles)
+    def run(
+        chosen: list[ClosedLoop], obstacles: Obstacles | None = None
+    ) -> tuple[list[Motion], list[Motion]]:
+        monkeypatch.setattr(courses.LOOPS, "pays", math.inf)
+        monkeypatch.setattr(courses.LOOPS, "code", None)
+        plain = run_loops(chosen, obstacles)
         courses.warm_up()
-        return plain, run_courses(chosen, obstacles)
+        return plain, run_loops(chosen, obstacles)
 
     return run
 
@@ -90,7 +92,7 @@ def held(v: float, w: float, seconds: float) -> np.ndarray:
 def test_plain_python_and_machine_code_drive_to_the_same_bits(both, name):
     rng = np.random.default_rng(3)
     chosen = [
-        course_along(
+        loop_along(
             path_named(path),
             drive,
             speed=0.25,
@@ -114,13 +116,13 @@ def test_any_script_among_obstacles_is_driven_to_the_same_bits(seed):
     rng = np.random.default_rng(seed)
     t = np.cumsum(rng.exponential(0.3, 60))
     script = np.column_stack([t, rng.uniform(-0.6, 0.6, 60), rng.uniform(-3, 3, 60)])
-    kept, courses._Loop.compiled = courses._Loop.compiled, None
+    kept, courses.LOOPS.code = courses.LOOPS.code, None
     try:
         plain = play(script, REAL, start=(-1.0, 0.5, 0.3), obstacles=ROOM, footprint_radius_m=RADIUS)
         courses.warm_up()
         compiled = play(script, REAL, start=(-1.0, 0.5, 0.3), obstacles=ROOM, footprint_radius_m=RADIUS)
     finally:
-        courses._Loop.compiled = kept
+        courses.LOOPS.code = kept
     assert_same(plain, compiled)
     distance, _ = ROOM.clearance(plain.poses[:, :2])
     assert distance.min() > RADIUS - 1e-5
@@ -129,7 +131,7 @@ def test_any_script_among_obstacles_is_driven_to_the_same_bits(seed):
 def test_a_robot_drives_to_the_same_bits_alone_in_blocks_and_among_others(both, monkeypatch):
     rng = np.random.default_rng(1)
     chosen = [
-        course_along(
+        loop_along(
             path_named(path),
             REAL,
             speed=speed,
@@ -146,44 +148,31 @@ def test_a_robot_drives_to_the_same_bits_alone_in_blocks_and_among_others(both, 
     plain, together = both(chosen)
     monkeypatch.setattr(courses, "BLOCK", 333)
     plain_in_blocks, in_blocks = both(chosen)
-    backward = run_courses(chosen[::-1])[::-1]
+    backward = run_loops(chosen[::-1])[::-1]
     monkeypatch.setattr(courses, "RECORDED", 1)
-    one_by_one = run_courses(chosen)
+    one_by_one = run_loops(chosen)
     monkeypatch.setattr(courses, "SHARE", 1)
-    in_threads = run_courses(chosen)
+    in_threads = run_loops(chosen)
     for n, first in enumerate(plain):
         for other in (together, plain_in_blocks, in_blocks, backward, one_by_one, in_threads):
             assert_same(first, other[n])
 
 
 def test_courses_are_not_changed_by_running_them(way):
-    course = course_along(path_named("sine"), REAL, speed=0.2)
-    assert_same(run_courses([course])[0], run_courses([course])[0])
+    course = loop_along(path_named("sine"), REAL, speed=0.2)
+    assert_same(run_loops([course])[0], run_loops([course])[0])
 
 
 def test_the_loop_opens_its_machine_code_when_that_has_paid(monkeypatch):
-    monkeypatch.setattr(courses._Loop, "compiled", None)
-    monkeypatch.setattr(courses._Loop, "made", 0)
-    monkeypatch.setattr(courses.lookup.LOOPS, "code", None)
-    monkeypatch.setattr(courses, "PAYS", 6000)
-    path = path_named("figure8")
-    first = follow(path, REAL, speed=0.2, duration_s=60.0)
-    assert courses._Loop.compiled is None
-    second = follow(path, REAL, speed=0.2, duration_s=60.0)
-    assert courses._Loop.compiled is not None
-    assert courses.lookup.LOOPS.code is not None  # which costs little more then
+    monkeypatch.setattr(courses.LOOPS, "code", None)
+    monkeypatch.setattr(courses.LOOPS, "done", 0)
+    steps = 20 * 4500  # numba is open here, so a twentieth pays
+    monkeypatch.setattr(courses.LOOPS, "pays", steps)
+    first = follow(path_named("figure8"), REAL, speed=0.2, duration_s=60.0)
+    assert courses.LOOPS.code is None
+    second = follow(path_named("figure8"), REAL, speed=0.2, duration_s=60.0)
+    assert courses.LOOPS.code is not None
     assert_same(first, second)
-
-
-def test_with_other_machine_code_open_the_loops_pays_sooner(monkeypatch):
-    monkeypatch.setattr(courses._Loop, "compiled", None)
-    monkeypatch.setattr(courses._Loop, "made", 0)
-    monkeypatch.setattr(courses, "PAYS", 60_000)
-    courses.lookup.warm_up()
-    follow(path_named("figure8"), REAL, speed=0.2, duration_s=50.0)
-    assert courses._Loop.compiled is None
-    follow(path_named("figure8"), REAL, speed=0.2, duration_s=60.0)
-    assert courses._Loop.compiled is not None
 
 
 # --- the drive --------------------------------------------------------------------------------------------
@@ -386,16 +375,16 @@ def test_a_controller_that_falls_silent_is_obeyed_until_the_drive_loses_patience
 
 
 def test_a_guide_asked_step_by_step_drives_as_the_loop_does():
-    course = course_along(path_named("figure8"), REAL, speed=0.25, duration_s=40.0, footprint_radius_m=RADIUS)
+    course = loop_along(path_named("figure8"), REAL, speed=0.25, duration_s=40.0, footprint_radius_m=RADIUS)
     chassis = Chassis(course)
     guide = dataclasses.replace(course.guide)
     while not guide.done and chassis.t < 40.0 - 1e-9:
         chassis.step(guide.command(chassis.t, *chassis.pose, *chassis.twist))
-    assert_same(chassis.motion(), run_courses([course])[0])
+    assert_same(chassis.motion(), run_loops([course])[0])
 
 
 def test_a_chassis_tells_where_it_is_and_what_it_touches():
-    course = Course(
+    course = ClosedLoop(
         drive=PROMPT,
         guide=guide_by_commands([[0.0, 0.0, 0.0]], PROMPT),
         dt=0.02,
@@ -473,9 +462,9 @@ def test_an_unknown_controller_is_refused_with_the_nearest_one():
 
 
 def test_courses_of_different_steps_are_not_run_at_once():
-    chosen = [course_along(LINE, REAL, speed=0.2, rate_hz=rate) for rate in (50.0, 20.0)]
+    chosen = [loop_along(LINE, REAL, speed=0.2, rate_hz=rate) for rate in (50.0, 20.0)]
     with pytest.raises(InputError, match="the same length of a step"):
-        run_courses(chosen)
+        run_loops(chosen)
 
 
 def test_a_shipped_scene_refuses_a_path_through_its_wall_or_its_furniture():

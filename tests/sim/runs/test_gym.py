@@ -13,7 +13,7 @@ from gymnasium.vector import SyncVectorEnv  # noqa: E402
 import magtwin.gym  # noqa: E402
 from magtwin.errors import InputError  # noqa: E402
 from magtwin.run.run import COLUMNS  # noqa: E402
-from magtwin.sim.runs.fleet import Fleet  # noqa: E402
+from magtwin.sim.runs.stepped import SteppedRobots  # noqa: E402
 from magtwin.sim.session import draw_session  # noqa: E402
 from magtwin.twin import Twin, open_twin  # noqa: E402
 
@@ -66,7 +66,7 @@ def test_robots_on_a_survey_alone_read_its_map_and_their_own_field(twin):
     env.reset(seed=1)
     for _ in range(5):
         env.step(np.tile(AHEAD, (3, 1)))
-    table = env.unwrapped.fleet.columns
+    table = env.unwrapped.stepped.columns
     assert np.isfinite(table["b_total_nt"]).all()
     assert (np.abs(table["b_disturbance_nt"]) > 10).all(), "of drawn sessions, in motion"
 
@@ -91,21 +91,21 @@ def test_robots_of_many_days_do_together_what_each_does_in_a_scene_of_its_day(tw
     poses = [(-2.0 + 0.5 * i, -1.2, 0.3 * i) for i in range(6)]
     common = {"anomaly_map": twin.field, "obstacles": twin.obstacles, "step_s": 0.1}
 
-    def driven(fleet, which):
-        fleet.begin(
+    def driven(robots, which):
+        robots.begin(
             list(range(len(which))),
             [poses[i] for i in which],
             [np.random.default_rng(i) for i in which],
             None if len(which) == 1 else days,
         )
         for k in range(12):
-            fleet.step(np.tile([0.2, 0.05 * k], (len(which), 1)))
-        return fleet.columns
+            robots.step(np.tile([0.2, 0.05 * k], (len(which), 1)))
+        return robots.columns
 
-    together = driven(Fleet(twin.scene, 6, **common), range(6))
+    together = driven(SteppedRobots(twin.scene, 6, **common), range(6))
     assert 0 < together["lidar_on"].sum() < 6
     for i, day in enumerate(days):
-        alone = driven(Fleet(replace(twin.scene, robot=day), 1, **common), [i])
+        alone = driven(SteppedRobots(replace(twin.scene, robot=day), 1, **common), [i])
         for name, values in alone.items():
             assert_allclose(together[name][i], values[0], rtol=1e-9, atol=1e-9, err_msg=name)
 
@@ -164,7 +164,7 @@ def test_sensors_tell_what_the_robot_did_within_their_errors(twin, line):
     env = gymnasium.make(NAME, scene=twin, path=line, signals=(*magtwin.gym.SIGNALS, "b_total_nt"))
     observations, rewards = drive(env, [AHEAD] * 50)
     x = column(env, observations, "odom_p")[-1, 0]
-    truth = env.unwrapped.robots.fleet.columns
+    truth = env.unwrapped.robots.stepped.columns
     way = truth["p_world_base"][0, 0] + 2.0
     assert 0.9 < way < 1.0  # 5 s at 0.2 m/s, and the time to get there
     assert_allclose(x, way, rtol=0.03)
@@ -226,9 +226,9 @@ def test_a_reward_of_ones_own_is_asked_for_each_step(twin):
 
     env = vector(twin, 2, reward=mine)
     env.reset(seed=0)
-    before = env.unwrapped.fleet.columns["b_total_nt"].copy()
+    before = env.unwrapped.stepped.columns["b_total_nt"].copy()
     _, rewards, *_ = env.step(np.tile(AHEAD, (2, 1)))
-    assert_array_equal(rewards, env.unwrapped.fleet.columns["b_total_nt"] - before)
+    assert_array_equal(rewards, env.unwrapped.stepped.columns["b_total_nt"] - before)
     assert len(seen) == 1
     assert seen[0].action.shape == (2, 2)
 

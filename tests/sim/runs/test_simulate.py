@@ -162,7 +162,7 @@ def test_hard_iron_makes_a_cosine_of_heading():
 
 
 def test_the_field_is_that_at_the_magnetometer_not_at_base_link():
-    from magtwin.field.sources.point_dipoles import dipole_field_nt
+    from magtwin.field.sources.dipoles import dipole_field_nt
 
     lever = np.array([0.1, -0.05, 0.36])
     parts = {"p_base_magnetometer": tuple(lever.tolist()), "base_height_m": -0.02}
@@ -489,12 +489,12 @@ def test_a_single_reading_is_a_run_too():
         ({"duration_s": float("inf")}, "duration_s must be above 0 s and finite, got inf"),
         (
             {"rate_hz": 1e9},
-            r"at 1e\+09 Hz make .*e\+\d+ readings, more than 20,000,000; lower rate_hz to .* Hz",
+            r"at 1e\+09 Hz make .*e\+\d+ readings, more than 20,000,000; lower `rate_hz` to .* Hz",
         ),
         (
             {"duration_s": 3600.0, "rate_hz": 1e4},
-            r"3600 s at 10000 Hz make 3\.6e\+07 readings, more than 20,000,000; lower rate_hz to 5556 Hz, "
-            r"or duration_s to 2000 s",
+            r"3600 s at 10000 Hz make 3\.6e\+07 readings, more than 20,000,000; lower `rate_hz` to 5556 Hz, "
+            r"or `duration_s` to 2000 s",
         ),
         ({"lidar": "maybe"}, 'lidar must be "schedule", "on" or "off"'),
         ({"outside": "guess"}, 'outside must be "nan", "clamp" or "raise"'),
@@ -510,8 +510,8 @@ def test_a_single_reading_is_a_run_too():
             {"path": Path("far", np.array([[0.0, 0.0], [2.9, 0.0]]))},
             r"path far leaves the floor at point 2 of 2",
         ),
-        ({"path": np.array([[0.0, 0.0], [1.0, 0.0]])}, "what to drive must be a Path, Commands, a Run or"),
-        ({"path": "figure8"}, "what to drive must be a Path"),
+        ({"path": np.array([[0.0, 0.0], [1.0, 0.0]])}, "path must be a Path, Commands, a Run or"),
+        ({"path": "figure8"}, "path must be a Path"),
         ({"disturbance_nt": lambda run: np.zeros(3)}, r"disturbance_nt must give shape \(\d+,\), got \(3,\)"),
     ],
 )

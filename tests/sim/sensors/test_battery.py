@@ -11,11 +11,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.sim.motion.drive import Motion
 from magtwin.sim.sensors.battery import (
     STEP_S,
+    Battery,
     Discharge,
     current_a,
-    discharge,
     open_voltage,
-    sense_battery,
     wheels_energy_j,
 )
 from magtwin.spec.drive import DriveSpec
@@ -25,8 +24,16 @@ DRIVE = DriveSpec()
 STILL = Motion(DRIVE, 0.02, np.zeros(10), np.zeros(10))
 
 
+def battery_of(spec: BatterySpec, on=False, seed: int = 0) -> Battery:
+    return Battery(spec, DRIVE, lambda t: np.full(np.shape(t), on), np.random.default_rng(seed))
+
+
 def discharged(spec: BatterySpec, motion: Motion = STILL, seconds: float = 600.0, on=False) -> Discharge:
-    return discharge(spec, DRIVE, motion, lambda t: np.full(np.shape(t), on), seconds)
+    battery = battery_of(spec, on)
+    times = np.arange(int(seconds / STEP_S) + 2) * STEP_S
+    return battery.draw(
+        wheels_energy_j(battery.spec, DRIVE, motion.at(times)), np.full(len(times) - 1, on), STEP_S
+    )
 
 
 def ramp(v: float, steps: int = 1000) -> Motion:
@@ -46,13 +53,12 @@ def ramp(v: float, steps: int = 1000) -> Motion:
 def test_what_the_pack_loses_is_what_was_drawn_and_its_own_heat(resistance, load, initial, speed, on):
     spec = BatterySpec(resistance_ohm=resistance, load_w=load, initial_fraction=initial)
     pack = discharged(spec, ramp(speed), 120.0, on)
-    current = pack.current_a[1:]
-    drawn = np.cumsum(pack.power_w + resistance * current**2) * STEP_S
-    lost = (initial - pack.fraction[1:]) * spec.capacity_wh * 3600
+    drawn = np.cumsum(pack.power_w + resistance * pack.current_a**2) * STEP_S
+    lost = (initial - pack.fraction) * spec.capacity_wh * 3600
     assert_allclose(lost, drawn, rtol=1e-9, atol=1e-7)
-    assert_allclose(pack.voltage_v[1:] * current, pack.power_w, rtol=1e-12)
-    rest = open_voltage(spec, pack.fraction[:-1])
-    assert_allclose(pack.voltage_v[1:], rest - resistance * current, rtol=1e-12)
+    assert_allclose(pack.voltage_v * pack.current_a, pack.power_w, rtol=1e-12)
+    rest = open_voltage(spec, np.append(initial, pack.fraction[:-1]))
+    assert_allclose(pack.voltage_v, rest - resistance * pack.current_a, rtol=1e-12)
 
 
 def test_the_load_is_that_of_electronics_lidar_and_motors():
@@ -75,7 +81,7 @@ def test_a_turn_on_the_spot_costs_the_way_of_both_wheels():
     turning = Motion(DRIVE, 0.02, np.zeros(500), np.full(500, 1.0))
     times = np.arange(0.0, 10.0, 0.05)
     rim = 1.0 * DRIVE.wheel_separation_m / 2
-    energy = wheels_energy_j(spec, DRIVE, turning, times)
+    energy = wheels_energy_j(spec, DRIVE, turning.at(times))
     assert_allclose(energy, spec.drag_n * rim * 0.05 / spec.motor_efficiency, rtol=1e-9)
 
 
@@ -89,7 +95,7 @@ def test_without_load_nothing_is_lost_and_nothing_sags():
 def test_a_pack_without_resistance_falls_by_load_over_capacity_an_hour():
     spec = BatterySpec(capacity_wh=26.0, load_w=13.0, initial_fraction=0.75, resistance_ohm=0.0)
     pack = discharged(spec, seconds=3600.0)
-    assert pack.fraction[round(3600 / STEP_S)] == pytest.approx(0.25, abs=1e-12)
+    assert pack.fraction[round(3600 / STEP_S) - 1] == pytest.approx(0.25, abs=1e-12)
     assert np.all(np.diff(pack.fraction) < 0)
 
 
@@ -130,29 +136,27 @@ def test_the_discharge_curve_goes_through_its_points_and_from_empty_to_full():
 def test_the_linear_model_is_the_papers():
     spec = BatterySpec(model="linear", load_w=13.0, initial_fraction=0.75, latency_s=0.0, jitter_s=0.0)
     pack = discharged(spec, ramp(0.3), 7000.0, on=True)
-    times = np.arange(len(pack.fraction)) * STEP_S
-    assert_allclose(pack.fraction, np.maximum(0.75 - 0.5 * times / 3600, 0.0), atol=1e-12)
-    assert_allclose(pack.voltage_v, open_voltage(spec, pack.fraction))
+    times = np.arange(1, len(pack.fraction) + 1) * STEP_S
+    assert_allclose(pack.fraction, np.maximum(0.75 - 0.5 * times / 3600, 0.0), atol=1e-10)
+    assert_allclose(pack.voltage_v[1:], open_voltage(spec, pack.fraction[:-1]))
     assert_allclose(pack.current_a * pack.voltage_v, 13.0)
-    t = np.arange(14_000) / 2.0
-    read = sense_battery(dataclasses.replace(spec, rate_hz=2.0), pack, t, np.random.default_rng(0))
-    noise = read["battery_v"] - open_voltage(spec, read["battery_fraction"])
-    assert noise.std() == pytest.approx(0.02, rel=0.03)  # one sigma: 0.6 %
-    assert noise.mean() == pytest.approx(0.0, abs=4 * 0.02 / np.sqrt(len(t)))
 
 
 def test_voltage_has_gaussian_noise_and_charge_and_current_have_none():
     spec = BatterySpec(rate_hz=10.0, voltage_noise_std_v=0.05, latency_s=0.0, jitter_s=0.0)
     pack = discharged(spec, seconds=2000.0)
-    t = np.arange(20_000) / 10.0
-    read = sense_battery(spec, pack, t, np.random.default_rng(0))
-    state = pack.index(t)
-    assert_array_equal(read["battery_fraction"], pack.fraction[state])
-    assert_array_equal(read["battery_a"], pack.current_a[state])
-    noise = read["battery_v"] - pack.voltage_v[state]
+    t = np.arange(1, 20_000) / 10.0
+    read = battery_of(spec).sense(STILL, t)
+    ended = np.floor(t / STEP_S + 1e-9).astype(int) - 1  # the last step that has ended
+    assert_array_equal(read["battery_fraction"], pack.fraction[ended])
+    assert_array_equal(read["battery_a"], pack.current_a[ended])
+    noise = read["battery_v"] - pack.voltage_v[ended]
     assert noise.std() == pytest.approx(0.05, rel=0.03)
+    assert noise.mean() == pytest.approx(0.0, abs=4 * 0.05 / np.sqrt(len(t)))
 
 
-def test_a_state_is_that_of_the_last_step_that_has_ended():
-    pack = discharged(BatterySpec(), seconds=1.0)
-    assert_array_equal(pack.index([-1.0, 0.0, 0.049, 0.05, 0.99, 5.0]), [0, 0, 0, 1, 19, len(pack.power_w)])
+def test_it_begins_at_rest_with_its_charge():
+    spec = BatterySpec(initial_fraction=0.7, voltage_noise_std_v=0.0)
+    read = battery_of(spec, on=True).sense(ramp(0.3), np.array([0.0, 0.049]))
+    assert_array_equal(read["battery_fraction"], 0.7)
+    assert_allclose(read["battery_v"] * read["battery_a"], spec.load_w + spec.lidar_w)

@@ -1,6 +1,7 @@
 """IMU: closed forms of rates and acceleration, its zero, tilt, bias, vibration and noise."""
 
 import numpy as np
+from clocks import held
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.frames import (
@@ -13,8 +14,7 @@ from magtwin.frames import (
     yaw_from_quat,
 )
 from magtwin.sim.motion.drive import Motion
-from magtwin.sim.motion.sampling import held
-from magtwin.sim.sensors.imu import sense_imu
+from magtwin.sim.sensors.imu import Imu
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.sensors import ImuSpec
 
@@ -42,7 +42,7 @@ def generator(seed: int = 0) -> np.random.Generator:
 
 
 def imu_of(spec: ImuSpec, motion: Motion, t, rng, q_base_imu_xyzw=IDENTITY_XYZW):
-    return sense_imu(spec, q_base_imu_xyzw, motion, t, rng)
+    return Imu(spec, q_base_imu_xyzw, rng).sense(motion, t)
 
 
 def test_an_imu_without_noise_reads_a_circles_rates_and_centripetal_acceleration():

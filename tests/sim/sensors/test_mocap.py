@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from clocks import held
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.frames import canonical, quat_conjugate, quat_from_yaw, quat_multiply, rotate
 from magtwin.sim.motion.drive import Motion
-from magtwin.sim.motion.sampling import held
-from magtwin.sim.sensors.mocap import dropouts, sense_mocap
+from magtwin.sim.sensors.mocap import Dropouts, Mocap
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.sensors import MocapSpec
 
@@ -22,7 +22,7 @@ def generator(seed: int = 0) -> np.random.Generator:
 
 
 def test_without_noise_it_is_the_true_pose_at_its_rate():
-    read = sense_mocap(MocapSpec(**QUIET), 0.04, CIRCLE, T, generator())
+    read = Mocap(MocapSpec(**QUIET), 0.04, generator()).sense(CIRCLE, T)
     stamps, latest = held(T, 120.0)
     pose = CIRCLE.at(stamps).pose[latest]
     assert_allclose(read["mocap_p"], np.column_stack([pose[:, :2], np.full(len(T), 0.04)]), atol=1e-12)
@@ -32,11 +32,11 @@ def test_without_noise_it_is_the_true_pose_at_its_rate():
 
 def test_a_body_that_is_taken_to_be_elsewhere_is_seen_there_whatever_its_heading():
     spec = MocapSpec(**QUIET, offset_m=(0.05, -0.02))
-    read = sense_mocap(spec, 0.04, CIRCLE, T, generator())
+    read = Mocap(spec, 0.04, generator()).sense(CIRCLE, T)
     turn, seen = read["mocap_q_xyzw"], read["mocap_p"]
     base = seen + rotate(turn, np.tile([0.05, -0.02, 0.0], (len(T), 1)))
     assert_allclose(
-        base, sense_mocap(MocapSpec(**QUIET), 0.04, CIRCLE, T, generator())["mocap_p"], atol=1e-12
+        base, Mocap(MocapSpec(**QUIET), 0.04, generator()).sense(CIRCLE, T)["mocap_p"], atol=1e-12
     )
 
 
@@ -48,7 +48,7 @@ def test_a_latency_that_drifts_below_0_is_refused():
 def test_its_noise_has_the_spread_of_its_spec():
     spec = MocapSpec(**{**QUIET, "p_noise_std_m": 0.002, "angle_noise_std": 0.01})
     t = np.arange(120 * 50) / 120.0
-    read, true = (sense_mocap(s, 0.0, CIRCLE, t, generator()) for s in (spec, MocapSpec(**QUIET)))
+    read, true = (Mocap(s, 0.0, generator()).sense(CIRCLE, t) for s in (spec, MocapSpec(**QUIET)))
     assert_allclose((read["mocap_p"] - true["mocap_p"]).std(axis=0), 0.002, rtol=0.05)
     off = quat_multiply(quat_conjugate(true["mocap_q_xyzw"]), read["mocap_q_xyzw"])
     assert_allclose((2 * off[:, :3] * np.sign(off[:, 3:])).std(axis=0), 0.01, rtol=0.05)
@@ -57,9 +57,9 @@ def test_its_noise_has_the_spread_of_its_spec():
 
 def test_in_a_dropout_the_last_pose_is_held_and_flagged():
     spec = MocapSpec(**{**QUIET, "dropout_s": 0.5}, dropout_every_s=3.0)
-    read = sense_mocap(spec, 0.0, CIRCLE, T, generator(1))
+    read = Mocap(spec, 0.0, generator(1)).sense(CIRCLE, T)
     stamps, latest = held(T, spec.rate_hz)
-    lost = dropouts(spec, stamps, generator(1).spawn(3)[2])
+    lost = Dropouts(spec, generator(1).spawn(3)[2]).lost(stamps)
     assert 5 < np.count_nonzero(np.diff(lost.astype(int)) == 1) < 40
     assert_array_equal(read["flag_pose_lost"], lost[latest])
     gone = read["flag_pose_lost"]
@@ -73,7 +73,7 @@ def test_in_a_dropout_the_last_pose_is_held_and_flagged():
 def test_dropouts_are_as_often_and_as_long_as_the_spec_says():
     spec = MocapSpec(dropout_every_s=5.0, dropout_s=1.0)
     stamps = np.arange(120 * 20_000) / 120.0
-    lost = dropouts(spec, stamps, generator())
+    lost = Dropouts(spec, generator()).lost(stamps)
     assert not lost[0]
     starts = np.count_nonzero(np.diff(lost.astype(int)) == 1)
     assert starts == pytest.approx(20_000 / 6, rel=0.06)  # some 3,300 cycles: 1.2 % is one sigma
@@ -82,4 +82,4 @@ def test_dropouts_are_as_often_and_as_long_as_the_spec_says():
 
 @pytest.mark.parametrize("none", [{"dropout_every_s": 0.0}, {"dropout_s": 0.0}])
 def test_a_figure_of_0_means_no_dropouts(none):
-    assert not dropouts(MocapSpec(**none), np.arange(10_000) / 10.0, generator()).any()
+    assert not Dropouts(MocapSpec(**none), generator()).lost(np.arange(10_000) / 10.0).any()

@@ -14,7 +14,6 @@ from magtwin.io.provenance import repeat
 from magtwin.learn.models.network import FieldNet
 from magtwin.run.run import COLUMNS
 from magtwin.sim.sensors.model_error import ModelError
-from magtwin.sim.sensors.noise import gauss_markov
 from magtwin.twin import Twin, in_session, open_twin
 
 SD, OFFSET, TIME_S = 120.0, 80.0, 2.0
@@ -65,12 +64,12 @@ def test_where_no_standard_deviation_is_known_there_is_no_error():
 
 @pytest.mark.parametrize("rate_hz", [5.0, 20.0, 135.0])
 def test_the_process_forgets_in_its_time_at_any_rate(rate_hz):
-    white = np.random.default_rng(1).standard_normal(round(2000 * rate_hz))
-    process = ModelError(OFFSET, TIME_S).process(white, rate_hz)
+    process = (
+        ModelError(OFFSET, TIME_S).process(np.random.default_rng(1), rate_hz).next(round(2000 * rate_hz))
+    )
     assert process.std() == pytest.approx(1.0, abs=0.06)  # 500 times of independence
     lag = round(TIME_S * rate_hz)
     assert np.mean(process[lag:] * process[:-lag]) == pytest.approx(np.exp(-1), abs=0.1)
-    assert_array_equal(process, gauss_markov(white, TIME_S, rate_hz))
 
 
 def test_readings_lie_in_their_intervals_on_many_sessions(twin):
@@ -162,7 +161,7 @@ def test_a_vector_of_robots_has_an_error_and_draws_the_rest_as_without(twin):
         rows = []
         for _ in range(3):
             env.step(np.tile([0.2, 0.0], (200, 1)))
-            rows.append({name: values.copy() for name, values in env.fleet.columns.items()})
+            rows.append({name: values.copy() for name, values in env.stepped.columns.items()})
         seen[model_error] = rows
     for a, b in zip(seen[True], seen[False], strict=True):
         assert_array_equal(a["b_total_nt"], b["b_total_nt"])

@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from clocks import held
 from numpy.testing import assert_allclose
 
 from magtwin.frames import yaw_from_quat
 from magtwin.sim.motion.drive import Motion
-from magtwin.sim.motion.sampling import held
-from magtwin.sim.sensors.odometry import sense_odometry
+from magtwin.sim.sensors.odometry import Odometry
 from magtwin.spec.drive import DriveSpec
 
 T = np.arange(135 * 60) / 135.0
@@ -29,7 +29,7 @@ def generator(seed: int = 0) -> np.random.Generator:
 
 
 def test_odometry_without_error_is_the_motion_seen_from_its_start():
-    odometry = sense_odometry(QUIET, CIRCLE, T, generator())
+    odometry = Odometry(QUIET, generator()).sense(CIRCLE, T)
     stamps, latest = held(T, 62.0)
     still = dataclasses.replace(CIRCLE, pose0=(0.0, 0.0, 0.0), poses=None).at(stamps).pose[latest]
     assert_allclose(odometry["odom_p"][:, :2], still[:, :2], atol=1e-9)
@@ -44,7 +44,7 @@ def test_odometry_without_error_is_the_motion_seen_from_its_start():
 def test_the_twist_is_the_mean_one_since_the_last_sample():
     v = np.minimum(0.3, 0.3 * 0.02 * np.arange(3000))  # 0.3 m/s2 up to 0.3 m/s
     motion = Motion(QUIET, 0.02, v, np.zeros(3000))
-    odometry = sense_odometry(QUIET, motion, T, generator())
+    odometry = Odometry(QUIET, generator()).sense(motion, T)
     stamps, latest = held(T, 62.0)
     way = motion.at(np.maximum([stamps[latest], stamps[latest] - 1 / 62], 0).ravel()).pose[:, 0]
     assert_allclose(odometry["odom_v"][:, 0], (way[: len(T)] - way[len(T) :]) * 62, atol=1e-9)
@@ -52,7 +52,7 @@ def test_the_twist_is_the_mean_one_since_the_last_sample():
 
 def test_odometry_drifts_by_the_wheels_errors():
     drive = dataclasses.replace(QUIET, odometry_noise_std=0.002, odometry_scale=(1.01, 0.98))
-    odometry = sense_odometry(drive, STRAIGHT, T, generator(4))
+    odometry = Odometry(drive, generator(4)).sense(STRAIGHT, T)
     left, right = np.array([1.01, 0.98]) * (1 + 0.002 * generator(4).standard_normal(2))
     w = 0.2 * (right - left) / 0.233
     stamps, latest = held(T, 62.0)
@@ -64,7 +64,7 @@ def test_odometry_drifts_by_the_wheels_errors():
 
 def test_wheels_that_slip_are_believed():
     slipping = Motion(QUIET, 0.02, np.full(3000, 0.18), np.zeros(3000), wheel_v=np.full(3000, 0.2))
-    odometry = sense_odometry(QUIET, slipping, T, generator())
+    odometry = Odometry(QUIET, generator()).sense(slipping, T)
     assert odometry["odom_p"][-1, 0] == pytest.approx(0.2 * 60, abs=0.01)
     assert slipping.poses[-1, 0] == pytest.approx(0.18 * 60)
 
@@ -73,7 +73,7 @@ def test_odometry_errors_have_the_spread_of_the_spec():
     drive = dataclasses.replace(QUIET, odometry_noise_std=0.02)
     t = np.array([0.0, 0.05])
     rng = generator()
-    v = [sense_odometry(drive, STRAIGHT, t, rng)["odom_v"][1, 0] for _ in range(2000)]
+    v = [Odometry(drive, rng).sense(STRAIGHT, t)["odom_v"][1, 0] for _ in range(2000)]
     # The mean of two wheels: 0.02 / sqrt 2; a spread from 2000 draws is known to 1.6 %.
     assert np.std(v) / 0.2 == pytest.approx(0.02 / np.sqrt(2), rel=0.06)
 
@@ -83,7 +83,7 @@ def test_noise_of_the_twist_has_the_spread_of_each_axis_and_leaves_the_pose_alon
         QUIET, odometry_v_noise_std=(0.01, 0.02, 0.03), odometry_w_noise_std=(0.1, 0.2, 0.3)
     )
     t = np.arange(62 * 60) / 62.0
-    a, b = (sense_odometry(drive, CIRCLE, t, generator()) for drive in (QUIET, noisy))
+    a, b = (Odometry(drive, generator()).sense(CIRCLE, t) for drive in (QUIET, noisy))
     for name, sd in (("odom_v", [0.01, 0.02, 0.03]), ("odom_w", [0.1, 0.2, 0.3])):
         assert_allclose((b[name] - a[name]).std(axis=0), sd, rtol=0.06)  # 3,720 draws: 1.2 % is one sigma
     for name in ("odom_p", "odom_q_xyzw"):

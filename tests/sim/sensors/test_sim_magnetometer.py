@@ -9,12 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.signal import welch
 
 from magtwin.errors import InputError
-from magtwin.sim.sensors.magnetometer import (
-    lost_in,
-    sense_magnetometer,
-    sensor_noise_nt,
-    vector_gain,
-)
+from magtwin.sim.sensors.magnetometer import Magnetometer, lost_in, vector_gain
 from magtwin.spec.sensors import MagnetometerSpec
 
 RATE_HZ = 135.0
@@ -25,7 +20,9 @@ FLAT = np.full(N, np.linalg.norm(DOWN[0]))
 
 
 def read(spec, b=FLAT, vector=DOWN, *, seed=0, rate_hz=RATE_HZ, steep=False):
-    return sense_magnetometer(spec, b, vector, np.random.default_rng(seed), rate_hz=rate_hz, steep=steep)
+    sensor = Magnetometer(spec, rate_hz, np.random.default_rng(seed))
+    axes = sensor.axes(vector, steep=steep)
+    return {**sensor.read(b, vector), "b_vector_measured_nt": axes}
 
 
 def scalar(spec, b=FLAT, vector=DOWN, **options):
@@ -40,7 +37,7 @@ def wave(frequency_hz: float, count: int = N) -> np.ndarray:
 
 
 def spectrum(spec: MagnetometerSpec, count: int, rate_hz: float, window: int):
-    noise = sensor_noise_nt(spec, count, rate_hz, np.random.default_rng(7))
+    noise = Magnetometer(spec, rate_hz, np.random.default_rng(7)).noisy(np.zeros(count))
     return welch(noise, rate_hz, nperseg=window)
 
 

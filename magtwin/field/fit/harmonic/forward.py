@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.field.sources.dipole_sums import dipole_field_and_gradient_nt, moment_rows
+from magtwin.field.sources.compiled_dipoles import dipole_field_and_gradient_nt, moment_rows
 from magtwin.field.sources.harmonic import HarmonicField
 
 Array = NDArray[np.float64]

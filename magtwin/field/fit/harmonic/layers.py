@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.field.survey.bins import means
 from magtwin.field.survey.bins import spacing_m as survey_spacing_m
-from magtwin.field.survey.means import means
 from magtwin.field.survey.readings import Readings
 
 Array = NDArray[np.float64]

@@ -7,11 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.field.fit.harmonic.forward import SOFT, Reading
-from magtwin.field.fit.harmonic.hyperparameters import Figures
-from magtwin.field.fit.harmonic.model import HarmonicModel, widened
+from magtwin.field.fit.harmonic.model import HarmonicModel, between, surveyed, widened
 from magtwin.field.fit.harmonic.posterior import Posterior
-from magtwin.field.fit.harmonic.problem import Problem
-from magtwin.field.survey.headings import between, surveyed
+from magtwin.field.fit.harmonic.problem import Figures, Problem
 from magtwin.field.survey.readings import Readings
 from magtwin.verdict import Z_90
 

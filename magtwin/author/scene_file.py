@@ -1,0 +1,319 @@
+"""A scene as a TOML file: what its tables hold, and the Scene that follows from them."""
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from magtwin.author.robot import RobotSettings, build_robot
+from magtwin.author.room import (
+    FurnitureTable,
+    asset_named,
+    check_name,
+    check_names,
+    check_start,
+    lab_of,
+    no_map,
+    obstacles_in,
+    placed_furniture,
+)
+from magtwin.author.scene import check_things
+from magtwin.errors import InputError
+from magtwin.files import existing, from_table, read_toml, refused_at, sha256
+from magtwin.path import resolve_path
+from magtwin.path.room import Room, path_in
+from magtwin.spec.base import ZERO3, Vec3
+from magtwin.spec.furniture import FurnitureSpec
+from magtwin.spec.lab import LabSpec, SurveySpec
+from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.robot import PlacedRobot, RobotSpec
+from magtwin.spec.scene import Scene
+from magtwin.usd.earth import checked
+from magtwin.usd.robot import load_robot
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RobotTable(RobotSettings):
+    """The robot: an asset, or a URDF and what a URDF cannot say. For several robots, write [[robot]] each."""
+
+    name: str = ""
+    """Name of its prim, required for each of several robots. With urdf, the name that the URDF must give."""
+
+    start: Vec3 | None = None
+    """Where it stands at first: x [m], y [m] and yaw [rad]. By default that of the scene or, of several
+    robots, where its path begins. Refused inside of furniture; the refusal names the nearest free place."""
+
+    path: str = ""
+    """What it drives unless told otherwise: the name of a path, "random", or a CSV file of x,y. Default:
+    figure8."""
+
+    asset: Path | None = None
+    """Robot that ships, by its name ("turtlebot4"), or USD file made by `magtwin robot`."""
+
+    urdf: Path | None = None
+    """URDF or xacro file to convert, in place of an asset."""
+
+    network: Path | None = None
+    """Weights that predict the robot's disturbance, for a neural magnetometer."""
+
+    kind: Literal["physical", "neural", "map-only"] | None = None
+    """What its magnetometer reads: the exact field, the map and the network's prediction, or the map. By
+    default neural with a network, else physical."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _EarthTable(EarthFieldSpec):
+    """The Earth's field, uniform over the room. It follows from place and date by the IGRF-14, to 2030."""
+
+    b_world_nt: Vec3 = ZERO3
+    """Field in world axes [nT], where it was measured. Unless measured is true, it must be the model's within
+    1 nT."""
+
+    @property
+    def spec(self) -> EarthFieldSpec:
+        """What it says, its field filled in or checked."""
+        return checked(EarthFieldSpec(**vars(self)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SourcesTable:
+    """Furniture and sources in a file of their own."""
+
+    file: Path
+    """TOML with [[furniture]] and [[source]] tables, which are added to those of the scene."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFile:
+    """A scene's TOML; docs/scenes.md is made from it."""
+
+    name: str
+    """Name of the scene and of its root layer: any that a file can have on every system."""
+
+    robot: tuple[_RobotTable, ...]
+
+    map: Path | None = None
+    """USD layer of the magnetic map. By default the scene is surveyed, see above."""
+
+    start: Vec3 = ZERO3
+    """Where the robot stands at first: x [m], y [m] and yaw [rad]. A path begins where it begins."""
+
+    seed: int = 0
+    """Seed of the magnetization of furniture that gives none, and of the survey's noise."""
+
+    lab: LabSpec = field(default_factory=LabSpec)
+    earth: _EarthTable | None = None
+    survey: SurveySpec | None = None
+    sources: _SourcesTable | None = None
+    source: tuple[SourceSpec, ...] = ()
+    furniture: tuple[FurnitureTable, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise InputError(f"seed must not be below 0, got {self.seed}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SourceFile:
+    """A TOML of what is magnetised, one [[source]] or [[furniture]] each."""
+
+    source: tuple[SourceSpec, ...] = ()
+    furniture: tuple[FurnitureTable, ...] = ()
+
+
+def scene_from_toml(
+    path: str | os.PathLike[str],
+    *,
+    map_layer: str | os.PathLike[str] | None = None,
+    network: str | os.PathLike[str] | None = None,
+    workshop: str | os.PathLike[str] | None = None,
+    inputs_of: Callable[[Path], tuple[str, ...]] = lambda weights: (),
+    survey_of: Callable[[Scene, SurveySpec, int, Obstacles], Path] | None = None,
+) -> Scene:
+    """The scene that a TOML describes, as scenes/lab.toml does; docs/scenes.md has every key.
+
+    Args:
+        path: The TOML; files that it names are taken from its folder.
+        map_layer: Map to use in place of the one that it names. The Earth's field, sources and furniture stay
+            as the TOML has them; `magtwin.twin.scene_from_toml` refuses a map that contradicts them.
+        network: Weights to use in place of those that it names.
+        workshop: Folder in which the asset is built of a robot that the TOML names by its URDF; a
+            self-contained scene copies it from there.
+        inputs_of: Gives the names of the inputs of a weights file, which this room cannot read; see
+            `magtwin.twin.scene_from_toml`. Without it the scene leaves them open.
+        survey_of: Surveys a scene that names no map, whose `map_layer` is not there yet, and gives the map
+            layer; called with the scene, how to survey it, the seed and what stands in the room.
+
+    Raises:
+        InputError: A key is misspelt or missing, or a file is not there; with file and line.
+    """
+    table = read_toml(path)
+    alone = isinstance(table.get("robot"), dict)  # [robot], not [[robot]]
+    if alone:
+        table = table | {"robot": [table["robot"]]}
+    given = from_table(SceneFile, table, path)
+    if not given.robot:
+        raise InputError(f"{path}: has no robot; add a [robot] table")
+    try:
+        check_name(given.name)
+    except InputError as error:
+        raise refused_at(path, "name", str(error)) from error
+    layer = Path(map_layer).resolve() if map_layer is not None else given.map
+    lab = lab_of(given.lab, table, path, None if layer is None else existing(layer, "map layer"))
+    pieces = placed_furniture(given.furniture, lab, path, seed=given.seed)
+    sources = given.source
+    if given.sources:
+        listed = read_sources(given.sources.file, seed=given.seed, lab=lab)
+        sources, pieces = (*listed[0], *sources), (*listed[1], *pieces)
+    if layer is None and (given.earth is None or survey_of is None):
+        raise no_map(path, furnished=bool(pieces or sources))
+    check_names(pieces, path)
+    standing = obstacles_in(lab, pieces)
+    robots: list[PlacedRobot] = []
+    for number, (one, keys) in enumerate(zip(given.robot, table["robot"], strict=True)):
+        where = f"{path}: [robot]" if alone else f"{path}: [[robot]] {one.name!r}"
+        robot = _robot(one, keys, where, workshop, named=not alone)
+        robot = _with_network(robot, one, network, where, inputs_of)
+        way = _way(one.path, Path(path).parent, where)
+        start, of_robot = one.start, True
+        if start is None:
+            of_robot = not (alone or (not robots and "start" in table))
+            room = Room(lab.floor_m, robot.footprint_radius_m, standing)
+            start = _beginning(way, room) if of_robot else given.start
+        robots.append(PlacedRobot(robot=robot, start=start, path=way))
+        try:
+            check_start(robots[-1], lab, standing)
+        except InputError as error:
+            section = {"section": "robot", "number": number} if of_robot else {}
+            raise refused_at(path, "start", str(error), **section) from error  # type: ignore[arg-type]
+    scene = Scene(
+        name=given.name,
+        map_layer=Path("surveyed") if layer is None else existing(layer, "map layer"),
+        map_sha256="" if layer is None else sha256(layer),
+        robot=robots[0].robot,
+        lab=lab,
+        earth=_earth(given.earth, path) if given.earth else None,
+        sources=sources,
+        furniture=pieces,
+        start=robots[0].start,
+        path=robots[0].path,
+        others=tuple(robots[1:]),
+    )
+    if layer is None and survey_of is not None:
+        check_things(scene)
+        try:
+            surveyed = survey_of(scene, given.survey or SurveySpec(), given.seed, standing)
+        except InputError as error:
+            raise InputError(f"{path}: cannot be surveyed: {error}") from error
+        scene = replace(scene, map_layer=surveyed, map_sha256=sha256(surveyed))
+    return scene
+
+
+def _robot(
+    table: _RobotTable,
+    keys: Mapping[str, Any],
+    where: str,
+    workshop: str | os.PathLike[str] | None,
+    *,
+    named: bool,
+) -> RobotSpec:
+    """The robot of a table of a scene's TOML, built from its URDF where it names one, under its name."""
+    if named and not table.name:
+        raise InputError(f'{where} needs name = "NAME", that of its prim')
+    if table.asset is not None and table.urdf is None:
+        known = {"asset", "network", "kind", "start", "path", *(["name"] if named else [])}
+        if others := sorted(set(keys) - known):
+            raise InputError(f"{where} {others[0]} goes with urdf; the asset says it already")
+        robot = load_robot(asset_named(table.asset, keys["asset"], where))
+        return replace(robot, name=table.name) if named else robot
+    if table.urdf is None or table.asset is not None:
+        raise InputError(f'{where} needs asset = "FILE.usda" or urdf = "FILE.urdf", one of the two')
+    if workshop is None:
+        raise InputError(f"{where} names a URDF; name a workshop, a folder to build the robot in")
+    settings = RobotSettings(**{f.name: getattr(table, f.name) for f in fields(RobotSettings)})
+    if named:
+        settings = replace(settings, name="")  # takes any of the URDF's own
+    folder = Path(workshop) / table.name if named else Path(workshop)
+    asset = folder / f"{table.urdf.name.split('.')[0]}.usda"
+    asset.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        build_robot(table.urdf, settings, asset)
+    except InputError as error:
+        raise InputError(f"{where} {error}") from error
+    robot = load_robot(asset)
+    return replace(robot, name=table.name) if named else robot
+
+
+def _with_network(
+    robot: RobotSpec,
+    table: _RobotTable,
+    network: str | os.PathLike[str] | None,
+    where: str,
+    inputs_of: Callable[[Path], tuple[str, ...]],
+) -> RobotSpec:
+    """A robot with the weights of its table, or those given in their place, and the kind that it says."""
+    weights = Path(network).resolve() if network is not None else table.network
+    if weights is not None:
+        weights = existing(weights, "weights file")
+        magnetometer = replace(
+            robot.magnetometer,
+            kind="neural",
+            network=weights,
+            network_sha256=sha256(weights),
+            inputs=inputs_of(weights),
+        )
+        robot = replace(robot, magnetometer=magnetometer)
+    if table.kind is not None and network is None:
+        robot = replace(robot, magnetometer=replace(robot.magnetometer, kind=table.kind))
+    if robot.magnetometer.kind == "neural" and robot.magnetometer.network is None:
+        raise InputError(f'{where} kind = "neural" needs network = "FILE" beside it')
+    return robot
+
+
+def _way(path: str, folder: Path, where: str) -> str | Path:
+    """What a robot is said to drive: a name, or a file from the TOML's folder; refused if it is neither."""
+    if path in ("", "random"):
+        return path
+    file = (folder / path).resolve()
+    named = not Path(path).suffix and not file.exists()
+    try:
+        resolve_path(path if named else file)
+    except InputError as error:
+        raise InputError(f"{where} path: {error}") from error
+    return path if named else file
+
+
+def _beginning(way: str | Path, room: Room) -> Vec3:
+    """Where a path begins and whither it goes, so that robots of one scene do not stand in each other."""
+    if way in ("", "random"):
+        return ZERO3
+    path = path_in(room, way)
+    x, y = path.p_xy[0].tolist()
+    return x, y, float(path.heading(0.0))
+
+
+def _earth(table: _EarthTable, path: str | os.PathLike[str]) -> EarthFieldSpec:
+    try:
+        return table.spec
+    except InputError as error:
+        raise InputError(f"{path}: [earth] {error}") from error
+
+
+def read_sources(
+    path: str | os.PathLike[str], *, seed: int = 0, lab: LabSpec | None = None
+) -> tuple[tuple[SourceSpec, ...], tuple[FurnitureSpec, ...]]:
+    """The sources and the furniture of a TOML such as maps/lab/sources.toml.
+
+    Args:
+        path: The TOML.
+        seed: Seed of the magnetization of furniture that gives none.
+        lab: Room whose slab the furniture must stand on; None does not check.
+
+    Raises:
+        InputError: A key is misspelt or missing, a figure is out of range, or a piece stands beside the
+            slab; with file and line.
+    """
+    listed = from_table(_SourceFile, read_toml(path), path)
+    return listed.source, placed_furniture(listed.furniture, lab, path, seed=seed)

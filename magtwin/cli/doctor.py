@@ -1,0 +1,133 @@
+"""`magtwin doctor`: what is installed, and what each missing extra would add."""
+
+import re
+import shutil
+import sys
+from ctypes.util import find_library
+from importlib.metadata import PackageNotFoundError, metadata, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from magtwin.cli.app import app
+from magtwin.cli.terminal import Done
+
+ADDS = {
+    "decomposition": "convex decomposition of collision meshes (magtwin robot --collision decomposition)",
+    "gym": "a Gymnasium environment (magtwin.gym)",
+    "onnx": "networks as ONNX (magtwin network export, magtwin export)",
+    "pandas": "runs as pandas tables (Run.to_pandas)",
+    "physics": "driving in Newton (magtwin run --engine newton)",
+    "polars": "runs as polars tables (Run.to_polars)",
+    "ros": "ROS 2 nodes on a machine without ROS (magtwin ros)",
+    "simready": "NVIDIA's SimReady profiles (magtwin validate --against simready)",
+    "validate": "NVIDIA's asset validator (magtwin validate --against nvidia)",
+    "xarray": "runs as xarray datasets (Run.to_xarray)",
+}
+"""What each extra is for."""
+
+PACKAGES = (
+    "usd-core",
+    "rerun-sdk",
+    "torch",
+    "numpy",
+    "scipy",
+    "numba",
+    "pyarrow",
+    "rosbags",
+    "pyvista",
+    "cyclopts",
+)
+"""Packages whose version matters in a report of a fault."""
+
+DRIVERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
+"""Folders in which Vulkan drivers are listed."""
+
+
+@app.command
+def doctor() -> Done:
+    """List what is installed, what each missing extra would add, and how to install it."""
+    from magtwin.report import Report
+
+    found = diagnose()
+    extras = {name: _line(extra) for name, extra in found["extras"].items()}
+    return Done(
+        Report(
+            f"magtwin {found['magtwin']}, Python {found['python']}",
+            metadata={"packages": found["packages"], "tools": found["tools"], "extras": extras},
+        ),
+        data=found,
+    )
+
+
+def diagnose() -> dict[str, Any]:
+    """Versions, tools and extras of this installation, as a table for JSON."""
+    tools = {
+        "Rerun viewer": _found(shutil.which("rerun"), "pip install rerun-sdk"),
+        "usdview": _found(
+            shutil.which("usdview"), "a build of OpenUSD; magtwin view opens a window without it"
+        ),
+        "Vulkan": _found(
+            _vulkan(), "apt install mesa-vulkan-drivers libvulkan1; pictures of recordings need it"
+        ),
+        "Newton": _found(_version("newton"), "pip install 'magtwin[physics]'"),
+        "ROS 2, rclpy": _found("installed" if find_spec("rclpy") else "", "source a ROS 2 installation"),
+        "ROS 2, cyclonedds": _found(_version("cyclonedds"), "pip install 'magtwin[ros]'"),
+        "NVIDIA validator": _found(_version("usd-validation-nvidia"), "pip install 'magtwin[validate]'"),
+        "SimReady validator": _found(_version("simready-validate"), "make simready, in a checkout"),
+    }
+    from magtwin.version import __version__
+
+    return {
+        "magtwin": __version__,
+        "python": sys.version.split()[0],
+        "packages": {name: _version(name) or "not installed" for name in PACKAGES},
+        "tools": tools,
+        "extras": _extras(),
+    }
+
+
+def _extras() -> dict[str, dict[str, Any]]:
+    """Each extra: which of its packages are missing, what it adds and how to install it."""
+    try:
+        required = metadata("magtwin").get_all("Requires-Dist") or []
+    except PackageNotFoundError:  # run from a source tree
+        required = []
+    extras: dict[str, dict[str, Any]] = {}
+    for name, adds in ADDS.items():
+        lines = [line for line in required if re.search(rf"extra == ['\"]{name}['\"]", line)]
+        packages = [match.group() for line in lines if (match := re.match(r"[\w.-]+", line))]
+        missing = [package for package in packages if not _version(package)]
+        extras[name] = {
+            "installed": bool(packages) and not missing,
+            "missing": missing,
+            "adds": adds,
+            "install": f"pip install 'magtwin[{name}]'",
+        }
+    return extras
+
+
+def _line(extra: dict[str, Any]) -> str:
+    return (
+        f"installed: {extra['adds']}"
+        if extra["installed"]
+        else f"missing: {extra['adds']}; {extra['install']}"
+    )
+
+
+def _found(what: str | None, otherwise: str) -> str:
+    return what or f"not found; {otherwise}"
+
+
+def _version(package: str) -> str:
+    """Version of an installed package, "" if it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def _vulkan() -> str:
+    """Vulkan drivers of this machine, "" if there are none or no loader."""
+    drivers = [file.stem for folder in DRIVERS for file in sorted(Path(folder).glob("*.json"))]
+    return ", ".join(drivers) if find_library("vulkan") else ""

@@ -1,0 +1,1 @@
+"""Commands that build data sets, and that train, evaluate and export predictors."""

@@ -1,0 +1,89 @@
+"""`magtwin compensate`: the platform's field taken out of a run's readings, by Tolles and Lawson's model."""
+
+from pathlib import Path
+
+from cyclopts import App
+
+from magtwin.cli.app import app
+from magtwin.cli.options import Flag, Force
+from magtwin.cli.terminal import Done, check_output, step
+
+compensate_app = App(name="compensate", help="Take the platform's field out of a run (Tolles-Lawson).")
+app.command(compensate_app)
+
+
+@compensate_app.command
+def fit(
+    run: Path,
+    *,
+    out: Path,
+    terms: str = "permanent,induced6,eddy9",
+    band_hz: tuple[float, float] = (0.1, 0.9),
+    no_band: Flag = False,
+    penalty: float | None = None,
+    truth: Flag = False,
+    force: Force = False,
+) -> Done:
+    """Fit the model to a calibration run: one that turns about in a field that is uniform or well mapped.
+
+    A map that the same robot surveyed in several headings holds the platform's field already, so what is
+    left to fit is small; survey without the platform, or calibrate outdoors.
+
+    Parameters
+    ----------
+    run
+        Run with field vectors (.parquet).
+    out
+        Model to write, a .json file.
+    terms
+        Terms, comma between: permanent; induced3, induced5 or induced6; eddy3, eddy8 or eddy9; bias, which
+        wants --no-band.
+    band_hz
+        Pass band of the manoeuvres [Hz].
+    no_band
+        Fit all frequencies, slow ones too.
+    penalty
+        Penalty of the regression; by cross-validation unless given.
+    truth
+        Take the directions from the exact field of a simulated run, b_vector_nt, in place of what the vector
+        axes read, b_vector_measured_nt: shows what their errors cost.
+    """
+    from magtwin.files import output
+    from magtwin.io.tables import read_parquet
+    from magtwin.learn.compensation.tolles_lawson import fit_run
+
+    check_output(out, (".json",), "a Tolles-Lawson model", force=force)
+    names = tuple(name.strip() for name in terms.split(",") if name.strip())
+    step("Fitting the model")
+    model = fit_run(
+        read_parquet(run),
+        vector="exact" if truth else "measured",
+        terms=names,
+        band_hz=None if no_band else band_hz,
+        ridge=penalty,
+    )
+    with output(out, force=force) as aside:
+        model.save(aside)
+    return Done(model.report(f"Tolles-Lawson model of {run}"), out)
+
+
+@compensate_app.command
+def apply(run: Path, model: Path, *, out: Path, force: Force = False) -> Done:
+    """Take what a fitted model explains out of a run's b_measured_nt.
+
+    Parameters
+    ----------
+    run
+        Run with field vectors (.parquet).
+    model
+        Model that `magtwin compensate fit` wrote (.json).
+    out
+        Compensated run to write, a .parquet file.
+    """
+    from magtwin.io.tables import read_parquet, write_parquet
+    from magtwin.learn.compensation.tolles_lawson import TollesLawson, compensate_run
+
+    check_output(out, (".parquet",), "a run", force=force)
+    compensated, report = compensate_run(read_parquet(run), TollesLawson.load(model))
+    write_parquet(compensated, out, force=force)
+    return Done(report, out)

@@ -1,0 +1,54 @@
+"""`magtwin net`: work with networks."""
+
+from pathlib import Path
+
+from cyclopts import App
+
+from magtwin.cli.app import app
+from magtwin.cli.options import Force, Licence
+from magtwin.cli.terminal import Done, check_output, step
+
+net_app = App(name="network", help="Convert and export networks.")
+app.command(net_app)
+
+
+@net_app.command(name="convert")
+def net_convert(pth: Path, *, out: Path, licence: Licence = "", force: Force = False) -> Done:
+    """Convert a released checkpoint (.pth) to safetensors, executing nothing of what it holds.
+
+    Parameters
+    ----------
+    pth
+        Checkpoint with the weights and the two scalers.
+    out
+        File to write, .safetensors.
+    """
+    from magtwin.learn.models.network import convert
+
+    check_output(out, (".safetensors",), "a network", force=force)
+    step("Reading the checkpoint")
+    net = convert(pth, out, licence=licence, force=force)
+    return Done(net.report(str(out)), out)
+
+
+@net_app.command(name="export")
+def net_export(weights: Path, *, out: Path, force: Force = False) -> Done:
+    """Export a network as ONNX, which runs in onnxruntime without torch and without magtwin.
+
+    Its input is float64 features in their units, as magtwin info lists them; its outputs are the disturbance
+    and the standard deviation of its error [nT]. Scalers are inside. What onnxruntime gives is held against
+    torch before the file is written. Needs the extra onnx.
+
+    Parameters
+    ----------
+    weights
+        Weights, .safetensors or .pth.
+    out
+        File to write, .onnx.
+    """
+    from magtwin.learn.inference.onnx import export_onnx
+
+    check_output(out, (".onnx",), "an ONNX file", force=force)
+    step("Exporting the network")
+    report = export_onnx(weights, out, force=force)
+    return Done(report, out)

@@ -1,0 +1,243 @@
+"""`magtwin map import`, `fit`, `validate` and `survey`: surveys to maps."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from magtwin.cli.maps.map import (
+    LAYERS,
+    Earth,
+    FieldTopic,
+    KeepStuck,
+    Kernel,
+    PoseTopic,
+    Sources,
+    headings_rad,
+    map_app,
+)
+from magtwin.cli.options import Force, Licence, Seed
+from magtwin.cli.terminal import Done, check_output, progress, step
+from magtwin.io.surveys.about import About
+from magtwin.io.surveys.columns import Columns
+
+TableColumns = Annotated[Columns, Parameter(name="*")]
+AboutSurvey = Annotated[About, Parameter(name="*")]
+COLUMNS, ABOUT = Columns(), About()
+
+
+@map_app.command(name="import")
+def map_import(
+    *sources: Sources,
+    out: Path,
+    about: AboutSurvey = ABOUT,
+    keep_stuck: KeepStuck = False,
+    pose_topic: PoseTopic = None,
+    field_topic: FieldTopic = None,
+    columns: TableColumns = COLUMNS,
+    force: Force = False,
+) -> Done:
+    """Import a survey as a map layer, if it is gridded, or as a file of readings.
+
+    Stuck readings are found and masked. Outliers are reported and kept.
+
+    Parameters
+    ----------
+    sources
+        Folder of 0_map.csv, 90_map.csv, ...: rows of x [m], y [m], heading [rad], field. Or tables (CSV,
+        Parquet), runs or rosbag2 folders; each is one run. A pattern in quotes ('drives/*.parquet') or a
+        folder of Parquet files stands for all its files. A plus joins files whose rows belong together:
+        time.csv+place.csv+field.csv.
+    out
+        Map layer (.usdc) or readings (.parquet) to write.
+    """
+    from magtwin.io.surveys.maps import import_survey
+
+    check_output(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
+    step("Reading the survey")
+    report = import_survey(
+        sources,
+        out,
+        columns=columns,
+        about=about,
+        keep_stuck=keep_stuck,
+        pose_topic=pose_topic,
+        field_topic=field_topic,
+        force=force,
+    )
+    return Done(report, out)
+
+
+@map_app.command(name="fit")
+def map_fit(
+    *sources: Sources,
+    out: Path,
+    method: Literal["trilinear", "cubic", "gp", "harmonic"] = "harmonic",
+    kernel: Kernel = None,
+    earth: Earth = None,
+    spacing_m: float | None = None,
+    headings_deg: str | None = None,
+    about: AboutSurvey = ABOUT,
+    keep_stuck: KeepStuck = False,
+    pose_topic: PoseTopic = None,
+    field_topic: FieldTopic = None,
+    columns: TableColumns = COLUMNS,
+    force: Force = False,
+) -> Done:
+    """Fit a model to a survey and write its map with variance.
+
+    Parameters
+    ----------
+    sources
+        Readings of any form that `magtwin map import` takes, and its .parquet files.
+    out
+        Map layer to write (.usdc).
+    method
+        trilinear interpolation between nodes, cubic, a Gaussian process (gp), or the field of equivalent
+        dipoles with the robot's own field (harmonic).
+    spacing_m
+        Spacing of the map's nodes [m]. Default: the survey's for trilinear, else the widest that costs almost
+        no accuracy; the report has the interpolation error.
+    headings_deg
+        Headings of the map [deg], such as 0,90,180,270. Default: the survey's for trilinear, else the fewest
+        of 4, 6, 8, 12 or 24 that cost almost no accuracy.
+    """
+    from magtwin.io.surveys.maps import fit_survey
+
+    check_output(out, LAYERS, "a map layer", force=force)
+    angles = None if headings_deg is None else headings_rad(headings_deg)
+    with progress(f"Fitting {method}") as advance:
+        report = fit_survey(
+            sources,
+            out,
+            method=method,
+            kernel=kernel,
+            earth=earth,
+            spacing_m=spacing_m,
+            headings_rad=angles,
+            columns=columns,
+            about=about,
+            keep_stuck=keep_stuck,
+            pose_topic=pose_topic,
+            field_topic=field_topic,
+            progress=advance,
+            force=force,
+        )
+    return Done(report, out)
+
+
+@map_app.command(name="validate")
+def map_validate(
+    *sources: Sources,
+    method: list[Literal["trilinear", "cubic", "gp", "harmonic"]] | None = None,
+    split: Literal["checkerboard", "heading", "run", "block"] | None = None,
+    kernel: Kernel = None,
+    earth: Earth = None,
+    within_m: float | None = None,
+    keep_stuck: KeepStuck = False,
+    pose_topic: PoseTopic = None,
+    field_topic: FieldTopic = None,
+    columns: TableColumns = COLUMNS,
+) -> Done:
+    """Measure how well each method predicts readings that were left out of its fit.
+
+    Parameters
+    ----------
+    sources
+        Readings of any form that `magtwin map import` takes, and its .parquet files.
+    method
+        Method to validate. May be repeated. Default: all methods.
+    split
+        What is left out at a time: every other node, one heading, one run, or blocks of the floor. Default:
+        nodes of a gridded survey, runs if there are several, else blocks.
+    within_m
+        Count only readings this near to a reading that was fitted [m].
+    """
+    from magtwin.io.surveys.maps import validate_methods
+
+    with progress("Validating") as advance:
+        report = validate_methods(
+            sources,
+            methods=method,
+            split=split,
+            kernel=kernel,
+            earth=earth,
+            within_m=within_m,
+            progress=advance,
+            columns=columns,
+            keep_stuck=keep_stuck,
+            pose_topic=pose_topic,
+            field_topic=field_topic,
+        )
+    return Done(report)
+
+
+@map_app.command(name="survey")
+def map_survey(
+    scene: Path,
+    *,
+    out: Path,
+    spacing_m: float = 0.25,
+    headings_deg: str = "0,90,180,270",
+    readings: int = 135,
+    height_m: float | None = None,
+    heading_error_deg: float = 2.0,
+    position_error_m: float = 0.01,
+    seed: Seed = 0,
+    name: str | None = None,
+    licence: Licence = "",
+    created: str | None = None,
+    force: Force = False,
+) -> Done:
+    """Survey a scene as its robot would, node by node, with sensor noise and pose errors.
+
+    The field is that of the stage as it is now: move a desk in it, survey again, and `magtwin map diff` finds
+    the change. The map's variance includes noise and pose errors. Nodes where the sensor loses lock or the
+    robot cannot stand are masked.
+
+    Parameters
+    ----------
+    scene
+        USD stage with a known Earth field.
+    out
+        Map layer (.usdc) or readings (.parquet) to write.
+    spacing_m
+        Spacing of the nodes [m].
+    headings_deg
+        Headings of the robot at each node [deg], ascending.
+    readings
+        Readings averaged at each node; the shipped map has 135, one second of them.
+    height_m
+        Height of the sensor above the floor [m]. Default: the robot's.
+    heading_error_deg
+        Standard deviation of the robot's heading about the node's [deg]. Readings record the heading; a map
+        takes the node's. 0 surveys the scene without this error.
+    position_error_m
+        Standard deviation of the robot's position about the node, along x and y [m]. The node is recorded.
+    name
+        Name of the map. Default: the name of the output.
+    created
+        Date of the survey, YYYY-MM-DD. Default: that of the Earth's field.
+    """
+    from magtwin.io.surveys.maps import survey_scene
+
+    check_output(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
+    angles = headings_rad(headings_deg)
+    with progress(f"Surveying {scene.name}", "headings") as advance:
+        report = survey_scene(
+            scene,
+            out,
+            spacing_m=spacing_m,
+            headings_rad=angles,
+            readings=readings,
+            height_m=height_m,
+            heading_error_deg=heading_error_deg,
+            position_error_m=position_error_m,
+            seed=seed,
+            name=name,
+            licence=licence,
+            created=created,
+            progress=advance,
+            force=force,
+        )
+    return Done(report, out)

@@ -1,0 +1,153 @@
+"""`magtwin map info`, `plot`, `diff`, `upward`, `export` and `epochs`: commands on maps that exist."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from magtwin.cli.maps.map import LAYERS, PICTURES, Date, MapFile, Sources, headings_rad, map_app
+from magtwin.cli.options import Force
+from magtwin.cli.terminal import Done, check_output, print_report, step
+
+
+@map_app.command(name="plot")
+def map_plot(
+    file: MapFile,
+    *,
+    out: Path,
+    quantity: Literal["field", "gradient", "variance", "mask", "headings"] = "field",
+    headings_deg: str | None = None,
+    date: Date = None,
+    force: Force = False,
+) -> Done:
+    """Draw a map as filled contours, one panel per heading.
+
+    Parameters
+    ----------
+    out
+        Picture to write (.png or .svg).
+    quantity
+        The field, its gradient along the floor, its standard deviation (variance), the masked nodes (mask),
+        or each heading minus the mean of all headings (headings).
+    headings_deg
+        Headings to draw [deg], such as 0,90,180,270. Default: the map's, or four of them if it has more than
+        eight.
+    """
+    from magtwin.figures.maps import plot_map
+    from magtwin.io.surveys.maps import open_map
+
+    check_output(out, PICTURES, "a picture", force=force)
+    angles = None if headings_deg is None else headings_rad(headings_deg)
+    step("Drawing the map")
+    plot_map(open_map(file, date), out, what=quantity, headings=angles, force=force)
+    return Done(wrote=out)
+
+
+@map_app.command(name="info")
+def map_info(file: MapFile, *, date: Date = None) -> Done:
+    """Print a map's metadata: field, uncertainty, method, sources, licence, frame, height and dates."""
+    from magtwin.field.maps.epochs import at_date
+    from magtwin.field.maps.statistics import map_metadata
+    from magtwin.io.surveys.maps import open_map
+    from magtwin.usd.maps import load_epochs
+
+    if file.is_dir():
+        return Done(map_metadata(open_map(file, date)))
+    epochs = load_epochs(file)
+    return Done(map_metadata(epochs[-1] if date is None else at_date(epochs, date), epochs))
+
+
+@map_app.command(name="diff")
+def map_diff(before: Path, after: Path, *, out: Path | None = None, force: Force = False) -> Done:
+    """Report what changed from one survey to another: where, how much, and how significant it is.
+
+    Parameters
+    ----------
+    before
+        The earlier map: a layer or stage, or a folder of survey CSVs.
+    after
+        The later map.
+    out
+        Picture to write (.png or .svg).
+    """
+    from magtwin.field.maps.difference import difference
+    from magtwin.io.surveys.maps import open_map
+
+    check_output(out, PICTURES, "a picture", force=force)
+    step("Comparing the maps")
+    change = difference(open_map(before), open_map(after))
+    if out is not None:
+        from magtwin.figures.maps import plot_difference
+
+        plot_difference(change, out, force=force)
+    report = change.report()
+    regions = [asdict(region) for region in change.regions]
+    whole = replace(report, metadata={**report.metadata, "regions": regions})
+    return Done(whole, out or (), table=lambda: print_report(report))
+
+
+@map_app.command(name="upward")
+def map_upward(
+    file: MapFile,
+    *,
+    height_m: Annotated[float, Parameter(help="Height of the sensor above the floor in the new map [m].")],
+    out: Path,
+    date: Date = None,
+    force: Force = False,
+) -> Done:
+    """Continue a map to another height: exactly by its harmonic field, else upward by its grid's spectrum.
+
+    Parameters
+    ----------
+    out
+        Map layer to write (.usdc).
+    """
+    from magtwin.field.maps.continuation import at_height
+    from magtwin.field.maps.statistics import map_metadata
+    from magtwin.io.surveys.maps import open_map
+    from magtwin.usd.maps import save_map
+
+    check_output(out, LAYERS, "a map layer", force=force)
+    step(f"Continuing the field to {height_m:g} m")
+    field = at_height(open_map(file, date), height_m)
+    save_map(field, out, force=force)
+    return Done(map_metadata(field), out)
+
+
+@map_app.command(name="export")
+def map_export(file: MapFile, *, out: Path, date: Date = None, force: Force = False) -> Done:
+    """Write a map as CSVs, one per heading, that `magtwin map import` reads back.
+
+    Comment lines above the rows keep the map's method, frame, height, date, licence and statistics. The rows
+    of a survey come back unchanged.
+
+    Parameters
+    ----------
+    out
+        Folder to make: 0_map.csv, 90_map.csv, ..., rows of x [m], y [m], heading [rad], field [nT].
+    """
+    from magtwin.field.survey.folder import write_survey
+    from magtwin.io.surveys.maps import open_map
+
+    return Done(wrote=tuple(write_survey(open_map(file, date), out, force=force)))
+
+
+@map_app.command(name="epochs")
+def map_epochs(*files: Sources, out: Path, force: Force = False) -> Done:
+    """Join maps of several dates into one layer that holds the drift of the field.
+
+    Parameters
+    ----------
+    files
+        Map layers of one grid, each with the date of its survey, in any order.
+    out
+        Map layer to write (.usdc), with one time sample per date; time codes are days since 2000-01-01.
+    """
+    from magtwin.field.maps.epochs import drift, in_order
+    from magtwin.usd.maps import load_epochs, save_map_series
+
+    check_output(out, LAYERS, "a map layer", force=force)
+    maps = in_order([epoch for file in files for epoch in load_epochs(file)])
+    save_map_series(maps, out, force=force)
+    return Done(drift(maps), out)

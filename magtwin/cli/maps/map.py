@@ -1,0 +1,55 @@
+"""The `magtwin map` group, and options that its commands share."""
+
+from math import radians
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.options import flag
+from magtwin.errors import InputError
+
+map_app = App(name="map", help="Import, fit, validate, compare and draw anomaly maps.")
+app.command(map_app)
+
+LAYERS = (".usdc", ".usd")
+PICTURES = (".png", ".svg")
+
+MapFile = Annotated[
+    Path, Parameter(help="Map layer or stage (.usd, .usda, .usdc), or a folder of survey CSVs.")
+]
+KeepStuck = Annotated[bool, flag("Keep readings of a sensor that was stuck.")]
+PoseTopic = Annotated[str | None, Parameter(help="Topic of the poses in a bag, if it has several.")]
+FieldTopic = Annotated[str | None, Parameter(help="Topic of the field in a bag, if it has several.")]
+Kernel = Annotated[
+    Literal["matern", "poisson"] | None,
+    Parameter(
+        help="Covariance of the Gaussian process: Matern of order 5/2, or Poisson, that of a field above "
+        "uncorrelated sources. Default: poisson."
+    ),
+]
+Earth = Annotated[
+    str | None,
+    Parameter(
+        help="The Earth's field for the harmonic fit: a scene; latitude,longitude,height,date [deg, deg, m, "
+        "YYYY-MM-DD] if the world's y is true north; or x,y,z in the world [nT]. Default: that of the "
+        "survey, if it is a twin's."
+    ),
+]
+Date = Annotated[
+    str | None,
+    Parameter(help="Date between the map's epochs, YYYY-MM-DD. Default: the latest epoch."),
+]
+Sources = Annotated[Path, Parameter(required=True)]
+
+
+def headings_rad(text: str) -> list[float]:
+    """Headings such as 0,90,180,270 [deg] in radians, each once, ascending."""
+    try:
+        degrees = sorted({float(word) % 360 for word in text.split(",")})
+    except ValueError:
+        degrees = []
+    if not degrees or any(h != h for h in degrees):
+        raise InputError(f"headings are degrees with commas between, such as 0,90,180,270; got {text!r}")
+    return [radians(h) for h in degrees]

@@ -1,0 +1,112 @@
+"""Options that several commands share: one type and one help text for each."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+
+def _whole(kind: type, tokens: Any) -> int:
+    """A whole number; cyclopts itself would round 1.5 to 2."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"a whole number is wanted, got {tokens[0].value!r}") from None
+
+
+def _session(kind: Any, tokens: Any) -> int | str:
+    """A session: its number, or "survey"."""
+    text = tokens[0].value
+    if text == "survey":
+        return "survey"
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError(f"a session is a whole number, or survey; got {text!r}") from None
+
+
+def flag(text: str) -> Any:
+    """A switch without a negative, with its help."""
+    return Parameter(negative="", help=text)
+
+
+Whole = Annotated[int, Parameter(converter=_whole)]
+Flag = Annotated[bool, Parameter(negative="")]
+Names = Annotated[list[str] | None, Parameter(consume_multiple=True)]
+Force = Annotated[bool, Parameter(name="--force", negative="", help="Replace outputs that exist.")]
+Json = Annotated[
+    bool, Parameter(name="--json", negative="", help="Print the result as one JSON document on stdout.")
+]
+Quiet = Annotated[
+    bool, Parameter(name="--quiet", negative="", help="Print no report and no progress; errors remain.")
+]
+Seed = Annotated[int, Parameter(converter=_whole, help="Seed of all random draws.")]
+Session = Annotated[
+    int | Literal["survey"] | None,
+    Parameter(
+        converter=_session,
+        help="Session to draw from the seed: charge, IMU offsets, wheels, odometry and the robot's own "
+        "field differ between sessions. survey: the robot as it was when the map was surveyed. Default: 0.",
+    ),
+]
+Network = Annotated[
+    Path | None,
+    Parameter(
+        name="--network",
+        help="Network of the magnetometer (.safetensors or .pth). none: a physical magnetometer. "
+        "Default: the scene's.",
+    ),
+]
+Magnetometer = Annotated[
+    Literal["physical", "neural", "map-only"] | None,
+    Parameter(
+        help="What the magnetometer reads: the exact field (physical), the map and a network's prediction "
+        "(neural), or the map alone (map-only). Default: the scene's."
+    ),
+]
+ModelError = Annotated[
+    bool,
+    Parameter(
+        help="Add to neural readings the prediction error that the network had on recordings it was not "
+        "trained on. --no-model-error leaves the prediction and the sensor's noise."
+    ),
+]
+Lidar = Annotated[
+    Literal["schedule", "on", "off"],
+    Parameter(help="Whether the LiDAR follows its schedule, or stays on or off."),
+]
+Outside = Annotated[
+    Literal["nan", "clamp", "raise"],
+    Parameter(help="Reading outside the map: nan, the nearest value inside (clamp), or an error (raise)."),
+]
+RateHz = Annotated[
+    float | None, Parameter(help="Magnetometer readings per second [Hz]. Default: the scene's.")
+]
+OutUnit = Annotated[
+    Literal["T", "nT"] | None,
+    Parameter(help="Unit of the field in a bag or ROS message. Default: T, as in ROS."),
+]
+Unit = Annotated[
+    Literal["nT", "uT", "T", "mG", "G"] | None,
+    Parameter(help="Unit of the field in the input. Default: found from its size."),
+]
+UsdFps = Annotated[
+    float | None,
+    Parameter(name="--usd-fps", help="Frames per second in USD. 0: one per reading. Default: 30."),
+]
+RunScene = Annotated[
+    Path | None, Parameter(help="Scene of the run. Default: the one that the run's metadata names.")
+]
+Remap = Annotated[
+    list[str] | None,
+    Parameter(
+        help="Name of a topic in the bag, as OURS:=THEIRS: /robot/enu/pose:=/vrpn/pose. May be repeated."
+    ),
+]
+Licence = Annotated[str, Parameter(help="Licence, an SPDX identifier such as MIT.")]
+Gamepad = Annotated[
+    Path | None,
+    Parameter(
+        help="Linux gamepad such as /dev/input/js0. The left stick drives, Start ends. Default: the keyboard."
+    ),
+]

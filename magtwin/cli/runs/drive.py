@@ -1,0 +1,159 @@
+"""`magtwin drive`."""
+
+import os
+import select
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from magtwin.cli.app import app
+from magtwin.cli.options import Force, Gamepad, ModelError, Network, Seed, Session
+from magtwin.cli.runs.run import draw_run
+from magtwin.cli.terminal import Done, announce, note, silence
+from magtwin.errors import InputError
+
+if TYPE_CHECKING:
+    from magtwin.sim.motion.manual import Hand, Recorder
+
+STATUS_HZ = 10.0
+"""Rate of the line about pose and speed [Hz]."""
+
+
+@app.command
+def drive(
+    scene: Path,
+    *,
+    out: Path = Path("drive"),
+    gamepad: Gamepad = None,
+    network: Network = None,
+    model_error: ModelError = True,
+    seed: Seed = 0,
+    session: Session = None,
+    live: bool = True,
+    force: Force = False,
+) -> Done:
+    """Drive a scene's robot by hand, in real time, and write the run.
+
+    The kinematic engine moves it from the scene's start. Keys: w/s or up/down for speed, a/d or left/right
+    for turning, x to go straight on, space to stop, q to end. It writes run.rrd, run.parquet, run.png and
+    commands.csv, which `magtwin run --commands` drives again to the last bit.
+
+    Parameters
+    ----------
+    scene
+        USD stage to drive in.
+    out
+        Folder to make.
+    live
+        Show the drive in a Rerun viewer while it goes on, if a window can be opened.
+    """
+    import numpy as np
+
+    from magtwin.files import existing, output
+    from magtwin.io.outputs import Outputs
+    from magtwin.io.outputs import drive as drive_again
+    from magtwin.sim.motion.commands import write_commands
+    from magtwin.sim.motion.drive import draw_wheel_errors
+    from magtwin.sim.motion.follow import CONTROL_RATE_HZ
+    from magtwin.sim.motion.manual import HELP, Gamepad, Keyboard, Recorder, at_start
+    from magtwin.sim.runs.sensing import streams
+    from magtwin.twin import in_session, open_twin
+
+    existing(scene, "scene")
+    if gamepad is not None and existing(gamepad, "gamepad").is_dir():
+        raise InputError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
+    with output(out, force=force) as folder:
+        twin = in_session(open_twin(scene, network=network, model_error=model_error), session, seed=seed)
+        robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
+        errors = draw_wheel_errors(robot.drive, streams(np.random.default_rng(seed))["drive"])
+        chassis = at_start(
+            robot.drive, twin.scene.start, twin.obstacles, robot.footprint_radius_m, errors, dt
+        )
+        hand: Hand = Keyboard(robot.drive) if gamepad is None else Gamepad(robot.drive)
+        recorder = Recorder(chassis, hand, dt)
+        with ExitStack() as stack:
+            show = None
+            if live:
+                from magtwin.io.rerun.live import live_view
+
+                try:
+                    show = stack.enter_context(live_view(twin.scene, scene))
+                except InputError as error:
+                    note(f"no view: {error}")
+            source = stack.enter_context(device(gamepad))
+            note(f"{HELP if gamepad is None else 'left stick drives, Start ends'}\r")
+            with silence():
+                _drive(recorder, hand, source, dt, show)
+        folder.mkdir()
+        write_commands(recorder.commands("commands.csv"), folder / "commands.csv")
+        driven = drive_again(
+            scene,
+            commands=folder / "commands.csv",
+            network=network,
+            model_error=model_error,
+            seed=seed,
+            session=session,
+            metadata={"commands_file": "commands.csv"},
+            report=announce,
+        )
+        Outputs(folder, picture=draw_run).write(driven)
+    again = f"magtwin run {scene} --commands {out / 'commands.csv'} --seed {seed}"
+    again += "" if session is None else f" --session {session}"
+    return Done(driven.run.report(f"Manual drive in {scene}"), out, text=f"Wrote {out}; again: {again}")
+
+
+def _drive(recorder: "Recorder", hand: "Hand", device: int, dt: float, show: object) -> None:
+    """Drive in real time until the hand is done; a slow machine drives in slow motion."""
+    due, step, told = time.monotonic(), 0, ""
+    try:
+        while not hand.done:
+            due = max(due + dt, time.monotonic())
+            while (left := due - time.monotonic()) > 0 and not hand.done:
+                if select.select([device], [], [], left)[0]:
+                    hand.feed(os.read(device, 1024))
+            recorder.step()
+            chassis = recorder.chassis
+            if callable(show):
+                show(chassis.t, chassis.pose)
+            if step % round(1 / dt / STATUS_HZ) == 0 and sys.stderr.isatty():
+                x, y, yaw = chassis.pose
+                v, w = hand.command
+                told = f"  {chassis.t:6.1f} s  at {x:+.2f} {y:+.2f} m  yaw {yaw:+.2f}  v {v:+.2f}  w {w:+.2f}"
+                print(f"\r{told}{'  BUMP' if chassis.bump else '      '}", end="", file=sys.stderr)  # noqa: T201
+            step += 1
+    except KeyboardInterrupt:
+        pass  # an end like any other: what was driven is kept
+    if told:
+        print("\r", file=sys.stderr)  # noqa: T201
+
+
+@contextmanager
+def device(gamepad: Path | None) -> Iterator[int]:
+    """A gamepad, or the terminal with its keys one by one; the terminal is restored at the end."""
+    if gamepad is not None:
+        try:
+            pad = os.open(gamepad, os.O_RDONLY | os.O_NONBLOCK)
+        except OSError as error:
+            raise InputError(f"{gamepad}: cannot be read ({error.strerror}); name a gamepad") from error
+        try:
+            yield pad
+        finally:
+            os.close(pad)
+        return
+    keys = sys.stdin.fileno()
+    if not os.isatty(keys):
+        yield keys  # keys from a pipe
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(keys)
+    try:
+        tty.setcbreak(keys)
+        yield keys
+    finally:
+        with suppress(termios.error):
+            termios.tcsetattr(keys, termios.TCSADRAIN, before)

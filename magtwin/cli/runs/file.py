@@ -1,0 +1,139 @@
+"""`magtwin info`, `view`, `convert` and `fetch`."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.options import Force, OutUnit, Remap, RunScene, Unit, UsdFps
+from magtwin.cli.terminal import Done, progress, silence, step
+from magtwin.errors import InputError
+
+
+@app.command
+def info(file: Path) -> Done:
+    """Print what a run, a stage, a map or a network holds, and its origin.
+
+    Parameters
+    ----------
+    file
+        A run (.parquet, .rrd, .mcap, .db3, .csv, .npz, .usd, a .json of the released node, or the folder of a
+        bag, of Parquet parts, or of magtwin run), a stage or a map (.usd, .usda, .usdc, .usdz), a folder of
+        survey CSVs (0_map.csv, ...), or a network (.safetensors, .pth, .onnx).
+    """
+    from magtwin.io.info import info_of
+
+    step(f"Reading {file.name}")
+    return Done(info_of(file))
+
+
+@app.command
+def view(
+    *files: Annotated[Path, Parameter(required=True)],
+    scene: RunScene = None,
+    offset_s: list[float] | None = None,
+) -> Done:
+    """Show runs or a stage in a viewer until it is closed.
+
+    Runs are shown in the Rerun viewer, in their lab if their scene is found. Several runs share one timeline,
+    each in its colour. A stage is shown in usdview if that is installed, else in a window.
+
+    Parameters
+    ----------
+    files
+        Runs in any format that magtwin reads, or one stage.
+    offset_s
+        Seconds to add to the times of a run, given once for each of several runs, in their order.
+    """
+    from magtwin.figures.views import view as show
+
+    with silence():
+        show(files, scene=scene, offsets_s=offset_s or ())
+    return Done()
+
+
+@app.command
+def convert(
+    run: Path,
+    out: Path,
+    *,
+    scene: RunScene = None,
+    storage: Literal["mcap", "sqlite3"] | None = None,
+    out_unit: OutUnit = None,
+    usd_fps: UsdFps = None,
+    remap: Remap = None,
+    unit: Unit = None,
+    force: Force = False,
+) -> Done:
+    """Convert a run to another format, or import a ROS bag.
+
+    Parameters
+    ----------
+    run
+        A run in any format that magtwin reads, or the parts of a run that did not end.
+    out
+        File to make: .parquet, .csv, .npz, .rrd, .mcap, .usd, .usda or .usdc. A name without a suffix is the
+        folder of a rosbag2.
+    storage
+        Storage of a bag. Default: mcap.
+    """
+    from magtwin.io.convert import convert_run
+
+    step("Converting the run")
+    result = convert_run(
+        run,
+        out,
+        scene=scene,
+        storage=storage,
+        out_unit=out_unit,
+        usd_fps=usd_fps,
+        topics=pairs("remap", remap) if remap else None,
+        unit=unit,
+        force=force,
+    )
+    rows = f"{result.rows:,} rows, {len(result)} columns, {result.duration_s:g} s"
+    data = {"rows": result.rows, "columns": len(result), "duration_s": result.duration_s}
+    return Done(wrote=out, text=f"Wrote {out}: {rows}", data=data)
+
+
+@app.command
+def fetch(
+    assets: Literal["aprilab", "turtlebot4"],
+    *,
+    out: Path | None = None,
+    base_url: str | None = None,
+    force: Force = False,
+) -> Done:
+    """Download original data at a pinned commit, and check each file's SHA-256.
+
+    Parameters
+    ----------
+    assets
+        aprilab: survey, released network and paths (MIT). turtlebot4: description packages (Apache-2.0,
+        BSD-3-Clause).
+    out
+        Folder to make. Default: the name of the assets.
+    base_url
+        Address of a mirror with the same paths.
+    """
+    from magtwin.fetch import fetch as fetch_files
+
+    folder = out or Path(assets)
+    with progress(f"Fetching {assets}", "files") as advance:
+        files = fetch_files(assets, folder, base_url=base_url, force=force, progress=advance)
+    return Done(wrote=folder, text=f"Wrote {len(files)} files to {folder}")
+
+
+def pairs(option: str, texts: list[str]) -> dict[str, str]:
+    """Values of an option as OURS:=THEIRS, or OURS=THEIRS, as a table."""
+    table = {}
+    for text in texts:
+        ours, _, theirs = text.partition("=")
+        ours = ours.removesuffix(":")
+        if not (ours and theirs):
+            raise InputError(
+                f"--{option} takes OURS:=THEIRS, such as /robot/enu/pose:=/vrpn/pose, got {text!r}"
+            )
+        table[ours] = theirs
+    return table

@@ -1,0 +1,91 @@
+"""`magtwin report` and `magtwin compare`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.options import Force, RunScene
+from magtwin.cli.terminal import Done, check_output, progress, stdout_console, step
+
+if TYPE_CHECKING:
+    from magtwin.run.compare import Comparison
+
+
+@app.command
+def report(
+    *runs: Annotated[Path, Parameter(required=True)],
+    out: Path = Path("report.html"),
+    scene: RunScene = None,
+    force: Force = False,
+) -> Done:
+    """Write one page about a run or a set of runs, with its pictures inside.
+
+    It has what was run, the map with the path, time series, errors by source, events and provenance. Several
+    runs get an overview first.
+
+    Parameters
+    ----------
+    runs
+        Runs in any format that magtwin reads; a folder that `magtwin sweep` made stands for all of its runs.
+    out
+        Page to write: .html, which needs no other file, .md or .json.
+    """
+    from magtwin.figures.views import report_runs
+
+    check_output(out, (".html", ".md", ".json"), "a report", force=force)
+    with progress("Reporting", "runs") as advance:
+        report_runs(runs, out, scene=scene, force=force, progress=advance)
+    return Done(wrote=out)
+
+
+@app.command
+def compare(
+    a: Path,
+    b: Path,
+    *,
+    align: Literal["time", "path", "none"] = "time",
+    out: Path | None = None,
+    force: Force = False,
+) -> Done:
+    """Compare two runs: how far apart they are in pose and in field.
+
+    Parameters
+    ----------
+    a
+        A run in any format that magtwin reads.
+    b
+        The run to compare with it.
+    align
+        time: shift the clocks so that the positions agree best. path: align by distance driven, for runs of
+        different speeds. none: keep the clocks.
+    out
+        Page (.html, .md, .json) or picture (.png, .svg) to write: readings as recorded and aligned, the
+        distance between the runs, and both paths.
+    """
+    from magtwin.figures.views import compare_files, names_of
+
+    check_output(out, (".html", ".md", ".json", ".png", ".svg"), "a comparison", force=force)
+    step("Comparing the runs")
+    comparison = compare_files(a, b, align=align, out=out, force=force)
+    return Done(comparison, out or (), table=lambda: _print(comparison, names_of(a, b)))
+
+
+def _print(comparison: "Comparison", names: tuple[str, str]) -> None:
+    """Print the agreements as a table."""
+    from rich.table import Table
+    from rich.text import Text
+
+    shift = f"moved by {comparison.shift:+.4f} {comparison.unit}"
+    how = "clocks as recorded" if comparison.align == "none" else shift
+    console = stdout_console()
+    console.print(Text(f"{names[1]} less {names[0]}, {how}; {len(comparison.at):,} readings", style="bold"))
+    table = Table(box=None, pad_edge=False)
+    for column in ("", "unit", "mean", "RMS", "mean abs.", "greatest", "correlation"):
+        table.add_column(column, justify="left" if column in ("", "unit") else "right", no_wrap=True)
+    for row in comparison.agreements():
+        correlation = "" if row.correlation is None else f"{row.correlation:.4f}"
+        numbers = (f"{value:,.4g}" for value in (row.mean, row.rms, row.mae, row.greatest))
+        table.add_row(row.name, row.unit, *numbers, correlation)
+    console.print(table)

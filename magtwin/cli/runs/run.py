@@ -1,0 +1,379 @@
+"""`magtwin run` and `magtwin demo`."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.options import (
+    Flag,
+    Force,
+    Lidar,
+    Magnetometer,
+    ModelError,
+    Network,
+    Outside,
+    OutUnit,
+    RateHz,
+    Seed,
+    Session,
+    UsdFps,
+)
+from magtwin.cli.terminal import Done, announce, note, progress, silence, step
+from magtwin.errors import InputError, find
+
+if TYPE_CHECKING:
+    from threading import Event
+
+    from magtwin.io.outputs import Driven, Outputs
+
+Outs = Annotated[list[Path] | None, Parameter(consume_multiple=False)]
+
+
+@app.command
+def demo(
+    *,
+    out: Path = Path("demo"),
+    seed: Seed = 0,
+    model_error: ModelError = True,
+    force: Force = False,
+) -> Done:
+    """Author a lab and a TurtleBot 4, drive a figure of eight and log what the magnetometer reads.
+
+    It writes the stages, run.rrd (opens in Rerun), run.parquet and pictures, in less than a minute.
+
+    Parameters
+    ----------
+    out
+        Folder to make.
+    """
+    from magtwin.author.robot import build_robot
+    from magtwin.author.scene import author_scene
+    from magtwin.files import output, shipped
+    from magtwin.io.outputs import Outputs, drive
+    from magtwin.twin import scene_from_toml
+
+    with output(out, force=force) as folder:
+        announce("Authoring the TurtleBot 4 from its URDF")
+        source = shipped("robots", "turtlebot4")
+        asset = folder / "robot" / "turtlebot4.usda"
+        build_robot(source / "turtlebot4.urdf", source / "robot.toml", asset)
+        announce("Authoring the lab around it, with its magnetic map")
+        scene = scene_from_toml(shipped("scenes", "lab.toml"))
+        scene = replace(scene, robot=replace(scene.robot, asset=asset))
+        scene_file = author_scene(scene, folder / "scene")
+        relative = {"scene_file": scene_file.relative_to(folder).as_posix()}
+        driven = drive(scene_file, seed=seed, model_error=model_error, metadata=relative, report=announce)
+        announce("Writing the run and pictures")
+        Outputs(folder, picture=draw_run).write(driven)
+        _picture(scene_file, folder / "lab.png")
+    pictures = ", ".join(str(file) for file in sorted(out.glob("*.png")))
+    text = f"\nLook at it:  magtwin view {out / 'run.rrd'}\nPictures:    {pictures}"
+    return Done(driven.run.report(f"Demo in {out}"), out, text=text)
+
+
+@app.command
+def run(
+    scene: Path,
+    *,
+    path: str | None = None,
+    fit: Flag = False,
+    commands: Path | None = None,
+    robot: str | None = None,
+    meet: Literal["refuse", "flag"] | None = None,
+    engine: Literal["kinematic", "newton"] = "kinematic",
+    replay: Path | None = None,
+    controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
+    network: Network = None,
+    magnetometer: Magnetometer = None,
+    model_error: ModelError = True,
+    seed: Seed = 0,
+    session: Session = None,
+    speed: float = 0.2,
+    duration_s: float | None = None,
+    rate_hz: RateHz = None,
+    lidar: Lidar = "schedule",
+    outside: Outside = "nan",
+    out: Outs = None,
+    out_unit: OutUnit = None,
+    usd_fps: UsdFps = None,
+    scans: Flag = False,
+    live: Flag = False,
+    viewer: str | None = None,
+    pace: float | None = None,
+    force: Force = False,
+) -> Done:
+    """Drive a scene's robot along a path and write the run.
+
+    Parameters
+    ----------
+    scene
+        USD stage to drive in.
+    path
+        sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle, curvilinear,
+        curvilinear_2; A to E, the cases of the paper's Table 1; random, a human-like driver, for a minute or
+        --duration-s; or a CSV file of x,y [m]. Named paths are scaled to the floor. Default: the path of the
+        scene, else figure8.
+    fit
+        Move and shrink the path until it fits the floor and its obstacles.
+    commands
+        CSV file of t,v,w [s, m/s, rad/s] to drive by in place of a path, as `magtwin drive` writes it.
+    robot
+        Robot, in a scene of several, that --path, --commands or --replay are for, and whose run alone is
+        written; the others drive what the scene says. Default: write every run, as run.NAME.rrd and so on.
+    meet
+        What happens if robots collide: refuse the run, or flag it as a bump. Default: refuse.
+    engine
+        What moves the robot: kinematic, or newton for physics in the stage.
+    replay
+        Run, in any format, to drive again as it was recorded, with the sensors as they are set now.
+    controller
+        What steers: magtwin's follower, the released package's controller, Stanley's, or pure pursuit.
+    speed
+        Forward speed on straight parts [m/s].
+    duration_s
+        Length of the run [s]; more than once along the path gives further laps. Default: once along the path.
+    out
+        Output; may be repeated. A file gets the format of its suffix: .rrd, .parquet, .mcap, .db3, .csv,
+        .npz, .usd, .usda or .usdc. A name without a suffix is a folder with run.rrd, run.parquet and run.png.
+        Default: the folder run.
+    scans
+        Cast the LiDAR's rays while it spins. Scans go into recordings, bags, and a table beside the run's,
+        such as run.scans.parquet.
+    live
+        Show the run in a Rerun viewer while it goes on. Files grow meanwhile, under names with "partial" or
+        "parts". Ctrl-C ends it and keeps what was driven.
+    viewer
+        Address of a running Rerun viewer to show it in, such as rerun+http://127.0.0.1:9876/proxy.
+    pace
+        Simulated seconds per second while it is shown. Default: 1.
+    """
+    from magtwin.files import existing
+    from magtwin.io.outputs import Outputs, drive
+    from magtwin.usd.scene import robots_in
+
+    existing(scene, "scene")
+    if scene.suffix == ".toml":
+        raise InputError(
+            f"{scene}: is the description of a scene; author it first: magtwin scene {scene} --out DIR"
+        )
+    outputs = Outputs.of(
+        out or [Path("run")], scans=scans, force=force, out_unit=out_unit, usd_fps=usd_fps, picture=draw_run
+    )
+    if live and viewer:
+        raise InputError("--live opens a viewer and --viewer names one; give one of them")
+    if pace is not None and not (live or viewer):
+        raise InputError("--pace is for a run that is shown; give --live, or drop it")
+    if pace is not None and not pace > 0:
+        raise InputError(f"--pace must be above 0 simulated seconds per second, got {pace:g}")
+    what = _what(path, commands, replay)
+    free = commands or replay  # driven without a path
+    for given, option, fault in (
+        (
+            controller != "follower" and (free or path == "random"),
+            f"--controller {controller}",
+            "follows a path",
+        ),
+        (speed != 0.2 and free, "--speed", "is for a path or a driver"),
+        (fit and (free or path == "random"), "--fit", "is for a path"),
+        (engine == "newton" and replay, "--engine newton", "cannot repeat the motion of a run"),
+    ):
+        if given:
+            raise InputError(f"{option} {fault}, and {what} is none; drop one")
+    if engine == "newton":
+        from magtwin.sim.engines.newton import check_installed
+
+        check_installed()
+    if viewer:
+        from magtwin.io.rerun.live import check_listens
+
+        check_listens(viewer)
+    options: dict[str, Any] = {
+        "commands": commands,
+        "replay": replay,
+        "network": network,
+        "magnetometer": magnetometer,
+        "model_error": model_error,
+        "seed": seed,
+        "session": session,
+        "speed": speed,
+        "duration_s": duration_s,
+        "rate_hz": rate_hz,
+        "lidar": lidar,
+        "outside": outside,
+        "controller": controller,
+    }
+    robots = robots_in(scene)
+    if robot is not None:
+        find("robot", robot, robots)
+    if len(robots) > 1:
+        names = ", ".join(robots)
+        if live or viewer:
+            raise InputError(f"--live and --viewer show one robot, and {scene} has {names}")
+        if engine == "newton":
+            raise InputError(f"--engine newton drives one robot by itself, and {scene} has {names}; drop it")
+        if robot is None and (path or free or fit):
+            raise InputError(f"which of {names} is to drive {what}? name it with --robot NAME")
+        return _run_robots(scene, outputs, robot=robot, path=path, fit=fit, meet=meet, scans=scans, **options)
+    if meet is not None:
+        raise InputError(f"--meet is for several robots, and {scene} has one; drop it")
+    if not (path or free):
+        what = str(next(iter(robots.values())) or what)
+    step("Opening the scene")
+    with ExitStack() as stack:
+        places = outputs
+        if live or viewer:
+            outputs.check_live()
+        else:
+            places = stack.enter_context(outputs.aside())
+        newton = progress("Driving in Newton", "steps") if engine == "newton" else nullcontext()
+        with newton as advance:
+            driven = drive(
+                scene, what, fit=fit, scans=scans, engine=engine, progress=advance, report=announce, **options
+            )
+        if live or viewer:
+            driven = _show(driven, outputs, viewer, pace or 1.0)
+        announce("Writing the run")
+        places.write(driven, recorded=bool(live or viewer))
+    return Done(driven.run.report(f"{what} in {scene}"), tuple(outputs.targets))
+
+
+def draw_run(driven: "Driven", out: Path, force: bool) -> None:
+    """Draw run.png: the path over the map."""
+    from magtwin.figures.runs import plot_run
+
+    planned = driven.planned.p_xy if driven.planned else None
+    plot_run(driven.run, driven.twin.field, out, planned=planned, force=force)
+
+
+def _run_robots(
+    scene: Path,
+    outputs: "Outputs",
+    *,
+    robot: str | None,
+    path: str | None,
+    fit: bool,
+    meet: Literal["refuse", "flag"] | None,
+    scans: bool,
+    **options: Any,
+) -> Done:
+    """Drive the robots of a scene of several, and write the run of each, or of the one that is named."""
+    from magtwin.io.formats import read_run
+    from magtwin.io.outputs import Driven
+    from magtwin.path import Path as Planned
+    from magtwin.report import Report
+    from magtwin.sim.motion.commands import read_commands
+    from magtwin.sim.motion.drive_input import drive_input
+    from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots
+
+    commands, replay = options.pop("commands"), options.pop("replay")
+    opening = {name: options.pop(name) for name in ("network", "magnetometer", "model_error")}
+    twin = open_twin(scene, **opening)
+    ways: dict[str, Any] = {spec.robot.name: spec.path or "figure8" for spec in twin.scene.robots}
+    if robot is not None and (commands or replay or path):
+        ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path
+    ways = {
+        name: drive_input(way, room_of(led_by(twin, name)), fit=fit and name == robot)
+        for name, way in ways.items()
+    }
+    names = list(ways) if robot is None else [robot]
+    own = {name: outputs if robot else outputs.of_robot(name) for name in names}
+    with ExitStack() as stack:
+        folder = stack.enter_context(replace(outputs, files=(), scans=()).aside()).folder
+        places = {}
+        for name in names:
+            aside = stack.enter_context(replace(own[name], folder=None).aside())
+            places[name] = replace(aside, folder=folder)
+        announce(f"Driving {', '.join(ways)}")
+        runs = simulate_robots(twin, ways, robots=names, meet=meet or "refuse", **options)
+        for name, run in runs.items():
+            its = led_by(twin, name)
+            planned = ways[name] if isinstance(ways[name], Planned) else None
+            seen = scan(its, run, seed=options["seed"]) if scans else None
+            places[name].write(Driven(run, its, planned, seen))
+    reports = {name: run.report(name) for name, run in runs.items()}
+    figures = tuple(replace(f, name=f"{n}: {f.name}") for n, r in reports.items() for f in r.figures)
+    metadata = {name: report.metadata for name, report in reports.items()}
+    files = dict.fromkeys(target for each in own.values() for target in each.targets)
+    return Done(Report(f"{', '.join(names)} in {scene}", figures, metadata), tuple(files))
+
+
+def _show(driven: "Driven", outputs: "Outputs", address: str | None, pace: float) -> "Driven":
+    """Show and record a run until its end or Ctrl-C, in a viewer at an address or in a window."""
+    from magtwin.io.outputs import record_live
+    from magtwin.io.rerun.viewer import live_viewer
+
+    with ExitStack() as stack:
+        stop = stack.enter_context(_ctrl_c())
+        window = address is None
+        if window:
+            try:
+                address, _ = stack.enter_context(live_viewer())
+            except InputError as error:
+                note(f"no view: {error}")
+        with progress("Live", "s") as advance:
+            driven = record_live(driven, outputs, address=address, pace=pace, stop=stop, progress=advance)
+        if window and address is not None and sys.stdin.isatty():
+            with silence():
+                _wait(address, stop)
+    return driven
+
+
+def _wait(address: str, stop: "Event") -> None:
+    """Leave the viewer open until it is closed, or Ctrl-C."""
+    from magtwin.io.rerun.live import check_listens
+
+    if not stop.is_set():
+        note("The run has ended; close the viewer, or press Ctrl-C")
+    while not stop.wait(0.5):
+        try:
+            check_listens(address)
+        except InputError:
+            return
+
+
+@contextmanager
+def _ctrl_c() -> Iterator["Event"]:
+    """An event that Ctrl-C sets; a second Ctrl-C interrupts as usual."""
+    import signal
+    from threading import Event, current_thread, main_thread
+
+    stop = Event()
+    if current_thread() is not main_thread():
+        yield stop
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def end(*_: object) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, end)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _what(path: str | None, commands: Path | None, replay: Path | None) -> str:
+    """What is driven, in a word; two of them are refused."""
+    given = {"--path": path, "--commands": commands, "--replay": replay}
+    named = [option for option, value in given.items() if value is not None]
+    if len(named) > 1:
+        raise InputError(f"{' and '.join(named)} each name what to drive; give one of them")
+    return path or str(commands or replay or "figure8")
+
+
+def _picture(scene_file: Path, out: Path) -> None:
+    """Draw a stage; if OpenGL is missing, print that and go on."""
+    from magtwin.figures.pictures import picture_of_stage
+
+    try:
+        picture_of_stage(scene_file, out)
+    except InputError as error:
+        note(f"no picture of the stage: {error}")

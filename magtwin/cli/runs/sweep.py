@@ -1,0 +1,112 @@
+"""`magtwin sweep`."""
+
+from pathlib import Path
+from typing import Literal
+
+from magtwin.cli.app import app
+from magtwin.cli.options import (
+    Flag,
+    Force,
+    Lidar,
+    Magnetometer,
+    ModelError,
+    Names,
+    Network,
+    Outside,
+    RateHz,
+    Seed,
+    Whole,
+)
+from magtwin.cli.terminal import Done, announce, progress
+from magtwin.errors import InputError
+
+RUNS_A_SESSION = 5
+"""Default number of runs per session: one for each default path."""
+
+
+@app.command
+def sweep(
+    scene: Path,
+    *,
+    out: Path = Path("runs"),
+    count: Whole = 100,
+    path: Names = None,
+    fit: Flag = False,
+    seed: Seed = 0,
+    sessions: Whole | None = None,
+    session: Literal["survey"] | None = None,
+    speed: float | None = None,
+    duration_s: float | None = None,
+    rate_hz: RateHz = None,
+    keep: Names = None,
+    network: Network = None,
+    magnetometer: Magnetometer = None,
+    model_error: ModelError = True,
+    lidar: Lidar = "schedule",
+    outside: Outside = "nan",
+    force: Force = False,
+) -> Done:
+    """Drive a scene's robot many times and write a data set: one Parquet file per run, and runs.csv.
+
+    Run k, in run_00000.parquet and so on, has the seed SEED + k and drives the next path in turn. runs.csv
+    lists file, path, seed, session, speed and readings. In a scene of several robots the first one drives,
+    alone.
+
+    Parameters
+    ----------
+    scene
+        USD stage to drive in.
+    out
+        Folder to make.
+    count
+        Number of runs.
+    path
+        Paths to drive in turn, as for `magtwin run`: names, cases A to E, random, CSV files. Default: sine,
+        lawnmower, figure8, continuous_cycle and random.
+    fit
+        Move and shrink each path until it fits the floor and its obstacles.
+    sessions
+        Number of sessions. Each has its own charge, IMU offsets, wheels, odometry and robot field, and an
+        equal share of the runs, one after the other. Default: one for every 5 runs.
+    session
+        survey: drive the robot as it was during the survey of the map, in every run.
+    speed
+        Forward speed on straight parts [m/s]. Default: drawn for each run from 0.2 to 0.3; 0.2 with
+        --session survey.
+    duration_s
+        Length of each run [s]; more than once along the path gives further laps. Default: once along it.
+    keep
+        Columns to write beside t. Default: all.
+    """
+    from magtwin.files import check_free, existing
+    from magtwin.sim.motion.drive_input import drive_input
+    from magtwin.twin import MIXTURE, open_twin, room_of
+    from magtwin.twin import sweep as drive_many
+
+    existing(scene, "scene")
+    for name, value, least in (("count", count, 1), ("sessions", sessions, 1), ("seed", seed, 0)):
+        if value is not None and value < least:
+            raise InputError(f"--{name} must be a whole number from {least} up, got {value}")
+    if sessions is not None and session is not None:
+        raise InputError("--session survey is one session; drop --sessions")
+    check_free(out, force=force)
+    for name in path or MIXTURE:
+        drive_input(name)  # refuses a wrong name before the scene is opened
+    announce("Opening the scene")
+    twin = open_twin(scene, network=network, magnetometer=magnetometer, model_error=model_error)
+    announce(f"Driving {count} runs")
+    runs = drive_many(
+        twin,
+        [drive_input(name, room_of(twin), fit=fit) for name in path or MIXTURE],
+        count,
+        seed=seed,
+        sessions=session or sessions or max(1, round(count / RUNS_A_SESSION)),
+        speeds=speed if speed is not None else 0.2 if session else "drawn",
+        columns=keep,
+        duration_s=duration_s,
+        rate_hz=rate_hz,
+        lidar=lidar,
+        outside=outside,
+    )
+    with progress("Driving", "runs") as advance:
+        return Done(runs.save(out, force=force, progress=advance), out)

@@ -1,0 +1,1 @@
+"""Commands that author scenes and robots, check them and export them."""

@@ -1,0 +1,93 @@
+"""`magtwin export`."""
+
+from pathlib import Path
+from typing import Literal
+
+from magtwin.cli.app import app
+from magtwin.cli.options import Force
+from magtwin.cli.terminal import Done, announce
+from magtwin.errors import InputError, find
+
+
+@app.command
+def export(
+    scene: Path,
+    *,
+    out: Path,
+    target: Literal["omniverse", "isaac", "newton", "viewer"] | None = None,
+    run: Path | None = None,
+    onnx: bool = True,
+    thumbnail: bool = True,
+    force: Force = False,
+) -> Done:
+    """Export a stage with everything that it needs, so that other programs open it anywhere.
+
+    Parameters
+    ----------
+    scene
+        A scene or any other stage (.usd, .usda, .usdc, .usdz), or the name of a shipped one: lab.
+    out
+        What to make: a folder, a package (.usdz), one layer (.usd, .usdc), or a .glb for the web.
+    target
+        Program to export for: omniverse; isaac, with an Action Graph for ROS 2; newton; or viewer, one layer
+        for simple viewers. Default: omniverse for folders and packages, else viewer.
+    run
+        Run in any format that magtwin reads, to play over the stage.
+    onnx
+        Write networks as ONNX beside their weights, if the extra onnx is installed.
+    thumbnail
+        Draw a picture of a folder's stage where asset browsers look for one.
+    """
+    from magtwin.export.package import export_scene
+    from magtwin.files import check_free, existing
+
+    check_free(out, force=force)
+    stage = _stage(scene)
+    animation = None
+    if run is not None:
+        from magtwin.io.formats import read_run
+
+        animation = read_run(existing(run, "run"))
+    made = export_scene(
+        stage,
+        out,
+        profile=target,
+        animation=animation,
+        to_onnx=_write_onnx if onnx and _has_onnx() else None,
+        thumbnail=_draw if thumbnail and target != "viewer" else None,
+        force=force,
+        progress=announce,
+    )
+    return Done(made.report(), tuple(made.files))
+
+
+def _stage(scene: Path) -> Path:
+    """A stage's file, or that of a scene that ships with magtwin."""
+    if scene.suffix == ".toml":
+        raise InputError(
+            f"{scene}: is the description of a scene; author it first: magtwin scene {scene} --out DIR"
+        )
+    if scene.suffix or scene.exists():
+        return scene
+    from magtwin.files import shipped
+
+    stages = sorted(shipped("scenes").glob("*/*.usda"))
+    return find("scene", str(scene), {file.stem: file for file in stages if file.stem == file.parent.name})
+
+
+def _write_onnx(weights: Path, out: Path) -> None:
+    from magtwin.learn.inference.onnx import export_onnx
+
+    export_onnx(weights, out)
+
+
+def _has_onnx() -> bool:
+    from importlib.util import find_spec
+
+    return bool(find_spec("onnx") and find_spec("onnxruntime"))
+
+
+def _draw(stage: Path, out: Path) -> None:
+    from magtwin.figures.pictures import picture_of_stage
+
+    picture_of_stage(stage, out, size=(256, 256), legend=False)  # its numbers would not fit

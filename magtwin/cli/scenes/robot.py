@@ -1,0 +1,146 @@
+"""`magtwin robot`: a description in, a USD articulation out, and back."""
+
+from pathlib import Path
+from typing import Literal
+
+from magtwin.cli.app import app
+from magtwin.cli.options import Flag, Force
+from magtwin.cli.terminal import Done, check_output, step
+from magtwin.errors import InputError
+
+
+@app.command
+def robot(
+    urdf: Path,
+    *,
+    out: Path,
+    settings: Path | None = None,
+    package: list[str] | None = None,
+    arg: list[str] | None = None,
+    missing_meshes: Literal["refuse", "note"] | None = None,
+    collision: Literal["hull", "decomposition", "mesh"] | None = None,
+    profile: Literal["general", "diff-drive"] | None = None,
+    drive: list[str] | None = None,
+    fix_base: bool | None = None,
+    merge_fixed: bool | None = None,
+    density_kg_m3: float | None = None,
+    mass_kg: float | None = None,
+    single_file: bool | None = None,
+    strict: bool | None = None,
+    thumbnail: Flag = False,
+    report: Path | None = None,
+    force: Force = False,
+) -> Done:
+    """Convert a URDF or xacro to a USD articulation that drives, or such a stage to a URDF.
+
+    Parameters
+    ----------
+    urdf
+        Robot description (.urdf, .xacro); or a stage with one robot, to write as a URDF.
+    out
+        Folder to make, with NAME.usda and its layers; or a .urdf to write from a stage, with the same
+        kinematics and inertia.
+    settings
+        TOML with drive, battery, platform field, sensor mounts and conversion, such as
+        robots/turtlebot4/robot.toml. Options given here override its [conversion].
+    package
+        NAME=DIR: folder of a package that package:// or $(find) names. May be repeated.
+    arg
+        NAME=VALUE: argument of the xacro. May be repeated.
+    missing_meshes
+        What to do about a missing mesh: refuse, or leave it out and note it. Default: refuse.
+    collision
+        Collision shape of a mesh: convex hull, convex decomposition (extra "decomposition"), or the mesh.
+    profile
+        general; or diff-drive: velocity drives on wheels, casters without friction, dead suspensions welded.
+    drive
+        PATTERN:TYPE[:stiffness=X][:damping=X][:max_force=X], TYPE velocity, position or none: drive of the
+        joints whose name fits. May be repeated; the first that fits wins.
+    fix_base
+        Fix the base to the world.
+    merge_fixed
+        Merge links on fixed joints into the body that carries them; their frames stay.
+    density_kg_m3
+        Density of links without inertia [kg/m3].
+    mass_kg
+        Mass of the data sheet to compare the robot's with [kg].
+    single_file
+        Write one root layer and its meshes, in place of Isaac Sim's layers.
+    strict
+        Refuse a conversion that loses anything.
+    thumbnail
+        Draw a picture of the robot beside it, which NVIDIA's SimReady profiles require.
+    report
+        Full report to write (.json).
+    """
+    from magtwin.author.from_urdf import DriveRule, from_urdf
+    from magtwin.files import output
+
+    if out.suffix == ".urdf":
+        given: tuple[object, ...] = (
+            settings,
+            package,
+            arg,
+            missing_meshes,
+            collision,
+            profile,
+            drive,
+            fix_base,
+            merge_fixed,
+        )
+        if any(
+            option is not None for option in (*given, density_kg_m3, mass_kg, single_file, strict, report)
+        ):
+            raise InputError("a stage is written as a URDF without other options than --force; drop them")
+        return _to_urdf(urdf, out, force=force)
+    check_output(report, (".json",), "a report", force=force)
+    choices = {
+        "packages": {k: Path(v) for k, v in _pairs("package", package).items()} if package else None,
+        "arguments": _pairs("arg", arg) if arg else None,
+        "missing_meshes": missing_meshes,
+        "collision": collision,
+        "profile": profile,
+        "drives": tuple(DriveRule.parse(text) for text in drive) if drive else None,
+        "fix_base": fix_base,
+        "merge_fixed": merge_fixed,
+        "density": density_kg_m3,
+        "mass": mass_kg,
+        "single_file": single_file,
+        "strict": strict,
+    }
+    step("Converting the robot")
+    made = from_urdf(
+        urdf,
+        out,
+        settings=settings,
+        force=force,
+        thumbnail=_thumbnail if thumbnail else None,
+        **{name: choice for name, choice in choices.items() if choice is not None},
+    )
+    if report is not None:
+        with output(report, force=force) as aside:
+            aside.write_text(made.report.to_json(), encoding="utf-8")
+    return Done(made.report.summary(), made.asset)
+
+
+def _to_urdf(stage: Path, out: Path, *, force: bool) -> Done:
+    from magtwin.author.from_urdf import write_urdf
+
+    if stage.suffix in (".urdf", ".xacro"):
+        raise InputError(f"{stage}: is no stage; a URDF is written from .usd, .usda, .usdc or .usdz")
+    return Done(write_urdf(stage, out, force=force), out)
+
+
+def _thumbnail(asset: Path, out: Path) -> None:
+    from magtwin.figures.pictures import picture_of_stage
+
+    picture_of_stage(asset, out, size=(256, 256))
+
+
+def _pairs(option: str, texts: list[str]) -> dict[str, str]:
+    """NAME=VALUE texts as a table."""
+    pairs = [text.partition("=") for text in texts]
+    for text, (name, equals, _) in zip(texts, pairs, strict=True):
+        if not (name and equals):
+            raise InputError(f"--{option} {text!r}: NAME=VALUE is wanted")
+    return {name: value for name, _, value in pairs}

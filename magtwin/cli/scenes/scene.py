@@ -1,0 +1,78 @@
+"""`magtwin new` and `magtwin scene`."""
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from magtwin.cli.app import app
+from magtwin.cli.options import Force, Network
+from magtwin.cli.terminal import Done, announce, check_output, progress
+
+
+@app.command
+def new(out: Path, *, force: Force = False) -> Done:
+    """Write a commented TOML of a small furnished room to start from.
+
+    Author it with `magtwin scene room.toml --out room`.
+
+    Parameters
+    ----------
+    out
+        TOML file to write; the scene gets its name.
+    """
+    from magtwin.twin import new_scene
+
+    check_output(out, (".toml",), "a scene's description", force=force)
+    new_scene(out, force=force)
+    folder = out.with_suffix("")
+    stage = shlex.quote(str(folder / f"{out.stem}.usda"))
+    author = f"magtwin scene {shlex.quote(str(out))} --out {shlex.quote(str(folder))}"
+    return Done(wrote=out, text=f"Wrote {out}\nNext:  {author}\n       magtwin run {stage}")
+
+
+@app.command
+def scene(
+    spec: str,
+    *,
+    out: Path,
+    map: Path | None = None,  # noqa: A002 - the option is called --map
+    network: Network = None,
+    force: Force = False,
+) -> Done:
+    """Author a scene from its TOML: the room, its magnetic map and a robot with sensors.
+
+    A scene without a map is surveyed by its own robot, from the Earth's field, furniture and sources.
+    `magtwin new room.toml` writes a TOML to start from; docs/scenes.md lists every key.
+
+    Parameters
+    ----------
+    spec
+        TOML file, or the name of a scene that ships with magtwin: lab, aprilab.
+    out
+        Folder to make. It holds everything that the stage needs and can be moved.
+    map
+        Map layer that replaces the one of the TOML. Earth, sources and furniture stay. A map that contradicts
+        them is refused, and the difference is given in nT.
+    """
+    from magtwin.author.scene import author_scene
+    from magtwin.files import check_free
+    from magtwin.twin import scene_from_toml
+    from magtwin.usd.info import info_of_stage
+    from magtwin.usd.robot import conversion_notes
+
+    check_free(out, force=force)
+    lines: list[str] = []
+    with TemporaryDirectory() as workshop:
+        announce(f"Reading {spec}")
+        with progress("Reading the scene", "headings") as advance:
+            read = scene_from_toml(
+                spec, map_layer=map, network=network, workshop=workshop, report=lines.append, progress=advance
+            )
+        announce("Authoring the stage")
+        root = author_scene(read, out, force=force)
+        made = [s.robot for s in read.robots if s.robot.asset.is_relative_to(Path(workshop).resolve())]
+        notes = {f"notes on {robot.name}": conversion_notes(robot.asset) for robot in made}
+    report = info_of_stage(root)
+    report = replace(report, metadata={**report.metadata, **notes})
+    return Done(report, root, text="\n".join([*lines, f"Wrote {root}"]))

@@ -1,0 +1,97 @@
+"""Methods that fit readings: the protocols, and where a method gets its name.
+
+A new method is a function that takes `Readings` and returns a `FieldModel`. Its options are keyword-only:
+
+    @map_method("mean")
+    def fit_mean(readings: Readings, *, floor_nt: float = 0.0) -> FieldModel: ...
+
+An installed package announces its methods as entry points of the group `magtwin.map_methods`. Then
+`magtwin map fit --method mean` and `fit(readings, "mean")` find it.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.field.survey.readings import Readings
+from magtwin.registry import Registry
+from magtwin.summary import Summarized, Summary, printable
+
+Array = NDArray[np.float64]
+
+
+class FieldModel(Protocol):
+    """A fit's total field over a floor, and how certain it is. It may have two more members.
+
+    `predict_nodes(p_xy, yaw)`, with the arguments and results of `predict`, is used for the nodes of a map.
+    `field`, a `HarmonicField`, becomes the map's.
+    """
+
+    @property
+    def method(self) -> str:
+        """Name of the method."""
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """Fitted or chosen parameters by name with unit: numbers, texts, lists of them."""
+
+    @property
+    def noise_nt2(self) -> float:
+        """Variance of a reading about the field [nT^2]; not part of the variance of `predict`."""
+
+    def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
+        """Field and its variance at poses.
+
+        Args:
+            p_xy: Positions of base_link in world [m], shape (..., 2).
+            yaw: Headings [rad], shape (...); the two shapes are broadcast.
+
+        Returns:
+            Field magnitude [nT] and its variance [nT^2], each of shape (...); nan where unknown.
+        """
+
+
+class MapMethod(Protocol):
+    """A function that fits readings. Every other parameter is an option, keyword-only.
+
+    If it has an option `progress`, that is called as progress(done, total, what).
+    """
+
+    def __call__(self, readings: Readings, /, **options: Any) -> FieldModel:
+        """Fit the good readings of a survey; raise `InputError` if they make no map."""
+
+
+METHODS: Registry[MapMethod] = Registry(
+    "method",
+    "map_methods",
+    {
+        "trilinear": "magtwin.field.fit.interpolation:fit_trilinear",
+        "cubic": "magtwin.field.fit.interpolation:fit_cubic",
+        "gp": "magtwin.field.fit.gp:fit_gp",
+        "harmonic": "magtwin.field.fit.harmonic.inversion:fit_harmonic",
+    },
+)
+"""Map methods by name."""
+
+map_method = METHODS.register
+"""Decorator that names a map method."""
+
+
+class FittedModel(Summarized):
+    """Summary of the built-in methods' models: method, parameters and noise."""
+
+    method: Any
+    parameters: Any
+    noise_nt2: Any
+
+    def _summary(self) -> Summary:
+        figures = [f"{name} {value}" for name, value in self.parameters.items()]
+        return Summary(
+            f"{type(self).__name__}: {self.method}, noise sd {math.sqrt(self.noise_nt2):.3g} nT",
+            (("figures", printable(", ".join(figures))),),
+            ("parameter", "value"),
+            [(name, str(value)) for name, value in self.parameters.items()],
+        )

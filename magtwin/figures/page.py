@@ -1,0 +1,203 @@
+"""Page: titled sections of pictures and tables, written as HTML, Markdown or JSON.
+
+An HTML page is one file with its pictures inside. It loads nothing and runs no script, and text from files,
+such as metadata and names, is escaped.
+"""
+
+import base64
+import json
+import math
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from magtwin.errors import InputError
+from magtwin.figures.canvas import Picture
+from magtwin.files import output
+from magtwin.summary import printable
+from magtwin.version import __version__
+
+LONGEST_TEXT = 500
+"""Characters of a cell that a page shows. JSON holds all of them."""
+
+LONG_CELL = 24
+"""Characters above which a table gives a cell's column more width."""
+
+
+class Cell(NamedTuple):
+    """A cell of an HTML table."""
+
+    label: str
+    """Head of its column, which phones show beside the text."""
+
+    text: str
+    kind: str
+    """CSS class: "number", "long" or ""."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text and numbers under a head; the first column names the row."""
+
+    title: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    note: str = ""
+    exact: bool = False
+    """Whether numbers are shown as they are: a seed of 1234 not as "1,234"."""
+
+    def columns(self) -> Iterator[tuple[str, bool]]:
+        """Head of each column, and whether the column is aligned as numbers."""
+        for name, values in zip(self.head, zip(*self.rows, strict=True), strict=True):
+            yield name, not self.exact and any(map(_is_number, values))
+
+    def cells(self) -> list[list[Cell]]:
+        """Rows of cells as text."""
+        return [[self._cell(*pair) for pair in zip(self.head, row, strict=True)] for row in self.rows]
+
+    def _cell(self, head: str, value: Any) -> Cell:
+        if self.exact:
+            return Cell(head, text_of(str(value)), "")
+        kind = "number" if _is_number(value) else "long" if len(str(value)) > LONG_CELL else ""
+        return Cell(head, text_of(value), kind)
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a page."""
+
+    title: str
+    lead: str = ""
+    pictures: tuple[Picture, ...] = ()
+    tables: tuple[Table, ...] = ()
+
+
+@dataclass(frozen=True)
+class Page:
+    """The content of a page, independent of its format."""
+
+    title: str
+    lead: str
+    sections: tuple[Section, ...]
+    overview: Table | None = None
+    """One row per section, if there are several."""
+
+    data: Mapping[str, Any] = field(default_factory=dict)
+    """Content of the JSON form."""
+
+
+def write_page(page: Page, path: str | os.PathLike[str], *, force: bool = False) -> None:
+    """Write a page as .html, .md or .json, whichever its file name ends in.
+
+    Args:
+        page: The page.
+        path: The file to make.
+        force: Whether to replace an existing file.
+
+    Raises:
+        InputError: The name has another ending, or the file exists and `force` was not given.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in WRITERS:
+        raise InputError(f"{path}: a report ends in {', '.join(WRITERS)}")
+    text = WRITERS[suffix](page)
+    with output(path, force=force) as aside:
+        aside.write_text(text, encoding="utf-8")
+
+
+def to_html(page: Page) -> str:
+    """A page as one HTML file."""
+    links = [f"#run-{k}" for k in range(len(page.sections))]
+    return _TEMPLATES.get_template("page.html").render(page=page, links=links, version=__version__)
+
+
+def to_markdown(page: Page) -> str:
+    """A page as Markdown, with those of its pictures that have a file."""
+    several = len(page.sections) > 1
+    parts = [f"# {_marked(page.title)}", _marked(page.lead)]
+    if page.overview:
+        parts += _markdown_table(page.overview, 2)
+    for section in page.sections:
+        if several:
+            parts.append(f"## {_marked(section.title)}")
+        if section.lead:
+            parts.append(_marked(section.lead))
+        for picture in section.pictures:
+            if picture.file:
+                parts.append(f"![{_marked(picture.alt)}]({picture.file})\n\n{_marked(picture.title)}")
+        for table in section.tables:
+            parts += _markdown_table(table, 3 if several else 2)
+    parts.append(f"Written by magtwin {_marked(__version__)}.")
+    return "\n\n".join(parts) + "\n"
+
+
+def to_json(page: Page) -> str:
+    """The data of a page as JSON; numbers that are not finite become null."""
+    return json.dumps(_finite({"magtwin": __version__, "title": page.title, **page.data}), indent=2) + "\n"
+
+
+WRITERS: Mapping[str, Callable[[Page], str]] = {".html": to_html, ".md": to_markdown, ".json": to_json}
+"""Formats of a page by file name ending."""
+
+
+def text_of(value: Any) -> str:
+    """A value as text: numbers to four digits, text without control characters and of limited length."""
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return f"{value:,}"
+    if isinstance(value, float | np.floating):
+        number = float(value)
+        if abs(number) >= 1000 and math.isfinite(number):
+            return f"{number:,.0f}"
+        return "0" if number == 0 else f"{number:.4g}"
+    text = printable(value)
+    return text if len(text) <= LONGEST_TEXT else text[:LONGEST_TEXT] + "…"
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a cell is aligned as a number: a number, or text such as "212.9 (0.493)"."""
+    if isinstance(value, str):
+        return re.fullmatch(r"[+-]?\d{1,3}(,?\d{3})*(\.\d+)?( ?%| \(.*\))?", value) is not None
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _markdown_table(table: Table, level: int) -> list[str]:
+    parts = [f"{'#' * level} {_marked(table.title)}"]
+    if table.rows:
+        rows = [[cell.text for cell in row] for row in table.cells()]
+        lines = [[_marked(text) for text in row] for row in (table.head, *rows)]
+        lines.insert(1, ["---"] * len(table.head))
+        parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
+    if table.note:
+        parts.append(_marked(table.note))
+    return parts
+
+
+def _marked(text: str) -> str:
+    """Text with the characters escaped that have a meaning in Markdown."""
+    return re.sub(r"([\\`*\[\]<>|!#~$]|(?<!\w)_|_(?!\w))", r"\\\1", text_of(text))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _finite(part) for name, part in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+_TEMPLATES = Environment(
+    loader=FileSystemLoader(Path(__file__).parent),
+    autoescape=True,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    undefined=StrictUndefined,
+)
+_TEMPLATES.filters |= {"text": text_of, "base64": lambda data: base64.b64encode(data).decode("ascii")}

@@ -1,0 +1,131 @@
+"""Training: learning curves and input correlations, as in Figures 6c and 2 of the paper."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import astuple, fields
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from magtwin.figures.canvas import (
+    INK,
+    MAP_INK,
+    OTHER_INK,
+    WIDTH_IN,
+    label,
+    legend_below,
+    new_figure,
+    save,
+)
+from magtwin.files import output
+from magtwin.learn.data.correlation import PAPER, Correlations
+from magtwin.learn.models.descent import Epoch
+
+
+def plot_learning_curve(
+    history: Sequence[Epoch],
+    out: str | os.PathLike[str],
+    *,
+    naive_rmse_nt: float | None = None,
+    title: str = "",
+    force: bool = False,
+) -> None:
+    """Draw the errors on the training and the validation rows over the epochs.
+
+    Args:
+        history: Result of `magtwin.learn.models.fit_network.train`.
+        out: PNG or SVG to write.
+        naive_rmse_nt: Error of the mean training label on the validation rows [nT], drawn as a line.
+        title: Title of the picture.
+        force: Whether to replace an existing file.
+
+    Raises:
+        InputError: `out` is not a picture or exists.
+    """
+    figure = new_figure(WIDTH_IN, 3.4)
+    ax = figure.subplots()
+    numbers = [epoch.number for epoch in history]
+    mark = "." if len(numbers) <= 60 else ""
+    ax.plot(numbers, [e.train_rmse_nt for e in history], color=OTHER_INK, marker=mark, label="training")
+    ax.plot(numbers, [e.val_rmse_nt for e in history], color=MAP_INK, marker=mark, label="validation")
+    if naive_rmse_nt is not None:
+        ax.axhline(naive_rmse_nt, color="0.5", ls="--", lw=1, label="validation, naive mean")
+    kept = next(epoch for epoch in reversed(history) if epoch.best)
+    ax.plot(kept.number, kept.val_rmse_nt, "o", mfc="none", mec=INK, ms=9, label=f"kept: epoch {kept.number}")
+    label_epochs(ax)
+    ax.set_axisbelow(True)
+    ax.set_title(title, fontsize=10)
+    legend_below(figure)
+    save(figure, out, force)
+
+
+def label_epochs(ax: Axes) -> None:
+    """Axes, ticks and grid of errors [nT] over whole epochs."""
+    ax.set_ylim(bottom=0)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    label(ax, "epoch", "RMSE [nT]")
+    ax.grid(color="0.9")
+
+
+def write_learning_curve(
+    history: Sequence[Epoch], out: str | os.PathLike[str], *, force: bool = False
+) -> None:
+    """Write the epochs as CSV: number, training and validation RMSE, validation MAE [nT], and whether best.
+
+    Raises:
+        InputError: `out` exists.
+    """
+    lines = [",".join(field.name for field in fields(Epoch))]
+    lines += [",".join(repr(int(v) if isinstance(v, bool) else v) for v in astuple(e)) for e in history]
+    with output(out, force=force) as aside:
+        aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def plot_correlations(
+    correlations: Correlations, out: str | os.PathLike[str], *, title: str = "", force: bool = False
+) -> None:
+    """Draw the correlation of each input with the disturbance, beside the paper's values.
+
+    Args:
+        correlations: The correlations.
+        out: PNG or SVG to write.
+        title: Title of the picture.
+        force: Whether to replace an existing file.
+
+    Raises:
+        InputError: `out` is not a picture or exists.
+    """
+    save(draw_correlations(correlations, title=title), out, force)
+
+
+def draw_correlations(correlations: Correlations, *, title: str = "") -> Figure:
+    """The figure that `plot_correlations` writes."""
+    names, count = correlations.features, len(correlations.features)
+    figure = new_figure(WIDTH_IN, 1.5 + 0.24 * count)
+    ax = figure.subplots()
+    y, rho, sd = np.arange(count), np.nan_to_num(correlations.rho), correlations.sd
+    ax.barh(y, rho, 0.7, color="#8fb3d9", label=f"{correlations.rows:,} readings")
+    known = np.isfinite(sd)
+    if known.any():
+        look: dict[str, Any] = {"fmt": "none", "ecolor": INK, "elinewidth": 1, "capsize": 2}
+        text = f"standard deviation over {correlations.groups} groups"
+        ax.errorbar(rho[known], y[known], xerr=sd[known], label=text, **look)
+    paper = [(PAPER[name], i) for i, name in enumerate(names) if name in PAPER]
+    if paper:
+        ax.plot(*zip(*paper, strict=True), "D", color=MAP_INK, ms=4.5, label="the paper's Figure 2")
+    for i in np.flatnonzero(np.isnan(correlations.rho)).tolist():
+        ax.text(0.01, i, "never varies", va="center", fontsize=9, color="0.4")
+    reach = np.nanmax(np.abs(np.append(rho, 0.4)) + np.nan_to_num(np.append(sd, 0.0)))
+    reach = min(1.1 * reach, 1.05)
+    ax.set(xlim=(-reach, reach), ylim=(count - 0.4, -0.6))
+    ax.set_yticks(y, names, fontsize=9)
+    ax.axvline(0, color=INK, lw=0.8)
+    label(ax, "Spearman's correlation with the disturbance")
+    ax.grid(axis="x", color="0.9")
+    ax.set_axisbelow(True)
+    ax.set_title(title, fontsize=10)
+    legend_below(figure)
+    return figure

@@ -1,0 +1,272 @@
+"""Views of files: show, draw or film a run or a stage; a page about runs; two runs compared."""
+
+import shutil
+import subprocess
+import tempfile
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+from magtwin.errors import InputError, MismatchWarning
+from magtwin.figures.page import write_page
+from magtwin.figures.reports import NamedRun, page_of_comparison, page_of_runs
+from magtwin.files import check_free, existing
+from magtwin.io.convert import twin_to_show
+from magtwin.io.formats import read_run
+from magtwin.io.provenance import map_of, planned_of
+from magtwin.run.compare import Comparison, compare
+from magtwin.run.run import Run
+from magtwin.usd.layers import stage_sha256
+
+MOST_PICTURED = 60
+"""Largest number of runs with pictures on a page; each takes 0.4 MB and a second."""
+
+STAGES = (".usd", ".usda", ".usdc", ".usdz")
+
+Source = str | Path
+
+
+def view(files: Sequence[Source], *, scene: Source | None = None, offsets_s: Sequence[float] = ()) -> None:
+    """Show runs in the Rerun viewer, or a stage in usdview or a window, until it is closed.
+
+    Args:
+        files: Runs in any format, on one timeline; or one stage.
+        scene: Stage to show runs in. None: the one of the metadata.
+        offsets_s: Seconds to add to the times of each of several runs.
+
+    Raises:
+        InputError: A file cannot be read, or there is no viewer.
+    """
+    paths = [Path(file) for file in files]
+    if not paths:
+        raise InputError("name a run or a stage to view")
+    if offsets_s and (len(offsets_s) != len(paths) or len(paths) < 2):
+        raise InputError(
+            f"`offsets_s` has one value for each of several runs, got {len(offsets_s)} of {len(paths)}",
+            parameter="offsets_s",
+        )
+    if len(paths) > 1:
+        _view_together(paths, scene, offsets_s or [0.0] * len(paths))
+    elif paths[0].suffix in STAGES and not paths[0].is_dir():
+        _view_stage(paths[0])
+    else:
+        _view_run(paths[0], scene)
+
+
+def picture(
+    file: Source,
+    out: Source,
+    *,
+    camera: str | None = None,
+    time_s: float | None = None,
+    size: tuple[int, int] = (1600, 1000),
+    scene: Source | None = None,
+    force: bool = False,
+) -> Sequence[str]:
+    """Draw a moment of a run in its lab, a stage, or a recording in the Rerun viewer, as a PNG.
+
+    Args:
+        file: Run in any format, stage, or recording.
+        out: PNG to write.
+        camera: "orbit", "top", "chase" or "x,y,z:x,y,z" [m]. None: orbit; a recording uses the Rerun viewer.
+        time_s: Moment of a run or recording [s]. None: its end, or where the viewer starts.
+        size: Width and height [pixels].
+        scene: Scene of a run. None: the one of the metadata.
+        force: Whether an existing output is replaced.
+
+    Returns:
+        Messages of the Rerun viewer.
+
+    Raises:
+        InputError: The file cannot be read or drawn, or the output exists.
+    """
+    from magtwin.figures.pictures import check_png, picture_of_stage
+    from magtwin.figures.scenery import View, picture_of_run
+
+    file, out = existing(file, "run, stage or recording"), check_free(check_png(out), force=force)
+    if file.suffix == ".rrd" and camera is None and scene is None:
+        from magtwin.io.rerun.viewer import screenshot
+
+        return screenshot(file, out, time_s=time_s, size=size, force=force)
+    if file.suffix in STAGES and time_s is None and scene is None:
+        if camera == "chase":
+            raise InputError(f"{file}: a stage has no run to follow; take another camera", parameter="camera")
+        seen = None if camera is None else View.of(camera).camera()
+        picture_of_stage(file, out, size=size, camera=seen, force=force)
+    else:
+        run, stage = _run_and_scene(file, scene)
+        picture_of_run(run, stage, out, time_s=time_s, camera=camera or "orbit", size=size, force=force)
+    return ()
+
+
+def film(
+    file: Source,
+    out: Source,
+    *,
+    scene: Source | None = None,
+    pace: float | None = None,
+    force: bool = False,
+    **options: Any,
+) -> None:
+    """Film a run in its lab.
+
+    Args:
+        file: Run in any format.
+        out: MP4 or GIF to write.
+        scene: Scene of the run. None: the one of the metadata.
+        pace: Simulated seconds per second of film. None: 1, or more for a film of at most 30 s.
+        force: Whether an existing output is replaced.
+        options: Of `magtwin.figures.films.film_of_run`: camera, fps, size, advance.
+
+    Raises:
+        InputError: The file cannot be read or drawn, or the output exists.
+    """
+    from magtwin.figures.films import film_of_run
+
+    file, out = existing(file, "run"), check_free(out, force=force)
+    run, stage = _run_and_scene(file, scene)
+    film_of_run(run, stage, out, speed=pace, force=force, **options)
+
+
+def report_runs(
+    runs: Sequence[Source],
+    out: Source,
+    *,
+    scene: Source | None = None,
+    force: bool = False,
+    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+) -> None:
+    """Write a page about runs: what was run, map and path, time series, errors, events, provenance.
+
+    Args:
+        runs: Runs in any format; a folder that `magtwin sweep` made stands for its runs.
+        out: Page to write (.html, .md or .json).
+        scene: Scene of the map below the paths. None: the one of each run's metadata.
+        force: Whether an existing page is replaced.
+        progress: Called with the number of runs done, the number in all and the current step.
+
+    Raises:
+        InputError: A run cannot be read, or the page cannot be written.
+    """
+    out = check_free(out, force=force)
+    files = [file for source in runs for file in runs_in(Path(source))]
+    names = [file.name for file in files]
+    named = []
+    for k, file in enumerate(files):
+        progress(k, len(files), f"reading {file.name}")
+        run, note, field = read_run(file), "", None
+        try:
+            field = map_of(run, scene, near=file)
+        except InputError as error:
+            note = f"Its map is not shown: {error}."
+        name = file.name if names.count(file.name) == 1 else str(file)
+        named.append(NamedRun(name, run, field, planned_of(run, near=file), note))
+    pictured = out.suffix == ".html" and len(named) <= MOST_PICTURED
+    page = page_of_runs(named, pictures=pictured, advance=lambda done: progress(done, len(named), "drawing"))
+    if out.suffix == ".html" and not pictured:
+        page = replace(page, lead=f"{page.lead} Pages of more than {MOST_PICTURED} runs have no pictures.")
+    write_page(page, out, force=force)
+
+
+def compare_files(
+    a: Source,
+    b: Source,
+    *,
+    align: Literal["time", "path", "none"] = "time",
+    out: Source | None = None,
+    force: bool = False,
+) -> Comparison:
+    """Compare two runs, and write a page or a picture of the comparison.
+
+    Args:
+        a: First run, in any format.
+        b: Second run.
+        align: As for `magtwin.run.compare.compare`.
+        out: Page (.html, .md, .json) or picture (.png, .svg) to write.
+        force: Whether an existing output is replaced.
+
+    Raises:
+        InputError: A run cannot be read, they do not overlap, or the output cannot be written.
+    """
+    a, b = Path(a), Path(b)
+    runs = read_run(a), read_run(b)
+    comparison = compare(*runs, align=align)
+    names = names_of(a, b)
+    if out is not None and Path(out).suffix in (".png", ".svg"):
+        from magtwin.figures.comparisons import plot_comparison
+
+        plot_comparison(*runs, comparison, out, names=names, force=force)
+    elif out is not None:
+        page = page_of_comparison(NamedRun(names[0], runs[0]), NamedRun(names[1], runs[1]), comparison)
+        write_page(page, out, force=force)
+    return comparison
+
+
+def names_of(a: Path, b: Path) -> tuple[str, str]:
+    """Names of two files that tell them apart."""
+    return (a.name, b.name) if a.name != b.name else (str(a), str(b))
+
+
+def runs_in(path: Path) -> list[Path]:
+    """The runs in a folder that `magtwin sweep` made, or the one run that a path names."""
+    if not (path / "runs.csv").is_file():
+        return [path]
+    return sorted(path.glob("run_*.parquet"))
+
+
+def _run_and_scene(file: Path, scene: Source | None) -> tuple[Run, Path]:
+    """A run and its scene; warns if the scene has changed since."""
+    from magtwin.twin import scene_of
+
+    run = read_run(file)
+    stage = scene_of(run, scene, near=file)
+    if "scene_sha256" in run.metadata and run.metadata["scene_sha256"] != stage_sha256(stage):
+        warnings.warn(
+            f"{stage} has changed since the run; it is drawn as it is now", MismatchWarning, stacklevel=3
+        )
+    return run, stage
+
+
+def _view_run(file: Path, scene: Source | None) -> None:
+    from magtwin.io.rerun.file import show_run
+    from magtwin.io.rerun.viewer import show
+
+    existing(file, "run")
+    if file.suffix == ".rrd" and scene is None:
+        show(file)
+    else:
+        run = read_run(file)
+        show_run(run, twin_to_show(run, file, scene), file=file)
+
+
+def _view_together(files: Sequence[Path], scene: Source | None, offsets_s: Sequence[float]) -> None:
+    from magtwin.io.rerun.file import write_comparison
+    from magtwin.io.rerun.viewer import show
+
+    alike = len({file.stem for file in files}) < len(files)
+    runs = {str(file) if alike else file.stem: read_run(file) for file in files}
+    if len(runs) < len(files):
+        raise InputError("one run is named twice; name each once")
+    twin = twin_to_show(next(iter(runs.values())), files[0], scene)
+    with tempfile.TemporaryDirectory() as folder:
+        rrd = Path(folder) / "runs.rrd"
+        write_comparison(runs, rrd, twin, offsets_s=dict(zip(runs, offsets_s, strict=True)))
+        show(rrd, source=files[0])
+
+
+def _view_stage(file: Path) -> None:
+    from magtwin.usd.animation import is_animation
+
+    existing(file, "stage")
+    if usdview := shutil.which("usdview"):
+        result = subprocess.run([usdview, str(file)], check=False)
+        if result.returncode:
+            raise InputError(f"{file}: usdview ended with status {result.returncode}")
+    elif file.suffix != ".usdz" and is_animation(file):
+        _view_run(file, file)
+    else:
+        from magtwin.figures.pictures import show_stage
+
+        show_stage(file)

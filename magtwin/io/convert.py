@@ -1,0 +1,90 @@
+"""Conversion of runs between formats, and the scene that a run is shown in."""
+
+import os
+import warnings
+from pathlib import Path
+from typing import Any, Literal
+
+from magtwin.errors import InputError, MismatchWarning
+from magtwin.files import check_free
+from magtwin.io.formats import format_of, read_run, write_run
+from magtwin.run.run import Run
+from magtwin.twin import Twin, led_by, open_twin, scene_of
+
+
+def convert_run(
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    scene: str | Path | None = None,
+    storage: Literal["mcap", "sqlite3"] | None = None,
+    out_unit: Literal["T", "nT"] | None = None,
+    usd_fps: float | None = None,
+    topics: dict[str, str] | None = None,
+    unit: str | None = None,
+    force: bool = False,
+) -> Run:
+    """Convert a run to the format of the output's name.
+
+    Args:
+        source: A run in any format; also the parts of one that did not end.
+        out: File to make; a name without a suffix is the folder of a rosbag2.
+        scene: Stage for formats that show it. None: the one of the metadata.
+        storage: Storage of a bag. None: mcap.
+        out_unit: Unit of the field in a bag. None: T.
+        usd_fps: Frames per second in USD; 0 for one per reading. None: 30.
+        topics: Names of topics in a foreign bag, by ours.
+        unit: Unit of the field in a foreign bag. None: found from its size.
+        force: Whether an existing output is replaced.
+
+    Returns:
+        The run.
+
+    Raises:
+        InputError: The source cannot be read, an option does not fit the formats, or the output exists.
+    """
+    source, out = Path(source), check_free(out, force=force)
+    given: dict[str, Any] = {"storage": storage, "units": out_unit, "fps": usd_fps}
+    options = {name: value for name, value in given.items() if value is not None}
+    if usd_fps == 0:
+        options["fps"] = None
+    takes = format_of(out).takes
+    if scene is not None and not takes & {"twin", "scene_file"}:
+        raise InputError(f"{out}: a table shows no scene; drop `scene`", parameter="scene")
+    if out.resolve() == source.resolve():
+        raise InputError(f"{out}: is the run itself; name another file")
+    reading: dict[str, Any] = {"topics": topics, "unit": unit}
+    run = read_run(source, **{name: value for name, value in reading.items() if value is not None})
+    twin = twin_to_show(run, source, scene) if takes & {"twin", "scene_file"} else None
+    write_run(run, out, twin, force=force, **options)
+    return run
+
+
+def twin_to_show(run: Run, file: Path, scene: str | Path | None = None) -> Twin | None:
+    """The scene to show a run in. Warns, and returns None, if the scene of the metadata is missing.
+
+    Args:
+        run: The run.
+        file: File of the run; its folder is searched for the scene.
+        scene: Scene to use in place of the one of the metadata.
+
+    Raises:
+        InputError: `scene` was given and cannot be opened.
+    """
+    try:
+        twin = open_twin(scene_of(run, scene, near=file), magnetometer="map-only")  # needs no network
+        if "robot" in run.metadata:
+            twin = led_by(twin, str(run.metadata["robot"]))
+    except InputError as error:
+        if scene is not None:
+            raise
+        warnings.warn(f"shown without a scene: {error}", MismatchWarning, stacklevel=2)
+        return None
+    then = run.metadata.get("scene_sha256")
+    if then is not None and then != twin.metadata.get("scene_sha256") and scene != file:
+        warnings.warn(
+            f"{twin.scene_file} has changed since the run; it is shown as it is now",
+            MismatchWarning,
+            stacklevel=2,
+        )
+    return twin

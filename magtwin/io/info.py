@@ -1,0 +1,94 @@
+"""Info: what a run, a stage, a map or a network holds."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from magtwin.errors import InputError, hint
+from magtwin.files import existing
+from magtwin.io.formats import FORMATS, read_run
+from magtwin.report import Figure, Report
+
+STAGES = (".usd", ".usda", ".usdc", ".usdz")
+NETWORKS = (".safetensors", ".pth", ".onnx")
+
+
+def info_of(path: str | os.PathLike[str]) -> Report:
+    """A report on the content and origin of a file.
+
+    Args:
+        path: A run in any format of `magtwin.io.formats`, a stage or a map, a folder of survey CSVs, or a
+            network.
+
+    Raises:
+        InputError: The file is missing, of an unknown kind, or damaged.
+    """
+    file = existing(path, "file")
+    if file.is_dir():
+        return _info_of_folder(file)
+    if file.suffix in NETWORKS:
+        return _info_of_network(file)
+    if file.suffix in STAGES:
+        return _info_of_usd(file)
+    if file.suffix in FORMATS:
+        return info_of_run(file)
+    known = hint(file.suffix, {*FORMATS, *STAGES, *NETWORKS})
+    raise InputError(f"{file}: unknown kind of file {file.suffix!r}; {known}")
+
+
+def info_of_run(file: Path) -> Report:
+    """Rows, duration, what was driven and read, sources, and each column with its unit and frame."""
+    run = read_run(file)
+    report = run.report(str(file))
+    columns = {}
+    for name, values in run.items():
+        spec = run.spec(name)
+        shape = f" x {values.shape[1]}" if values.ndim > 1 else ""
+        words = (spec.unit or "-", spec.frame and f"in {spec.frame}", spec.doc)
+        columns[name + shape] = "  ".join(word for word in words if word)
+    figures = (*report.figures[:2], Figure("columns", len(run)), *report.figures[2:])
+    return replace(report, figures=figures, metadata={**report.metadata, "columns": columns})
+
+
+def _info_of_folder(folder: Path) -> Report:
+    if not any(folder.glob("*_map.csv")):
+        return info_of_run(folder)
+    from magtwin.field.maps.statistics import map_metadata
+    from magtwin.field.survey.folder import read_survey
+
+    return map_metadata(read_survey(folder)[0])
+
+
+def _info_of_usd(file: Path) -> Report:
+    from magtwin.field.maps.statistics import map_metadata
+    from magtwin.usd.animation import is_animation
+    from magtwin.usd.info import info_of_stage
+    from magtwin.usd.maps import is_map_layer, load_epochs
+
+    if file.suffix != ".usdz" and is_animation(file):
+        run = info_of_run(file)
+        try:
+            return _with_figures(run, info_of_stage(file).figures)
+        except InputError as error:  # the scene is missing, the run is complete
+            return replace(run, metadata={**run.metadata, "stage": str(error)})
+    if file.suffix == ".usdz" or not is_map_layer(file):
+        return info_of_stage(file)
+    epochs = load_epochs(file)
+    card = map_metadata(epochs[-1], epochs)
+    stage = [figure for figure in info_of_stage(file).figures if figure.value != 0]
+    return replace(_with_figures(card, stage), title=f"{card.title} ({file})")
+
+
+def _info_of_network(file: Path) -> Report:
+    if file.suffix == ".onnx":
+        from magtwin.learn.inference.onnx import report_onnx
+
+        return report_onnx(file)
+    from magtwin.learn.models.predictor import load_predictor
+
+    return load_predictor(file).report(str(file))
+
+
+def _with_figures(report: Report, figures: Sequence[Figure]) -> Report:
+    return replace(report, figures=(*report.figures, *figures))

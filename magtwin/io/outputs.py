@@ -1,0 +1,321 @@
+"""Outputs of a run: drive a scene, and write every file that was asked for, or none."""
+
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from threading import Event
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
+
+from magtwin.errors import InputError
+from magtwin.files import check_free, output
+from magtwin.io.formats import format_of, read_run, write_run
+from magtwin.path import Path as Planned
+from magtwin.run.run import Run
+from magtwin.sim.motion.commands import Commands, read_commands
+from magtwin.sim.motion.drive_input import drive_input
+from magtwin.twin import Session, Twin, in_session, open_twin, room_of, scan, simulate
+
+if TYPE_CHECKING:
+    from magtwin.io.recorder import Sink
+    from magtwin.sim.sensors.lidar import Scans
+
+IN_FOLDER = ("run.rrd", "run.parquet")
+"""Runs in a folder that is named as an output; the LiDAR's scans and a picture lie beside them."""
+
+GROWING = (".rrd", ".parquet", ".mcap", ".db3", "")
+"""Suffixes of files that grow while a run is shown live; "" is the folder of a bag."""
+
+USD = (".usd", ".usda", ".usdc")
+
+
+@dataclass(frozen=True)
+class Driven:
+    """A run with its twin, the planned path and the LiDAR's scans."""
+
+    run: Run
+    twin: Twin
+    planned: Planned | None = None
+    scans: "Scans | None" = None
+
+
+def drive(
+    scene_file: str | Path,
+    path: str = "figure8",
+    *,
+    commands: str | Path | None = None,
+    replay: str | Path | None = None,
+    network: str | Path | None = None,
+    magnetometer: Literal["physical", "neural", "map-only"] | None = None,
+    model_error: bool = True,
+    seed: int = 0,
+    session: Session | None = None,
+    fit: bool = False,
+    scans: bool = False,
+    metadata: Mapping[str, str | int] = MappingProxyType({}),
+    report: Callable[[str], Any] = lambda text: None,
+    **options: Any,
+) -> Driven:
+    """Drive a scene's robot along a path, by commands, or as in a recorded run.
+
+    Args:
+        scene_file: The stage.
+        path: Path, as for `magtwin.simulate`.
+        commands: CSV of commands to drive by, in place of the path.
+        replay: Run to drive again, in place of the path.
+        network: As for `magtwin.open_twin`.
+        magnetometer: As for `magtwin.open_twin`.
+        model_error: As for `magtwin.open_twin`.
+        seed: Seed of all noise.
+        session: As for `magtwin.simulate`.
+        fit: Whether the path is moved and shrunk until it fits.
+        scans: Whether the LiDAR's rays are cast.
+        metadata: Metadata of the run, such as names of files that move with it.
+        report: Called with a line about each step.
+        options: Of `magtwin.simulate`.
+
+    Raises:
+        InputError: As for `magtwin.simulate`, or a file cannot be read.
+    """
+    what: Any = path
+    if commands is not None:
+        what = read_commands(Path(commands))
+    elif replay is not None:
+        what = read_run(replay)
+        metadata = {"replay_file": Path(replay).as_posix(), **metadata}
+    elif path != "random":
+        drive_input(path)  # refuses a wrong name before the scene is opened
+    twin = open_twin(scene_file, network=network, magnetometer=magnetometer, model_error=model_error)
+    twin = in_session(twin, session, seed=seed)
+    planned = None
+    if what is path and path != "random":
+        what = planned = drive_input(path, room_of(twin), fit=fit)
+        if isinstance(planned, Planned) and planned.placing:
+            report(
+                f"Path {planned.name} is {_placing(planned.placing)} to fit this floor and what stands on it"
+            )
+    if isinstance(what, Commands) and (text := what.beyond(twin.scene.robot.drive)):
+        report(text)
+    report(f"Driving {getattr(planned, 'name', None) or path}")
+    run = simulate(twin, what, seed=seed, **options).with_metadata(**metadata)
+    if scans:
+        report("Casting the LiDAR's rays")
+    return Driven(run, twin, planned, scan(twin, run, seed=seed) if scans else None)  # type: ignore[arg-type]
+
+
+def _placing(placing: tuple[float, ...]) -> str:
+    """How a path was brought onto the floor, in words."""
+    scale_x, scale_y, x, y = placing
+    scale = f"{scale_x:.2g}" if scale_x == scale_y else f"{scale_x:.2g} in x and {scale_y:.2g} in y"
+    parts = [f"scaled by {scale} from its 6 x 3.5 m floor"] if (scale_x, scale_y) != (1, 1) else []
+    parts += [f"moved by ({x:.2f}, {y:.2f}) m"] if max(abs(x), abs(y)) >= 0.005 else []
+    return " and ".join(parts)
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Files and a folder to write a run to: all of them, or none.
+
+    A file gets the format of its suffix. A name without a suffix is a folder, with run.rrd, run.parquet, a
+    picture and the LiDAR's scans.
+    """
+
+    folder: Path | None
+    files: tuple[Path, ...] = ()
+    scans: tuple[Path, ...] = ()
+    """Tables of the LiDAR's scans, beside Parquet files."""
+    force: bool = False
+    out_unit: Literal["T", "nT"] | None = None
+    """Unit of the field in bags. None: T."""
+    usd_fps: float | None = None
+    """Frames per second in USD, 0 for one per reading. None: 30."""
+    robot: str = ""
+    """Robot whose name becomes part of the file names, in a scene of several."""
+    picture: Callable[[Driven, Path, bool], None] | None = None
+    """Draws run.png in the folder: called with the run, the file and `force`."""
+
+    @classmethod
+    def of(cls, out: "list[Path] | tuple[Path, ...]", *, scans: bool = False, **options: Any) -> "Outputs":
+        """Outputs by their names; refuses unknown formats, two outputs of one name, and files that exist."""
+        folders = [path for path in out if not path.suffix]
+        files = tuple(path for path in out if path.suffix)
+        if len(folders) > 1:
+            raise InputError(
+                f"{folders[1]}: a second folder; a run fills one folder, and any number of files"
+            )
+        for file in files:
+            if not format_of(file).write:
+                raise InputError(f"{file}: {format_of(file).name} is read, not written; name another format")
+        tables = tuple(_scans_of(file) for file in files if scans and file.suffix == ".parquet")
+        made = cls(folders[0] if folders else None, files, tables, **options)
+        targets = made.targets
+        if len({target.resolve() for target in targets}) < len(targets):
+            raise InputError("two outputs have one name; give each its own")
+        for name, value, takes in (("out_unit", made.out_unit, "units"), ("usd_fps", made.usd_fps, "fps")):
+            if value is not None and not any(takes in format_of(file).takes for file in files):
+                kind = "a bag" if takes == "units" else "a USD layer"
+                raise InputError(f"`{name}` is for {kind}; name one as an output, or drop it", parameter=name)
+        for target in targets:
+            check_free(target, force=made.force)
+        return made
+
+    @property
+    def targets(self) -> list[Path]:
+        """Everything that is written."""
+        return [*([self.folder] if self.folder else []), *self.files, *self.scans]
+
+    def of_robot(self, robot: str) -> "Outputs":
+        """Outputs of one robot of several: run.NAME.rrd in place of run.rrd."""
+        files = tuple(_with_name(file, robot) for file in self.files)
+        tables = tuple(_scans_of(file) for file in files if self.scans and file.suffix == ".parquet")
+        return replace(self, files=files, scans=tables, robot=robot)
+
+    @contextmanager
+    def aside(self) -> Iterator["Outputs"]:
+        """The same outputs in temporary places, which replace the targets at the end: all, or none."""
+        with ExitStack() as stack:
+            places: dict[Path, Path] = {}
+            for target in self.targets:
+                if target.suffix in USD:  # names its scene by a relative path: written in place, last
+                    places[target] = check_free(target, force=self.force)
+                else:
+                    places[target] = stack.enter_context(output(target, force=self.force))
+            if self.folder is not None:
+                places[self.folder].mkdir()
+            try:
+                yield replace(
+                    self,
+                    folder=places[self.folder] if self.folder is not None else None,
+                    files=tuple(places[file] for file in self.files),
+                    scans=tuple(places[file] for file in self.scans),
+                )
+            except InputError as error:
+                text = str(error)
+                for target, place in places.items():
+                    text = text.replace(str(place), str(target))
+                raise InputError(text, parameter=error.parameter) from error
+
+    def check_live(self) -> None:
+        """Refuse partial files of an earlier run that was shown live."""
+        from magtwin.io.recorder import partial_of
+
+        for target in self._runs():
+            if target.suffix in (".rrd", ".mcap", ".db3"):
+                check_free(partial_of(target), force=self.force)
+
+    def sinks(self, driven: Driven) -> list["Sink"]:
+        """Writers that take the run as it comes, one per growing format."""
+        from magtwin.io.bags import BagWriter
+        from magtwin.io.rerun.live import RrdWriter
+        from magtwin.io.tables import ParquetParts
+
+        expected: dict[str, Any] = {
+            "expected": driven.run,
+            "planned": driven.planned,
+            "scans": driven.scans,
+            "force": self.force,
+        }
+        sinks: dict[str, Any] = {}
+        for target in self._runs():
+            if target.suffix == ".rrd" and ".rrd" not in sinks:
+                sinks[".rrd"] = RrdWriter(target, driven.twin, **expected)
+            elif target.suffix == ".parquet" and ".parquet" not in sinks:
+                sinks[".parquet"] = ParquetParts(target, force=self.force)
+            elif target.suffix in (".mcap", ".db3"):
+                unit = self.out_unit or "T"
+                sinks[str(target)] = BagWriter(
+                    target, driven.twin, units=unit, scans=driven.scans, force=self.force
+                )
+        return list(sinks.values())
+
+    def write(self, driven: Driven, *, recorded: bool = False) -> None:
+        """Write the run to every target, each format once; `recorded` formats are there already."""
+        written: dict[str, Path] = {}
+        for target in sorted(self._runs(), key=lambda file: file.suffix in USD):
+            if target.suffix in written:
+                shutil.copyfile(written[target.suffix], target)
+                continue
+            written[target.suffix] = target
+            if not (recorded and target.suffix in GROWING):
+                self._write_run(driven, target)
+        if driven.scans is not None:
+            from magtwin.io.scans import write_scans
+
+            inside = () if self.folder is None else (_with_name(self.folder / "run.parquet", self.robot),)
+            for file in (*map(_scans_of, inside), *self.scans):
+                write_scans(driven.scans, file, force=self.force)
+        if self.folder is not None and self.picture is not None:
+            self.picture(driven, _with_name(self.folder / "run.png", self.robot), self.force)
+
+    def _write_run(self, driven: Driven, target: Path) -> None:
+        options: dict[str, Any] = {}
+        takes = format_of(target).takes
+        if self.out_unit is not None and "units" in takes:
+            options["units"] = self.out_unit
+        if self.usd_fps is not None and "fps" in takes:
+            options["fps"] = self.usd_fps or None
+        known: dict[str, Any] = {"planned": driven.planned, "scans": driven.scans}
+        write_run(driven.run, target, driven.twin, **known, force=self.force, **options)
+
+    def _runs(self) -> list[Path]:
+        """Files that hold the run."""
+        inside = [] if self.folder is None else [self.folder / name for name in IN_FOLDER]
+        return [*(_with_name(file, self.robot) for file in inside), *self.files]
+
+
+def record_live(
+    driven: Driven,
+    outputs: Outputs,
+    *,
+    address: str | None,
+    pace: float = 1.0,
+    stop: Event | None = None,
+    progress: Callable[[float, float, str], Any] = lambda done, total, what: None,
+) -> Driven:
+    """Emit a run in step with the clock to its files and to a Rerun viewer.
+
+    Args:
+        driven: The run.
+        outputs: Files that grow meanwhile; `Outputs.write` writes the others afterwards.
+        address: Address of a Rerun viewer. None: only files.
+        pace: Simulated seconds per second.
+        stop: Ends the run early when set.
+        progress: Called with seconds done, seconds in all and a word.
+
+    Returns:
+        The run until its end, or until it was stopped.
+
+    Raises:
+        InputError: It was stopped before the first reading.
+    """
+    from magtwin.io.recorder import Recorder, in_step
+    from magtwin.io.rerun.live import LiveViewer
+
+    run, viewers = driven.run, []
+    if address is not None:
+        viewers = [LiveViewer(address, driven.twin, expected=run, planned=driven.planned, scans=driven.scans)]
+    with Recorder(outputs.sinks(driven), viewers) as recorder:
+        for block in in_step(run, pace, stop=stop):
+            recorder.append(block)
+            progress(round(float(block["t"][-1])), round(float(run["t"][-1])), "Ctrl-C ends it")
+    if not recorder.rows:
+        raise InputError("ended before the first reading; nothing is written")
+    scans = driven.scans
+    if recorder.rows < run.rows:
+        run = run.take(slice(recorder.rows))
+        if scans is not None:
+            seen = scans.t <= run["t"][-1]
+            scans = type(scans)(*(getattr(scans, field.name)[seen] for field in fields(scans)))
+    return replace(driven, run=run, scans=scans)
+
+
+def _scans_of(file: Path) -> Path:
+    """The table of scans beside a run's table."""
+    return file.with_suffix(".scans.parquet")
+
+
+def _with_name(file: Path, robot: str) -> Path:
+    """A file of one robot of several: run.NAME.rrd for run.rrd; unchanged if the name is ""."""
+    return file.with_name(f"{file.stem}.{robot}{file.suffix}") if robot else file

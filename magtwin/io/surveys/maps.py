@@ -1,0 +1,391 @@
+"""Surveys to maps: import a survey of any form, fit a model to it, validate methods on it, survey a scene."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from math import radians
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.survey.readings import TAKEN, Readings
+from magtwin.files import check_free, sha256
+from magtwin.io.surveys.about import About
+from magtwin.io.surveys.columns import Columns
+from magtwin.io.surveys.readings import is_pattern, read_readings, save_readings
+from magtwin.report import Report
+
+Method = Literal["trilinear", "cubic", "gp", "harmonic"]
+Split = Literal["checkerboard", "heading", "run", "block"]
+Source = str | os.PathLike[str]
+Progress = Callable[..., None]
+
+LAYERS = (".usdc", ".usd")
+"""Suffixes of map layers."""
+
+LEAST_READINGS = 8
+"""Smallest number of good readings that a map can be fitted to."""
+
+USUAL_READINGS = 100
+"""Number of good readings below which the report doubts the map."""
+
+USUAL_SPAN_M = 300.0
+"""Extent of a survey above which the report asks for the unit of its positions [m]."""
+
+
+def open_map(file: Source, date: str | None = None) -> AnomalyMap:
+    """The map of a layer or stage, or of a folder of survey CSVs.
+
+    Args:
+        file: Layer, stage, or folder with one CSV per heading.
+        date: Date between the epochs of a layer, YYYY-MM-DD. None: the latest epoch.
+
+    Raises:
+        InputError: There is no map, it is damaged, or a folder is asked for a date.
+    """
+    from magtwin.field.survey.folder import read_survey as read_folder
+    from magtwin.usd.maps import load_map
+
+    if not Path(file).is_dir():
+        return load_map(file, date)
+    if date is not None:
+        raise InputError(f"{file}: a folder of CSVs has no dates; leave out `date`", parameter="date")
+    return read_folder(file)[0]
+
+
+def read_survey(
+    sources: Sequence[Source],
+    *,
+    columns: Columns | None = None,
+    about: About | None = None,
+    keep_stuck: bool = False,
+    pose_topic: str | None = None,
+    field_topic: str | None = None,
+) -> tuple[Readings, Report]:
+    """Readings of a survey of any form, with stuck readings masked, and the report on them.
+
+    Args:
+        sources: As for `magtwin.io.surveys.readings.read_readings`.
+        columns: Columns of tables.
+        about: Metadata that the files lack.
+        keep_stuck: Whether stuck readings stay in.
+        pose_topic: Topic of a bag's poses, if it has several.
+        field_topic: Topic of a bag's field, if it has several.
+
+    Raises:
+        InputError: A source cannot be read, or all of its readings are stuck.
+    """
+    from magtwin.field.survey.stuck import mask_stuck
+
+    known = {} if about is None else {**asdict(about), "name": None}  # errors name the file
+    readings = read_readings(
+        *sources, columns=columns, pose_topic=pose_topic, field_topic=field_topic, **known
+    )
+    masked, report = mask_stuck(readings)
+    if taken := [part.removeprefix(TAKEN) for part in readings.source.split("; ") if part.startswith(TAKEN)]:
+        report = replace(report, metadata={**report.metadata, "taken": taken})
+    if not (keep_stuck or masked.good.any()):
+        raise InputError(
+            f"{sources[0]}: all {len(readings)} readings come from a sensor that was stuck; survey again, or "
+            "keep them with `keep_stuck=True`",
+            parameter="keep_stuck",
+        )
+    return (readings if keep_stuck else masked), report
+
+
+def import_survey(
+    sources: Sequence[Source],
+    out: Source,
+    *,
+    columns: Columns | None = None,
+    about: About | None = None,
+    keep_stuck: bool = False,
+    pose_topic: str | None = None,
+    field_topic: str | None = None,
+    force: bool = False,
+) -> Report:
+    """Write a survey as a map layer, which it must be gridded for, or as readings.
+
+    Args:
+        sources: As for `read_survey`; a folder with one CSV per heading too.
+        out: Map layer (.usdc) or readings (.parquet) to write.
+        columns: Columns of tables.
+        about: Metadata that the files lack.
+        keep_stuck: Whether stuck readings stay in.
+        pose_topic: Topic of a bag's poses, if it has several.
+        field_topic: Topic of a bag's field, if it has several.
+        force: Whether an existing output is replaced.
+
+    Returns:
+        A report on the field and on stuck readings.
+
+    Raises:
+        InputError: A source cannot be read, or the output cannot be written.
+    """
+    from magtwin.field.survey.folder import node_map
+    from magtwin.field.survey.folder import read_survey as read_folder
+    from magtwin.usd.maps import save_map
+
+    out, columns, about = _checked(out, force), columns or Columns(), about or About()
+    name = about.name or out.stem
+    if out.suffix != ".parquet" and len(sources) == 1 and _is_survey_folder(Path(sources[0]), columns):
+        field, report = read_folder(
+            sources[0],
+            **{**asdict(about), "name": name},
+            unit=columns.unit or "nT",
+            scale=columns.scale,
+            keep_stuck=keep_stuck,
+        )
+        save_map(field, out, force=force)
+        return report
+    readings, found = read_survey(
+        sources,
+        columns=columns,
+        about=about,
+        keep_stuck=keep_stuck,
+        pose_topic=pose_topic,
+        field_topic=field_topic,
+    )
+    readings = readings.with_(name=name)
+    if out.suffix == ".parquet":
+        save_readings(readings, out, force=force)
+        return _joined(readings.report(), found)
+    field = node_map(readings)
+    save_map(field, out, force=force)
+    return _joined(field.report(), found)
+
+
+def fit_survey(
+    sources: Sequence[Source],
+    out: Source,
+    *,
+    method: Method = "harmonic",
+    kernel: Literal["matern", "poisson"] | None = None,
+    earth: str | None = None,
+    spacing_m: float | None = None,
+    headings_rad: Sequence[float] | None = None,
+    columns: Columns | None = None,
+    about: About | None = None,
+    keep_stuck: bool = False,
+    pose_topic: str | None = None,
+    field_topic: str | None = None,
+    progress: Progress | None = None,
+    force: bool = False,
+) -> Report:
+    """Fit a model to a survey and write its map with variance.
+
+    Args:
+        sources: As for `import_survey`.
+        out: Map layer to write (.usdc).
+        method: One of `magtwin.field.fit.fit.METHODS`.
+        kernel: Covariance of the Gaussian process. None: poisson.
+        earth: The Earth's field for the harmonic fit, as for `magtwin.author.earth.earth_of`.
+        spacing_m: Spacing of the map's nodes [m]. None: chosen by accuracy.
+        headings_rad: Headings of the map [rad]. None: chosen by accuracy.
+        columns: Columns of tables.
+        about: Metadata that the files lack.
+        keep_stuck: Whether stuck readings stay in.
+        pose_topic: Topic of a bag's poses, if it has several.
+        field_topic: Topic of a bag's field, if it has several.
+        progress: Called with the number done, the total, and a word.
+        force: Whether an existing output is replaced.
+
+    Returns:
+        A report on the map, its grid, stuck readings and doubts.
+
+    Raises:
+        InputError: A source cannot be read, has too few good readings, or the output cannot be written.
+    """
+    from magtwin.field.fit.fit import fit, grid_report, raster
+    from magtwin.usd.maps import save_map
+
+    out, about = _checked(out, force), about or About()
+    options = _method_options([method], kernel, earth).get(method, {})
+    readings, report = read_survey(
+        sources,
+        columns=columns,
+        about=about,
+        keep_stuck=keep_stuck,
+        pose_topic=pose_topic,
+        field_topic=field_topic,
+    )
+    if doubts := _doubts(readings, sources[0]):
+        report = replace(report, metadata={**report.metadata, "doubts": doubts})
+    model = fit(readings, method, progress=progress, **options)
+    named = readings.with_(name=about.name or out.stem)
+    field = raster(model, named, spacing_m=spacing_m, headings_rad=headings_rad, progress=progress)
+    save_map(field, out, force=force)
+    return _joined(_joined(field.report(), grid_report(field)), report)
+
+
+def validate_methods(
+    sources: Sequence[Source],
+    *,
+    methods: Sequence[str] | None = None,
+    split: Split | None = None,
+    kernel: Literal["matern", "poisson"] | None = None,
+    earth: str | None = None,
+    within_m: float | None = None,
+    progress: Progress | None = None,
+    **reading: Any,
+) -> Report:
+    """Predict left-out readings of a survey with each method, and report the errors.
+
+    Args:
+        sources: As for `import_survey`.
+        methods: Methods to validate. None: all.
+        split: What is left out. None: nodes of a gridded survey, runs if there are several, else blocks.
+        kernel: Covariance of the Gaussian process. None: poisson.
+        earth: The Earth's field for the harmonic fit, as for `magtwin.author.earth.earth_of`.
+        within_m: Count only readings this near to one that was fitted [m].
+        progress: Called with the number done, the total, and a word.
+        reading: Options of `read_survey`.
+
+    Raises:
+        InputError: A source cannot be read, or an option belongs to a method that is not validated.
+    """
+    from magtwin.field.fit.check import FILLED, check
+    from magtwin.field.fit.fit import METHODS
+
+    chosen = list(methods or METHODS)
+    options = {**FILLED, **_method_options(chosen, kernel, earth)}
+    readings, _ = read_survey(sources, **reading)
+    if split is None:
+        split = "checkerboard" if readings.grid is not None else "run" if len(readings.runs) > 1 else "block"
+    return check(readings, chosen, split=split, within_m=within_m, options=options, progress=progress)
+
+
+def survey_scene(
+    scene_file: Source,
+    out: Source,
+    *,
+    spacing_m: float = 0.25,
+    headings_rad: Sequence[float],
+    readings: int = 135,
+    height_m: float | None = None,
+    heading_error_deg: float = 2.0,
+    position_error_m: float = 0.01,
+    seed: int = 0,
+    name: str | None = None,
+    licence: str = "",
+    created: str | None = None,
+    progress: Progress | None = None,
+    force: bool = False,
+) -> Report:
+    """Survey a scene as its robot would: node by node, with sensor noise and pose errors.
+
+    Args:
+        scene_file: USD stage with a known Earth field.
+        out: Map layer (.usdc) or readings (.parquet) to write.
+        spacing_m: Spacing of the nodes [m].
+        headings_rad: Headings at each node [rad], ascending.
+        readings: Readings averaged at a node.
+        height_m: Height of the sensor above the floor [m]. None: the robot's.
+        heading_error_deg: Standard deviation of the robot's heading about the node's [deg].
+        position_error_m: Standard deviation of the robot's x and y about the node [m].
+        seed: Seed of noise and errors.
+        name: Name of the map. None: that of `out`.
+        licence: Licence of the map, an SPDX identifier.
+        created: Date of the survey, YYYY-MM-DD. None: that of the Earth's field.
+        progress: Called with the number of headings done and their total.
+        force: Whether an existing output is replaced.
+
+    Raises:
+        InputError: The scene has no Earth field, a number is out of range, or the output cannot be written.
+    """
+    from magtwin.sim.room_survey import blocked_by
+    from magtwin.sim.survey import survey, survey_readings
+    from magtwin.usd.layers import layer_files
+    from magtwin.usd.maps import save_map
+    from magtwin.usd.obstacles import read_obstacles
+    from magtwin.usd.scene import read_scene
+
+    out = _checked(out, force)
+    if seed < 0:
+        raise InputError(f"`seed` must be a whole number from 0 up, got {seed}", parameter="seed")
+    twin = read_scene(scene_file, check_network=False)
+    day = twin.earth.date if twin.earth is not None else ""
+    files = [file for file in layer_files(scene_file) if file.resolve() != twin.map_layer.resolve()]
+    options: dict[str, Any] = {
+        "rng": np.random.default_rng(seed),
+        "spacing_m": spacing_m,
+        "headings_rad": headings_rad,
+        "readings": readings,
+        "height_m": height_m,
+        "heading_error_rad": radians(heading_error_deg),
+        "position_error_m": position_error_m,
+        "source": "; ".join(f"{file.name} sha256:{sha256(file)}" for file in files),
+        "licence": licence,
+        "created": day if created is None else created,
+        "progress": progress,
+        "blocked": blocked_by(twin, read_obstacles(scene_file)),
+    }
+    if out.suffix == ".parquet":
+        surveyed = replace(survey_readings(twin, **options), name=name or out.stem)
+        save_readings(surveyed, out, force=force)
+        return surveyed.report()
+    field = survey(twin, **options, name=name or out.stem)
+    field = replace(field, parameters={**field.parameters, "seed": seed})
+    save_map(field, out, force=force)
+    return field.report()
+
+
+def _checked(out: Source, force: bool) -> Path:
+    return check_free(out, force=force)
+
+
+def _is_survey_folder(source: Path, columns: Columns) -> bool:
+    """Whether a source is a folder with one CSV per heading, whose columns need no names."""
+    if (source / "metadata.yaml").is_file() or is_pattern(source) or any(source.glob("*.parquet")):
+        return False
+    named = replace(columns, unit=None, scale=None) != Columns()
+    return (source.is_dir() or not source.exists()) and not named
+
+
+def _doubts(readings: Readings, source: Source) -> list[str]:
+    """What makes a map of these readings doubtful; too few readings are refused."""
+    from magtwin.field.fit.harmonic.problem import ONE_HEADING
+
+    count, yaw, doubts = int(readings.good.sum()), readings.yaw[readings.good], list[str]()
+    if readings.grid is None and count < LEAST_READINGS:
+        raise InputError(
+            f"{source}: {count} of {len(readings)} readings are good; a map needs {LEAST_READINGS} at least, "
+            "and some hundred to be of use"
+        )
+    if readings.grid is None and count < USUAL_READINGS:
+        doubts.append(f"only {count} good readings: the map is valid only next to them")
+    if (span := float(np.ptp(readings.p_xy, axis=0).max())) > USUAL_SPAN_M:
+        doubts.append(f"the readings span {span:,.0f} m: are their positions in metres?")
+    mean = np.exp(1j * yaw).mean()
+    if np.abs(mean) >= ONE_HEADING:
+        doubts.append(
+            f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: the robot's own field cannot be "
+            "separated from the room's; survey in several headings"
+        )
+    return doubts
+
+
+def _method_options(
+    methods: Sequence[str], kernel: str | None, earth: str | None
+) -> dict[str, dict[str, Any]]:
+    """Options by method; an option of a method that is not used is refused."""
+    from magtwin.author.earth import earth_of
+
+    for name, value, method in (("kernel", kernel, "gp"), ("earth", earth, "harmonic")):
+        if value is not None and method not in methods:
+            raise InputError(f"`{name}` is for `method={method}`; drop it for {methods[0]}", parameter=name)
+    options: dict[str, dict[str, Any]] = {}
+    if kernel is not None:
+        options["gp"] = {"kernel": kernel}
+    if earth is not None:
+        options["harmonic"] = {"earth_nt": earth_of(earth)}
+    return options
+
+
+def _joined(report: Report, below: Report) -> Report:
+    """A report with the figures and metadata of another below its own."""
+    figures, metadata = report.figures + below.figures, {**report.metadata, **below.metadata}
+    return replace(report, figures=figures, metadata=metadata)

@@ -1,0 +1,161 @@
+"""NeuralMagnetometer: a predictor that gives a Run its disturbance."""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin import files
+from magtwin.errors import InputError
+from magtwin.learn.data.features import columns_of, features
+from magtwin.learn.models.predictor import Predictor, load_predictor
+from magtwin.learn.models.regressor import summary_of
+from magtwin.learn.models.weights import MetadataValue
+from magtwin.run.run import Run
+from magtwin.sim.sensors.model_error import ModelError
+from magtwin.summary import Summarized, Summary
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, repr=False)
+class Read(Summarized):
+    """Predictions for the rows of a run."""
+
+    disturbance_nt: Array
+    """Disturbance [nT], shape (N,)."""
+
+    sd_nt: Array
+    """Standard deviation of its error [nT], shape (N,); nan if unknown."""
+
+    outside: NDArray[np.bool_] | None
+    """Whether an input left the range of the training rows, shape (N,); None if not computed."""
+
+
+class NeuralMagnetometer(Summarized):
+    """Runs a predictor of any kind on runs."""
+
+    def __init__(self, net: Predictor, *, name: str = "", sha256: str = "") -> None:
+        """Use a predictor.
+
+        Args:
+            net: The predictor.
+            name: Name of its file, kept in the metadata of runs.
+            sha256: Checksum of its file, kept in the metadata of runs.
+        """
+        self.net, self.name, self.sha256 = net, name, sha256
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], *, sha256: str = "") -> "NeuralMagnetometer":
+        """Load a weights file: safetensors of any kind, or a released `.pth`.
+
+        Args:
+            path: The weights.
+            sha256: SHA-256 that the file must have; "" accepts any.
+
+        Raises:
+            InputError: No such file, another checksum, or not a predictor.
+        """
+        path = files.existing(path, "weights file")
+        checksum = files.sha256(path)
+        if sha256 and checksum != sha256.lower():
+            raise InputError(
+                f"{path}: its sha256 is {checksum}, expected {sha256}; get the file again "
+                "or change the checksum"
+            )
+        return cls(load_predictor(path), name=path.name, sha256=checksum)
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Names of the inputs, in order."""
+        return self.net.features
+
+    @property
+    def columns(self) -> frozenset[str]:
+        """Columns of a Run that the inputs are taken from."""
+        return frozenset(columns_of(self.features))
+
+    @property
+    def residual_sd_nt(self) -> float:
+        """Root mean square error on held-out recordings [nT]; nan if unknown."""
+        return self.net.residual_sd_nt
+
+    def model_error(self) -> ModelError | None:
+        """Statistics of the error of its predictions; None if its metadata lack them.
+
+        Raises:
+            InputError: The statistics in the metadata are invalid.
+        """
+        values = [self.net.metadata.get(name) for name in ("residual_offset_sd_nt", "residual_time_s")]
+        if None in values or (self.net.kind == "mlp" and math.isnan(self.residual_sd_nt)):
+            return None
+        figures = [float(value) if isinstance(value, int | float) else math.nan for value in values]
+        if not all(0 <= figure < math.inf for figure in figures):
+            raise InputError(
+                f"{self.name}: residual_offset_sd_nt and residual_time_s of its metadata must be finite and "
+                f"not below 0, got {values[0]!r} and {values[1]!r}"
+            )
+        return ModelError(*figures)
+
+    @property
+    def metadata(self) -> Mapping[str, MetadataValue]:
+        """Metadata of a run about its network: file, checksum, layers and parameters.
+
+        The mean training label is included if known, and the kind if it is not a perceptron.
+        """
+        metadata: dict[str, MetadataValue] = {
+            "network": self.name,
+            "network_sha256": self.sha256,
+            "network_layers": self.net.layers_text,
+            "network_parameters": self.net.parameters_count,
+        }
+        if "label_mean_nt" in self.net.metadata:
+            metadata["network_label_mean_nt"] = float(self.net.metadata["label_mean_nt"])
+        return metadata if self.net.kind == "mlp" else metadata | {"network_kind": self.net.kind}
+
+    def disturbance_nt(self, run: Run) -> Array:
+        """Disturbance at each reading of a run [nT], shape (N,).
+
+        Raises:
+            InputError: The run lacks a column that the network reads.
+        """
+        return self.read([run], outside=False)[0].disturbance_nt
+
+    def read(self, runs: Sequence[Run], *, outside: bool = True) -> list[Read]:
+        """Disturbances, their standard deviations and rows outside the training ranges of each run.
+
+        Args:
+            runs: At least one. The result of a run does not depend on the other runs.
+            outside: Whether to compute `Read.outside`.
+
+        Raises:
+            InputError: A run lacks a column that the network reads.
+        """
+        parts = [features(run, self.features) for run in runs]
+        x = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        ends = np.cumsum([run.rows for run in runs])[:-1]
+        mean, sd = (np.split(values, ends) for values in self.net.predict(x))
+        flags = np.split(self.net.outside(x), ends) if outside else [None] * len(runs)
+        return [Read(*values) for values in zip(mean, sd, flags, strict=True)]
+
+    def outside_training(self, run: Run) -> NDArray[np.bool_]:
+        """Whether an input of a reading left the range of the training rows, shape (N,)."""
+        return self.outside(features(run, self.features))
+
+    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
+        """As `outside_training`, from features, shape (N, F)."""
+        return self.net.outside(x)
+
+    def predict(self, x: ArrayLike) -> Array:
+        """Disturbances [nT], shape (N,), from features in their units, shape (N, F)."""
+        return self.net.predict(x)[0]
+
+    def predict_with_sd(self, x: ArrayLike) -> tuple[Array, Array]:
+        """Disturbances and standard deviations of their errors [nT], each (N,), from features (N, F)."""
+        return self.net.predict(x)
+
+    def _summary(self) -> Summary:
+        return summary_of(self.net, f"NeuralMagnetometer {self.name}".rstrip())

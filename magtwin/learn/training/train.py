@@ -1,0 +1,302 @@
+"""Train a model on a data set and measure its errors on recordings that it never saw."""
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.files import check_free, output, sha256
+from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
+from magtwin.learn.data.origin import ROBOT_METADATA
+from magtwin.learn.data.residuals import HeldOut, held_out_errors, residuals
+from magtwin.learn.data.split import PARTS, Part, Split
+from magtwin.learn.data.split import split as split_recordings
+from magtwin.learn.models.descent import Epoch
+from magtwin.learn.models.predictor import PREDICTORS, Fit, FitTask, Predictor, load_predictor
+from magtwin.learn.models.weights import MetadataValue
+from magtwin.learn.training.config import TrainConfig
+from magtwin.learn.training.model_card import model_card
+from magtwin.learn.training.result import PartErrors, TrainingResult
+from magtwin.learn.training.training_data import TrainingData, read_training_data
+from magtwin.verdict import SEPARATOR, coverage, recordings_text
+from magtwin.version import __version__
+
+Array = NDArray[np.float64]
+
+ORIGIN = (
+    *("map_method", "map_height_m", "map_extent_m", "map_samples_nt", "alignment", "poses"),
+    *ROBOT_METADATA,
+)
+"""Metadata of a data set that weights keep."""
+
+
+def train(
+    dataset: Dataset | str | os.PathLike[str],
+    *,
+    out: str | os.PathLike[str] | None = None,
+    config: TrainConfig | None = None,
+    force: bool = False,
+    resume: bool = False,
+    progress: Callable[[Epoch], None] | None = None,
+    advance: Callable[[int, int], None] | None = None,
+    **options: Any,
+) -> TrainingResult:
+    """Train a model and measure its errors on recordings that it never saw.
+
+    Args:
+        dataset: Labelled recordings, or the folder of a data set.
+        out: Weights file to write, .safetensors. The model card is written beside it as .md. After each epoch
+            the state is written to .checkpoint, which is removed at the end.
+        config: Model and options. Default: the paper's network.
+        force: Replace existing files.
+        resume: Continue from the checkpoint beside `out`; the weights are those of an uninterrupted training.
+        progress: Called after each epoch.
+        advance: Called after each step with the rows done and the rows of all epochs.
+        **options: Fields of `TrainConfig`, such as model="hybrid" or seed=3. They override `config`.
+
+    Raises:
+        InputError: The recordings do not suffice, the data set lacks a column of a feature, an option does
+            not fit the model, or a file exists.
+    """
+    config = (config or TrainConfig()).with_options(**options)
+    checkpoint = None
+    if out is not None:
+        out = Path(out)
+        checkpoint = out.with_suffix(".checkpoint")
+        for path in (out, out.with_suffix(".md")):
+            check_free(path, force=force)
+        if checkpoint.exists() and not (resume or force):
+            raise InputError(
+                f"{checkpoint}: an unfinished training; resume it (--resume), or replace it (--force)"
+            )
+    dataset = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
+    deals, draws = np.random.default_rng(config.seed).spawn(2)
+    parts = split_recordings(dataset.recordings, config.split, hold_out=config.hold_out, rng=deals)
+    result = fit(
+        config,
+        dataset,
+        parts,
+        rng=draws,
+        checkpoint=checkpoint,
+        resume=resume,
+        progress=progress,
+        advance=advance,
+    )
+    if out is not None and checkpoint is not None:
+        result.predictor.save(out, force=force)
+        with output(out.with_suffix(".md"), force=force) as aside:
+            aside.write_text(model_card(result, out.name, sha256(out)), encoding="utf-8")
+        checkpoint.unlink(missing_ok=True)
+    return result
+
+
+def fit(
+    config: TrainConfig,
+    dataset: Dataset,
+    split: Split,
+    *,
+    rng: np.random.Generator,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    progress: Callable[[Epoch], None] | None = None,
+    advance: Callable[[int, int], None] | None = None,
+) -> TrainingResult:
+    """Train on one part of a data set, stop and calibrate by another, judge by the third.
+
+    Args:
+        config: Model and options; its `seed`, `split` and `hold_out` are not read.
+        dataset: Labelled recordings.
+        split: Recordings of training, validation and test.
+        rng: Source of the initial weights, the order of rows and dropout.
+        checkpoint: File for the state after each epoch.
+        resume: Continue from `checkpoint`.
+        progress: Called after each epoch.
+        advance: Called after each step with the rows done and the rows of all epochs.
+
+    Raises:
+        InputError: A part has no rows, the data set lacks a column of a feature, or the model cannot be
+            fitted.
+    """
+    data = read_training_data(dataset, split, config.inputs)
+    init = None if config.init is None else load_predictor(config.init)
+    if init is not None and init.kind != config.kind:
+        raise InputError(
+            f"{config.init}: holds a {init.kind}, but the training is of a {config.kind}; continue from "
+            f"another file, or train with --model {'paper' if init.kind == 'mlp' else init.kind}"
+        )
+    device = device_of(config)
+    task = FitTask(
+        features=config.inputs,
+        train=data.rows["train"],
+        validation=data.rows["validation"],
+        train_groups=data.groups["train"],
+        validation_groups=data.groups["validation"],
+        options=config.options,
+        rng=rng,
+        init=init,
+        freeze=config.freeze,
+        device=device,
+        checkpoint=checkpoint,
+        resume=resume,
+        progress=progress,
+        advance=advance,
+    )
+    threads = torch.get_num_threads()
+    if config.threads is not None:
+        torch.set_num_threads(config.threads)
+    try:
+        fitted = PREDICTORS[config.kind].fit(task)
+    finally:
+        torch.set_num_threads(threads)
+    predictor, labels = fitted.model, task.train.y
+    mean, sd = float(labels.mean()), float(labels.std())
+    models = [predictor] if init is None else [predictor, init]
+    parts = tuple(_errors(data, part, models, mean)[0] for part in PARTS[1:])
+    path_of = {recording.name: recording.path for recording in dataset.recordings}
+    _, *paths = _errors(data, "test", models, mean, [path_of[name] for name in data.rows["test"].names])
+    predictor.residual_sd_nt = parts[-1].rmse_nt
+    predictor.metadata.update(_provenance(config, dataset, split, len(labels), device))
+    predictor.metadata.update(label_mean_nt=mean, label_sd_nt=sd)
+    if fitted.history:
+        kept = next(epoch for epoch in reversed(fitted.history) if epoch.best)
+        predictor.metadata.update(epochs_run=fitted.history[-1].number, epoch_kept=kept.number)
+    if fitted.choice:
+        predictor.metadata.update(
+            network="kept" if fitted.choice.kept else "left out",
+            base_validation_mae_nt=fitted.choice.base_mae_nt,
+            whole_validation_mae_nt=fitted.choice.whole_mae_nt,
+        )
+    for part in parts:
+        values = {"mae_nt": part.mae_nt, "naive_mae_nt": part.naive_mae_nt, "ridge_mae_nt": part.ridge_mae_nt}
+        predictor.metadata.update({f"{part.name}_{key}": value for key, value in values.items()})
+        if math.isfinite(part.coverage):
+            predictor.metadata[f"{part.name}_coverage_90"] = part.coverage
+    if (statistics := residuals(_held_out(data, fitted))) is not None:
+        predictor.metadata.update(statistics.metadata())
+    recordings = {recording.name: recording for recording in dataset.recordings}
+    learned, tested = ([recordings[name] for name in split.names(part)] for part in ("train", "test"))
+    sessions = dict.fromkeys(recording.session for recording in learned)
+    driven = dict.fromkeys(recording.path for recording in learned)
+    predictor.metadata.update(
+        training_sessions=SEPARATOR.join(sessions), training_paths=SEPARATOR.join(driven)
+    )
+    judged_on = recordings_text(
+        len(tested), [test.session for test in tested], [test.path for test in tested], sessions, driven
+    )
+    return TrainingResult(
+        predictor=predictor,
+        config=config,
+        history=fitted.history,
+        choice=fitted.choice,
+        split=split,
+        parts=parts,
+        paths=tuple(paths),
+        label_mean_nt=mean,
+        label_sd_nt=sd,
+        rows=len(labels),
+        judged_on=judged_on,
+    )
+
+
+def device_of(config: TrainConfig) -> str:
+    """Where torch trains: "cpu" or "cuda".
+
+    Raises:
+        InputError: The configuration asks for a GPU and torch has none.
+    """
+    if config.device == "cuda" and not torch.cuda.is_available():
+        raise InputError(
+            "device cuda: this torch sees no GPU; install one that does, or give --device cpu or auto"
+        )
+    return "cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu"
+
+
+def _held_out(data: TrainingData, fitted: Fit) -> list[HeldOut]:
+    """Errors on recordings that the model was not fitted to.
+
+    These are validation and test, and training if the model was fitted without each of its groups in turn.
+    """
+    errors = []
+    for part in PARTS:
+        rows = data.rows[part]
+        predicted = fitted.held_out_nt if part == "train" else fitted.model.predict(rows.x)[0]
+        if predicted is not None:
+            errors += held_out_errors(rows, predicted - rows.y, data.dataset.recordings)
+    return errors
+
+
+def _errors(
+    data: TrainingData, part: Part, models: Sequence[Predictor], mean: float, paths: Sequence[str] = ()
+) -> list[PartErrors]:
+    """Errors on all rows of a part, then on those of each path; `paths` are those of its recordings."""
+    rows = data.rows[part]
+    naive = mean - rows.y
+    ridge = data.ridge_of(part)[0] - rows.y
+    predicted = [model.predict(rows.x) for model in models]
+    errors = [values - rows.y for values, _ in predicted]
+    masks = {str(part): np.ones(len(rows.y), bool)}
+    for path in dict.fromkeys(paths):
+        on_path = np.array([name == path for name in paths])[rows.recording]
+        if on_path.any():
+            masks[f"{part}, path {path}"] = on_path
+    return [
+        PartErrors(
+            name,
+            len(np.unique(rows.recording[mask])),
+            int(mask.sum()),
+            _mae(errors[0][mask]),
+            _rmse(errors[0][mask]),
+            _mae(naive[mask]),
+            _rmse(naive[mask]),
+            _mae(ridge[mask]),
+            _rmse(ridge[mask]),
+            coverage(errors[0][mask], predicted[0][1][mask]),
+            _mae(errors[1][mask]) if len(errors) > 1 else math.nan,
+        )
+        for name, mask in masks.items()
+    ]
+
+
+def _provenance(
+    config: TrainConfig, dataset: Dataset, split: Split, rows: int, device: str
+) -> Mapping[str, MetadataValue]:
+    """Metadata that reproduce a training."""
+    stored = config if config.init is None else replace(config, init=Path(config.init.name))
+    metadata: dict[str, MetadataValue] = {"warning": split.leak} if split.leak else {}
+    metadata |= {
+        "dataset": dataset.folder.resolve().name,
+        "dataset_sha256": sha256(dataset.folder / MANIFEST),
+        "map": dataset.map_name,
+        "map_sha256": dataset.map_sha256,
+        "lever_arm_m": ", ".join(f"{c:g}" for c in dataset.alignment.lever_arm_m),
+        "latency_s": dataset.alignment.latency_s,
+        **{name: dataset.metadata[name] for name in ORIGIN if name in dataset.metadata},
+        "config": stored.to_toml(),
+        "seed": config.seed,
+        "split": split.by,
+        "training_rows": rows,
+        "magtwin": __version__,
+    }
+    if config.kind != "linear":
+        threads = config.threads or torch.get_num_threads()
+        metadata |= {"threads": threads, "torch": str(torch.__version__), "device": device}
+    if config.licence:
+        metadata["licence"] = config.licence
+    if config.init is not None:
+        metadata |= {"init": config.init.name, "init_sha256": sha256(config.init)}
+    return metadata
+
+
+def _mae(error: Array) -> float:
+    return float(np.mean(np.abs(error)))
+
+
+def _rmse(error: Array) -> float:
+    return float(np.sqrt(np.mean(error**2)))

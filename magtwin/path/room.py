@@ -1,0 +1,261 @@
+"""Placement: a path brought onto a floor, between the things that stand on it."""
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.path.curves import CASES, PATHS, path_named
+from magtwin.path.points import resolve_path
+from magtwin.path.polyline import Path
+from magtwin.spec.obstacles import Obstacles
+
+Array = NDArray[np.float64]
+
+FLOOR_M = (6.0, 3.5)
+"""Floor that the named paths are made for [m]."""
+
+RADIUS_M = 0.171
+"""Radius of the robot that they are made for [m]."""
+
+CLEAR_M = 0.05
+"""Room left beside obstacles where there is enough, as a robot strays a little from its path [m]."""
+
+STEP_M = 0.03
+"""Spacing of the raster on which the free floor is looked for [m]; wider on large floors."""
+
+MOST_CELLS = 400_000
+"""Cells of that raster at most."""
+
+SHRINK = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)
+"""Sizes that are tried, as shares of what the floor without obstacles would take."""
+
+SHIFTS = 13
+"""Places that are tried along each axis, for each size."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """What a path must fit into."""
+
+    floor_m: tuple[float, float]
+    """Extent of the floor in x and y, centred on the world's origin [m]."""
+
+    footprint_radius_m: float
+    """Radius of the robot [m]."""
+
+    obstacles: Obstacles
+    """What stands in the room."""
+
+    def refusal(self, path: Path) -> InputError | None:
+        """Why a robot cannot drive the path here; None if it can."""
+        try:
+            check_on_floor(path, self.floor_m, self.footprint_radius_m)
+            check_clear(path, self.obstacles, self.footprint_radius_m)
+        except InputError as error:
+            return error
+        return None
+
+    @property
+    def reach_m(self) -> Array:
+        """Largest |x| and |y| that the robot's centre can have [m], shape (2,)."""
+        return np.asarray(self.floor_m) / 2 - self.footprint_radius_m
+
+
+def path_in(room: Room, way: str | os.PathLike[str]) -> Path:
+    """The path that a name or a CSV file stands for; a named one is brought onto the floor of the room.
+
+    On the floor of 6 x 3.5 m that they are made for, named paths are as they are. On another they are
+    scaled with it, in x and in y; where something stands in the way they are moved and made smaller,
+    until the robot passes. A CSV file is taken as it is.
+
+    Args:
+        room: Where it is driven.
+        way: A name of `PATHS`, a case A to E, or a CSV file.
+
+    Raises:
+        InputError: There is no such path, or no room for it.
+    """
+    text = os.fspath(way)
+    if text not in PATHS and text not in CASES:
+        return resolve_path(FilePath(text) if isinstance(way, FilePath) else text)
+    path = path_named(text)
+    if tuple(room.floor_m) == FLOOR_M and room.refusal(path) is None:
+        return path
+    made_for = np.asarray(FLOOR_M) / 2 - RADIUS_M
+    if min(room.reach_m) <= 0:
+        raise InputError(f"path {path.name} does not fit: {_too_small(room)}")
+    return _placed(path, room, room.reach_m / made_for, each_way=True)
+
+
+def fit_path(path: Path, room: Room) -> Path:
+    """A path that keeps its shape, moved and if need be made smaller until it fits into a room.
+
+    Args:
+        path: Any path; one that fits is returned as it is.
+        room: Where it is driven.
+
+    Raises:
+        InputError: It does not fit at a quarter of what the empty floor would take.
+    """
+    if room.refusal(path) is None:
+        return path
+    if min(room.reach_m) <= 0:
+        raise InputError(f"path {path.name} does not fit: {_too_small(room)}")
+    half = np.ptp(path.p_xy, axis=0) / 2
+    with np.errstate(divide="ignore"):
+        whole = min(1.0, float(np.min(room.reach_m / half)))
+    return _placed(path, room, np.array([whole, whole]), each_way=False)
+
+
+def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> None:
+    """Whether a round robot on the path stays on a floor that is centred on the world's origin.
+
+    Args:
+        path: Where its centre goes.
+        floor_m: Extent of the floor in x and y [m].
+        footprint_radius_m: Radius of the robot [m].
+
+    Raises:
+        InputError: It does not; the text gives the first such point and how far it is outside.
+    """
+    beyond = np.max(np.abs(path.p_xy) + footprint_radius_m - np.array(floor_m) / 2, axis=1)
+    outside = np.flatnonzero(beyond > 1e-9)
+    if len(outside):
+        i = int(outside[0])
+        x, y = path.p_xy[i]
+        needs = np.ptp(path.p_xy, axis=0) + 2 * footprint_radius_m
+        raise InputError(
+            f"path {path.name} leaves the floor at point {i + 1} of {len(beyond)}, ({x:.3f}, {y:.3f}) m, by "
+            f"{beyond[i]:.3f} m: with a robot of radius {footprint_radius_m:g} m it needs {needs[0]:.2f} x "
+            f"{needs[1]:.2f} m, the floor is {floor_m[0]:g} x {floor_m[1]:g} m; "
+            f"{_what_fits(path, floor_m, footprint_radius_m)}"
+        )
+
+
+def _what_fits(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> str:
+    """What would bring a path onto the floor, in words."""
+    room = np.array(floor_m) - 2 * footprint_radius_m
+    if min(room) <= 0:
+        return "the floor is no wider than the robot; enlarge it"
+    low, high = path.p_xy.min(axis=0), path.p_xy.max(axis=0)
+    with np.errstate(divide="ignore"):
+        scale = float(np.min(room / (high - low)))
+    if scale >= 1:
+        x, y = np.clip(0.0, high - room / 2, low + room / 2) * -1.0 + 0.0
+        return f"moved by ({x:.2f}, {y:.2f}) m it fits: give --fit, or move its points"
+    return f"scaled by {math.floor(scale * 100) / 100:g} it fits: give --fit, or enlarge the floor"
+
+
+def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> None:
+    """Whether a round robot on the path passes all obstacles.
+
+    Args:
+        path: Where its centre goes.
+        obstacles: What it must not touch.
+        footprint_radius_m: Radius of the robot [m].
+
+    Raises:
+        InputError: It touches one; the text gives the first such point and the obstacle.
+    """
+    step = max(footprint_radius_m / 4, path.length / 100_000)  # a straight segment may be long
+    s = np.union1d(np.linspace(0.0, path.length, math.ceil(path.length / step) + 1), path.s)
+    p = path.at(np.minimum(s, path.length))
+    distance, which = obstacles.clearance(p, reach_m=footprint_radius_m)
+    touched = np.flatnonzero(distance < footprint_radius_m - 1e-9)
+    if len(touched):
+        i = int(touched[0])
+        raise InputError(
+            f"path {path.name} runs into {obstacles.names[which[i]]}: {s[i]:.3f} m along it, at "
+            f"({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, a robot of radius {footprint_radius_m:g} m is "
+            f"{footprint_radius_m - distance[i]:.3f} m too near; give --fit, or move the path or the obstacle"
+        )
+
+
+def _too_small(room: Room) -> str:
+    x, y = room.floor_m
+    return f"the floor of {x:g} x {y:g} m is no wider than a robot of radius {room.footprint_radius_m:g} m"
+
+
+def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
+    """The path at the largest size that fits, up to `whole` (2,), as near to its own place as it can be."""
+    middle = (path.p_xy.min(axis=0) + path.p_xy.max(axis=0)) / 2
+    half = np.ptp(path.p_xy, axis=0) / 2
+    sizes = [(a, b) for a in SHRINK for b in (SHRINK if each_way else (a,))]
+    sizes.sort(key=lambda size: (-size[0] * size[1], abs(size[0] - size[1]), -size[0]))
+    for clear in (CLEAR_M, 0.0):
+        free = _Free(room, clear)
+        for share in sizes:
+            scale = whole * share
+            slack = np.maximum(room.reach_m - half * scale - clear, 0.0)
+            start = middle * scale if each_way else middle
+            shifts = _shifts(np.clip(start, -slack, slack), slack) - middle * scale + 0.0
+            if each_way:  # scaled with the floor a path keeps the room that it is made with
+                shifts = np.vstack([np.zeros(2), shifts])
+            dense = _dense(path, scale, max(free.step_m, 0.02))
+            for shift in shifts[free.holds(dense, shifts)]:
+                numbers = (float(scale[0]), float(scale[1]), float(shift[0]), float(shift[1]))
+                found = path.placed(numbers)
+                if room.refusal(found) is None:
+                    return found
+    raise InputError(
+        f"path {path.name} does not fit between what stands on the floor of {room.floor_m[0]:g} x "
+        f"{room.floor_m[1]:g} m, not even at a quarter of its size; move the furniture, or give points of "
+        "your own in a CSV file"
+    )
+
+
+def _shifts(home: Array, slack: Array) -> Array:
+    """Middles to try, nearest to `home` first, shape (N, 2)."""
+    axes = [np.union1d(np.linspace(-s, s, SHIFTS), [h]) for s, h in zip(slack, home, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    away = np.round(np.hypot(*(grid - home).T), 9)
+    return np.asarray(grid[np.lexsort((grid[:, 1], grid[:, 0], away))])
+
+
+def _dense(path: Path, scale: Array, step_m: float) -> Array:
+    """Points along a scaled path, a step apart, and its own, shape (N, 2)."""
+    scaled = path.placed((float(scale[0]), float(scale[1]), 0.0, 0.0))
+    count = min(math.ceil(scaled.length / step_m) + 1, 20_000)
+    return scaled.at(np.linspace(0.0, scaled.length * (1 - 1e-12), count))
+
+
+class _Free:
+    """The floor as a raster of places where the robot's centre can be."""
+
+    def __init__(self, room: Room, clear_m: float) -> None:
+        """Look where a robot has `clear_m` to spare beside what stands on the floor itself."""
+        half = np.asarray(room.floor_m) / 2
+        self.step_m = max(STEP_M, math.sqrt(4 * half[0] * half[1] / MOST_CELLS))
+        self._low = -half
+        axes = [np.arange(-h, h + self.step_m, self.step_m) for h in half]
+        at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        inside = [k for k, o in enumerate(room.obstacles.outlines) if _meets(o, half)]
+        standing = Obstacles(
+            tuple(room.obstacles.names[k] for k in inside),
+            tuple(room.obstacles.outlines[k] for k in inside),
+        )
+        # A point is at most this far from the nearest node of the raster.
+        needed = room.footprint_radius_m + clear_m + self.step_m / math.sqrt(2)
+        distance, _ = standing.clearance(at.reshape(-1, 2), reach_m=needed)
+        self._free = (distance >= needed).reshape(at.shape[:2])
+
+    def holds(self, points: Array, shifts: ArrayLike) -> NDArray[np.bool_]:
+        """Whether all points (N, 2) are free under each of the shifts (M, 2), shape (M,)."""
+        if self._free.all():
+            return np.ones(len(np.asarray(shifts)), bool)
+        most: Array = np.array(self._free.shape) - 1.0
+        held = []
+        for shift in np.asarray(shifts):
+            cell = np.clip(np.rint((points + shift - self._low) / self.step_m), 0, most).astype(int)
+            held.append(bool(self._free[cell[:, 0], cell[:, 1]].all()))
+        return np.array(held)
+
+
+def _meets(outline: Array, half: Array) -> bool:
+    """Whether an outline comes onto the floor, not only to its edge."""
+    return bool(np.all(outline.max(axis=0) > -half + 1e-6) and np.all(outline.min(axis=0) < half - 1e-6))

@@ -1,0 +1,74 @@
+"""DriveInput: what a robot can be told to drive, from a name, a file, points, a path, commands or a run."""
+
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from magtwin.errors import InputError
+from magtwin.path import Path, resolve_path
+from magtwin.path.room import Room, fit_path, path_in
+from magtwin.run.run import Run
+from magtwin.sim.motion.commands import Commands
+
+DriveInput = Path | Commands | Run | str
+"""A path, commands, a run to drive again, or "random"."""
+
+
+def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> DriveInput:
+    """Resolve the `path` argument of `magtwin.simulate`.
+
+    Args:
+        path: The name of a path, a CSV file, or points (N, 2) [m], which become a `Path`. "random", a `Path`,
+            `Commands` and a `Run` stay as they are.
+        room: Where it is driven: named paths are scaled to its floor, see `magtwin.path.path_in`.
+            Default: the floor for which they were designed.
+        fit: Whether a path that does not fit into the room is moved and shrunk until it does.
+
+    Raises:
+        InputError: There is no such path, no room for it, or it cannot be driven.
+    """
+    if isinstance(path, Commands | Run) or (isinstance(path, str) and path == "random"):
+        return path
+    if isinstance(path, Path):
+        return fit_path(path, room) if fit and room is not None else path
+    if isinstance(path, str | FilePath | list | tuple | np.ndarray):
+        named = isinstance(path, str | FilePath) and room is not None
+        resolved = path_in(room, path) if named else resolve_path(path)  # type: ignore[arg-type]
+        return fit_path(resolved, room) if fit and room is not None else resolved
+    raise InputError(
+        "path must be a name, a CSV file, points (N, 2) [m], a Path, Commands or a Run, got "
+        f"{type(path).__name__}",
+        parameter="path",
+    )
+
+
+def drive_inputs(paths: Any, room: Room | None = None) -> DriveInput | list[DriveInput]:
+    """One input for all runs, or a list with one for each; a repeated name or file is read once.
+
+    Args:
+        paths: What `drive_input` takes, or an iterable of it. Points (N, 2) are one path.
+        room: As for `drive_input`.
+    """
+    single = isinstance(paths, str | FilePath | Path | Commands | Run)
+    if single or not hasattr(paths, "__iter__"):
+        return drive_input(paths, room)
+    listed = list(paths)
+    if _are_points(listed):
+        return drive_input(listed, room)
+    known: dict[Any, DriveInput] = {}
+    keys = [path if isinstance(path, str | FilePath) else id(path) for path in listed]
+    for key, path in zip(keys, listed, strict=True):
+        if key not in known:
+            known[key] = drive_input(path, room)
+    return [known[key] for key in keys]
+
+
+def _are_points(values: list[Any]) -> bool:
+    """Whether each is a pair of numbers."""
+    return bool(values) and all(
+        isinstance(row, np.ndarray | list | tuple)
+        and len(row) == 2
+        and all(isinstance(number, int | float | np.number) for number in row)
+        for row in values
+    )

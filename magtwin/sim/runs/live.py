@@ -1,0 +1,215 @@
+"""LiveRobot: a robot that is commanded while it drives, with its sensors read step by step.
+
+If `simulate` drives the same commands from the same seed, it gives the same columns.
+"""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.run.run import Run
+from magtwin.sim.motion.closed_loop import Chassis
+from magtwin.sim.motion.commands import Commands
+from magtwin.sim.motion.drive import Moment, advance, draw_wheel_errors, wheel_rates
+from magtwin.sim.motion.follow import CONTROL_RATE_HZ
+from magtwin.sim.motion.manual import at_start
+from magtwin.sim.runs.sensing import LidarMode, Sensing, streams
+from magtwin.sim.runs.simulate import check_run, run_metadata
+from magtwin.sim.sensors.clock import Samples
+from magtwin.sim.sensors.lidar import Scanner, Scans
+from magtwin.sim.sensors.model_error import ModelError
+from magtwin.spec.drive import DriveSpec
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.scene import Scene
+
+Array = NDArray[np.float64]
+Network = Callable[[Run], tuple[NDArray[Any], NDArray[Any], "NDArray[np.bool_] | None"]]
+"""From rows of a run to the disturbance of each, the standard deviation of its error [nT], and whether it is
+out of the training's range. Rows come in the order of time, each once."""
+
+KEPT = 256
+"""Control steps that are kept: 5 s, more than any sensor looks back."""
+
+
+class Track:
+    """The last steps of a chassis, as `magtwin.sim.motion.drive.Motion` tells all of them."""
+
+    def __init__(self, drive: DriveSpec, dt: float, pose0: tuple[float, float, float]) -> None:
+        """Begin at rest."""
+        self._drive, self._dt = drive, dt
+        self._first, self._count = 0, 0
+        self._steps = np.zeros((2 * KEPT, 13))
+        self._pose = np.array(pose0, float)
+        self._turned = np.zeros(2)  # the sum of rates, which a Motion multiplies by dt once
+        self._v = 0.0
+
+    @property
+    def steps(self) -> int:
+        """How many steps have been made."""
+        return self._first + self._count
+
+    @property
+    def end_s(self) -> float:
+        """Time at the end of the last step [s]."""
+        return self.steps * self._dt
+
+    def add(self, record: Array) -> None:
+        """A step, as `magtwin.sim.motion.loop.RECORD` tells it."""
+        if self._count == len(self._steps):
+            self._steps[:KEPT] = self._steps[KEPT:]
+            self._first, self._count = self._first + KEPT, KEPT
+        x, y, yaw, v, w, wheel_v, wheel_w, v_cmd, w_cmd, bump = record
+        rates = wheel_rates(wheel_v, wheel_w, self._drive)
+        row = self._steps[self._count]
+        row[:3], row[3:5], row[5:7] = self._pose, self._turned * self._dt, rates
+        row[7:] = v, w, (v - self._v) / self._dt, v_cmd, w_cmd, bump
+        self._pose, self._v = np.array([x, y, yaw]), v
+        self._turned = self._turned + rates
+        self._count += 1
+
+    def at(self, t: Any) -> Moment:
+        """As `magtwin.sim.motion.drive.Motion.at`, of times within the steps that are kept."""
+        t = np.asarray(t, float)
+        starts = np.arange(self._first, self.steps) * self._dt
+        k = np.maximum(np.searchsorted(starts, t, side="right") - 1, 0)
+        into = np.clip(t - starts[k], 0.0, self._dt)
+        then = self._steps[: self._count].take(k, axis=0)
+        v, w, a, v_cmd, w_cmd, bump = then[:, 7:].T
+        pose = advance(then[:, :3], v, w, into)
+        turned = then[:, 3:5] + then[:, 5:7] * into[:, None]
+        return Moment(pose=pose, v=v, w=w, a=a, wheel_angle=turned, v_cmd=v_cmd, w_cmd=w_cmd, bump=bump > 0)
+
+
+class LiveRobot:
+    """A robot of a scene that is commanded step by step."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        anomaly_map: AnomalyMap,
+        rng: np.random.Generator,
+        obstacles: Obstacles | None = None,
+        rate_hz: float | None = None,
+        network: Network | None = None,
+        model_error: ModelError | None = None,
+        outside: Literal["nan", "clamp"] = "nan",
+        lidar: LidarMode = "schedule",
+    ) -> None:
+        """Put it at the scene's start, at rest.
+
+        Args:
+            scene: As for `magtwin.sim.runs.simulate.simulate`, like all that follows.
+            anomaly_map: The map of `scene.map_layer`.
+            rng: Source of all noise.
+            obstacles: What stops the robot, and what its LiDAR sees.
+            rate_hz: Magnetometer readings a second [Hz]. Default: the scene's.
+            network: Predicts the disturbance of a neural magnetometer.
+            model_error: Statistics of the error of these predictions; None draws no error.
+            outside: What the map reads outside its extent.
+            lidar: Whether the LiDAR follows its schedule, or stays on or off.
+
+        Raises:
+            InputError: It would begin in an obstacle, or an option is out of range.
+        """
+        robot, obstacles = scene.robot, obstacles or Obstacles()
+        self.rate_hz = check_run(
+            scene,
+            Commands("live", np.zeros((1, 3))),
+            anomaly_map=anomaly_map,
+            rate_hz=rate_hz,
+            duration_s=None,
+            lidar=lidar,
+            network=network is not None,
+        )
+        self.step_s = 1.0 / CONTROL_RATE_HZ
+        draws = streams(rng)
+        errors = draw_wheel_errors(robot.drive, draws["drive"])
+        radius = robot.footprint_radius_m
+        self._chassis: Chassis = at_start(robot.drive, scene.start, obstacles, radius, errors, self.step_s)
+        self._track = Track(robot.drive, self.step_s, scene.start)
+        self._network, self._model_error, self._height_m = network, model_error, robot.base_height_m
+        self._sensing = Sensing(
+            scene,
+            draws,
+            anomaly_map=anomaly_map,
+            rate_hz=self.rate_hz,
+            outside=outside,
+            lidar=lidar,
+            network=network is not None,
+        )
+        self._scanner = Scanner(robot, obstacles, draws["lidar"])
+        self._noise_sd_nt = robot.magnetometer.noise_density_nt * np.sqrt(self.rate_hz / 2)
+        self._readings = 0
+        self._rows: list[tuple[float, float, float]] = []
+        self._metadata = {**run_metadata(self._sensing), "controller": "commands", "lidar": lidar}
+
+    @property
+    def t(self) -> float:
+        """Time at the end of the last step [s]."""
+        return self._track.end_s
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """Pose at the end of the last step: x [m], y [m], yaw [rad] in world."""
+        return self._chassis.pose
+
+    @property
+    def commands(self) -> Commands:
+        """The commands so far; `simulate` drives the same run from them."""
+        end = (self._track.steps * self.step_s, 0.0, 0.0)
+        return Commands("live", np.array([(0.0, 0.0, 0.0), *self._rows, end]))
+
+    def step(self, command: tuple[float, float] | None = None) -> Run:
+        """Drive on for a control step, and read the sensors in its time.
+
+        Args:
+            command: Forward speed [m/s] and yaw rate [rad/s]. None keeps the last command until the drive's
+                command_timeout_s is over. In the first step the robot stands.
+
+        Returns:
+            The readings in the step's time, every column of `COLUMNS`; there may be none.
+
+        Raises:
+            InputError: The command is not finite.
+        """
+        begin = self._track.end_s
+        if begin == 0:
+            command = (0.0, 0.0)
+        self._chassis.step(command)
+        if command is not None and begin > 0:
+            self._rows.append((begin, *command))
+        self._track.add(self._chassis.last)
+        return self._read()
+
+    def scans(self) -> Scans:
+        """The LiDAR's scans whose time lay in the last step, with the times at which they will arrive."""
+
+        def poses(t: Array) -> Array:
+            x, y, yaw = self._track.at(t).pose.T
+            return np.column_stack([x, y, np.full(len(t), self._height_m), yaw])
+
+        return self._scanner.scan(self._track.end_s, poses, self._sensing.lidar_on)
+
+    def samples(self) -> dict[str, list[Samples]]:
+        """The samples of odometry, imu, mocap and battery since the last call, by these names."""
+        return {name: sensor.clock.take_fresh() for name, sensor in self._sensing.sampled.items()}
+
+    def _read(self) -> Run:
+        until = self._track.end_s
+        count = int(np.ceil(until * self.rate_hz - 1e-9))
+        t = np.arange(self._readings, count) / self.rate_hz
+        self._readings = count
+        columns, known = self._sensing.sense(self._track, t, until), {}
+        if self._network is None:
+            predicted = None
+        else:
+            mean, sd, beyond = self._network(Run(columns, self._metadata))
+            predicted = mean, sd
+            known["b_sd_nt"] = np.hypot(sd, self._noise_sd_nt)
+            if beyond is not None:
+                known["flag_out_of_distribution"] = beyond
+        return Run({**self._sensing.read(columns, predicted, self._model_error), **known}, self._metadata)

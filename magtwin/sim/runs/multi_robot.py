@@ -1,0 +1,153 @@
+"""Several robots that drive in one lab at the same time, a Run each.
+
+Each is driven as if it were alone, with its own random numbers. Then the least distances are found, and each
+robot's sensors are read with the others beside it: their iron at its magnetometer, their footprints at its
+own.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Literal
+
+import numpy as np
+
+from magtwin.errors import InputError, find
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.run.run import Run
+from magtwin.sim.motion.drive_input import DriveInput
+from magtwin.sim.motion.engine import Kinematic
+from magtwin.sim.runs.neighbours import Approach, Neighbour, approaches
+from magtwin.sim.runs.sensing import LidarMode, Outside, Sensing, streams
+from magtwin.sim.runs.simulate import Predict, check_run, sense_all, travel
+from magtwin.sim.sensors.model_error import ModelError
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.scene import Scene
+
+
+def simulate_robots(
+    scene: Scene,
+    paths: Mapping[str, DriveInput],
+    *,
+    anomaly_map: AnomalyMap,
+    rngs: Mapping[str, np.random.Generator],
+    wanted: Iterable[str] | None = None,
+    meet: Literal["refuse", "flag"] = "refuse",
+    speed: float = 0.2,
+    duration_s: float | None = None,
+    rate_hz: float | None = None,
+    obstacles: Obstacles | None = None,
+    controller: str = "follower",
+    disturbances_nt: Mapping[str, Predict | None] | None = None,
+    model_errors: Mapping[str, ModelError | None] | None = None,
+    outside: Outside = "nan",
+    lidar: LidarMode = "schedule",
+) -> dict[str, Run]:
+    """Drive robots of a scene at the same time, each with the kinematic engine.
+
+    A robot's Run is that of `simulate` in `scene.led_by(name)` with the same generator, except for the
+    field of the others at its magnetometer, and the bumps.
+
+    Args:
+        scene: Lab and robots.
+        paths: What each robot drives, by its name, as for `simulate`. Robots without a path are absent.
+        anomaly_map: The map of `scene.map_layer`.
+        rngs: Source of all noise of each robot, by name.
+        wanted: Names of the robots whose sensors are read. Default: all. The others drive nevertheless.
+        meet: What happens if footprints overlap: a refusal with time and place, or flag_bump in both Runs
+            while it lasts; they drive through each other.
+        speed: As for `simulate`, of each.
+        duration_s: As for `simulate`, of each.
+        rate_hz: As for `simulate`.
+        obstacles: As for `simulate`.
+        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`.
+        disturbances_nt: What predicts the disturbance of each robot with a neural magnetometer, by name.
+        model_errors: Statistics of the errors of these predictions, by name; None draws no error.
+        outside: As for `simulate`.
+        lidar: As for `simulate`.
+
+    Returns:
+        A Run for each wanted robot, by name. Its metadata name the robot, and the robot that came nearest,
+        with clearance [m] and time [s].
+
+    Raises:
+        InputError: Robots would meet, or `simulate` would refuse one; the text names it.
+    """
+    if not paths:
+        raise InputError("no robot is to drive; name one at least", parameter="paths")
+    find("way of robots to meet", meet, {"refuse": None, "flag": None})
+    predicts = {name: (disturbances_nt or {}).get(name) for name in paths}
+    led = {name: scene.led_by(name) for name in paths}
+    rates, draws, robots, metadata = {}, {}, {}, {}
+    for name, path in paths.items():
+        try:
+            rates[name] = check_run(
+                led[name],
+                path,
+                anomaly_map=anomaly_map,
+                rate_hz=rate_hz,
+                duration_s=duration_s,
+                lidar=lidar,
+                network=predicts[name] is not None,
+            )
+            draws[name] = streams(rngs[name])
+            motion, metadata[name] = travel(
+                led[name],
+                path,
+                draws[name],
+                speed,
+                duration_s,
+                obstacles or Obstacles(),
+                controller,
+                Kinematic(),
+            )
+        except InputError as error:
+            raise InputError(f"robot {name!r}: {error}", parameter=error.parameter) from error
+        robots[name] = Neighbour(led[name].robot, motion)
+    near = list(approaches(robots))
+    if meet == "refuse":
+        _check_apart(near)
+    runs = {}
+    for name in paths if wanted is None else wanted:
+        robot, predict = find("robot", name, robots), predicts[name]
+        sensing = Sensing(
+            led[name],
+            draws[name],
+            anomaly_map=anomaly_map,
+            rate_hz=rates[name],
+            outside=outside,
+            lidar=lidar,
+            network=predict is not None,
+            neighbours=[other for key, other in robots.items() if key != name],
+        )
+        how = {**metadata[name], "outside": outside, "lidar": lidar}
+        sensed = sense_all(sensing, robot.motion, duration_s, how)
+        run = sensed.read(None if predict is None else predict(sensed.run), (model_errors or {}).get(name))
+        runs[name] = run.with_metadata(robot=name, **_nearest(name, near))
+    return runs
+
+
+def _check_apart(near: Iterable[Approach]) -> None:
+    """Refuse robots that meet; the text names the first two."""
+    met = [approach for approach in near if approach.meet_s is not None]
+    if met:
+        first = min(met, key=lambda approach: approach.meet_s or 0.0)
+        a, b = first.names
+        x, y = first.p_meet
+        raise InputError(
+            f"robots {a!r} and {b!r} would run into each other after {first.meet_s:.2f} s at ({x:.2f}, "
+            f"{y:.2f}) m; give one another path, start or speed, or have it flagged as a bump "
+            '(meet="flag")'
+        )
+
+
+def _nearest(name: str, near: Iterable[Approach]) -> dict[str, str | float]:
+    """Metadata of a robot's nearest approach; empty if it drove alone."""
+    own = [approach for approach in near if name in approach.names]
+    if not own:
+        return {}
+    least = min(own, key=lambda approach: approach.clearance_m)
+    other = next(other for other in least.names if other != name)
+    return {
+        "nearest_robot": other,
+        "nearest_clearance_m": round(least.clearance_m, 6),
+        "nearest_t_s": least.t_s,
+    }

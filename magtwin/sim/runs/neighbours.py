@@ -1,0 +1,195 @@
+"""Neighbours: the other robots in a lab, as a robot's magnetometer and its bumper meet them.
+
+A robot feels the iron of another one as a point dipole at the other's base_link: the moment that makes the
+permanent and the induced part of the other's platform at the other's own magnetometer, so that what is known
+of a robot tells what it does to others. Far away that is what its iron does, near by about so; where in the
+robot the iron is, nobody has measured. Its motors, LiDAR, battery and turning iron are left out.
+
+Robots do not see each other while they drive. How near they came is found afterwards.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.errors import InputError
+from magtwin.sim.interference import NEAREST_M, sensor_places
+from magtwin.sim.motion.drive import Moment
+from magtwin.sim.motion.engine import Travel
+from magtwin.sim.motion.sampling import Moving, moment_at
+from magtwin.spec.robot import RobotSpec
+from magtwin.spec.scene import Scene
+
+Array = NDArray[np.float64]
+
+MU_0_NT = 4 * math.pi * 1e2
+"""Magnetic constant [nT m/A]."""
+
+RATE_STEP_S = 1e-3
+"""Half of the time over which a neighbour's field is differenced [s]; robots go 0.3 mm in it."""
+
+SEEN_HZ = 50.0
+"""How often it is looked how far robots are apart [Hz]: every 12 mm of two that drive at each other."""
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbour:
+    """Another robot, and what it did."""
+
+    robot: RobotSpec
+    motion: Travel
+
+
+@dataclass(frozen=True)
+class Approach:
+    """How near two robots came."""
+
+    names: tuple[str, str]
+    """Theirs."""
+
+    clearance_m: float
+    """Least distance between their footprints [m]; below 0 where they overlap."""
+
+    t_s: float
+    """When [s]."""
+
+    p_xy: tuple[float, float]
+    """Where: midway between them [m]."""
+
+    meet_s: float | None
+    """When their footprints first overlapped [s]; none if they never did."""
+
+    p_meet: tuple[float, float]
+    """Where they did, midway between them, or else where they were nearest [m]."""
+
+
+def iron_moments(robot: RobotSpec, b_base_nt: ArrayLike) -> Array:
+    """Moment at base_link's origin that stands for a robot's iron.
+
+    With r u the way from there to its magnetometer and B = h + S b its permanent and induced field at that,
+    B = mu_0 / 4 pi r^3 (3 (m . u) u - m) has the solution m = 4 pi r^3 / mu_0 (3/2 (B . u) u - B).
+
+    Args:
+        robot: Its platform, and where its magnetometer is.
+        b_base_nt: Ambient field b in base_link axes [nT], shape (N, 3).
+
+    Returns:
+        Moments in base_link axes [A m2], shape (N, 3).
+
+    Raises:
+        InputError: Its magnetometer is at base_link's origin, so no moment can stand for its iron.
+    """
+    platform, b = robot.platform, np.asarray(b_base_nt, float)
+    iron = np.einsum("nk,jk->nj", b, np.reshape(platform.soft_iron, (3, 3))) + platform.hard_iron_nt
+    r = math.hypot(*robot.p_base_magnetometer)
+    if not iron.any():
+        return iron
+    if not r > NEAREST_M:
+        raise InputError(
+            f"robot {robot.name!r}: its magnetometer is at the origin of base_link, so no dipole there can "
+            "stand for its iron, which other robots feel; move the magnetometer, or run it by itself"
+        )
+    u = np.divide(robot.p_base_magnetometer, r)
+    return np.asarray(4 * math.pi * r**3 / MU_0_NT * (1.5 * (iron @ u)[:, None] * u - iron))
+
+
+def neighbours_field_nt(
+    scene: Scene, neighbours: Sequence[Neighbour], motion: Moving, t: ArrayLike, true: Moment
+) -> Array:
+    """What other robots add to the field at a robot's magnetometer.
+
+    (1 + S) b + E db/dt with their field b in base_link axes: the robot's own soft iron and eddy currents
+    answer to it as to the lab's.
+
+    Args:
+        scene: A scene whose Earth's field is known, and its first robot, which reads.
+        neighbours: The other robots.
+        motion: What the first robot did.
+        t: Times of the readings, ascending [s], shape (N,).
+        true: Its motion at these times.
+
+    Returns:
+        Field in base_link axes [nT], shape (N, 3).
+    """
+    t = np.asarray(t, float)
+    later, sooner = (_at_sensor(scene, neighbours, motion, t + dt) for dt in (RATE_STEP_S, -RATE_STEP_S))
+    yaw = true.pose[:, 2]
+    b = _turned(_at_sensor(scene, neighbours, motion, t), -yaw)
+    rate = _turned((later - sooner) / (2 * RATE_STEP_S), -yaw)
+    rate[:, 0] += true.w * b[:, 1]
+    rate[:, 1] -= true.w * b[:, 0]
+    soft, eddy = (
+        np.reshape(m, (3, 3)) for m in (scene.robot.platform.soft_iron, scene.robot.platform.eddy_s)
+    )
+    return np.asarray(b + np.einsum("nk,jk->nj", b, soft) + np.einsum("nk,jk->nj", rate, eddy))
+
+
+def _at_sensor(scene: Scene, neighbours: Sequence[Neighbour], motion: Moving, t: Array) -> Array:
+    """The neighbours' field at the first robot's magnetometer at times [s], in world axes [nT], (N, 3)."""
+    assert scene.earth is not None
+    p_sensor = sensor_places(scene.robot, moment_at(motion, t).pose)
+    field = np.zeros((len(t), 3))
+    for other in neighbours:
+        pose = moment_at(other.motion, t).pose
+        earth = np.broadcast_to(scene.earth.b_world_nt, (len(t), 3))
+        m_world = _turned(iron_moments(other.robot, _turned(earth, -pose[:, 2])), pose[:, 2])
+        height = np.full(len(t), other.robot.base_height_m)
+        field += _dipole_each_nt(p_sensor - np.column_stack([pose[:, :2], height]), m_world)
+    return field
+
+
+def _dipole_each_nt(r: Array, m: Array) -> Array:
+    """Field of N dipoles m (N, 3), each at its own point r (N, 3) from it [nT]; as `dipole_field_nt`."""
+    d = np.sqrt(np.sum(r * r, axis=1))[:, None]
+    along = 3 * np.sum(m * r, axis=1)[:, None] * r / d**5
+    return np.asarray(MU_0_NT / (4 * math.pi) * (along - m / d**3))
+
+
+def approaches(travels: Mapping[str, Neighbour]) -> Iterator[Approach]:
+    """How near each two of some robots came, from the start to the end of the last; who has arrived stands.
+
+    Args:
+        travels: The robots by name.
+    """
+    end = max(one.motion.duration_s for one in travels.values())
+    t = np.arange(int(end * SEEN_HZ) + 1) / SEEN_HZ
+    places = {name: one.motion.at(t).pose[:, :2] for name, one in travels.items()}
+    for a, b in combinations(travels, 2):
+        apart = np.hypot(*(places[a] - places[b]).T)
+        apart -= travels[a].robot.footprint_radius_m + travels[b].robot.footprint_radius_m
+        middle = (places[a] + places[b]) / 2
+        nearest = int(np.argmin(apart))
+        met = np.flatnonzero(apart < 0)
+        first = int(met[0]) if len(met) else nearest
+        yield Approach(
+            names=(a, b),
+            clearance_m=float(apart[nearest]),
+            t_s=float(t[nearest]),
+            p_xy=(float(middle[nearest, 0]), float(middle[nearest, 1])),
+            meet_s=float(t[first]) if len(met) else None,
+            p_meet=(float(middle[first, 0]), float(middle[first, 1])),
+        )
+
+
+def touching(
+    t: Array, motion: Moving, robot: RobotSpec, neighbours: Sequence[Neighbour]
+) -> NDArray[np.bool_]:
+    """Whether a robot's footprint overlaps another's at times [s], shape (N,)."""
+    here = motion.at(t).pose[:, :2]
+    touches = np.zeros(len(t), bool)
+    for other in neighbours:
+        there = other.motion.at(t).pose[:, :2]
+        reach = robot.footprint_radius_m + other.robot.footprint_radius_m
+        touches |= np.hypot(*(here - there).T) < reach
+    return touches
+
+
+def _turned(v: Array, angle: Array) -> Array:
+    """Vectors (N, 3) turned about z by angles (N,)."""
+    x, y, z = v.T
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.column_stack([cos * x - sin * y, sin * x + cos * y, z])

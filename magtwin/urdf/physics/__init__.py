@@ -1,0 +1,1 @@
+"""What moves and weighs: links, joints, drives, wheels and contact, as UsdPhysics has them."""

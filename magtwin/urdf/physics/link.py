@@ -1,0 +1,155 @@
+"""Link: a rigid body with its mass, or a frame without mass and shape."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Gf, Usd, UsdPhysics
+
+from magtwin.errors import InputError
+from magtwin.frames import matrix_from_quat, wxyz_from_xyzw
+from magtwin.urdf.description.description import Description, origin_of
+from magtwin.urdf.description.model import Link
+from magtwin.urdf.physics.inertia import MassProperties, combined, principal_axes
+from magtwin.urdf.physics.solid import read_solid
+
+LINK_API, SITE_API = "IsaacLinkAPI", "IsaacSiteAPI"
+"""Isaac Sim's applied schemas; their plugins are not installed here."""
+
+
+@dataclass(frozen=True)
+class Rider:
+    """A link that is a body or part of one."""
+
+    link: Link
+
+    pose: NDArray[np.float64]
+    """Pose of the link in the body, shape (4, 4)."""
+
+    colliders: list[Usd.Prim] = field(default_factory=list)
+    """Its colliders below the body's prim."""
+
+    visuals: list[Usd.Prim] = field(default_factory=list)
+    """Its visuals below the body's prim."""
+
+
+def is_marker(link: Link) -> bool:
+    """Whether a link is only a frame, without mass and shape."""
+    return link.inertial is None and not link.visuals and not link.collisions
+
+
+def define_body(
+    prim: Usd.Prim, parts: Sequence[Rider], description: Description, density: float | None = None
+) -> Usd.Prim:
+    """Make an Xform a rigid body with the total mass, centre and principal inertia of its links.
+
+    Args:
+        prim: The Xform, with its shapes below it.
+        parts: The body's own link, and links merged into it.
+        description: Receives notes of repairs and guesses.
+        density: Density of links without mass [kg/m3]; None leaves them without.
+
+    Raises:
+        InputError: A mass is not above 0, or an inertia is impossible; the message gives the line.
+    """
+    prim.AddAppliedSchema(LINK_API)
+    UsdPhysics.RigidBodyAPI.Apply(prim).CreateRigidBodyEnabledAttr(True)
+    parts = [part for part in parts if part is parts[0] or not is_marker(part.link)]
+    properties = [_mass_properties(part, prim, description, density, len(parts) == 1) for part in parts]
+    known = [each for each in properties if each is not None]
+    if not known:
+        return prim
+    whole = known[0] if len(known) == 1 else combined(known)
+    mass = UsdPhysics.MassAPI.Apply(prim)
+    mass.CreateMassAttr(whole.mass)
+    mass.CreateCenterOfMassAttr(Gf.Vec3f(*(round(float(v), 12) + 0.0 for v in whole.centre)))
+    if not np.isfinite(whole.inertia).all():
+        return prim  # the engine computes it, see the note
+    tensor = whole.inertia.copy()
+    tensor[np.abs(tensor) < 1e-9 * np.abs(tensor).max()] = 0.0
+    moments, q, _ = principal_axes(tensor)
+    mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, moments)))
+    mass.CreatePrincipalAxesAttr(Gf.Quatf(*(round(float(v), 7) + 0.0 for v in wxyz_from_xyzw(q))))
+    return prim
+
+
+def define_frame(prim: Usd.Prim) -> Usd.Prim:
+    """Make an Xform a site: a named frame on the body above it."""
+    prim.AddAppliedSchema(SITE_API)
+    return prim
+
+
+def _mass_properties(
+    part: Rider, body: Usd.Prim, description: Description, density: float | None, alone: bool
+) -> MassProperties | None:
+    """Mass properties of a link in its body's frame; None if unknown.
+
+    If a link is a body of its own and has a mass but no inertia, the inertia is NaN: the engine computes it.
+    """
+    link, inertial = part.link, part.link.inertial
+    if inertial is None:
+        return _from_shapes(part, body, description, density, alone)
+    if inertial.mass is None or not (np.isfinite(inertial.mass) and inertial.mass > 0):
+        raise description.refused("link", link.name, f"has a mass of {inertial.mass!r} kg; give one above 0")
+    mass, centre = float(inertial.mass), (part.pose @ origin_of(inertial))[:3, 3]
+    if inertial.inertia is not None:
+        tensor = _checked(link, np.asarray(inertial.inertia, float), origin_of(inertial), description)
+        return MassProperties(mass, centre, part.pose[:3, :3] @ tensor @ part.pose[:3, :3].T)
+    if alone:
+        description.note(f"link {link.name!r} has no <inertia>: engines take it from its colliders")
+        return MassProperties(mass, centre, np.full((3, 3), np.nan))
+    solid = read_solid(part.colliders or part.visuals, body)
+    if solid is None:
+        description.note(f"link {link.name!r} has no <inertia> and no shape: its mass counts as a point")
+        return MassProperties(mass, centre, np.zeros((3, 3)))
+    description.note(f"link {link.name!r} has no <inertia>: taken from its shape, filled evenly")
+    return MassProperties(mass, centre, solid.mass_properties(mass / solid.volume).inertia)
+
+
+def _from_shapes(
+    part: Rider, body: Usd.Prim, description: Description, density: float | None, alone: bool
+) -> MassProperties | None:
+    """Mass properties of a link without `<inertial>`: its shapes at a density, if one is given."""
+    name = part.link.name
+    if density is None:
+        lacks = "engines take its mass from its colliders" if alone else "it adds none to its body's"
+        if alone and not part.colliders:
+            lacks = "without a collider, engines cannot find its mass; give a density"
+        description.note(f"link {name!r} has no <inertial>: {lacks}")
+        return None
+    used, solid = "colliders", read_solid(part.colliders, body)
+    if solid is None:
+        used, solid = "visuals", read_solid(part.visuals, body)
+    if solid is None:
+        description.note(f"link {name!r} has no <inertial> and no shape to fill: it has no mass")
+        return None
+    filled = solid.mass_properties(density)
+    description.note(
+        f"link {name!r} has no <inertial>: {filled.mass:.3g} kg, its {used} at {density:g} kg/m3"
+    )
+    return filled
+
+
+def _checked(link: Link, tensor: NDArray, origin: NDArray, description: Description) -> NDArray[np.float64]:
+    """An inertia in its link's axes, repaired if slightly impossible.
+
+    Args:
+        link: The link.
+        tensor: In the axes of the `<inertial>`, shape (3, 3).
+        origin: Pose of the `<inertial>` in the link, shape (4, 4).
+        description: Receives a note of a repair.
+    """
+    turned = origin[:3, :3] @ tensor @ origin[:3, :3].T
+    cleared = np.where(np.abs(turned) < 1e-9 * np.abs(turned).max(), 0.0, turned)
+    try:
+        moments, q, repaired = principal_axes(cleared)
+    except InputError as error:
+        raise description.refused("link", link.name, f"has an impossible inertia: {error}") from error
+    if not repaired:
+        return turned
+    description.note(
+        f"link {link.name!r}: its largest moment of inertia exceeded the sum of the others; reduced to it"
+    )
+    R = matrix_from_quat(q)
+    return R @ np.diag(moments) @ R.T

@@ -1,0 +1,156 @@
+"""Mechanism: which joints move, which follow another, and the rest position of each."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from magtwin.urdf.description.description import Description, origin_of
+from magtwin.urdf.description.model import Joint
+from magtwin.urdf.options import DEFAULTS, Options
+
+SINGLE = ("revolute", "continuous", "prismatic")
+"""Joints with one degree of freedom: only these can have mimics and default drives."""
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """A joint follows another: q = multiplier q_leader + offset."""
+
+    leader: str
+    """Name of the leading joint, which follows no other."""
+
+    multiplier: float
+    """Ratio of the two values [1; rad/m or m/rad if one rotates and the other slides]."""
+
+    offset: float
+    """Value when the leader is at 0 [rad or m]."""
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """The joints of a description by name."""
+
+    description: Description
+
+    welded: Mapping[str, str]
+    """Joints that cannot move, with the reason; "" for joints of type fixed."""
+
+    mimics: Mapping[str, Mimic]
+    """Joints that follow another."""
+
+    rests: Mapping[str, float]
+    """Authored value of joints that do not rest at 0 [rad or m]."""
+
+    def pose(self, joint: Joint) -> NDArray[np.float64]:
+        """T_parent_child of a joint's links at rest, shape (4, 4)."""
+        T, rest = origin_of(joint), self.rests.get(joint.name, 0.0)
+        return T @ displacement(joint.axis, rest, slides=joint.type == "prismatic") if rest else T
+
+    def poses(self) -> dict[str, NDArray[np.float64]]:
+        """T_root_link of each link at rest, shape (4, 4)."""
+        poses = {self.description.root: np.eye(4)}
+        for child, joint in self.description.joints.items():
+            poses[child] = poses[joint.parent] @ self.pose(joint)
+        return poses
+
+
+def read_mechanism(description: Description, options: Options = DEFAULTS) -> Mechanism:
+    """Determine which joints move.
+
+    A joint is welded if it is fixed, if its limits leave no range, or if its limits give neither effort nor
+    speed, unless it is continuous, where exporters fill in zeros. With the profile diff-drive, a prismatic
+    joint without one of the two is welded too: it stands for a suspension whose spring a URDF cannot
+    describe. A joint that follows a welded joint is welded.
+
+    Raises:
+        InputError: A mimicking joint has several axes, or the multiplier 0; the message gives the line.
+    """
+    joints = {joint.name: joint for joint in description.joints.values()}
+    welded = {}
+    for joint in joints.values():
+        reason = _weld_reason(joint, options)
+        if reason is not None:
+            welded[joint.name] = reason
+            if reason:
+                description.note(f"joint {joint.name!r} ({joint.type}) {reason}: welded")
+    mimics, rests = {}, {}
+    for name, joint in joints.items():
+        if name in welded:
+            rest = _welded_value(joint, welded)
+            if rest:
+                rests[name] = rest
+            if joint.mimic is not None:
+                description.note(
+                    f"joint {name!r} cannot move: its mimic of {joint.mimic.joint!r} is left out"
+                )
+            continue
+        if joint.mimic is None:
+            continue
+        mimic = _resolved(joint, joints, description)
+        if mimic.leader in welded:
+            welded[name] = f"follows {mimic.leader!r}, which cannot move"
+            description.note(f"joint {name!r} {welded[name]}: welded")
+        else:
+            mimics[name] = mimic
+        start = mimic.multiplier * _welded_value(joints[mimic.leader], welded) + mimic.offset
+        if start:
+            rests[name] = start
+    return Mechanism(description, welded, mimics, rests)
+
+
+def displacement(axis: ArrayLike, value: float, *, slides: bool) -> NDArray[np.float64]:
+    """Motion of a joint's child from its place at 0: a rotation about the axis, or a slide along it, (4, 4).
+
+    R = 1 + sin(q) K + (1 - cos(q)) K^2, with K the cross product with the unit axis (Rodrigues).
+    """
+    T, unit = np.eye(4), np.asarray(axis, float) / np.linalg.norm(axis)
+    if slides:
+        T[:3, 3] = value * unit
+        return T
+    K = np.cross(np.eye(3), unit)
+    T[:3, :3] += np.sin(value) * K + (1 - np.cos(value)) * K @ K
+    return T
+
+
+def _weld_reason(joint: Joint, options: Options) -> str | None:
+    """Why a joint cannot move; "" if it is fixed, None if it can move."""
+    limit = joint.limit
+    if joint.type == "fixed":
+        return ""
+    if limit is None:
+        return None
+    powerless = limit.effort == 0 and limit.velocity == 0 and joint.type != "continuous"
+    closed = (
+        joint.type in ("revolute", "prismatic") and limit.lower is not None and limit.lower == limit.upper
+    )
+    if powerless or closed:
+        return "cannot move by its own limits"
+    if options.profile == "diff-drive" and joint.type == "prismatic" and 0 in (limit.effort, limit.velocity):
+        return "is a suspension without effort or speed"
+    return None
+
+
+def _resolved(joint: Joint, joints: Mapping[str, Joint], description: Description) -> Mimic:
+    """The first joint of a chain of mimics, with the total ratio; the description has no circle."""
+    multiplier, offset, at = 1.0, 0.0, joint
+    while at.mimic is not None:
+        ratio = 1.0 if at.mimic.multiplier is None else float(at.mimic.multiplier)
+        if ratio == 0:
+            raise description.refused("joint", at.name, "mimics with multiplier 0; make it fixed")
+        offset += multiplier * float(at.mimic.offset or 0.0)
+        multiplier *= ratio
+        at = joints[at.mimic.joint]
+    if joint.type not in SINGLE:
+        text = f"is {joint.type} and has no single value to mimic {at.name!r} with"
+        raise description.refused("joint", joint.name, text)
+    return Mimic(at.name, multiplier, offset)
+
+
+def _welded_value(joint: Joint, welded: Mapping[str, str]) -> float:
+    """Rest position of a joint that follows none [rad or m]; not 0 only for equal limits."""
+    limit = joint.limit
+    if welded.get(joint.name) and limit and limit.lower is not None and limit.lower == limit.upper:
+        return float(limit.lower)
+    return 0.0

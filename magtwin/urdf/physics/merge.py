@@ -1,0 +1,91 @@
+"""Merge: the body that each link is or rides on; welded links can become part of the body above."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.urdf.description.description import origin_of
+from magtwin.urdf.description.model import Shape
+from magtwin.urdf.physics.link import is_marker
+from magtwin.urdf.physics.mechanism import Mechanism
+
+Place = tuple[str, NDArray[np.float64]]
+"""Name of a body, and a pose in it, shape (4, 4)."""
+
+WORLD = ""
+"""Name of the world, which is not a body; joints to it hold the robot at its prim's frame."""
+
+
+def place_links(mechanism: Mechanism, *, merge: bool = False) -> dict[str, Place]:
+    """The body that each link is or rides on, with its pose in it; parents before children.
+
+    Links that are only frames ride on the nearest body above; those above the first body, such as
+    base_footprint, on that. If a joint moves everything relative to a root without mass, such as the rail of
+    a slide, the root is the world.
+
+    Args:
+        mechanism: Joints of the description.
+        merge: Whether links with mass or shape that cannot move also ride on the body above.
+    """
+    description = mechanism.description
+    base, above = _base(mechanism)
+    poses = mechanism.poses()
+    home = np.eye(4) if base == WORLD else poses[base]
+    places = {name: (base, np.linalg.inv(home) @ poses[name]) for name in above}
+    if base != WORLD:
+        places[base] = (base, np.eye(4))
+    for name, link in description.links.items():
+        if name in places:
+            continue
+        joint = description.joints[name]
+        body, pose = places[joint.parent]
+        if joint.name in mechanism.welded and (is_marker(link) or (merge and body != WORLD)):
+            places[name] = (body, pose @ mechanism.pose(joint))
+        else:
+            places[name] = (name, np.eye(4))
+    return {name: places[name] for name in description.links}
+
+
+def riders(places: dict[str, Place], body: str) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """The links that are part of a body or ride on it, itself first, with their poses in it."""
+    yield body, np.eye(4)
+    for name, (carrier, pose) in places.items():
+        if carrier == body != name:
+            yield name, pose
+
+
+def carried(shapes: Iterable[Shape], pose: NDArray, link: str, body: str) -> list[Shape]:
+    """Visuals or colliders of a link as shapes of its body.
+
+    Args:
+        shapes: Visuals or collisions.
+        pose: Pose of the link in the body, shape (4, 4).
+        link: Name of the link; shapes without a name get it.
+        body: Name of the body's own link, whose shapes stay unchanged.
+    """
+    if link == body:
+        return list(shapes)
+    return [replace(shape, origin=pose @ origin_of(shape), name=shape.name or link) for shape in shapes]
+
+
+def _base(mechanism: Mechanism) -> tuple[str, list[str]]:
+    """The robot's first body, or the world; and the links above it, which are only frames."""
+    description = mechanism.description
+    above, pending = {description.root: [description.root]}, [description.root]
+    while pending:
+        link = pending.pop(0)
+        if not is_marker(description.links[link]):
+            return link, above[link][:-1]
+        for child, joint in description.joints.items():
+            if joint.parent == link and joint.name in mechanism.welded:
+                above[child] = [*above[link], child]
+                pending.append(child)
+    joints = description.joints
+    moving = [child for child, joint in joints.items() if joint.parent in above and child not in above]
+    if not moving:
+        return description.root, []
+    if len(moving) == 1 and joints[moving[0]].type == "floating":
+        return moving[0], above[joints[moving[0]].parent]
+    return WORLD, list(above)

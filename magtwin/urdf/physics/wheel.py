@@ -1,0 +1,163 @@
+"""Wheel: for the profile diff-drive, the driven wheels of a robot and the parts that slide on the floor."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from fnmatch import fnmatchcase
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Usd, UsdGeom, UsdPhysics
+
+from magtwin.errors import InputError
+from magtwin.urdf.description.description import Description, origin_of
+from magtwin.urdf.description.model import Joint, Link
+from magtwin.urdf.options import DriveRule
+from magtwin.urdf.physics.drive import WheelDrive
+from magtwin.urdf.physics.gazebo import Surface
+from magtwin.urdf.physics.mechanism import Mechanism
+
+WHEEL_FRICTION, CASTER_FRICTION = 1.0, 0.05
+"""Default friction of driven wheels (rubber) and of sliding parts (a polished ball)."""
+
+RESPONSE = 0.007
+"""Response time of a wheel's velocity drive [s]."""
+
+GRAVITY = 9.81
+"""[m/s2]."""
+
+CASTER_NAMES = ("caster", "castor")
+"""Words in the names of links that slide."""
+
+FLOOR = 0.002
+"""Height above the lowest point of the wheels within which other parts touch the floor [m]."""
+
+
+def find_wheels(mechanism: Mechanism, named: Iterable[str] = ()) -> tuple[str, ...]:
+    """Names of the joints of a robot's driven wheels.
+
+    These are the joints that a drive plugin names. Without a plugin, they are the continuous joints about a
+    horizontal axis, except casters: joints with such a name, or below a joint that swivels.
+
+    Args:
+        mechanism: Joints of the description.
+        named: Joints that a drive plugin names.
+
+    Raises:
+        InputError: There are fewer than two.
+    """
+    description, poses = mechanism.description, mechanism.poses()
+    joints = {joint.name: joint for joint in description.joints.values()}
+    wheels = tuple(n for n in named if n in joints and joints[n].type in ("continuous", "revolute"))
+    if not wheels:
+        slopes = {
+            name: abs(poses[joint.child][2, :3] @ joint.axis) / np.linalg.norm(joint.axis)
+            for name, joint in joints.items()
+            if joint.type == "continuous"
+        }
+        wheels = tuple(
+            name
+            for name, slope in slopes.items()
+            if slope < 0.5  # within 30 degrees of the horizontal
+            and not any(word in f"{name} {joints[name].child}".lower() for word in CASTER_NAMES)
+            and not any(slopes.get(above.name, 0) >= 0.5 for above in _above(joints[name], description))
+        )
+    if len(wheels) < 2:
+        raise InputError(
+            f"{description.path}: profile diff-drive needs two wheels, continuous joints about a horizontal "
+            f"axis; found {', '.join(wheels) or 'none'}; convert with the profile general"
+        )
+    return wheels
+
+
+def not_on(wheels: Iterable[str], rules: Iterable[DriveRule]) -> tuple[DriveRule, ...]:
+    """The rules that match no driven wheel; the profile's gains replace those of an interface."""
+    names = tuple(wheels)
+    return tuple(rule for rule in rules if not any(fnmatchcase(name, rule.joints) for name in names))
+
+
+def fit_wheels(
+    mechanism: Mechanism, wheels: Iterable[str], bodies: Mapping[str, Usd.Prim]
+) -> dict[str, WheelDrive]:
+    """Drives of the wheels, from the robot's mass m, the number of wheels n and their radius r.
+
+    Gain kd = m r^2 / (n t): the robot reaches a commanded speed within about t = RESPONSE. Torque
+    mu m g r / n: the most that the floor can take. In Newton 1.8, a robot of 5.4 kg at 120 to 500 steps a
+    second follows a step of the command to 3 %. Ten times the gain needs 500 steps, because the solver
+    slows a saturated drive by kd dt as if that were inertia.
+
+    Args:
+        mechanism: Joints of the description.
+        wheels: Joints of driven wheels.
+        bodies: Prims of the bodies by link name, with masses and shapes.
+
+    Returns:
+        Drives by joint name; the default where a wheel has no shape or the robot no mass.
+    """
+    masses = [
+        UsdPhysics.MassAPI(p).GetMassAttr().Get() for p in bodies.values() if p.HasAPI(UsdPhysics.MassAPI)
+    ]
+    names = tuple(wheels)
+    share, fitted = sum(masses) / len(names), {}
+    joints = {joint.name: joint for joint in mechanism.description.joints.values()}
+    for name in names:
+        body = bodies.get(joints[name].child)
+        radius = 0.0 if body is None else _radius(body, joints[name].axis)
+        fitted[name] = WheelDrive()
+        if share * radius > 0:
+            torque = WHEEL_FRICTION * share * GRAVITY * radius
+            damping = share * radius**2 / RESPONSE
+            fitted[name] = WheelDrive(float(f"{damping:.3g}"), float(f"{torque:.3g}"))
+    return fitted
+
+
+def grip(mechanism: Mechanism, wheels: Iterable[str], surfaces: Mapping[str, Surface]) -> dict[str, Surface]:
+    """Surfaces by link, with default friction for wheels and casters.
+
+    A caster is a link with a collider that has such a name, or whose primitive touches the floor.
+
+    Args:
+        mechanism: Joints of the description, which receives notes.
+        wheels: Joints of driven wheels.
+        surfaces: Surfaces from the URDF; they override the defaults.
+    """
+    description, poses = mechanism.description, mechanism.poses()
+    given, driven = dict(surfaces), {j.child for j in description.joints.values() if j.name in wheels}
+    floor = min((_lowest(description.links[name], poses[name]) for name in driven), default=np.inf)
+    for name, link in description.links.items():
+        if name in given or not link.collisions:
+            continue
+        if name in driven:
+            friction, what = WHEEL_FRICTION, "a driven wheel"
+        elif (
+            any(word in name.lower() for word in CASTER_NAMES)
+            or abs(_lowest(link, poses[name]) - floor) < FLOOR
+        ):
+            friction, what = CASTER_FRICTION, "a caster"
+        else:
+            continue
+        given[name] = replace(Surface(), friction=friction)
+        description.note(f"link {name!r} is {what} and gives no friction: {friction:g}")
+    return given
+
+
+def _radius(body: Usd.Prim, axis: NDArray) -> float:
+    """Half the largest extent of a wheel across its axis [m]; 0 if it has no shape."""
+    purposes = [UsdGeom.Tokens.guide, UsdGeom.Tokens.default_, UsdGeom.Tokens.render]
+    cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes)
+    extent = cache.ComputeUntransformedBound(body).ComputeAlignedRange()
+    across = np.abs(axis) / np.linalg.norm(axis) < 0.7
+    return 0.0 if extent.IsEmpty() else float(np.max(np.asarray(extent.GetSize())[across]) / 2)
+
+
+def _above(joint: Joint, description: Description) -> Iterable[Joint]:
+    """The joints between a joint and the root."""
+    while joint.parent in description.joints:
+        joint = description.joints[joint.parent]
+        yield joint
+
+
+def _lowest(link: Link, pose: NDArray) -> float:
+    """Height of the lowest point of a link's primitive colliders in the root's frame [m]; inf for none."""
+    poses = ((pose @ origin_of(part), part.geometry) for part in link.collisions)
+    heights = [T[2, 3] - form.half_extents(T[:3, :3])[2] for T, form in poses if form.mesh is None]
+    return float(min(heights, default=np.inf))

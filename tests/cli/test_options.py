@@ -1,0 +1,178 @@
+"""What every command has: help, --json, --quiet, old names, flags in refusals, completion and doctor."""
+
+import json
+import resource
+import subprocess
+import sys
+
+import pytest
+
+from magtwin.cli import main
+from magtwin.cli.app import app
+from magtwin.cli.renamed import COMMANDS
+from magtwin.errors import InputError
+
+
+def commands(group=app, words=()):
+    """The words of every command, with its app."""
+    if group.default_command is not None and words:
+        yield words, group
+    for name in group:
+        if not name.startswith("-"):
+            yield from commands(group[name], (*words, name))
+
+
+ALL = dict(commands())
+
+
+@pytest.mark.parametrize("words", ALL, ids=" ".join)
+def test_help_is_complete(words, capsys):
+    main([*words, "--help"])
+    text = capsys.readouterr().out
+    assert text.startswith(f"Usage: magtwin {' '.join(words)}")
+    assert "--empty-" not in text
+    assert "[ARGS" not in text
+    assert "--json:" in text
+    assert "--quiet:" in text
+    summary = ALL[words].help.splitlines()[0]
+    assert summary.endswith((".", ":")) or len(words) == 1
+    for argument in ALL[words].assemble_argument_collection(parse_docstring=True):
+        if argument.parameter.show is not False and argument.parse:
+            assert argument.parameter.help or argument.children, (words, argument.names)
+
+
+def test_an_option_has_one_meaning():
+    """Names that meant two things in the previous release, and the commands that still have them."""
+    kept = {
+        "--speed": {"run", "sweep", "ros follow"},
+        "--pace": {"run", "film", "ros sim", "ros replay"},
+        "--topic": {"ros record", "ros replay"},
+        "--profile": {"robot"},
+        "--name": {"map import", "map fit", "map survey"},
+        "--robot": {"run"},
+        "--against": {"validate"},
+        "--align": {"compare"},
+        "--duration": set(),
+        "--net": set(),
+        "--what": set(),
+    }
+    for option, expected in kept.items():
+        having = {" ".join(w) for w, sub in ALL.items() if option in _names(sub)}
+        assert having == expected, option
+
+
+def _names(command):
+    return {name for argument in command.assemble_argument_collection() for name in argument.names}
+
+
+@pytest.mark.parametrize("old", COMMANDS, ids=" ".join)
+def test_an_old_command_prints_the_new_one(old, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([*old, "a", "--out", "b"])
+    assert stop.value.code == 2
+    text = f"magtwin: magtwin {' '.join(old)} is called magtwin {COMMANDS[old]} now\n"
+    assert capsys.readouterr().err == text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["run", "a", "--duration", "3"], "--duration is called --duration-s now"),
+        (["run", "a", "--parquet=b.parquet"], "--parquet is called --out FILE now"),
+        (["film", "a", "--out", "b.mp4", "--speed", "4"], "--speed is called --pace now"),
+        (["export", "lab", "--out", "b", "--profile", "isaac"], "--profile is called --target now"),
+        (["ros", "sim", "a", "--profile", "aprilab"], "--profile is called --out-unit nT now"),
+        (["ros", "follow", "sine", "--robot", "a"], "--robot is called --asset now"),
+        (["scene", "lab", "--net", "a", "--out", "b"], "--net is called --network now"),
+    ],
+)
+def test_an_old_option_prints_the_new_one(arguments, text, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == f"magtwin: {text}\n"
+
+
+def test_a_command_that_writes_prints_its_files_as_json_and_nothing_when_quiet(tmp_path, capfd):
+    out = tmp_path / "room.toml"
+    main(["new", str(out), "--json"])
+    output = capfd.readouterr()
+    assert json.loads(output.out) == {"wrote": [str(out)]}
+    assert output.err == ""
+    main(["new", str(out), "--force", "--quiet"])
+    assert capfd.readouterr() == ("", "")
+    with pytest.raises(SystemExit):
+        main(["new", str(out), "--quiet"])
+    assert "exists already" in capfd.readouterr().err
+
+
+def test_quiet_runs_print_nothing_and_still_write(lab_scene, tmp_path, capfd):
+    out = tmp_path / "a.npz"
+    main(
+        [
+            "run",
+            str(lab_scene),
+            "--magnetometer",
+            "physical",
+            "--duration-s",
+            "1",
+            "--out",
+            str(out),
+            "--quiet",
+        ]
+    )
+    assert capfd.readouterr() == ("", "")
+    assert out.is_file()
+
+
+def test_a_refusal_names_flags_in_place_of_parameters(monkeypatch, tmp_path, capsys):
+    import magtwin.twin
+
+    def refuse(*args, **options):
+        raise InputError("give `force=True`, or another `map_layer`; `other=1` stays", parameter="force")
+
+    monkeypatch.setattr(magtwin.twin, "scene_from_toml", refuse)
+    with pytest.raises(SystemExit):
+        main(["scene", "lab", "--out", str(tmp_path / "x"), "--quiet"])
+    assert capsys.readouterr().err == "magtwin: give --force, or another --map; `other=1` stays\n"
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_is_a_script_of_all_commands(shell, capsys):
+    main(["completion", shell])
+    script = capsys.readouterr().out
+    assert all(words[-1] in script for words in ALL)
+    if shell == "bash":
+        subprocess.run(["bash", "-n"], input=script, text=True, check=True)
+
+
+def test_doctor_lists_extras_and_how_to_install_them(capsys):
+    main(["doctor", "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert found["extras"]["physics"]["install"] == "pip install 'magtwin[physics]'"
+    assert {"Rerun viewer", "Vulkan", "Newton", "NVIDIA validator"} <= found["tools"].keys()
+    main(["doctor"])
+    assert "pip install" in capsys.readouterr().out
+
+
+def test_cheap_checks_come_first_and_say_what_to_do(tmp_path, capsys):
+    (tmp_path / "a.toml").touch()
+    for arguments, text in (
+        (["run", tmp_path / "a.toml"], "author it first: magtwin scene"),
+        (["run", tmp_path, "--out", "x.txt"], "unknown format of a run"),
+        (["map", "fit", "gone.csv", "--out", "x.csv"], "a map layer ends in .usdc or .usd"),
+    ):
+        with pytest.raises(SystemExit):
+            main([str(word) for word in arguments])
+        assert text in capsys.readouterr().err
+
+
+def test_help_takes_less_than_half_a_second_of_the_processor():
+    def seconds():
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return used.ru_utime + used.ru_stime
+
+    begin = seconds()
+    for _ in range(3):
+        subprocess.run([sys.executable, "-m", "magtwin", "--help"], capture_output=True, check=True)
+    assert (seconds() - begin) / 3 < 0.5

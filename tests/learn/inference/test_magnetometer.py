@@ -1,0 +1,206 @@
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from test_features import a_run
+from test_network import RELEASED, a_net
+
+from magtwin.errors import InputError
+from magtwin.files import sha256, shipped
+from magtwin.learn.data.features import FULL, features
+from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+from magtwin.learn.models.perceptron import in_threads
+from magtwin.sim.session import session_of
+from magtwin.twin import open_twin, sweep
+
+
+def forward64(net, x):
+    """Disturbances in float64 throughout, by plain numpy."""
+    h = (x - net.x_mean.numpy()) / net.x_scale.numpy()
+    for i, layer in enumerate(net.linears):
+        h = h @ layer.weight.detach().double().numpy().T + layer.bias.detach().double().numpy()
+        h = np.maximum(h, 0) if i < len(net.linears) - 1 else h
+    return float(net.y_mean) + float(net.y_scale) * h[:, 0]
+
+
+def inputs(net, rows, seed=0):
+    """Features distributed as the training rows were."""
+    rng = np.random.default_rng(seed)
+    return net.x_mean.numpy() + net.x_scale.numpy() * rng.normal(size=(rows, len(net.features)))
+
+
+@pytest.fixture(scope="module")
+def paper():
+    """The paper's shape with random weights."""
+    return NeuralMagnetometer(a_net(FULL, (512, 512, 512, 512)))
+
+
+def test_the_released_network_errs_by_less_than_a_hundredth_nt_against_float64(real_data):
+    released = NeuralMagnetometer.load(real_data / RELEASED)
+    x = inputs(released.net, 3000)
+    assert_allclose(released.predict(x), forward64(released.net, x), atol=0.01)  # of up to 8,000 nT
+
+
+def test_blocks_agree_with_torch_on_the_whole_array(paper):
+    x = inputs(paper.net, 1500)
+    with torch.inference_mode():
+        assert_allclose(paper.predict(x), paper.net(torch.from_numpy(x)).numpy(), atol=1e-3)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 15, 16, 17, 511, 512, 513, 1025])
+def test_a_rows_bytes_do_not_depend_on_how_many_rows_there_are(paper, rows):
+    x = inputs(paper.net, 1100)
+    all_at_once = paper.predict(x)
+    assert_array_equal(paper.predict(x[:rows]), all_at_once[:rows])
+    assert_array_equal(paper.predict(x[-rows:]), all_at_once[-rows:])
+
+
+def test_one_thread_and_two_give_the_same_bytes_and_torch_keeps_its_threads(paper):
+    x = inputs(paper.net, 1100)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        two = paper.predict(x)
+        assert torch.get_num_threads() == 2
+        torch.set_num_threads(1)
+        assert_array_equal(paper.predict(x), two)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_nan_in_gives_nan_out_in_that_row_alone(paper):
+    x = inputs(paper.net, 600)
+    clean = paper.predict(x)
+    x[[3, 555], [0, 19]] = np.nan
+    y = paper.predict(x)
+    assert_array_equal(np.flatnonzero(np.isnan(y)), [3, 555])
+    assert_array_equal(np.delete(y, [3, 555]), np.delete(clean, [3, 555]))
+
+
+def test_no_rows_give_no_disturbances(paper):
+    assert paper.predict(np.empty((0, 20))).shape == (0,)
+
+
+def test_a_run_is_read_by_the_names_of_the_networks_inputs():
+    net = a_net(["odom_w_z", "yaw_deg", "battery_v"])
+    run = a_run(40)
+    x = np.column_stack([run["odom_w"][:, 2], np.degrees(run["yaw"]) % 360, run["battery_v"]])
+    assert_allclose(NeuralMagnetometer(net).disturbance_nt(run), forward64(net, x), atol=1e-3)
+
+
+def test_an_input_beyond_its_training_range_is_outside():
+    net = a_net(["battery_fraction", "imu_w_z"])
+    net.x_min.copy_(torch.tensor([0.2, -1.0], dtype=torch.float64))
+    net.x_max.copy_(torch.tensor([1.0, 1.0]))
+    x = [[0.2, 1.0], [1.0, -1.0], [-0.1, 0.0], [0.5, 1.01], [np.nan, 0.0]]
+    assert NeuralMagnetometer(net).outside(x).tolist() == [False, False, True, True, True]
+
+
+def test_where_the_range_is_unknown_5_scales_from_the_mean_are_outside(real_data):
+    released = NeuralMagnetometer.load(real_data / RELEASED)
+    mean, scale = released.net.x_mean.numpy(), released.net.x_scale.numpy()
+    x = np.stack([mean, mean + 4.9 * scale, mean - 5.1 * scale])
+    x = np.vstack([x, np.where(np.arange(20) == 18, -0.1, mean)])  # the battery runs below empty
+    assert released.outside(x).tolist() == [False, False, True, True]
+
+
+def test_rounding_of_an_input_that_never_varied_is_not_outside():
+    net = a_net(["battery_v"])
+    net.x_min.fill_(15.1)
+    net.x_max.fill_(15.1)
+    assert not NeuralMagnetometer(net).outside([[np.nextafter(15.1, 16)]]).any()
+
+
+def test_outside_training_reads_the_run(paper):
+    run = a_run(30)
+    assert_array_equal(paper.outside_training(run), paper.outside(features(run)))
+
+
+def test_the_metadata_name_the_file_its_checksum_and_its_shape(tmp_path):
+    path = tmp_path / "small.safetensors"
+    a_net(hidden=(8, 4), residual_sd_nt=55.0).save(path)
+    magnetometer = NeuralMagnetometer.load(path, sha256=sha256(path).upper())
+    assert dict(magnetometer.metadata) == {
+        "network": "small.safetensors",
+        "network_sha256": sha256(path),
+        "network_layers": "20-8-4-1",
+        "network_parameters": 20 * 8 + 8 + 8 * 4 + 4 + 4 + 1,
+    }
+    assert magnetometer.residual_sd_nt == 55.0
+
+
+def test_another_checksum_is_refused(tmp_path):
+    path = tmp_path / "n.safetensors"
+    a_net().save(path)
+    with pytest.raises(InputError) as refused:
+        NeuralMagnetometer.load(path, sha256="00ff")
+    assert str(refused.value) == (
+        f"{path}: its sha256 is {sha256(path)}, expected 00ff; get the file again or change the checksum"
+    )
+
+
+def test_features_of_another_width_are_refused(paper):
+    with pytest.raises(InputError, match=r"reads 20 features a row, shape \(N, 20\); got \(5, 19\)"):
+        paper.predict(np.zeros((5, 19)))
+
+
+# The networks that ship
+
+
+@pytest.fixture(scope="module", params=["turtlebot4_paper", "turtlebot4_hybrid"])
+def shipped_network(request):
+    return NeuralMagnetometer.load(shipped("weights", f"{request.param}.safetensors"))
+
+
+@pytest.fixture(scope="module")
+def new_days():
+    """Two of the paper's test paths, each on a day of its own, by physics."""
+    twin = open_twin(shipped("scenes", "lab", "lab.usda"), magnetometer="physical")
+    days = [session_of(twin.scene.robot, 77, day) for day in range(2)]
+    runs = sweep(twin, ["narrow_figure8", "curvilinear"], (5, 6), robots=days, rate_hz=5.0)
+    return [run.take(np.flatnonzero(~run["flag_outside_map"])) for run in runs]
+
+
+def test_the_paper_s_network_has_its_shape_and_reads_its_inputs():
+    paper = NeuralMagnetometer.load(shipped("weights", "turtlebot4_paper.safetensors"))
+    assert paper.metadata["network_layers"] == "20-512-512-512-512-1"
+    assert paper.features == FULL
+
+
+def test_the_card_is_of_the_shipped_network(shipped_network):
+    card = shipped("weights", shipped_network.name).with_suffix(".md").read_text(encoding="utf-8")
+    assert f"SHA-256 `{shipped_network.sha256}`" in " ".join(card.split())
+
+
+def test_the_shipped_network_does_better_than_the_mean_label_on_days_and_paths_it_never_saw(
+    shipped_network, new_days
+):
+    label = np.concatenate([run["b_truth_nt"] - run["b_map_nt"] for run in new_days])
+    found = np.concatenate([shipped_network.disturbance_nt(run) for run in new_days])
+    naive = np.abs(label - shipped_network.net.metadata["label_mean_nt"]).mean()
+    share = {"mlp": 0.85, "hybrid": 0.5}[shipped_network.net.kind]  # the cards: 0.66 and 0.27
+    assert np.abs(found - label).mean() < share * naive
+
+
+def test_a_battery_that_is_fuller_than_any_trained_on_is_flagged(new_days):
+    paper = NeuralMagnetometer.load(shipped("weights", "turtlebot4_paper.safetensors"))
+    fullest = paper.net.x_max.numpy()[paper.features.index("battery_fraction")]
+    for run in new_days:
+        flagged = paper.outside(features(run, paper.features))
+        assert flagged[run["battery_fraction"] > fullest + 1e-6].all()
+        assert flagged[run["battery_fraction"] < fullest].mean() < 0.3
+
+
+def test_work_is_done_in_each_thread_and_the_first_failure_is_raised_after_all_ended():
+    before, done = torch.get_num_threads(), []
+    in_threads(lambda: done.append(torch.get_num_threads()), 3)
+    assert done == [1, 1, 1]
+
+    def fails():
+        done.append(0)
+        raise ArithmeticError("no")
+
+    with pytest.raises(ArithmeticError, match="no"):
+        in_threads(fails, 2)
+    assert done == [1, 1, 1, 0, 0]
+    assert torch.get_num_threads() == before

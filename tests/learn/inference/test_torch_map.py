@@ -1,0 +1,168 @@
+"""Fields in torch: the numbers of numpy, and derivatives that torch, the map and small steps agree on."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose, assert_array_equal
+
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.sources.harmonic import HarmonicField
+from magtwin.learn.inference.torch_map import TorchHarmonic, TorchMap
+
+QUARTERS = (0.0, 90.0, 180.0, 270.0)
+HEADINGS = [QUARTERS, (33.0,), (0.0, 180.0), (15.0, 100.0, 110.0, 300.0)]
+
+
+def field_map(*, degrees=QUARTERS, masked=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    values = 41_000 + 3_000 * rng.standard_normal((len(degrees), 6, 9))
+    return AnomalyMap(
+        values_nt=values,
+        valid=rng.random(values.shape) >= masked,
+        origin_m=(-1.0, 0.5),
+        cell_m=(0.25, 0.1),
+        headings_rad=np.radians(degrees),
+        name="lab",
+    )
+
+
+def poses(field, count, seed=1):
+    """Poses in and about the map, some on nodes, some at the headings of layers, some no pose at all."""
+    rng = np.random.default_rng(seed)
+    x0, x1, y0, y1 = field.extent
+    p = rng.uniform((x0 - 0.2, y0 - 0.1), (x1 + 0.2, y1 + 0.1), (count, 2))
+    yaw = rng.uniform(-20, 20, count)
+    p[::4] = np.round((p[::4] - field.origin_m) / field.cell_m) * field.cell_m + field.origin_m
+    yaw[::3] = rng.choice(field.headings_rad, len(yaw[::3]))
+    p[1, 0], p[2, 1], yaw[3], yaw[5], p[6, 0] = np.nan, np.nan, np.nan, np.inf, np.inf
+    return p, yaw
+
+
+def by_autograd(look, p, yaw):
+    """Values at poses, and their derivatives by x, y and yaw."""
+    p = torch.tensor(p, requires_grad=True)
+    yaw = torch.tensor(yaw, requires_grad=True)
+    b = look(p, yaw)
+    slopes = torch.autograd.grad(b.sum(), (p, yaw))
+    return b.detach().numpy(), np.column_stack([slope.numpy() for slope in slopes])
+
+
+@pytest.mark.parametrize("degrees", HEADINGS)
+@pytest.mark.parametrize("masked", [0.0, 0.1])
+@pytest.mark.parametrize("outside", ["nan", "clamp"])
+def test_a_map_in_torch_gives_the_bytes_of_its_lookup_and_the_derivatives_of_its_gradient(
+    degrees, masked, outside
+):
+    field = field_map(degrees=degrees, masked=masked)
+    p, yaw = poses(field, 2_000)
+    b, slopes = by_autograd(lambda *pose: TorchMap(field).lookup(*pose, outside=outside), p, yaw)
+    want_b, want_slopes = field.lookup_with_gradient(p, yaw, outside=outside)
+    assert_array_equal(b, want_b)
+    assert_allclose(
+        slopes, want_slopes, rtol=1e-12, atol=1e-9
+    )  # sums of 8 products of 1e5 nT, in another order
+
+
+@pytest.mark.parametrize("degrees", HEADINGS)
+def test_derivatives_of_a_map_are_what_small_steps_say(degrees):
+    torch_map = TorchMap(field_map(degrees=degrees))
+    rng = np.random.default_rng(2)
+    at = rng.uniform(0.1, 0.9, (20, 2)) + rng.integers(0, 5, (20, 2))  # away from where derivatives jump
+    p = torch.tensor(at * (0.25, 0.1) + (-1.0, 0.5), requires_grad=True)
+    yaw = torch.tensor(rng.uniform(0.62, 1.5, 20), requires_grad=True)
+    assert torch.autograd.gradcheck(torch_map.lookup, (p, yaw), rtol=1e-6)
+    assert torch.autograd.gradgradcheck(torch_map.lookup, (p, yaw), rtol=1e-5)
+
+
+def test_a_pose_can_be_found_by_descending_to_a_known_field():
+    x, y = np.meshgrid(np.arange(9) * 0.25, np.arange(9) * 0.25)
+    bowl = 41_000 + 500 * ((x - 0.6) ** 2 + (y - 1.3) ** 2)
+    torch_map = TorchMap(
+        AnomalyMap(values_nt=bowl[None], origin_m=(0.0, 0.0), cell_m=(0.25, 0.25), headings_rad=[0.0])
+    )
+    p = torch.tensor([1.6, 0.4], requires_grad=True)
+    descent = torch.optim.SGD([p], lr=5e-4)
+    for _ in range(60):
+        descent.zero_grad()
+        torch_map(p, 0.0).backward()
+        descent.step()
+    assert_allclose(p.detach(), (0.6, 1.3), atol=0.15)  # the least node's cell and half a step
+
+
+def test_single_precision_is_good_to_a_hundredth_nt_in_values_of_double():
+    field = field_map()
+    rng = np.random.default_rng(3)
+    p = rng.uniform(field.extent[::2], field.extent[1::2], (500, 2)).astype(np.float32)
+    yaw = rng.uniform(-3, 3, 500).astype(np.float32)
+    want = field.lookup(p, yaw)
+    double = TorchMap(field).lookup(torch.tensor(p), torch.tensor(yaw))
+    assert double.dtype == torch.float32
+    assert_allclose(double, want, rtol=0, atol=0.004)  # half a unit in the last place of 65,536 nT
+    single = TorchMap(field).float().lookup(torch.tensor(p), torch.tensor(yaw))
+    assert_allclose(single, want, rtol=0, atol=0.5)  # 1e4 nT a cell times 10 cells of 2^-23, and 3 rad
+
+
+def test_the_border_belongs_to_the_map_in_single_precision_too():
+    field = AnomalyMap(values_nt=np.ones((1, 4, 4)), origin_m=(0, 0), cell_m=(0.1, 0.1), headings_rad=[0])
+    got = TorchMap(field).float().lookup(torch.tensor([[0.3, 0.3], [0.0, 0.3], [0.31, 0.0]]), 0.0)
+    assert_array_equal(got.isnan(), [False, False, True])
+
+
+def test_shapes_are_broadcast_and_kept_in_torch():
+    torch_map = TorchMap(field_map())
+    assert torch_map(torch.zeros(2), 0.0).shape == ()
+    assert torch_map(torch.zeros(4, 1, 2), torch.zeros(7)).shape == (4, 7)
+    assert torch_map(torch.zeros(0, 2), 0.0).shape == (0,)
+
+
+def test_what_torch_cannot_look_up_is_refused():
+    torch_map = TorchMap(field_map())
+    with pytest.raises(InputError, match=r"shape \(\.\.\., 2\), got \(3,\)"):
+        torch_map(torch.zeros(3), 0.0)
+    with pytest.raises(InputError, match="outside must be"):
+        torch_map(torch.zeros(2), 0.0, outside="zero")
+    with pytest.raises(InputError, match=r"^1 of 2 points lie off the map 'lab'.*\(9\.000, 0\.700\)"):
+        torch_map(torch.tensor([[0.0, 0.7], [9.0, 0.7]]), 0.0, outside="raise")
+    with pytest.raises(InputError, match="p_xy is on meta, the field on cpu"):
+        torch_map(torch.zeros(2, device="meta"), 0.0)
+    assert torch_map(torch.tensor([0.0, 0.7]), 0.0, outside="raise") > 0
+
+
+@pytest.fixture
+def harmonic():
+    rng = np.random.default_rng(4)
+    return HarmonicField(
+        p_world_dipole=np.column_stack([rng.uniform(-2, 2, (40, 2)), rng.uniform(-1, -0.3, 40)]),
+        m_world=rng.normal(0, 3, (40, 3)),
+        b_uniform_nt=(500.0, 20_000.0, -36_000.0),
+        hard_iron_nt=(300.0, -500.0, 800.0),
+        soft_iron=0.02 * rng.standard_normal((3, 3)),
+        p_base_sensor=(0.1, -0.05, 0.4),
+    )
+
+
+@pytest.mark.parametrize("height_m", [None, 0.9])
+def test_a_harmonic_field_in_torch_has_the_numbers_of_numpys(harmonic, height_m):
+    rng = np.random.default_rng(5)
+    p, yaw = rng.uniform(-2, 2, (6, 50, 2)), rng.uniform(-4, 4, 50)
+    ours = TorchHarmonic(harmonic)
+    got = ours(torch.tensor(p), torch.tensor(yaw), height_m=height_m)
+    assert_allclose(got, harmonic.magnitude_nt(p, yaw, height_m=height_m), rtol=1e-12)
+    above = np.concatenate([p, np.full((6, 50, 1), 0.3)], axis=-1)
+    assert_allclose(ours.field_nt(torch.tensor(above)), harmonic.field_nt(above), rtol=1e-11, atol=1e-7)
+
+
+def test_derivatives_of_a_harmonic_field_are_what_small_steps_say(harmonic):
+    rng = np.random.default_rng(6)
+    p = torch.tensor(rng.uniform(-2, 2, (8, 2)), requires_grad=True)
+    yaw = torch.tensor(rng.uniform(-4, 4, 8), requires_grad=True)
+    assert torch.autograd.gradcheck(TorchHarmonic(harmonic).magnitude_nt, (p, yaw), rtol=1e-5, atol=1e-2)
+
+
+def test_the_figures_of_a_harmonic_field_have_derivatives_too(harmonic):
+    ours = TorchHarmonic(harmonic)
+    iron = ours.hard_iron_nt.clone().requires_grad_()
+    ours.hard_iron_nt = iron
+    ours(torch.zeros(5, 2, dtype=torch.float64), torch.linspace(0, 3, 5)).sum().backward()
+    assert (iron.grad != 0).all()

@@ -1,0 +1,394 @@
+"""Paths: arc length, nearest point, names, files, the floor."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from magtwin.errors import InputError, UnknownNameError
+from magtwin.path import (
+    CASES,
+    PATHS,
+    Path,
+    check_clear,
+    check_on_floor,
+    curvilinear,
+    lawnmower,
+    path,
+    path_named,
+    read_path_csv,
+    resolve_path,
+    sine,
+    spline,
+    split_lawnmower,
+)
+from magtwin.spec.obstacles import Obstacles
+
+FLOOR, FOOTPRINT = (6.0, 3.5), 0.171
+
+
+def circle(radius: float, points: int = 4001) -> Path:
+    u = np.linspace(0, 2 * np.pi, points)
+    return Path("circle", radius * np.column_stack([np.cos(u), np.sin(u)]), closed=True)
+
+
+def test_arc_length_of_a_circle_is_two_pi_r():
+    assert circle(0.7).length == pytest.approx(2 * np.pi * 0.7, rel=1e-6)  # chords: u^2 / 24 short
+
+
+def test_curvature_of_a_circle_is_one_over_r_and_left_is_positive():
+    s = np.linspace(0, 4, 50)
+    assert_allclose(circle(0.7).curvature(s), 1 / 0.7, rtol=1e-3)
+    assert_allclose(Path("back", circle(0.7).p_xy[::-1]).curvature(s[5:-5]), -1 / 0.7, rtol=1e-3)
+
+
+def test_heading_of_a_circle_is_the_tangent_and_a_closed_path_repeats():
+    path = circle(1.0)
+    s = np.linspace(-10, 10, 101)
+    wanted = np.column_stack([-np.sin(s), np.cos(s)])
+    seen = np.column_stack([np.cos(path.heading(s)), np.sin(path.heading(s))])
+    assert_allclose(seen, wanted, atol=2e-3)  # half a segment's turn
+    assert_allclose(path.at(s), path.at(s + path.length), atol=1e-12)
+
+
+def test_an_open_path_goes_on_straight_beyond_its_ends():
+    path = Path("line", np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0]]))
+    assert_allclose(path.at([-1.0, 0.5, 1.0, 2.0, 4.0]), [[-1, 0], [0.5, 0], [1, 0], [1, 1], [1, 3]])
+
+
+def test_a_corner_turns_by_its_angle_and_a_fold_by_half_a_turn():
+    corner = Path("corner", np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0]]))
+    fold = Path("fold", np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]))
+    assert corner.turn(1.0, 0.03) == pytest.approx(np.pi / 2)
+    assert abs(fold.turn(1.0, 0.03)) == pytest.approx(np.pi)
+
+
+def test_neighbours_that_coincide_are_merged_and_a_closed_path_ends_where_it_began():
+    path = Path("square", np.array([[0.0, 0], [0, 0], [1, 0], [1, 1], [1, 1], [0, 1]]), closed=True)
+    assert_allclose(path.p_xy, [[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
+    assert path.length == 4.0
+
+
+def test_points_of_a_path_cannot_be_changed():
+    with pytest.raises(ValueError, match="read-only"):
+        path_named("sine").p_xy[0] = 0
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(st.floats(-3, 3), st.floats(-2, 2)), min_size=1, max_size=20))
+def test_nearest_agrees_with_a_dense_search(points):
+    path = path_named("figure8")
+    s, d = path.nearest(points)
+    assert_allclose(np.hypot(*(path.at(s) - points).T), np.abs(d), atol=1e-12)
+    dense = path.at(np.linspace(0, path.length, 20_001))
+    least = np.min(np.hypot(*(np.asarray(points)[:, None] - dense).transpose(2, 0, 1)), axis=1)
+    assert np.all(np.abs(d) <= least + 1e-12)
+    assert_allclose(np.abs(d), least, atol=4e-4)  # half the dense spacing
+
+
+def test_distance_is_positive_to_the_left_of_the_path_and_keeps_the_shape_of_the_points():
+    path = Path("line", np.array([[0.0, 0.0], [4.0, 0.0]]))
+    s, d = path.nearest([[[1.0, 0.2], [3.0, -0.1]]])
+    assert_allclose(s, [[1, 3]])
+    assert_allclose(d, [[0.2, -0.1]])
+
+
+def test_a_closed_path_is_prolonged_by_laps_and_an_open_one_back_and_forth():
+    loop, line = circle(1.0), Path("line", np.array([[0.0, 0.0], [1.0, 0.0]]))
+    laps = loop.prolonged(20.0)
+    assert laps.length >= 20.0
+    assert_allclose(laps.at(np.arange(18.0)), loop.at(np.arange(18.0)), atol=1e-9)
+    assert_allclose(line.prolonged(2.5).p_xy[:, 0], [0, 1, 0, 1])
+    assert_allclose(line.prolonged(0.1).p_xy, line.p_xy)
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_every_named_path_fits_the_default_floor_and_bears_its_name(name):
+    path = path_named(name)
+    check_on_floor(path, FLOOR, FOOTPRINT)
+    assert path.name == name
+
+
+def test_the_sine_is_equation_7():
+    path = sine(amplitude_m=0.5, wavenumber_rad_m=3.0, phase_rad=0.4, y_mid_m=0.1)
+    assert_allclose(path.p_xy[:, 1], 0.5 * np.sin(3.0 * path.p_xy[:, 0] - 0.4) + 0.1, atol=1e-12)
+
+
+def test_a_lawnmower_sweeps_step_by_step_up_to_its_end():
+    path = lawnmower(x_first_m=0.0, x_last_m=1.1, height_m=2.0, step_m=0.5, y_first_m=-1.0)
+    assert_allclose(path.p_xy, [[0, -1], [0, 1], [0.5, 1], [0.5, -1], [1, -1], [1, 1]])
+    back = lawnmower(x_first_m=1.0, x_last_m=0.0, step_m=0.5)
+    assert_allclose(np.unique(back.p_xy[:, 0]), [0, 0.5, 1])
+    assert back.p_xy[0, 0] == 1.0
+
+
+def test_the_lawnmower_is_the_released_one(real_data):
+    released = read_path_csv(real_data / "aprilab/paths/lawnmower_path5.csv")
+    assert released.length == pytest.approx(path_named("lawnmower").length)
+    assert_allclose(path_named("lawnmower").nearest(released.p_xy)[1], 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["figure8", "narrow_figure8"])
+def test_a_figure_of_eight_is_symmetric_about_both_axes(name):
+    path = path_named(name)
+    for mirror in ([-1, 1], [1, -1]):
+        assert_allclose(path.nearest(path.p_xy * mirror)[1], 0, atol=1e-9)
+
+
+def test_the_released_figure8_is_the_named_one_of_its_size(real_data):
+    released = read_path_csv(real_data / "aprilab/paths/figure8_path.csv")
+    ours = PATHS["figure8"](half_length_m=2.0, half_width_m=0.75)
+    assert released.closed
+    assert_allclose(ours.nearest(released.p_xy)[1], 0, atol=1e-4)  # half a chord's sagitta
+
+
+@pytest.mark.parametrize(
+    ("file", "closed"),
+    [
+        ("figure8_path", True),
+        ("continous_cycle", True),
+        ("sinwave_data", False),
+        ("path", False),
+        ("lawnmower_path5", False),
+    ],
+)
+def test_released_paths_are_read_and_lie_on_the_floor(real_data, file, closed):
+    path = read_path_csv(real_data / f"aprilab/paths/{file}.csv")
+    check_on_floor(path, FLOOR, FOOTPRINT)
+    assert path.closed == closed
+
+
+def test_a_released_path_that_leaves_the_floor_is_refused_with_the_point_and_how_far(real_data):
+    path = read_path_csv(real_data / "aprilab/paths/lawnmower_path25.csv")
+    with pytest.raises(InputError, match=r"lawnmower_path25\.csv leaves the floor at point 8 of 240"):
+        check_on_floor(path, FLOOR, FOOTPRINT)
+
+
+def test_a_path_that_leaves_the_floor_says_by_how_much():
+    path = Path("far", np.array([[0.0, 0.0], [2.0, 0.0], [3.0, 0.0]]))
+    with pytest.raises(InputError, match=r"at point 3 of 3, \(3\.000, 0\.000\) m, by 0\.171 m"):
+        check_on_floor(path, FLOOR, FOOTPRINT)
+
+
+def test_a_path_on_the_very_edge_is_on_the_floor():
+    check_on_floor(Path("edge", np.array([[0.0, 0.0], [2.829, 1.579]])), FLOOR, FOOTPRINT)
+
+
+@pytest.mark.parametrize(
+    "text", ["0,0\n1,2\n", "x,y\n0,0\n1,2\n", "# x,y\n\n0 , 0\n1e0,2\n\n", "\ufeff0,0\r\n1,2"]
+)
+def test_a_csv_is_read_with_or_without_a_header(tmp_path, text):
+    file = tmp_path / "p.csv"
+    file.write_text(text, encoding="utf-8")
+    assert_allclose(read_path_csv(file).p_xy, [[0, 0], [1, 2]])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", r"p\.csv: no points in it"),
+        ("x,y\n", r"p\.csv: no points in it"),
+        ("1,2\n", r"p\.csv: only one point in it"),
+        ("1,2\n1,2\n", r"p\.csv: only one point in it"),
+        ("0,0\n1,2,3\n", r"p\.csv:2: a point is two numbers, x,y in metres; got '1,2,3'"),
+        ("0,0\n\n1\n", r"p\.csv:3: a point is two numbers"),
+        ("0,0\n1,two\n", r"p\.csv:2: not a number in '1,two'"),
+        ("x,y\nm,m\n0,0\n", r"p\.csv:2: not a number in 'm,m'"),
+        ("0,0\n1,nan\n", r"p\.csv:2: a point must be finite"),
+        ("0,0\n1,inf\n", r"p\.csv:2: a point must be finite"),
+    ],
+)
+def test_a_csv_that_is_no_path_is_refused_with_file_and_line(tmp_path, text, says):
+    file = tmp_path / "p.csv"
+    file.write_text(text)
+    with pytest.raises(InputError, match=says):
+        read_path_csv(file)
+
+
+def test_a_csv_that_is_not_text_or_not_there_is_refused(tmp_path):
+    (tmp_path / "p.csv").write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(InputError, match=r"p\.csv: not a text file"):
+        read_path_csv(tmp_path / "p.csv")
+    with pytest.raises(InputError, match=r"q\.csv: no such path file; did you mean 'p\.csv'"):
+        read_path_csv(tmp_path / "q.csv")
+    with pytest.raises(InputError, match="not a text file"):
+        read_path_csv(tmp_path)
+
+
+def test_resolve_takes_a_name_or_a_file_and_names_the_near_one(tmp_path):
+    file = tmp_path / "p.csv"
+    file.write_text("0,0\n1,2\n")
+    assert resolve_path("figure8").name == "figure8"
+    assert resolve_path(file).name == "p.csv"
+    with pytest.raises(InputError, match="did you mean 'figure8'"):
+        resolve_path("figure9")
+    with pytest.raises(InputError, match="no such path file"):
+        resolve_path(str(tmp_path / "absent.csv"))
+    with pytest.raises(UnknownNameError, match="no path 'figure9'"):
+        path_named("figure9")
+
+
+@pytest.mark.parametrize(
+    ("points", "says"),
+    [
+        (np.zeros((3, 3)), r"must have shape \(N, 2\)"),
+        (np.zeros((0, 2)), "two different points are needed, got 0"),
+        (np.zeros((3, 2)), "two different points are needed, got 1"),
+        (np.array([[0.0, 0.0], [np.nan, 1.0]]), "point 1 is not finite"),
+    ],
+)
+def test_points_that_are_no_path_are_refused(points, says):
+    with pytest.raises(InputError, match=says):
+        Path("bad", points)
+
+
+def test_a_lawnmower_without_a_step_is_refused():
+    with pytest.raises(InputError, match="step_m of a lawnmower must be above 0"):
+        lawnmower(step_m=0.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (
+            lambda: lawnmower(step_m=1e-12),
+            r"'lawnmower': step_m 1e-12 m .* would make 1e\+13 points, more than",
+        ),
+        (lambda: lawnmower(x_last_m=math.inf), "'lawnmower': .* would make inf points"),
+        (lambda: spline([[0, 0], [3, 4], [0, 0]], spacing_m=1e-9), "'spline': spacing_m 1e-09 m over 10 m"),
+        (lambda: curvilinear(depth=-1.0), r"depth of .* at least 0 and below 1, got -1\.0"),
+        (lambda: curvilinear(depth=math.nan), "depth of .* got nan"),
+        (lambda: curvilinear(lobes=2.5), r"lobes of .* whole number, got 2\.5"),
+    ],
+)
+def test_a_path_of_no_size_that_could_be_driven_is_refused(make, says):
+    with pytest.raises(InputError, match=says):
+        make()
+
+
+def test_smooth_named_paths_can_be_driven_at_a_fifth_of_a_metre_a_second():
+    # k v < w_max of the drive; the narrow figure's ends, of radius 4 b^2 / a = 0.15 m, are tightest.
+    for name in ("sine", "figure8", "curvilinear", "narrow_figure8"):
+        path = path_named(name)
+        s = np.linspace(0.05, path.length - 0.05, 4000)
+        assert np.abs(path.curvature(s)).max() < 1.9 / 0.2, name
+    narrow = path_named("narrow_figure8")
+    ends = np.abs(narrow.curvature(narrow.length * np.array([0.25, 0.75])))
+    assert_allclose(ends, 2.4 / (4 * 0.3**2), rtol=0.03)  # its points are 5 mm apart
+
+
+def test_the_curvilinear_path_bends_both_ways():
+    path = path_named("curvilinear")
+    k = path.curvature(np.linspace(0, path.length, 2000))
+    assert k.min() < -2
+    assert k.max() > 2
+
+
+def test_arc_length_is_that_of_the_points():
+    path = path_named("curvilinear")
+    assert path.length == pytest.approx(sum(math.dist(a, b) for a, b in itertools.pairwise(path.p_xy)))
+
+
+def test_a_case_of_table_1_is_a_named_path():
+    assert {case: path_named(case).name for case in CASES} == dict(CASES)
+    assert list(CASES) == list("ABCDE")
+    assert resolve_path("A").name == "fast_sine"
+
+
+def test_the_fast_sine_is_the_released_one(real_data):
+    released = read_path_csv(real_data / "aprilab" / "paths" / "sinwave_data.csv")
+    _, distance = released.nearest(path_named("fast_sine").p_xy)
+    assert np.abs(distance).max() < 0.03  # the released one has 50 points a wave, whose chords cut its crests
+    assert path_named("fast_sine").length == pytest.approx(released.length, rel=0.01)
+
+
+def test_the_continuous_cycle_is_the_released_one(real_data):
+    released = read_path_csv(real_data / "aprilab" / "paths" / "continous_cycle.csv")
+    ours = path_named("continuous_cycle")
+    assert ours.closed
+    assert ours.length == pytest.approx(released.length, rel=1e-3)
+    _, distance = released.nearest(ours.p_xy)
+    assert np.abs(distance).max() < 0.01
+
+
+def test_a_split_lawnmower_mows_one_half_and_then_the_other_back():
+    path = split_lawnmower(y_split_m=0.3, step_m=0.5)
+    low = path.p_xy[:, 1] < 0.3
+    assert np.count_nonzero(np.diff(low)) == 1  # it crosses the split line once
+    assert low[0]
+    assert_allclose([path.p_xy[:, 1].min(), path.p_xy[:, 1].max()], [-1.5, 1.5])
+    gap = path.p_xy[~low, 1].min() - path.p_xy[low, 1].max()
+    assert gap == pytest.approx(0.5)
+    assert_allclose(path.p_xy[0, 0], path.p_xy[-1, 0])
+
+
+def test_a_split_line_outside_the_floor_is_refused():
+    with pytest.raises(InputError, match="y_split_m of a split_lawnmower must lie between"):
+        split_lawnmower(y_split_m=1.4)
+
+
+@settings(deadline=None)  # the first call imports scipy.interpolate
+@given(st.integers(3, 9), st.integers(0, 2**32 - 1), st.booleans())
+def test_a_spline_goes_through_its_points_without_a_kink(count, seed, closed):
+    rng = np.random.default_rng(seed)
+    angle = np.sort(rng.uniform(0, 2 * np.pi, count)) + np.arange(count)
+    points = np.column_stack([angle, rng.uniform(-1, 1, count)])
+    path = spline(points, closed=closed)
+    _, distance = path.nearest(points)
+    assert np.abs(distance).max() < 1e-9
+    fine = spline(points, closed=closed, spacing_m=0.0002)
+    at = np.linspace(0.1, 0.9, 50) * fine.length
+    wide, narrow = (np.abs(fine.turn(at, reach)) for reach in (0.002, 0.0005))
+    assert np.all(narrow < 0.6 * wide + 1e-3), "a bend turns less within less of it, a kink does not"
+
+
+def test_a_closed_spline_through_four_points_of_a_circle_is_nearly_round():
+    angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    path = spline(np.column_stack([np.cos(angle), np.sin(angle)]), closed=True)
+    assert_allclose(np.hypot(*path.p_xy.T), 1.0, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("points", "options", "says"),
+    [
+        ([[0, 0], [1, 0]], {}, "needs three points"),
+        ([[0, 0], [1, 0], [1, 0]], {}, "needs three points"),
+        ([[0, 0], [1, 0], [2, 1]], {"spacing_m": 0.0}, "above 0 m"),
+        ([[0, 0], [1, np.nan], [2, 1]], {}, "not finite"),
+    ],
+)
+def test_a_spline_through_too_little_is_refused(points, options, says):
+    with pytest.raises(InputError, match=says):
+        spline(points, **options)
+
+
+DESK = Obstacles(("/World/Desk",), (np.array([[0.5, -0.2], [1.0, -0.2], [1.0, 0.2], [0.5, 0.2]]),))
+
+
+def test_a_path_through_a_desk_is_refused_with_the_place_and_the_prim():
+    line = Path("line", np.array([[-2.0, 0.0], [2.0, 0.0]]))
+    with pytest.raises(InputError, match=r"path line runs into /World/Desk: 2\.3\d\d m along it"):
+        check_clear(line, DESK, 0.171)
+
+
+def test_a_path_that_passes_at_just_the_robot_s_radius_is_clear():
+    check_clear(Path("line", np.array([[-2.0, 0.371], [2.0, 0.371]])), DESK, 0.171)
+    with pytest.raises(InputError, match=r"0\.001 m too near"):
+        check_clear(Path("line", np.array([[-2.0, 0.37], [2.0, 0.37]])), DESK, 0.171)
+
+
+def test_a_registered_path_has_a_name_like_any_other(monkeypatch):
+    monkeypatch.setattr(PATHS, "_loaded", dict(PATHS._loaded))
+
+    @path("triangle")
+    def triangle() -> Path:
+        return Path("triangle", np.array([[0, 0], [2, 0], [1, 1]], float), closed=True)
+
+    assert path_named("triangle").length == pytest.approx(2 + 2 * math.sqrt(2))
+    assert resolve_path("triangle").name == "triangle"
+    with pytest.raises(UnknownNameError, match="no path 'triangl'; did you mean 'triangle'"):
+        path_named("triangl")

@@ -1,0 +1,138 @@
+"""Paths on floors of any size: they fit and pass what stands there; on the default floor nothing changes."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from magtwin.cli import main
+from magtwin.errors import InputError
+from magtwin.path import CASES, PATHS, Path, check_clear, check_on_floor, path_named
+from magtwin.path.room import FLOOR_M, RADIUS_M, Room, fit_path, path_in
+from magtwin.spec.obstacles import Obstacles
+from magtwin.twin import open_twin, simulate
+
+
+def box(x: float, y: float, wide: float, deep: float) -> np.ndarray:
+    return np.array([x, y]) + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array([wide, deep]) / 2
+
+
+def room(x: float, y: float, *boxes: np.ndarray, radius: float = RADIUS_M) -> Room:
+    return Room((x, y), radius, Obstacles(tuple(f"box_{k}" for k in range(len(boxes))), boxes))
+
+
+@pytest.mark.parametrize("name", [*PATHS, *CASES])
+def test_on_the_default_floor_named_paths_are_as_they_were_to_the_bit(name):
+    path, made = path_in(room(*FLOOR_M), name), path_named(name)
+    assert path.placing == ()
+    assert path.p_xy.tobytes() == made.p_xy.tobytes()
+
+
+def test_the_default_lab_leaves_every_named_path_as_it_is(lab_scene):
+    twin = open_twin(lab_scene)
+    lab = Room(twin.scene.lab.floor_m, twin.scene.robot.footprint_radius_m, twin.obstacles)
+    assert all(path_in(lab, name).placing == () for name in PATHS)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    name=st.sampled_from(sorted(PATHS)),
+    x=st.floats(1.0, 30.0),
+    y=st.floats(1.0, 30.0),
+    radius=st.floats(0.05, 0.4),
+)
+def test_a_named_path_fills_any_empty_floor_in_the_same_proportion(name, x, y, radius):
+    path, made = path_in(room(x, y, radius=radius), name), path_named(name)
+    check_on_floor(path, (x, y), radius)
+    reach, made_for = np.array([x, y]) / 2 - radius, np.array(FLOOR_M) / 2 - RADIUS_M
+    np.testing.assert_allclose(
+        np.abs(path.p_xy).max(axis=0) / reach, np.abs(made.p_xy).max(axis=0) / made_for, rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize("name", PATHS)
+@pytest.mark.parametrize(
+    "where",
+    [
+        room(6.0, 3.5, box(1.0, 1.4, 1.5, 0.7)),
+        room(3.0, 3.0, box(-1.3, 0.5, 0.4, 1.0), box(1.1, 1.1, 0.6, 0.6)),
+        room(12.0, 8.0, *(box(x, 0.0, 0.4, 0.4) for x in (-3, 0, 3))),
+        room(5.0, 4.0, box(-1.0, 1.7, 3.0, 0.5), box(2.1, 0.1, 0.7, 3.0)),
+    ],
+)
+def test_a_named_path_passes_what_stands_in_its_way(name, where):
+    path = path_in(where, name)
+    check_on_floor(path, where.floor_m, where.footprint_radius_m)
+    check_clear(path, where.obstacles, where.footprint_radius_m)
+    assert np.ptp(path.p_xy, axis=0).min() > 0.15 * min(where.floor_m)
+    assert len(path.p_xy) == len(path_named(name).p_xy)
+
+
+def test_a_path_that_fits_is_not_touched_by_a_fit():
+    path = Path("own", np.array([[0.0, 0.0], [1.0, 1.0]]))
+    assert fit_path(path, room(4.0, 3.0)) is path
+
+
+def test_a_fit_keeps_the_shape_and_only_moves_what_is_small_enough():
+    square = Path("own", np.array([[1.0, 1.0], [3.0, 1.0], [3.0, 2.0], [1.0, 2.0]]), closed=True)
+    moved = fit_path(square, room(4.0, 3.0))
+    assert moved.placing[:2] == (1.0, 1.0)
+    np.testing.assert_allclose(np.diff(moved.p_xy, axis=0), np.diff(square.p_xy, axis=0), atol=1e-12)
+    shrunk = fit_path(square, room(2.0, 2.0))
+    assert shrunk.placing[0] == shrunk.placing[1] < 1
+    check_on_floor(shrunk, (2.0, 2.0), RADIUS_M)
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        (
+            [[-3, 0], [3, 0]],
+            r"needs 6\.34 x 0\.34 m, the floor is 4 x 3 m; scaled by 0\.6 it fits: give --fit",
+        ),
+        ([[0, 0], [3, 0]], r"needs 3\.34 x 0\.34 m, .* moved by \(-1\.17, 0\.00\) m it fits: give --fit"),
+    ],
+)
+def test_a_path_that_does_not_fit_is_told_what_would(points, said):
+    path = Path("own", np.array(points, float))
+    with pytest.raises(InputError, match=said):
+        check_on_floor(path, (4.0, 3.0), RADIUS_M)
+    check_on_floor(fit_path(path, room(4.0, 3.0)), (4.0, 3.0), RADIUS_M)
+
+
+def test_what_the_refusal_says_is_true():
+    path = Path("own", np.array([[0.0, 0.0], [3.0, 0.0]]))
+    check_on_floor(path.placed((1.0, 1.0, -1.1711, 0.0)), (4.0, 3.0), RADIUS_M)
+    path = Path("own", np.array([[-3.0, 0.0], [3.0, 0.0]]))
+    check_on_floor(path.placed((0.6, 0.6, 0.0, 0.0)), (4.0, 3.0), RADIUS_M)
+
+
+def test_no_room_is_refused():
+    with pytest.raises(InputError, match=r"the floor of 0\.3 x 3 m is no wider than a robot"):
+        path_in(room(0.3, 3.0), "sine")
+    with pytest.raises(InputError, match="does not fit between what stands on the floor of 2 x 2 m"):
+        path_in(room(2.0, 2.0, box(0, 0, 1.6, 1.6)), "sine")
+
+
+@pytest.mark.parametrize("placing", [(0.0, 1.0, 0.0, 0.0), (1.0, 1.0), (1.0, 1.0, np.inf, 0.0)])
+def test_a_placing_that_is_none_is_refused(placing):
+    with pytest.raises(InputError, match="two scales above 0 and two shifts"):
+        path_named("sine").placed(placing)
+
+
+def test_a_fitted_run_is_repeated_to_the_bit(lab_scene, tmp_path, capsys):
+    (tmp_path / "far.csv").write_text("0,0\n4,0\n4,1\n")
+    run = ["run", str(lab_scene), "--path", str(tmp_path / "far.csv"), "--rate-hz", "5", "--network", "none"]
+    with pytest.raises(InputError, match=r"far\.csv leaves the floor .*give --fit"):
+        main([*run, "--out", str(tmp_path / "run.parquet"), "--debug"])
+    main([*run, "--out", str(tmp_path / "run.parquet"), "--fit"])
+    assert "Path far.csv is moved by (" in capsys.readouterr().err
+    main(["reproduce", str(tmp_path / "run.parquet")])
+    assert "yes, to the bit" in capsys.readouterr().out
+    with pytest.raises(InputError, match="--fit is for a path"):
+        main([*run[:2], "--path", "random", "--fit", "--debug"])
+
+
+def test_a_run_on_the_default_lab_says_nothing_of_a_placing(lab_scene):
+    run = simulate(open_twin(lab_scene, network="none"), "figure8", duration_s=1.0, rate_hz=5.0)
+    assert "path_placing" not in run.metadata

@@ -1,0 +1,32 @@
+"""A scene's stage is opened once; its parts are read from that one stage."""
+
+from pathlib import Path
+
+import pytest
+from pxr import Usd
+
+from magtwin.errors import UnknownNameError
+from magtwin.files import shipped
+from magtwin.usd.layers import stage_sha256
+from magtwin.usd.maps import load_map
+from magtwin.usd.obstacles import read_obstacles
+from magtwin.usd.scene import open_scene, read_scene
+
+LAB = shipped("scenes", "lab", "lab.usda")
+
+
+def test_parts_of_an_opened_scene_are_those_read_one_by_one(monkeypatch):
+    scene, field, obstacles = read_scene(LAB), load_map(read_scene(LAB).map_layer), read_obstacles(LAB)
+    opened = open_scene(LAB)
+    monkeypatch.setattr(Usd.Stage, "Open", None)  # parts need no other stage
+    assert opened.file == Path(LAB)
+    assert opened.scene == scene
+    assert (opened.map.values_nt == field.values_nt).all()
+    assert opened.obstacles.names == obstacles.names
+    assert opened.obstacles is opened.obstacles
+    assert {shape.link for shape in opened.shapes} <= {"", *opened.links}
+    assert opened.alone(scene.robot.name) is opened, "it is alone already"
+    with pytest.raises(UnknownNameError, match="no robot 'nobody'"):
+        opened.alone("nobody")
+    monkeypatch.undo()
+    assert opened.sha256 == stage_sha256(LAB)
