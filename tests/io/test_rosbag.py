@@ -146,7 +146,7 @@ def test_the_unit_is_told_by_size_or_by_option(tmp_path, factor, unit):
     assert_allclose(read_bag_readings(bag).b_nt, 41_000)
     assert_allclose(read_bag_readings(bag, unit=unit).b_nt, 41_000)
     other = "nT" if unit != "nT" else "T"
-    with pytest.raises(InputError, match=f"the mean of /mag .* were it {unit}, .* say --unit {unit}"):
+    with pytest.raises(InputError, match=f"the mean of /mag .* in {unit} .* give --unit {unit}"):
         read_bag_readings(bag, unit=other)
 
 

@@ -198,7 +198,7 @@ def test_parquet_with_text_or_holes_is_refused(tmp_path):
 
 def test_an_output_that_exists_is_kept_unless_forced(written):
     before = written.read_bytes()
-    with pytest.raises(InputError, match="exists already; give --force"):
+    with pytest.raises(InputError, match="exists already; give `force=True`"):
         write_parquet(some_run(seed=1), written)
     assert written.read_bytes() == before
     write_parquet(some_run(seed=1), written, force=True)

@@ -237,7 +237,7 @@ def test_the_unit_is_told_by_size_and_said(tmp_path, scale, unit):
     assert_allclose(run["b_measured_nt"], 41_000 + np.arange(200), rtol=1e-12)
     assert (run.metadata["field_unit"], run.metadata["field_unit_told"]) == (unit, "by its size")
     assert read_bag(bag, unit=unit).metadata["field_unit_told"] == "given"
-    with pytest.raises(InputError, match=f"were it {unit}"):
+    with pytest.raises(InputError, match=f"in {unit} it would be"):
         read_bag(bag, unit="G")
 
 

@@ -67,7 +67,7 @@ def test_units_are_turned_into_nt(tmp_path, unit, factor):
 )
 def test_a_mistaken_unit_is_refused_by_the_one_that_would_fit(tmp_path, value, said, wanted):
     path = file(tmp_path, f"x,y,yaw,field\n0,0,0,{value}\n")
-    with pytest.raises(InputError, match=f"a.csv: the mean of field .* were it {wanted}, .*--unit {wanted}$"):
+    with pytest.raises(InputError, match=f"a.csv: the mean of field .* in {wanted} .*--unit {wanted}$"):
         read_readings(path, columns=Columns(unit=said))
 
 
@@ -302,7 +302,7 @@ def test_the_same_readings_give_the_same_bytes_with_units_on_every_column(tmp_pa
     assert schema.field("b_nt").metadata[b"unit"] == b"nT"
     assert schema.field("p_xy_x").metadata[b"unit"] == b"m"
     assert json.loads(schema.metadata[b"magtwin_readings"])["source"] == readings.source
-    with pytest.raises(InputError, match=r"a\.parquet: exists already; give --force"):
+    with pytest.raises(InputError, match=r"a\.parquet: exists already; give `force=True`"):
         save_readings(readings, tmp_path / "a.parquet")
 
 
