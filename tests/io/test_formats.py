@@ -8,10 +8,11 @@ from test_cli import refused
 from test_run import assert_same, every_column
 from test_tables import few_bytes
 
+import magtwin
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.io.bags import BagWriter
-from magtwin.io.formats import FORMATS, read_run, write_run
+from magtwin.io.formats import FORMATS, Format, read_run, write_run
 from magtwin.io.tables import ParquetParts
 from magtwin.run.run import Column, Run
 from magtwin.twin import Twin, open_twin, simulate
