@@ -207,7 +207,7 @@ class Outputs:
 
     def sinks(self, driven: Driven) -> list["Sink"]:
         """Writers that take the run as it comes, one per growing format."""
-        from magtwin.io.bags.rosbag import BagWriter
+        from magtwin.io.bags.writer import BagWriter
         from magtwin.io.rerun.live import RrdWriter
         from magtwin.io.tables import ParquetParts
 

@@ -7,13 +7,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_cli import refused
 from test_gp import survey
-from test_latch import gridded
+from test_stuck import gridded
 from test_rosbag import at_middle, drive, write_bag
 
 from magtwin.author.earth import earth_of
 from magtwin.cli import main
 from magtwin.field.sources.earth import earth_field_nt
-from magtwin.field.survey.folder import import_survey
+from magtwin.io.surveys.maps import open_map
 from magtwin.io.surveys.readings import load_readings, save_readings
 from magtwin.usd.maps import load_map
 from magtwin.usd.scene import read_scene
@@ -31,7 +31,7 @@ def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, cap
     assert report["figures"]["latched at every heading"]["value"] == 17
     assert report["figures"]["masked nodes"]["value"] == np.count_nonzero(~field.valid) > 68
     assert np.isnan(field.lookup([-1.25, 0.75], 0.0))
-    assert_array_equal(field.valid, import_survey(maps).valid)
+    assert_array_equal(field.valid, open_map(maps).valid)
     run("map", "import", maps, "--out", tmp_path / "b.usdc", "--keep-stuck", "--json")
     whole = load_map(tmp_path / "b.usdc")
     assert whole.valid.all()
@@ -290,7 +290,7 @@ def test_a_fit_of_one_heading_and_of_few_readings_says_that_they_are_doubtful(tm
     said = " ".join(capsys.readouterr().out.split())
     assert "only 16 good readings" in said
     assert "one heading only, 29 deg: the robot's own field cannot be separated" in said
-    assert "field in uT, as its size tells (--unit)" in said
+    assert "field in uT, by its size (--unit)" in said
 
 
 @pytest.mark.parametrize("method", ["harmonic", "gp", "trilinear"])
