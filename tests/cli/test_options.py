@@ -159,7 +159,7 @@ def test_cheap_checks_come_first_and_say_what_to_do(lab_scene, tmp_path, capfd):
     (tmp_path / "a.toml").touch()
     for arguments, text in (
         (["run", tmp_path / "a.toml"], "author it first: magtwin scene"),
-        (["run", tmp_path, "--out", "x.txt"], "no known kind of run file"),
+        (["run", tmp_path, "--out", "x.txt"], "unknown format of a run"),
         (["map", "fit", "gone.csv", "--out", "x.csv"], "a map layer ends in .usdc or .usd"),
         (["train", tmp_path, "--out", tmp_path / "x.safetensors"], "build one from the runs first"),
         (["scene", "lab", "--map", lab_scene, "--out", tmp_path / "s"], "is no map layer"),

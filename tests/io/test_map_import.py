@@ -28,7 +28,7 @@ def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, cap
     run("map", "import", maps, "--out", tmp_path / "a.usdc", "--licence", "MIT", "--json")
     report = json.loads(capsys.readouterr().out)
     field = load_map(tmp_path / "a.usdc")
-    assert report["figures"]["latched at every heading"]["value"] == 17
+    assert report["figures"]["stuck at every heading"]["value"] == 17
     assert report["figures"]["masked nodes"]["value"] == np.count_nonzero(~field.valid) > 68
     assert np.isnan(field.lookup([-1.25, 0.75], 0.0))
     assert_array_equal(field.valid, open_map(maps).valid)
@@ -37,7 +37,7 @@ def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, cap
     assert whole.valid.all()
     assert whole.lookup([-1.25, 0.75], 0.0) == pytest.approx(35_602.1, abs=0.1)
     report = json.loads(capsys.readouterr().out)
-    assert report["figures"]["latched at every heading"]["value"] == 17
+    assert report["figures"]["stuck at every heading"]["value"] == 17
 
 
 def test_readings_kept_as_parquet_make_the_same_layer_as_the_folder(tmp_path, capsys, real_data):
@@ -98,7 +98,7 @@ def test_scattered_readings_make_no_nodes_and_the_way_on_is_told(tmp_path, capsy
     [
         (("a.csv", "--x", "px"), "no column 'px'; did you mean 'x'"),
         (("a.csv", "--vector", "a,b"), "vector takes 3 columns"),
-        (("a.csv", "--unit", "uT"), "say --unit nT"),
+        (("a.csv", "--unit", "uT"), "give --unit nT"),
         (("m.usdc",), "m.usdc: a stage or a map, not readings"),
         (("b.csv",), "b.csv: no such source of readings; did you mean 'a.csv'"),
         (("a.csv+b.csv",), "b.csv: no such file of readings"),
@@ -145,7 +145,7 @@ def test_a_fit_and_a_check_run_from_readings_with_latched_ones_out(tmp_path, cap
     save_readings(gridded(0, change=latch), tmp_path / "a.parquet")
     run("map", "fit", tmp_path / "a.parquet", "--method", "trilinear", "--out", tmp_path / "a.usdc", "--json")
     report = json.loads(capsys.readouterr().out)
-    assert report["figures"]["latched at every heading"]["value"] == 12
+    assert report["figures"]["stuck at every heading"]["value"] == 12
     field = load_map(tmp_path / "a.usdc")
     assert field.values_nt[field.valid].min() > 32_000
     run("map", "validate", tmp_path / "a.parquet", "--method", "trilinear", "--json")

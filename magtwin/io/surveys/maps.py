@@ -270,8 +270,7 @@ def survey_scene(
     Raises:
         InputError: The scene has no Earth field, a number is out of range, or the output cannot be written.
     """
-    from magtwin.sim.survey import blocked_by
-    from magtwin.sim.survey import survey, survey_readings
+    from magtwin.sim.survey import blocked_by, survey, survey_readings
     from magtwin.usd.layers import layer_files
     from magtwin.usd.maps import save_map
     from magtwin.usd.obstacles import read_obstacles
