@@ -13,7 +13,7 @@ from test_stuck import gridded
 from magtwin.author.earth import earth_of
 from magtwin.cli import main
 from magtwin.field.sources.earth import earth_field_nt
-from magtwin.field.survey.folder import read_survey
+from magtwin.io.surveys.maps import open_map
 from magtwin.io.surveys.readings import load_readings, save_readings
 from magtwin.usd.maps import load_map
 from magtwin.usd.scene import read_scene
@@ -31,7 +31,7 @@ def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, cap
     assert report["figures"]["stuck at every heading"]["value"] == 17
     assert report["figures"]["masked nodes"]["value"] == np.count_nonzero(~field.valid) > 68
     assert np.isnan(field.lookup([-1.25, 0.75], 0.0))
-    assert_array_equal(field.valid, read_survey(maps)[0].valid)
+    assert_array_equal(field.valid, open_map(maps).valid)
     run("map", "import", maps, "--out", tmp_path / "b.usdc", "--keep-stuck", "--json")
     whole = load_map(tmp_path / "b.usdc")
     assert whole.valid.all()

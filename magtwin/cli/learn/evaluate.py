@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Seed
+from magtwin.cli.options import Flag, Force, Names, Seed
 from magtwin.cli.terminal import Done, progress, stdout_console, step
 from magtwin.errors import InputError
 
@@ -16,9 +16,7 @@ if TYPE_CHECKING:
     from magtwin.figures.page import Section
     from magtwin.learn.evaluation.evaluation import Evaluation
 
-Flag = Annotated[bool, Parameter(negative="")]
-Files = Annotated[list[Path] | None, Parameter(negative="", consume_multiple=True)]
-Names = Annotated[list[str] | None, Parameter(negative="", consume_multiple=True)]
+Files = Annotated[list[Path] | None, Parameter(consume_multiple=True)]
 
 MOST_CASES = 7
 """Most rows of the table on a terminal."""

@@ -22,6 +22,8 @@ def net_convert(pth: Path, *, out: Path, licence: Licence = "", force: Force = F
         Checkpoint with the weights and the two scalers.
     out
         File to write, .safetensors.
+    licence
+        Licence of the weights, an SPDX identifier such as MIT, kept in their metadata.
     """
     from magtwin.learn.models.network import convert
 
