@@ -14,4 +14,4 @@ with open("cart.urdf", "w") as file:
     file.write(URDF)
 robot = mt.from_urdf("cart.urdf", "cart/cart.usda")
 print(robot.asset)
-print(robot.report)
+print(robot.report.summary())

@@ -18,12 +18,16 @@ if TYPE_CHECKING:
     from magtwin.author.from_urdf import from_urdf as from_urdf
     from magtwin.errors import InputError as InputError
     from magtwin.errors import MismatchWarning as MismatchWarning
-    from magtwin.field.fit.fit import fit as fit_map
+    from magtwin.export.package import export_scene as export_scene
+    from magtwin.export.validation.validate import validate as validate
+    from magtwin.field.fit.fit import fit_map as fit_map
     from magtwin.field.maps.map import AnomalyMap as AnomalyMap
+    from magtwin.field.survey.readings import Readings as Readings
     from magtwin.figures.plot import plot as plot
     from magtwin.io.formats import read_run as load_run
     from magtwin.io.formats import write_run as save_run
-    from magtwin.io.surveys.readings import load_readings as read_survey
+    from magtwin.io.provenance import repeat_of as reproduce
+    from magtwin.io.surveys.survey import read_survey as read_survey
     from magtwin.io.sweeps import save_runs as save_runs
     from magtwin.learn.models.predictor import load_predictor as load_predictor
     from magtwin.learn.training.train import train as train
@@ -36,6 +40,7 @@ if TYPE_CHECKING:
     from magtwin.twin import Twin as Twin
     from magtwin.twin import author_scene as author_scene
     from magtwin.twin import in_session as in_session
+    from magtwin.twin import new_scene as new_scene
     from magtwin.twin import open_twin as open_twin
     from magtwin.twin import scene_from_toml as scene_from_toml
     from magtwin.twin import simulate as simulate
@@ -49,6 +54,7 @@ _NAMES = {
     "COLUMNS": "run.run",
     "InputError": "errors",
     "MismatchWarning": "errors",
+    "Readings": "field.survey.readings",
     "Run": "run.run",
     "Scene": "spec.scene",
     "Twin": "twin",
@@ -56,15 +62,18 @@ _NAMES = {
     "build_dataset": "learning",
     "error_budget": "learning",
     "evaluate": "learning",
-    "fit_map": "field.fit.fit:fit",
+    "export_scene": "export.package",
+    "fit_map": "field.fit.fit",
     "from_urdf": "author.from_urdf",
     "in_session": "twin",
     "load_map": "usd.maps",
     "load_predictor": "learn.models.predictor",
     "load_run": "io.formats:read_run",
+    "new_scene": "twin",
     "open_twin": "twin",
     "plot": "figures.plot",
-    "read_survey": "io.surveys.readings:load_readings",
+    "read_survey": "io.surveys.survey",
+    "reproduce": "io.provenance:repeat_of",
     "save_map": "usd.maps",
     "save_run": "io.formats:write_run",
     "save_runs": "io.sweeps",
@@ -73,6 +82,7 @@ _NAMES = {
     "simulate_robots": "twin",
     "sweep": "twin",
     "train": "learn.training.train",
+    "validate": "export.validation.validate",
 }
 """Module of each public name, and its name there if it differs."""
 
@@ -81,6 +91,7 @@ __all__ = [
     "AnomalyMap",
     "InputError",
     "MismatchWarning",
+    "Readings",
     "Run",
     "Scene",
     "Twin",
@@ -88,15 +99,18 @@ __all__ = [
     "build_dataset",
     "error_budget",
     "evaluate",
+    "export_scene",
     "fit_map",
     "from_urdf",
     "in_session",
     "load_map",
     "load_predictor",
     "load_run",
+    "new_scene",
     "open_twin",
     "plot",
     "read_survey",
+    "reproduce",
     "save_map",
     "save_run",
     "save_runs",
@@ -105,6 +119,7 @@ __all__ = [
     "simulate_robots",
     "sweep",
     "train",
+    "validate",
 ]
 
 

@@ -30,6 +30,7 @@ from magtwin.version import __version__
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer, Read
+    from magtwin.sim.extensions import Interference, SensorFactory
     from magtwin.sim.motion.commands import Commands
     from magtwin.sim.motion.controllers import Controller
     from magtwin.sim.motion.engine import Engine
@@ -52,7 +53,9 @@ def simulate(
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: "str | Controller" = "follower",
-    engine: "Literal['kinematic', 'newton'] | Engine" = "kinematic",
+    engine: "str | Engine" = "kinematic",
+    sensors: "Iterable[str | SensorFactory]" = (),
+    interference: "Iterable[str | Interference]" = (),
     progress: Callable[[int, int, str], Any] | None = None,
 ) -> Run:
     """Drive the scene's robot along a path and read every sensor.
@@ -75,8 +78,11 @@ def simulate(
         outside: What the map reads outside its extent: nan, the nearest value inside, or an error.
         controller: "follower", "release", "stanley" or "pure_pursuit", or a custom
             `magtwin.sim.motion.controllers.Controller`.
-        engine: "kinematic"; "newton" for physics in the stage (extra `physics`); or a custom
-            `magtwin.sim.motion.engine.Engine`.
+        engine: "kinematic"; "newton" for physics in the stage (extra `physics`); the name of a registered
+            engine; or a custom `magtwin.sim.motion.engine.Engine`.
+        sensors: Custom sensors whose columns are added: names of registered ones, or factories; see
+            `magtwin.sim.extensions`.
+        interference: Custom terms of the field at the magnetometer: names of registered ones, or functions.
         progress: As for `engine_named`.
 
     Returns:
@@ -111,6 +117,8 @@ def simulate(
         obstacles=twin.obstacles,
         controller=controller,
         engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
+        sensors=sensors,
+        interference=interference,
     )
     check_read(run, twin.field)
     return finished(twin, run, path, reads[-1] if reads else None, seed=seed, duration_s=duration_s)
@@ -230,7 +238,7 @@ def engine_named(
     """The engine that moves a twin's robot.
 
     Args:
-        name: "kinematic" or "newton".
+        name: "kinematic", "newton", or the name of a registered engine.
         twin: The twin that it moves in.
         progress: Called by slow engines with steps done, steps at most, and the simulated time as text.
 
@@ -238,11 +246,11 @@ def engine_named(
         InputError: No engine has that name, or it is not installed; the text names the extra.
     """
     from magtwin.sim.engines.newton import Newton, check_installed
-    from magtwin.sim.motion.engine import Kinematic
+    from magtwin.sim.motion.engine import ENGINES
 
-    find("engine", name, {"kinematic": None, "newton": None})
-    if name == "kinematic":
-        return Kinematic()
+    find("engine", name, dict.fromkeys([*ENGINES, "newton"]))
+    if name != "newton":
+        return ENGINES[name]
     check_installed()
     return Newton(twin.scene_file, twin.scene.robot, progress)
 
